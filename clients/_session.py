@@ -12,10 +12,10 @@ import os
 import time
 import uuid
 from collections import deque
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 from weakref import WeakValueDictionary
 
 import anyio
@@ -32,6 +32,7 @@ from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.dealer import Dealer
 from vram_arbiter.clients.net.diagnose import START, obstacle
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
+from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -57,7 +58,7 @@ class _Subscriber:
     """Events that a subscriber has not read yet."""
 
     def __init__(self) -> None:
-        self._events: deque[r.Message] = deque(maxlen=SUBSCRIBER_QUEUE_MAX)
+        self._events: deque[Mapping[str, Any]] = deque(maxlen=SUBSCRIBER_QUEUE_MAX)
         self._arrived = anyio.Event()
         self._closed = False
 
@@ -65,11 +66,11 @@ class _Subscriber:
         self._closed = True
         self._arrived.set()
 
-    def put(self, event: r.Message) -> None:
+    def put(self, event: Mapping[str, Any]) -> None:
         self._events.append(event)
         self._arrived.set()
 
-    async def get(self) -> r.Message:
+    async def get(self) -> Mapping[str, Any]:
         while not self._events:
             self._arrived = anyio.Event()
             if self._closed:
@@ -101,7 +102,7 @@ class Session:
         self._greeted: Answer[None] = Answer()
         self._alarm_at = float("inf")
         self._alarm_moved = anyio.Event()
-        self._replies: dict[int, Answer[r.Message]] = {}
+        self._replies: dict[int, Answer[AnyReply]] = {}
         self._lost = False
         self._distrusted = False  # since the last contact
 
@@ -215,7 +216,7 @@ class Session:
         use_context.enter(use_id)
         return use
 
-    async def events(self) -> AsyncGenerator[r.Message]:
+    async def events(self) -> AsyncGenerator[Mapping[str, Any]]:
         """Yield history events from now on."""
         subscriber = _Subscriber()
         self._subscribers.append(subscriber)
@@ -237,9 +238,9 @@ class Session:
     def new_id(self) -> str:
         return uuid.uuid4().hex
 
-    async def reply(self, request_id: int) -> r.Message:
+    async def reply(self, request_id: int) -> AnyReply:
         self.check_open()
-        answer: Answer[r.Message] = Answer()
+        answer: Answer[AnyReply] = Answer()
         self._replies[request_id] = answer
         try:
             self.pump()

@@ -16,6 +16,7 @@ import uuid
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -32,6 +33,9 @@ from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
 from vram_arbiter.schemas.wire.requests import Gang, LeaseSpec
 
 CONNECT_TIMEOUT_S: Final = 5.0
@@ -268,8 +272,9 @@ class AsyncClient:
         fields: Mapping[str, Any] | None = None,
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> r.Message:
-        """Send any request of `schemas.wire.requests` that has no method here."""
+    ) -> AnyReply:
+        """Send any request of `schemas.wire.requests` that has no method here. Returns the reply's
+        type of `schemas.wire.replies`."""
         session = self._session
         return await session.reply(
             session.protocol.connection.request(
@@ -277,32 +282,32 @@ class AsyncClient:
             )
         )
 
-    async def status(self) -> r.Message:
+    async def status(self) -> StatusReply:
         """Return the state of everything, with the leases of all pages. A lease that moves meanwhile
         is listed once, or not at all."""
-        shown = await self.ask("status")
-        leases = {lease["lease_id"]: lease for lease in shown["leases"]}
-        after = shown.pop("next", None)
-        while after is not None:
-            page = await self.ask("status", {"after": after})
-            leases |= {lease["lease_id"]: lease for lease in page["leases"]}
-            after = page.get("next")
-        return {**shown, "leases": list(leases.values())}
+        first = page = await self._asked(StatusReply, "status")
+        leases = {lease.lease_id: lease for lease in page.leases}
+        while page.next is not None:
+            page = await self._asked(StatusReply, "status", {"after": page.next})
+            leases |= {lease.lease_id: lease for lease in page.leases}
+        return replace(first, leases=tuple(leases.values()), next=None)
 
-    async def why(self, consumer: str) -> r.Message:
+    async def why(self, consumer: str) -> WhyReply:
         """Return what blocks this consumer: by how many bytes, on which condition, what comes next."""
-        return await self.ask("why", {"consumer": consumer})
+        return await self._asked(WhyReply, "why", {"consumer": consumer})
 
     async def history(
         self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()
-    ) -> r.Message:
+    ) -> HistoryReply:
         """Return events after sequence number `after`, oldest first."""
-        return await self.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)})
+        fields = {"after": after, "limit": limit, "kinds": list(kinds)}
+        return await self._asked(HistoryReply, "history", fields)
 
-    async def ping(self, *, timeout_s: float = 2.0) -> r.Message:
-        return await self.ask("ping", timeout_s=timeout_s)
+    async def ping(self, *, timeout_s: float = 2.0) -> PingReply:
+        """Wait for a sign of life."""
+        return await self._asked(PingReply, "ping", timeout_s=timeout_s)
 
-    async def subscribe(self) -> AsyncIterator[r.Message]:
+    async def subscribe(self) -> AsyncIterator[Mapping[str, Any]]:
         """Yield history events from now on, also across restarts of the arbiter. A subscriber that
         does not read loses the oldest."""
         events = self._session.events()
@@ -311,3 +316,15 @@ class AsyncClient:
                 yield event
         finally:
             await events.aclose()
+
+    async def _asked[R](
+        self,
+        kind: type[R],
+        op: str,
+        fields: Mapping[str, Any] | None = None,
+        *,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+    ) -> R:
+        reply = await self.ask(op, fields, timeout_s=timeout_s)
+        assert isinstance(reply, kind)
+        return reply

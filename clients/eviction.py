@@ -8,7 +8,7 @@ must not know what a holder may do with its lease meanwhile.
 
 import logging
 from collections.abc import Awaitable, Callable
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import anyio
 
@@ -17,6 +17,7 @@ from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._protocol.records import LeaseRecord
 from vram_arbiter.clients.handlers import Handler, call
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
+from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.requests import LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ class Driver(Protocol):
         """Return a unique name, short enough for a use id."""
         ...
 
-    async def reply(self, request_id: int) -> dict[str, Any]:
+    async def reply(self, request_id: int) -> AnyReply:
         """Send what is queued and wait for the answer to a request. Raises its typed error."""
         ...
 
@@ -216,7 +217,7 @@ class Departure:
     async def _clear_the_gpu(self) -> str:
         """Free the bytes. Returns how the lease waits for its return ("": it is over)."""
         push = self._record.revoke
-        may_park = self._park_now or (push is not None and bool(push.get("park")))
+        may_park = self._park_now or (push is not None and push.park)
         if may_park and self._park is not None and not self.own_will:
             await self._guarded(self._park, "park")
             return "parked"

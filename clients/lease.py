@@ -8,7 +8,7 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
-from typing import Any, Literal
+from typing import Literal
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import traces
@@ -16,6 +16,8 @@ from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord, TokenP
 from vram_arbiter.clients.eviction import Departure, Driver
 from vram_arbiter.clients.handlers import Handlers, call
 from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
+from vram_arbiter.schemas.wire.pushes import RevokePush
+from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -65,7 +67,7 @@ class AsyncLease:
     @property
     def gpu(self) -> str:
         """UUID of the GPU that was granted."""
-        return str(self._record.view.get("gpu"))
+        return str(self._record.view.gpu)
 
     @property
     def state(self) -> LeaseState:
@@ -163,7 +165,8 @@ class AsyncLease:
         )
         self._resizing = True
         reply = await self._driver.reply(request)
-        if reply["state"] == "held":
+        assert isinstance(reply, AcquireReply)
+        if reply.state == "held":
             self._resizing = False
         while self._resizing and not self._departure.gone:
             await self._departure.progress.wait()
@@ -237,13 +240,13 @@ class AsyncLease:
             await self._departure.progress.wait()
 
     # -- the arbiter's part (called by the client) -------------------------------------------------
-    def _revoke_asked(self, push: dict[str, Any], first: bool) -> None:
+    def _revoke_asked(self, push: RevokePush, first: bool) -> None:
         if first and not self._departure.gone:
             eta = self._handlers.safe_point_eta_s
             self._driver.protocol.holdings.revoke_ack(
                 self._record, eta() if eta else None, self._driver.now()
             )
-            with traces.joined(push.get("traceparent")):  # the trace of the request that needs room
+            with traces.joined(push.traceparent):  # the trace of the request that needs room
                 if not self._departure.asked:
                     self._notify(self._handlers.on_revoke, "on_revoke", Eviction.of(push))
                 self._departure.start()

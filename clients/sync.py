@@ -30,6 +30,9 @@ from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
 from vram_arbiter.clients.handlers import Handler, Handlers
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease, AsyncUse, LeaseState
 from vram_arbiter.schemas.errors import BadState, VramError
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 
@@ -410,26 +413,27 @@ class Client:
         fields: Mapping[str, Any] | None = None,
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> r.Message:
+    ) -> AnyReply:
         """Send any request of `schemas.wire.requests` that has no method here."""
         return self._portal.call(self._client.ask, op, fields, timeout_s=timeout_s)
 
-    def status(self) -> r.Message:
+    def status(self) -> StatusReply:
         """Return the state of everything; see `AsyncClient.status`."""
         return self._portal.call(self._client.status)
 
-    def why(self, consumer: str) -> r.Message:
+    def why(self, consumer: str) -> WhyReply:
         """Return what blocks this consumer; see `AsyncClient.why`."""
         return self._portal.call(self._client.why, consumer)
 
-    def history(self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()) -> r.Message:
+    def history(self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()) -> HistoryReply:
         """Return events after sequence number `after`, oldest first."""
         return self._portal.call(self._client.history, after, limit, kinds)
 
-    def ping(self, *, timeout_s: float = 2.0) -> r.Message:
+    def ping(self, *, timeout_s: float = 2.0) -> PingReply:
+        """Wait for a sign of life."""
         return self._portal.call(self._client.ping, timeout_s=timeout_s)
 
-    def subscribe(self) -> Iterator[r.Message]:
+    def subscribe(self) -> Iterator[Mapping[str, Any]]:
         """Yield history events from now on; blocks for the next one. Close the iterator to stop."""
         return self._iterate(self._client.subscribe())
 

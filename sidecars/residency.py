@@ -243,9 +243,7 @@ class Residency:
         except VramError as error:
             _log.info("uses of the lease are unknown (%s): staying", error.code)
             return True
-        return any(
-            view["lease_id"] == self.lease.lease_id and view["uses"] for view in status["leases"]
-        )
+        return any(view.lease_id == self.lease.lease_id and view.uses for view in status.leases)
 
     def _prepare_blocking(self) -> None:
         self._adapter.prepare()

@@ -24,7 +24,17 @@ from vram_arbiter.clients._protocol.records import (
     Up,
 )  # fmt: skip
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.errors import ArbiterUnreachable, UnknownSession, VramError, from_wire
+from vram_arbiter.schemas.codec import CodecError, from_map
+from vram_arbiter.schemas.errors import (
+    ArbiterUnreachable,
+    InternalError,
+    UnknownSession,
+    VramError,
+    from_wire,
+)
+from vram_arbiter.schemas.wire.decode import decode_push, decode_reply
+from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.replies import ReattachReply, WelcomeReply
 
 HELLO_TIMEOUT_S = 2.0  # an unanswered hello is said again on a fresh socket
 REFUSED_RETRY_S = 1.0  # after a refused hello (a full server may have room later)
@@ -40,7 +50,7 @@ class Above(Protocol):
         """What the arbiter has to hear of before anything else (`schemas.wire.ReattachLease`); empty: nothing."""
         ...
 
-    def reattached(self, reply: Message) -> None:
+    def reattached(self, reply: ReattachReply) -> None:
         """Its verdict on them."""
         ...
 
@@ -48,7 +58,7 @@ class Above(Protocol):
         """We are up: ask again for what the arbiter may not know (of requests without a reply the connection takes care)."""
         ...
 
-    def pushed(self, message: Message, now: float) -> None:
+    def pushed(self, push: AnyPush, now: float) -> None:
         """The arbiter said something unasked."""
         ...
 
@@ -58,12 +68,11 @@ class Above(Protocol):
 
 
 class Connection:
-    """`phase`, and what the arbiter said of itself: `welcome`, `epoch`, `heartbeat_s`, `grace_s`."""
+    """`phase`, and what the arbiter said of itself: `epoch`, `heartbeat_s`, `grace_s`."""
 
     def __init__(self, above: Above, *, name: str, instance: str, role: str) -> None:
         self.instance = instance
         self.phase = "down"
-        self.welcome: Message = {}
         self.epoch: int | None = None
         self.heartbeat_s = d.HEARTBEAT_S
         self.grace_s = d.FENCE_GRACE_S
@@ -120,7 +129,8 @@ class Connection:
             return
         self._heard_at, self._pinged = now, False
         if "push" in message:
-            self._above.pushed(message, now)
+            if (push := decode_push(message)) is not None:  # else a newer arbiter's
+                self._above.pushed(push, now)
         elif message.get("re") == self._handshake_id and self.phase != "up":
             self.asked_at = self._handshake_at
             self._handshake_reply(message, now)
@@ -243,16 +253,15 @@ class Connection:
             self._phase_deadline = now + REFUSED_RETRY_S
             return
         if self.phase == "greeting":
-            self.welcome = message
+            welcome = from_map(WelcomeReply, message)
             self.epoch = int(message["epoch"])
-            self.heartbeat_s = float(message.get("heartbeat_s", self.heartbeat_s))
-            self.grace_s = float(message.get("grace_s", self.grace_s))
+            self.heartbeat_s, self.grace_s = welcome.heartbeat_s, welcome.grace_s
             if kept := self._above.reattachments():
                 self.phase = "reattaching"
                 self._send_handshake({"op": "reattach", "leases": kept}, now)
                 return
         else:
-            self._above.reattached(message)
+            self._above.reattached(from_map(ReattachReply, message))
         self._come_up(now)
 
     def _come_up(self, now: float) -> None:
@@ -273,11 +282,7 @@ class Connection:
             self.asked_at = max(self.asked_at, request.sent_at)
         if message.get("ok"):
             if request is not None and isinstance(request_id, int):
-                del self._pending[request_id]
-                if request.on_reply is not None:
-                    request.on_reply(message, now)
-                if not request.quiet:
-                    self._events.append(Replied(request_id, message))
+                self._succeed(request_id, request, message, now)
             return
         error = from_wire(message.get("error") or {})
         if isinstance(error, UnknownSession):
@@ -285,6 +290,20 @@ class Connection:
             self.contact_lost("the arbiter forgot the session")
         elif request is not None and isinstance(request_id, int):
             self._fail(request_id, error, now)
+
+    def _succeed(self, request_id: int, request: Pending, message: Message, now: float) -> None:
+        op = request.message["op"]
+        try:
+            reply = decode_reply(op, message)
+        except CodecError as error:
+            wrong = f"the arbiter's answer to {op} is not understood: {error}"
+            self._fail(request_id, InternalError(wrong, hint="are both of one version?"), now)
+            return
+        del self._pending[request_id]
+        if request.on_reply is not None:
+            request.on_reply(reply, now)
+        if not request.quiet:
+            self._events.append(Replied(request_id, reply))
 
     def _fail(self, request_id: int, error: VramError, now: float) -> None:
         request = self._pending.pop(request_id)

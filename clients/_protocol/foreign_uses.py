@@ -5,8 +5,9 @@ know nothing of the client's own leases: their uses are part of what is re-attac
 """
 
 from vram_arbiter.clients._protocol.connection import Connection
-from vram_arbiter.clients._protocol.records import ForeignUseRecord, Message, TokenPair, UseLost
+from vram_arbiter.clients._protocol.records import ForeignUseRecord, TokenPair, UseLost
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.wire.decode import AnyReply
 
 
 class ForeignUses:
@@ -27,7 +28,7 @@ class ForeignUses:
         use = ForeignUseRecord(lease_id, token, label, traceparent)
         self._uses[use_id] = use
 
-        def begun(_: Message, __: float) -> None:
+        def begun(_: AnyReply, __: float) -> None:
             use.begun = True
 
         def refused(_: VramError, __: float) -> None:

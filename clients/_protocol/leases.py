@@ -20,6 +20,7 @@ from vram_arbiter.clients._protocol.records import (
     Resized,
     Returned,
     RevokeAsked,
+    error_of,
     token_of,
 )  # fmt: skip
 from vram_arbiter.schemas import defaults as d
@@ -29,8 +30,16 @@ from vram_arbiter.schemas.errors import (
     LeaseRevoking,
     VramError,
     WaitTimeout,
-    from_wire,
 )
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.pushes import LostPush, RevokePush
+from vram_arbiter.schemas.wire.replies import (
+    AcquireReply,
+    ReattachReply,
+    ReleaseReply,
+    RenewReply,
+)
+from vram_arbiter.schemas.wire.views import LeaseView
 
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
 """Replies that say that the lease is no longer ours."""
@@ -47,7 +56,7 @@ class Holdings:
 
     # -- asked by the holder -----------------------------------------------------------------------------------------
     def ready(self, record: LeaseRecord, measured_bytes: int | None, now: float) -> int:
-        def held(_: Message, __: float) -> None:
+        def held(_: AnyReply, __: float) -> None:
             record.held, record.measured_bytes = True, measured_bytes
 
         message = {"op": "ready", **record.ref(), "measured_bytes": measured_bytes}
@@ -127,8 +136,9 @@ class Holdings:
         if asleep:
             return self._say_asleep(record, message, now, timeout_s)
 
-        def let_go(reply: Message, at: float) -> None:
-            if str(reply.get("next", "")) in AWAY:
+        def let_go(reply: AnyReply, at: float) -> None:
+            assert isinstance(reply, ReleaseReply)
+            if reply.next in AWAY:
                 self._cancel(record, at)
 
         return self._connection.ask(message, now, timeout_s, on_reply=let_go)
@@ -155,12 +165,12 @@ class Holdings:
         """It is granted."""
         self.held[record.lease_id] = record
 
-    def returned(self, view: Message) -> None:
+    def returned(self, view: LeaseView) -> None:
         """Granted again? The same record goes on under the new token."""
-        record = self.asleep.get(view["lease_id"])
-        if record is None or view.get("token") is None or view["state"] != "loading":
+        record = self.asleep.get(view.lease_id)
+        if record is None or view.token is None or view.state != "loading":
             return
-        token = token_of(view)
+        token = token_of(view.token)
         if token <= record.token:
             return
         self._wake(record)
@@ -184,33 +194,34 @@ class Holdings:
         if record := self.held.get(lease_id):
             self._resized(record)
 
-    def revoked(self, push: Message) -> None:
-        record = self.held.get(push["lease_id"])
-        if record is not None and record.token == token_of(push):
+    def revoked(self, push: RevokePush) -> None:
+        record = self.held.get(push.lease_id)
+        if record is not None and record.token == token_of(push.token):
             first, record.revoke = record.revoke is None, push
             self._connection.tell(RevokeAsked(record, push, first))
 
-    def lost(self, push: Message) -> None:
-        record = self._record(push["lease_id"])
-        if record is not None and record.token == token_of(push):
-            self._gone(record, from_wire(push["error"]))
+    def lost(self, push: LostPush) -> None:
+        record = self._record(push.lease_id)
+        if record is not None and record.token == token_of(push.token):
+            self._gone(record, error_of(push.error))
 
     # -- contact -----------------------------------------------------------------------------------------------------
     def reattachments(self) -> list[Message]:
         return [record.reattachment() for record in (*self.held.values(), *self.asleep.values())]
 
-    def reattached(self, reply: Message) -> None:
-        for entry in reply.get("leases", ()):
-            record = self._record(entry["lease_id"])
+    def reattached(self, reply: ReattachReply) -> None:
+        for entry in reply.leases:
+            record = self._record(entry.lease_id)
             if record is None:
                 continue
-            if entry.get("kept") and record.asleep:
-                self.returned(entry["lease"])  # if its grant was lost on the way
-            elif entry.get("kept"):
+            if entry.kept and record.asleep:
+                if entry.lease is not None:
+                    self.returned(entry.lease)  # if its grant was lost on the way
+            elif entry.kept:
                 record.confirmed_at = record.renewed_at = self._connection.asked_at
                 record.revoke = None  # a push that is still meant comes again
             else:
-                self._gone(record, _why_gone(entry))
+                self._gone(record, error_of(entry.error))
 
     def say_again(self, now: float) -> None:
         """A new daemon knows from the re-attachment that a lease is away or held, not that it is wanted, or at another size."""
@@ -303,12 +314,12 @@ class Holdings:
         def sleeps() -> bool:
             return record.asleep != "" and record.token == token
 
-        def let_go(reply: Message, _: float) -> None:
-            then = str(reply.get("next", ""))
+        def let_go(reply: AnyReply, _: float) -> None:
+            assert isinstance(reply, ReleaseReply)
             if not sleeps():
                 return
-            if then in AWAY:
-                record.asleep = then
+            if reply.next in AWAY:
+                record.asleep = reply.next
             else:
                 over(LeaseLost(f"{record.lease_id} may not come back", hint="acquire again"))
 
@@ -333,8 +344,9 @@ class Holdings:
     def _send_reacquire(self, record: LeaseRecord, now: float, *, quiet: bool = False) -> int:
         """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease."""
 
-        def replied(reply: Message, _: float) -> None:
-            self.returned(reply["lease"])
+        def replied(reply: AnyReply, _: float) -> None:
+            assert isinstance(reply, AcquireReply)
+            self.returned(reply.lease)
 
         def refused(error: VramError, _: float) -> None:
             record.wanted = False
@@ -355,11 +367,12 @@ class Holdings:
     ) -> int:
         """`quiet`: said again by ourselves, so that its end is told whatever it is."""
 
-        def replied(reply: Message, _: float) -> None:
+        def replied(reply: AnyReply, _: float) -> None:
+            assert isinstance(reply, AcquireReply)
             record.spec = {**record.spec, "footprint": footprint}
-            if reply["state"] == "held" and quiet:
+            if reply.state == "held" and quiet:
                 self._resized(record)
-            elif reply["state"] == "held":
+            elif reply.state == "held":
                 record.resizing = None
 
         def refused(error: VramError, _: float) -> None:
@@ -385,15 +398,16 @@ class Holdings:
         for record in batch:
             record.renewed_at = now
 
-        def renewed(reply: Message, _: float) -> None:
-            alive = set(reply.get("alive", ()))
+        def renewed(reply: AnyReply, _: float) -> None:
+            assert isinstance(reply, RenewReply)
+            alive = set(reply.alive)
             for record in batch:
                 if record.lease_id in alive:
                     record.confirmed_at = max(record.confirmed_at, now)
-            for entry in reply.get("gone", ()):
-                gone = self.held.get(entry["lease_id"])
+            for entry in reply.gone:
+                gone = self.held.get(entry.lease_id)
                 if gone is not None and gone in batch:
-                    self._gone(gone, _why_gone(entry))
+                    self._gone(gone, error_of(entry.error))
 
         message = {"op": "renew", "leases": [record.ref() for record in batch]}
         self._connection.ask(message, now, on_reply=renewed, quiet=True)
@@ -421,10 +435,6 @@ def waited_in_vain(spec: Message, what: str, waited_s: float | None = None) -> W
         hint="is the arbiter running? see `vramctl status`",
         details={} if waited_s is None else {"waited_s": waited_s},
     )
-
-
-def _why_gone(entry: Message) -> VramError:
-    return from_wire(entry.get("error") or {"code": "lease_lost"})
 
 
 def _renew_at(record: LeaseRecord) -> float:

@@ -14,9 +14,19 @@ from collections.abc import Iterator
 from vram_arbiter.clients._protocol.connection import Connection
 from vram_arbiter.clients._protocol.foreign_uses import ForeignUses
 from vram_arbiter.clients._protocol.leases import Holdings
-from vram_arbiter.clients._protocol.records import HistoryEvent, Message
+from vram_arbiter.clients._protocol.records import HistoryEvent, Message, error_of
 from vram_arbiter.clients._protocol.waits import Waits
-from vram_arbiter.schemas.errors import from_wire
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.pushes import (
+    AnyPush,
+    DeniedPush,
+    EventPush,
+    GrantedPush,
+    LostPush,
+    ResizedPush,
+    RevokePush,
+)
+from vram_arbiter.schemas.wire.replies import ReattachReply
 
 
 class ClientProtocol:
@@ -32,7 +42,7 @@ class ClientProtocol:
     def subscribe(self, now: float) -> int:
         """History events from now on, also after reconnects."""
 
-        def subscribed(_: Message, __: float) -> None:
+        def subscribed(_: AnyReply, __: float) -> None:
             self._subscribed = True
 
         return self.connection.ask({"op": "subscribe"}, now, on_reply=subscribed)
@@ -64,7 +74,7 @@ class ClientProtocol:
     def reattachments(self) -> list[Message]:
         return self.holdings.reattachments()
 
-    def reattached(self, reply: Message) -> None:
+    def reattached(self, reply: ReattachReply) -> None:
         self.holdings.reattached(reply)
 
     def say_again(self, now: float) -> None:
@@ -74,22 +84,20 @@ class ClientProtocol:
         self.holdings.say_again(now)
         self.foreign_uses.say_again(now)
 
-    def pushed(self, message: Message, now: float) -> None:
-        """Pushes that we do not know are ignored: an older client lives with a newer arbiter."""
-        match message["push"]:
-            case "granted":
-                view = message["lease"]
-                if not self.waits.pushed_grant(view, now):
-                    self.holdings.returned(view)
-            case "denied":
-                error = from_wire(message["error"])
-                if not self.waits.pushed_denial(message["lease_id"], error):
-                    self.holdings.denied(message["lease_id"], error)
-            case "resized":
-                self.holdings.resized(message["lease_id"])
-            case "revoke":
-                self.holdings.revoked(message)
-            case "lost":
-                self.holdings.lost(message)
-            case "event":
-                self.connection.tell(HistoryEvent(message["event"]))
+    def pushed(self, push: AnyPush, now: float) -> None:
+        match push:
+            case GrantedPush():
+                if not self.waits.pushed_grant(push.lease, now):
+                    self.holdings.returned(push.lease)
+            case DeniedPush():
+                error = error_of(push.error)
+                if not self.waits.pushed_denial(push.lease_id, error):
+                    self.holdings.denied(push.lease_id, error)
+            case ResizedPush():
+                self.holdings.resized(push.lease_id)
+            case RevokePush():
+                self.holdings.revoked(push)
+            case LostPush():
+                self.holdings.lost(push)
+            case EventPush():
+                self.connection.tell(HistoryEvent(push.event))

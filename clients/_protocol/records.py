@@ -1,22 +1,34 @@
 """What the client's protocol tells its owner, and what it remembers of leases, waits, requests and uses. Plain data, no behaviour."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.errors import VramError, from_wire
+from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.pushes import RevokePush
+from vram_arbiter.schemas.wire.views import LeaseView
 
 Message = dict[str, Any]
 TokenPair = tuple[int, int]
-OnReply = Callable[[Message, float], None]
+OnReply = Callable[[AnyReply, float], None]
 OnError = Callable[[VramError, float], None]
 
 
-def token_of(message: Message) -> TokenPair:
-    """The token in a lease's view or in a push."""
-    epoch, serial = message["token"]
-    return int(epoch), int(serial)
+def token_of(token: Token | None) -> TokenPair:
+    """Return the token of a view or a push as a pair. Raises ValueError where it is not shown."""
+    if token is None:
+        raise ValueError("a grant without a token")
+    return token.epoch, token.serial
+
+
+def error_of(view: ErrorView | None) -> VramError:
+    """Return the typed error; a lease that is gone without a word was lost."""
+    return from_wire({"code": "lease_lost"} if view is None else to_map(view))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +45,9 @@ class Eviction:
     """Of the request that needs the room; None where there is none."""
 
     @classmethod
-    def of(cls, push: Message) -> "Eviction":
-        order = push.get("order") or {}
-        return cls(
-            push.get("cause", ""),
-            order.get("by") or push.get("wanted_by", ""),
-            push.get("reason", ""),
-            push.get("priority"),
-        )
+    def of(cls, push: RevokePush) -> "Eviction":
+        by = push.wanted_by if push.order is None else push.order.by
+        return cls(push.cause, by, push.reason, push.priority)
 
 
 # -- what the owner is told -----------------------------------------------------------------------------------------
@@ -68,7 +75,7 @@ class Refused:
 @dataclass(frozen=True, slots=True)
 class Replied:
     request_id: int
-    body: Message
+    body: AnyReply
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +101,7 @@ class RevokeAsked:
     """Asked to leave, or told again."""
 
     record: "LeaseRecord"
-    push: Message
+    push: RevokePush
     first: bool
 
 
@@ -132,7 +139,7 @@ class UseLost:
 
 @dataclass(frozen=True, slots=True)
 class HistoryEvent:
-    event: Message
+    event: Mapping[str, Any]
 
 
 Event = (
@@ -161,13 +168,13 @@ class LeaseRecord:
     token: TokenPair
     nonce: str
     spec: Message
-    view: Message
+    view: LeaseView
     confirmed_at: float  # when the last message that the arbiter confirmed was *sent*
     renewed_at: float
     held: bool = False  # False: still loading
     measured_bytes: int | None = None
     uses: set[str] = field(default_factory=set)
-    revoke: Message | None = None
+    revoke: RevokePush | None = None
     released: bool = False
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
     wanted: bool = False  # asleep, and its owner waits for its return

@@ -17,11 +17,13 @@ from vram_arbiter.clients._protocol.records import (
     Denied,
     Granted,
     LeaseRecord,
-    Message,
     Waiter,
     token_of,
 )
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.replies import AcquireReply
+from vram_arbiter.schemas.wire.views import LeaseView
 
 
 class Waits:
@@ -62,9 +64,9 @@ class Waits:
             self._ask_to_cancel(waiter, now)
 
     # -- said by the arbiter -----------------------------------------------------------------------------------------
-    def pushed_grant(self, view: Message, now: float) -> bool:
+    def pushed_grant(self, view: LeaseView, now: float) -> bool:
         """Was it for one of these?"""
-        waiter = self._of(view["lease_id"])
+        waiter = self._of(view.lease_id)
         if waiter is not None:
             self._granted(waiter, view, now)
         return waiter is not None
@@ -112,7 +114,8 @@ class Waits:
             **waiter.extra,
         }
 
-        def replied(reply: Message, at: float) -> None:
+        def replied(reply: AnyReply, at: float) -> None:
+            assert isinstance(reply, AcquireReply)
             if waiter.nonce in self._waiters:
                 self._replied(waiter, reply, at)
 
@@ -125,24 +128,22 @@ class Waits:
             quiet=True,
         )
 
-    def _replied(self, waiter: Waiter, reply: Message, now: float) -> None:
-        view = reply["lease"]
-        waiter.lease_id = view["lease_id"]
-        if (
-            reply.get("state") == "loading"
-        ):  # not by its token: one that was away shows its last one
+    def _replied(self, waiter: Waiter, reply: AcquireReply, now: float) -> None:
+        view = reply.lease
+        waiter.lease_id = view.lease_id
+        if reply.state == "loading":  # not by its token: one that was away shows its last one
             self._granted(waiter, view, now)
         elif waiter.abandoned:
             self._ask_to_cancel(waiter, now)
 
-    def _granted(self, waiter: Waiter, view: Message, now: float) -> None:
+    def _granted(self, waiter: Waiter, view: LeaseView, now: float) -> None:
         """The message may have waited for us longer than the lease lives: what is sure is only that it was sent after the arbiter
         heard the newest request that it has answered."""
         self._waiters.pop(waiter.nonce, None)
         heard_at = self._connection.asked_at
         record = LeaseRecord(
-            lease_id=view["lease_id"],
-            token=token_of(view),
+            lease_id=view.lease_id,
+            token=token_of(view.token),
             nonce=waiter.nonce,
             spec=waiter.spec,
             view=view,

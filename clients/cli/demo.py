@@ -35,6 +35,7 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
@@ -282,12 +283,12 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
     if client is None:
         display.show(None)
         return
-    status = await client.status()
+    status = to_map(await client.status())
     watch.samples += [(time.monotonic(), gpu) for gpu in status["gpus"]]
     watch.capacity_bytes = status["gpus"][0]["capacity_bytes"]
     after = watch.events[-1]["seq"] if watch.events else 0
-    for event in (await client.history(after=after))["events"]:
-        watch.events.append(event)
+    for event in (await client.history(after=after)).events:
+        watch.events.append(dict(event))
         display.event(event, event["at_wall_s"] - watch.wall_offset_s - watch.start_s)
     display.show(status)
 

@@ -216,7 +216,7 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
 
     async def listen() -> None:
         async for event in client.subscribe():
-            live.put_nowait(event)
+            live.put_nowait(dict(event))
 
     async with client:
         listening = asyncio.create_task(listen())
@@ -236,7 +236,7 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
                     last = 0  # the arbiter began a new history: its numbers start at 1 again
                 if event["seq"] > last + 1:  # the arbiter was away, or we were slow
                     missed = await client.history(last, PAGE)
-                    for older in missed["events"]:
+                    for older in missed.events:
                         if last < older["seq"] < event["seq"]:
                             tell(older)
                 if event["seq"] > last:

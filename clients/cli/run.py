@@ -13,10 +13,9 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import ValidationError
 
@@ -31,6 +30,7 @@ from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes, parse_bytes
+from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -245,21 +245,20 @@ class _Run:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), pause_s)
             self._wake.clear()
-            self._decide(lease, {})
+            self._decide(lease, None)
             with contextlib.suppress(VramError):
-                status = await self._client.ask(
-                    "status"
-                )  # its first page has the heads of the queues
+                status = await self._client.ask("status")  # its first page has all queues' heads
+                assert isinstance(status, StatusReply)
                 self._measure(lease, status)
                 self._decide(lease, status)
             pause_s = LOOK_S
 
-    def _measure(self, lease: AsyncLease, status: Mapping[str, Any]) -> None:
+    def _measure(self, lease: AsyncLease, status: StatusReply) -> None:
         used = sum(
-            process["used_bytes"] or 0
-            for gpu in status["gpus"]
-            for process in gpu["processes"]
-            if lease.lease_id in process["lease_ids"]
+            process.used_bytes or 0
+            for gpu in status.gpus
+            for process in gpu.processes
+            if lease.lease_id in process.lease_ids
         )
         self.peak_bytes = max(self.peak_bytes, used)
 
@@ -271,15 +270,15 @@ class _Run:
     async def lost(self, lease: AsyncLease, error: VramError) -> None:
         _say(f"{lease.lease_id} was lost: {error}")
 
-    def _decide(self, lease: AsyncLease, status: Mapping[str, Any]) -> None:
+    def _decide(self, lease: AsyncLease, status: StatusReply | None) -> None:
         """End the program where a revoke is for a higher priority. A request that came after the revoke is seen in `status`."""
         eviction = lease.evicted
         if eviction is None or self._ending or self._spec.on_revoke != "priority":
             return
         waiting = [
-            (view["consumer"], view["priority"])
-            for view in status.get("leases", ())
-            if view["state"] == "queued" and view["gpu"] in (None, lease.gpu)
+            (view.consumer, view.priority)
+            for view in (() if status is None else status.leases)
+            if view.state == "queued" and view.gpu in (None, lease.gpu)
         ]
         asked_by = self._spec.priority + 1 if eviction.priority is None else eviction.priority
         waiting.append((eviction.by, asked_by))
@@ -322,9 +321,9 @@ async def _tell_why(
     try:
         done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
         if not done:
-            for entry in (await client.why(consumer))["leases"]:
-                if entry["state"] == "queued":
-                    _say(f"waiting: {entry['text']}")
+            for entry in (await client.why(consumer)).leases:
+                if entry.state == "queued":
+                    _say(f"waiting: {entry.text}")
         return await acquiring
     finally:
         acquiring.cancel()

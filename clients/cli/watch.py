@@ -11,6 +11,7 @@ from vram_arbiter.clients.cli import arguments, text
 from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.request import TIMEOUT_S
+from vram_arbiter.schemas.codec import to_map
 
 REFRESH_S = 0.5
 """Between two readings of the status; every event refreshes at once as well."""
@@ -61,7 +62,7 @@ async def _live(client: AsyncClient, events_shown: int) -> None:
 
     async def follow() -> None:
         async for event in client.subscribe():
-            newest.append(event)
+            newest.append(dict(event))
             changed.set()
 
     following = asyncio.create_task(follow())
@@ -70,7 +71,7 @@ async def _live(client: AsyncClient, events_shown: int) -> None:
             lines: list[str] = ["…"]
             while not following.done():
                 if client.connected:
-                    lines = text.status_lines(await client.status())
+                    lines = text.status_lines(to_map(await client.status()))
                 else:
                     lines = [
                         f"no contact to the arbiter at {client.endpoint}; what it said last:",

@@ -33,6 +33,7 @@ from tests.support.lease_check import Finding, Hindrance, Story, check_leases, r
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked
 
@@ -207,9 +208,9 @@ class Storm:
     async def _tell_user(self, client: AsyncClient, lease: str) -> None:
         """Give the user a lease to mark a use on. Only an operator's status shows its token."""
         with contextlib.suppress(VramError):
-            shown = {view["lease_id"]: view for view in (await client.status())["leases"]}
-            if self._user is not None and (token := shown.get(lease, {}).get("token")) is not None:
-                self._user.tell(f"{lease} {token[0]} {token[1]}")
+            tokens = {view.lease_id: view.token for view in (await client.status()).leases}
+            if self._user is not None and (token := tokens.get(lease)) is not None:
+                self._user.tell(f"{lease} {token.epoch} {token.serial}")
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -486,7 +487,7 @@ class Storm:
 
         async def clean(client: AsyncClient) -> bool:
             nonlocal status
-            status = dict(await client.status())
+            status = to_map(await client.status())
             return (
                 not status["leases"]
                 and status["phase"] == "serving"

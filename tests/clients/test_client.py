@@ -30,7 +30,10 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WaitTimeout,
 )
+from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.views import Totals
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
@@ -47,7 +50,7 @@ def anyio_backend(request: pytest.FixtureRequest) -> str:
 
 
 async def states(client: AsyncClient) -> dict[str, str]:
-    return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
+    return {lease.consumer: lease.state for lease in (await client.status()).leases}
 
 
 async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
@@ -56,7 +59,7 @@ async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: S
         assert (lease.state, lease.token[0]) == ("loading", client.epoch)
         await lease.ready(5 << 30)
         async with lease.use("detect"):
-            assert (await client.status())["leases"][0]["uses"] == 1
+            assert (await client.status()).leases[0].uses == 1
         assert lease.state == "held"
         await lease.release()
         await lease.release()
@@ -105,16 +108,14 @@ async def test_status_is_whole_though_it_comes_in_pages(
         for number in range(waiters):
             await clients[1 + number % 4].ask("acquire", {"nonce": f"n{number}", **asked})
         page = await clients[0].ask("status")
-        assert (len(page["leases"]), page["totals"]) == (
-            STATUS_PAGE,
-            {"leases": waiters + 1, "waiting": waiters},
-        )
+        assert isinstance(page, StatusReply)
+        assert (len(page.leases), page.totals) == (STATUS_PAGE, Totals(waiters + 1, waiters))
         whole = await clients[0].status()
-        assert [lease.get("position") for lease in whole["leases"]] == [
+        assert [lease.position for lease in whole.leases] == [
             None,
             *range(1, waiters + 1),
         ]
-        assert "next" not in whole
+        assert whole.next is None
         vramctl = str(Path(sys.executable).with_name("vramctl"))
         command = [vramctl, "status", "--json", "--endpoint", arbiter_daemon.endpoint]
         told = await anyio.run_process(command)
@@ -355,7 +356,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
             said.append(unloading(*arguments))
             return said[-1]
 
-        async def refused_once(number: int) -> dict[str, Any]:
+        async def refused_once(number: int) -> AnyReply:
             answer = await reply(number)
             if said == [number]:
                 raise LimitExceeded("too many messages", hint="wait")
@@ -380,7 +381,7 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
         lease = await client.acquire(spec("a", 5))
         reply = client._session.reply
 
-        async def refused(number: int) -> dict[str, Any]:
+        async def refused(number: int) -> AnyReply:
             await reply(number)
             raise LimitExceeded("too many messages", hint="wait")
 
@@ -406,7 +407,7 @@ async def test_an_observer_may_look_but_not_acquire(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint, role="observer") as client:
-        assert (await client.status())["clients"] == 1
+        assert (await client.status()).clients == 1
         with pytest.raises(VramError, match="observer"):
             await client.acquire(spec("a", 1))
 
@@ -444,7 +445,7 @@ async def test_subscribers_see_events_in_order(
             kind for kind in kinds if kind != "queued"
         ]  # where the first reading of the card is still under way
         assert kinds == ["granted", "ready", "switch", "released"]
-        assert [event["kind"] for event in (await client.history(kinds=["granted"]))["events"]] == [
+        assert [event["kind"] for event in (await client.history(kinds=["granted"])).events] == [
             "granted"
         ]
 
@@ -568,9 +569,9 @@ async def test_leases_and_uses_survive_a_kill_of_the_daemon(
                 await anyio.to_thread.run_sync(arbiter.start)
                 await until(lambda: client.connected)
                 async with within(WAIT_S):
-                    while (shown := (await client.status())["leases"][0])["uses"] != 2:
+                    while (shown := (await client.status()).leases[0]).uses != 2:
                         await anyio.sleep(0.01)
-            assert (shown["lease_id"], shown["state"]) == (lease.lease_id, "held")
+            assert (shown.lease_id, shown.state) == (lease.lease_id, "held")
             assert client.epoch > lease.token[0]
             wanted = beside(client.acquire(spec("b", 5), WAIT_S))
             await until(lambda: lease.revoking)

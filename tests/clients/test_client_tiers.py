@@ -81,7 +81,7 @@ async def parkable(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
 
 
 async def states(client: AsyncClient) -> dict[str, str]:
-    return {lease["consumer"]: lease["state"] for lease in (await client.status())["leases"]}
+    return {lease.consumer: lease.state for lease in (await client.status()).leases}
 
 
 async def test_a_standby_lease_returns_by_itself_when_there_is_room(
@@ -233,8 +233,8 @@ async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
         await job.ready()
         async with job.use("render") as use:
             async with use.yielded():
-                assert (await client.status())["leases"][0]["uses"] == 0
-            assert (await client.status())["leases"][0]["uses"] == 1
+                assert (await client.status()).leases[0].uses == 0
+            assert (await client.status()).leases[0].uses == 1
             with pytest.raises(VramError):
                 await lend(use, client.acquire(spec("llm", 5), WAIT_S))
         assert model.did == ["unload"]
@@ -260,7 +260,7 @@ async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: S
         return Footprint(load_peak_bytes=gib * GIB, steady_bytes=gib * GIB, residue_bytes=0)
 
     async def charged(client: AsyncClient) -> int:
-        return int((await client.status())["leases"][0]["charge_bytes"])
+        return int((await client.status()).leases[0].charge_bytes)
 
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2))
@@ -325,7 +325,7 @@ async def test_a_resize_that_waits_outlives_the_daemon(
 
 async def until_growing(client: AsyncClient) -> None:
     async with within(WAIT_S):
-        while not any(lease.get("resizing") for lease in (await client.status())["leases"]):
+        while not any(lease.resizing for lease in (await client.status()).leases):
             await anyio.sleep(0.02)
 
 

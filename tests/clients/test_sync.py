@@ -28,9 +28,9 @@ def test_lease_use_release(client: Client, spec: Spec) -> None:
     with client.lease(spec("a", 5)) as lease:
         lease.ready(5 << 30)
         with lease.use("detect"):
-            assert client.status()["leases"][0]["uses"] == 1
+            assert client.status().leases[0].uses == 1
         assert lease.state == "held"
-        assert client.why("a")["leases"][0]["state"] == "held"
+        assert client.why("a").leases[0].state == "held"
     assert lease.state == "gone"
     with pytest.raises(LeaseLost), lease.use():
         pytest.fail("a use began on a released lease")
@@ -75,8 +75,8 @@ def test_a_use_on_anothers_lease(
     lease.ready()
     with Client("runner", endpoint=arbiter_daemon.endpoint) as runner:
         with runner.use(lease.lease_id, lease.token, "goal"):
-            assert runner.status()["leases"][0]["uses"] == 1
-        assert runner.status()["leases"][0]["uses"] == 0
+            assert runner.status().leases[0].uses == 1
+        assert runner.status().leases[0].uses == 0
 
 
 def test_events_can_be_iterated(client: Client, spec: Spec) -> None:
@@ -110,7 +110,7 @@ def test_not_across_a_fork(client: Client, spec: Spec) -> None:
         os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     lease.ready()
-    assert client.status()["leases"][0]["state"] == "held"
+    assert client.status().leases[0].state == "held"
 
 
 def test_closed_or_unreachable(tmp_path: Path) -> None:

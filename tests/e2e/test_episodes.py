@@ -230,7 +230,7 @@ class Stage:
         del self.events[: loads[-1]]
 
     async def leases(self) -> dict[str, str]:
-        return {view["consumer"]: view["state"] for view in (await self.arbiter.status())["leases"]}
+        return {view.consumer: view.state for view in (await self.arbiter.status()).leases}
 
     async def goal_under_way(self) -> AcceptedGoal:
         """A goal that has its policy resident and in use, held inside a call of the model, and the detector away."""
@@ -276,8 +276,10 @@ class Stage:
             == 1
         )
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
-        (shown,) = (await self.arbiter.status())["leases"]
-        assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == shown["token"]
+        (shown,) = (await self.arbiter.status()).leases
+        assert shown.token is not None
+        token = [shown.token.epoch, shown.token.serial]
+        assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == token
         assert await self.leases() == {"detector": "held"}
 
     def detector_was_away(self) -> bool:
@@ -305,7 +307,7 @@ async def done(stage: Stage) -> None:
             break
     (line,) = [line for line in said.splitlines() if " detector " in line]
     assert " standby " in line, said
-    why = (await stage.arbiter.why("detector"))["leases"][0]["text"]
+    why = (await stage.arbiter.why("detector")).leases[0].text
     assert why == "detector: on standby until policy has left"
     assert stage.detector_was_away()
     stage.programs.tell("hold", False)
@@ -359,8 +361,8 @@ async def past_its_deadline(stage: Stage) -> None:
     assert (stage.programs.runtime / "policy/holding").exists()
     assert (await stage.leases())["detector"] == "standby"
     assert stage.detector_was_away()
-    (card,) = (await stage.arbiter.status())["gpus"]
-    assert card["charged_bytes"] >= POLICY_BYTES
+    (card,) = (await stage.arbiter.status()).gpus
+    assert card.charged_bytes >= POLICY_BYTES
     stage.programs.tell("hold", False)
     await stage.detector_is_back()
 

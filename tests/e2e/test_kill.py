@@ -19,6 +19,7 @@ import pytest
 from tests.support.fakegpu_check import check_log
 from vram_arbiter.arbiter.host.gpu.fake import make_card
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 
@@ -115,15 +116,14 @@ class Box:
         async with asyncio.timeout(PATIENCE_S), self.client() as client:
             while True:
                 with contextlib.suppress(ArbiterUnreachable):
-                    status: dict[str, Any] = dict(await client.status())
+                    status: dict[str, Any] = to_map(await client.status())
                     if good(status):
                         return status
                 await asyncio.sleep(0.02)
 
     async def history(self) -> list[dict[str, Any]]:
         async with self.client() as client:
-            events: list[dict[str, Any]] = (await client.history())["events"]
-            return events
+            return [dict(event) for event in (await client.history()).events]
 
     def log(self) -> str:
         return (self.card / "log.jsonl").read_text()
@@ -290,7 +290,7 @@ def test_a_holder_in_use_is_asked_but_left_alone_until_its_safe_point() -> None:
         assert consumers(status)["waiter"] == "queued"
         async with box.client() as client:
             why = await client.why("waiter")
-        assert why["leases"][0]["blockers"][0]["consumer"] == "holder"
+        assert why.leases[0].blockers[0].consumer == "holder"
         holder.tell("end")
         await waiter.until("ready")
         kinds = [

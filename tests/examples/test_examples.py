@@ -35,7 +35,7 @@ def run(daemon: ArbiterProcess, name: str, *arguments: str, by: str = sys.execut
 def kinds(daemon: ArbiterProcess, consumer: str) -> list[str]:
     """Kinds of the history events of a consumer, in order."""
     with Client("test", endpoint=daemon.endpoint) as arbiter:
-        events = arbiter.history()["events"]
+        events = arbiter.history().events
     return [event["kind"] for event in events if event.get("consumer") == consumer]
 
 

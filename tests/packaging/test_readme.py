@@ -122,7 +122,7 @@ def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: P
     with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         kinds = [
             event["kind"]
-            for event in client.history()["events"]
+            for event in client.history().events
             if event.get("consumer") == "detector"
         ]
     assert {"granted", "ready", "use_began", "use_ended", "released"} <= set(kinds)

@@ -102,7 +102,7 @@ async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon)
             await residency.load()
         await client.done
         assert (model.loads, residency.state, residency.token()) == (0, "unloaded", None)
-        while (await client.status())["leases"]:
+        while (await client.status()).leases:
             await asyncio.sleep(0.02)
         assert await residency.load(), "the next request asks anew"
         assert (model.loads, residency.state) == (1, "resident")

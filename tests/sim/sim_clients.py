@@ -10,7 +10,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
-from typing import Any
 
 from tests.support.simulation.card import SimOutOfMemory
 from tests.support.simulation.clock import ProcessLoop
@@ -160,7 +159,7 @@ class Cast:
                 yield Entitlement(
                     client.process.key,
                     record.lease_id,
-                    GpuId(str(record.view["gpu"])),
+                    GpuId(str(record.view.gpu)),
                     max(size, residue),
                     residue,
                     record.spec["mode"] == "exclusive",
@@ -506,8 +505,8 @@ class Observer(Program):
         while not self.cast.stopping:
             await self.pause(3.0)
             try:
-                status: dict[str, Any] = await self.client.status()
-                names = sorted({view["consumer"] for view in status["leases"]})
+                status = await self.client.status()
+                names = sorted({view.consumer for view in status.leases})
                 if names:
                     await self.client.why(self.random.choice(names))
             except VramError as error:

@@ -27,7 +27,46 @@ WELCOME = {
 def view(
     lease_id: str = "L1-1", token: list[int] | None = None, state: str = "loading"
 ) -> dict[str, Any]:
-    return {"lease_id": lease_id, "token": token, "state": state, "gpu": "GPU-1"}
+    return {
+        "lease_id": lease_id,
+        "token": token,
+        "state": state,
+        "gpu": "GPU-1",
+        "consumer": "detector",
+        "model": "m",
+        "mode": "shared",
+        "priority": 50,
+        "pid": 1,
+        "evictable": True,
+        "charge_bytes": 5,
+        "uses": 0,
+        "since_s": 0.0,
+    }
+
+
+PLAIN: Mapping[str, Mapping[str, Any]] = {
+    "ping": {"server": "s"},
+    "status": {
+        "phase": "serving",
+        "uptime_s": 1.0,
+        "gpus": [],
+        "leases": [],
+        "clients": 1,
+        "totals": {"leases": 0, "waiting": 0},
+        "drained": "",
+        "host_ram": {"budget_bytes": 0, "parked_bytes": 0},
+    },
+    "ready": {"lease": view()},
+    "use_begin": {"uses": 1},
+    "use_end": {"uses": 0},
+    "yield": {"uses": 0},
+    "revoke_ack": {"state": "revoking"},
+    "unloading": {"state": "unloading"},
+    "cancel": {"state": "over"},
+    "release": {"state": "verifying", "next": "released"},
+    "oom": {"learnt_load_peak_bytes": None},
+}
+"""What the arbiter answers where a test does not say it."""
 
 
 class Wire:
@@ -61,7 +100,14 @@ class Wire:
 
     def reply(self, request: Mapping[str, Any], **body: Any) -> None:
         self.connection.receive(
-            {"re": request["id"], "epoch": self.epoch, "ok": True, **body}, self.now
+            {
+                "re": request["id"],
+                "epoch": self.epoch,
+                "ok": True,
+                **PLAIN.get(request["op"], {}),
+                **body,
+            },
+            self.now,
         )
 
     def refuse(self, request: Mapping[str, Any], code: str, **details: Any) -> None:
@@ -71,7 +117,9 @@ class Wire:
         )
 
     def push(self, kind: str, **body: Any) -> None:
-        self.connection.receive({"push": kind, "seq": 1, "epoch": self.epoch, **body}, self.now)
+        plain = {"reason": "", "wanted_by": "", "deadline_in_s": 30.0} if kind == "revoke" else {}
+        head = {"push": kind, "seq": 1, "epoch": self.epoch}
+        self.connection.receive({**head, **plain, **body}, self.now)
 
     def tick(self, seconds: float) -> None:
         self.now += seconds
@@ -115,8 +163,6 @@ def evict(
         "revoke",
         lease_id=record.lease_id,
         token=list(record.token),
-        reason="",
-        wanted_by="",
         park=True,
     )
     link.holdings.release(record, False, link.now, 5.0, asleep=asleep)

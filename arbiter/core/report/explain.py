@@ -56,7 +56,7 @@ def view_for(core: Core, lease: Lease, reader: ProcessKey | None) -> dict[str, A
     that is needed to mark a use, which keeps a lease from being evicted."""
     shown = view(core, lease)
     if reader is not None and reader != lease.process:
-        del shown["token"]
+        shown["token"] = None
     return shown
 
 

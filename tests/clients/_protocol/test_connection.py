@@ -16,7 +16,7 @@ def test_requests_before_the_greeting_are_sent_after_it() -> None:
     link.reply(message, phase="serving")
     (replied,) = link.told()
     assert isinstance(replied, r.Replied)
-    assert (replied.request_id, replied.body["phase"]) == (request, "serving")
+    assert (replied.request_id, replied.body.phase) == (request, "serving")
 
 
 def test_hello_without_an_answer_asks_for_a_fresh_socket() -> None:
@@ -140,3 +140,18 @@ def test_a_subscription_outlives_the_connection(link: Wire) -> None:
     link.told()
     link.greet()
     link.one("subscribe")
+
+
+def test_an_answer_of_another_shape_fails_its_request(link: Wire) -> None:
+    """A reply without its fields ended in a KeyError somewhere in the client."""
+    request = link.connection.request("status", {}, link.now)
+    link.reply(link.one("status"), leases=[{"lease_id": "L1-1"}])
+    (failed,) = link.told()
+    assert isinstance(failed, r.Failed)
+    assert failed.request_id == request
+    assert "the arbiter's answer to status is not understood" in str(failed.error)
+
+
+def test_a_push_of_a_newer_arbiter_is_ignored(link: Wire) -> None:
+    link.push("sung", lease_id="L1-1")
+    assert link.told() == []

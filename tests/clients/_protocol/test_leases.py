@@ -103,7 +103,7 @@ def test_revoke_is_told_first_once_and_then_as_news(link: Wire) -> None:
     first, second = link.told()
     assert isinstance(first, r.RevokeAsked)
     assert isinstance(second, r.RevokeAsked)
-    assert (first.first, second.first, second.push["uses"]) == (True, False, 0)
+    assert (first.first, second.first, second.push.uses) == (True, False, 0)
     link.push("revoke", lease_id="L1-1", token=[1, 7], uses=0)
     assert link.told() == []
 
@@ -133,7 +133,7 @@ def test_reattachment_says_what_is_held_and_used(link: Wire) -> None:
     link.reply(
         reattach,
         leases=[
-            {"lease_id": "L1-1", "kept": True, "lease": {}},
+            {"lease_id": "L1-1", "kept": True, "lease": view(token=[1, 2], state="held")},
             {"lease_id": "L1-3", "kept": False, "error": {"code": "lease_expired"}},
         ],
     )

@@ -208,7 +208,7 @@ def test_a_look_at_the_socket_disturbs_nobody(
     """`obstacle` connects and says nothing."""
     for _ in range(300):
         assert obstacle(arbiter_daemon.endpoint) is None
-    assert client.status()["clients"] == 1
+    assert client.status().clients == 1
 
 
 def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import sys
 import termios
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,6 +23,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.views import LeaseView
 
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
@@ -76,9 +76,9 @@ def running(
         process.communicate(timeout=PATIENCE_S)
 
 
-def view(client: Client, consumer: str) -> dict[str, Any]:
-    (found,) = [lease for lease in client.status()["leases"] if lease["consumer"] == consumer]
-    return dict(found)
+def view(client: Client, consumer: str) -> LeaseView:
+    (found,) = [lease for lease in client.status().leases if lease.consumer == consumer]
+    return found
 
 
 def said(process: "subprocess.Popen[str]") -> str:
@@ -235,7 +235,7 @@ def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
         assert "waiting: " in said(second)
         if not options:
             assert "next waits for its room (priority 40)" in said(first)
-        assert (view(client, "job")["uses"], first.poll()) == (1, None)
+        assert (view(client, "job").uses, first.poll()) == (1, None)
         first.terminate()
         assert first.wait(PATIENCE_S) == 5
     assert second.wait(PATIENCE_S) == 4
@@ -299,9 +299,9 @@ def test_run_is_pinned_only_on_request(
     client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     with running(arbiter_daemon.environ, "--pin"):
-        assert view(client, "job")["evictable"] is False
+        assert view(client, "job").evictable is False
     with running(arbiter_daemon.environ, "--priority", "60", "--on-revoke", "term") as process:
-        assert view(client, "job")["evictable"] is True
+        assert view(client, "job").evictable is True
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert process.wait(PATIENCE_S) == 5
     lease.release()

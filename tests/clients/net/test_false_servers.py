@@ -164,7 +164,7 @@ def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
             assert heard() == []
         (arbiter_daemon.runtime / "arbiter.sock").unlink(missing_ok=True)
         arbiter_daemon.start()
-        assert client.status()["leases"][0]["lease_id"] == lease.lease_id
+        assert client.status().leases[0].lease_id == lease.lease_id
         assert lease.state == "held"
         lease.release()
 

@@ -57,10 +57,10 @@ async def scenario(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -
         held: list[int] = []
         async for feedback in goal.feedback():
             if feedback["state"] == "running" and not held:
-                (lease,) = (await watcher.status())["leases"]
-                assert lease["consumer"] == "passthrough"
-                assert lease["state"] == "held"
-                held.append(lease["pid"])
+                (lease,) = (await watcher.status()).leases
+                assert lease.consumer == "passthrough"
+                assert lease.state == "held"
+                held.append(lease.pid)
         result = await goal.result(120)
         assert result["status"] == "succeeded", result
         assert result["data"]["steps"] == 60

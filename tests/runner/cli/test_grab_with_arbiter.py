@@ -59,7 +59,7 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
             if feedback["state"] == "running":
                 break
         ((state, uses),) = leases(await rival.status(), "grab")
-        told = [(e["kind"], e.get("reason")) for e in (await rival.history())["events"]]
+        told = [(e["kind"], e.get("reason")) for e in (await rival.history()).events]
         assert state == "held", f"no goal runs before its policy is ready: {told}"
         assert uses >= 1, "the goal is one use; an op under way is another"
         whole_card = LeaseSpec(
