@@ -199,7 +199,7 @@ async def test_revoked_at_the_safe_point_and_not_before(
     async def unload() -> None:
         story.append("unload")
 
-    def revoked(_: object, eviction: Eviction) -> None:
+    async def revoked(_: object, eviction: Eviction) -> None:
         story.append(f"revoke for {eviction.by}")
 
     async with (
@@ -469,7 +469,7 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
         asked = beside(client.status())
         await anyio.to_thread.run_sync(arbiter.start)
         await until(lambda: client.connected and client.epoch > pinned.token[0])
-        assert (await asked)["epoch"] == client.epoch
+        assert (await asked).epoch == client.epoch
         # the card is empty in this test: whatever the daemon decides about the old lease, the waiter's place was renewed
         if pinned.state == "loading":
             await pinned.ready()
