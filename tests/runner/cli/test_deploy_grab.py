@@ -5,7 +5,6 @@ import random
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
@@ -13,6 +12,7 @@ from grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.wire.replies import StatusReply
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
 
@@ -61,8 +61,8 @@ def programs(arbiter_daemon: ArbiterProcess) -> Iterator[GrabPrograms]:
     started.close()
 
 
-def uses(status: dict[str, Any]) -> list[int]:
-    return [lease["uses"] for lease in status["leases"] if lease["consumer"] == "grab"]
+def uses(status: StatusReply) -> list[int]:
+    return [lease.uses for lease in status.leases if lease.consumer == "grab"]
 
 
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:

@@ -7,7 +7,6 @@ import asyncio
 import os
 import signal
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
@@ -15,6 +14,7 @@ from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
@@ -31,12 +31,8 @@ def programs(arbiter_daemon: ArbiterProcess) -> Iterator[GrabPrograms]:
     started.close()
 
 
-def leases(status: dict[str, Any], consumer: str) -> list[tuple[str, int]]:
-    return [
-        (lease["state"], lease["uses"])
-        for lease in status["leases"]
-        if lease["consumer"] == consumer
-    ]
+def leases(status: StatusReply, consumer: str) -> list[tuple[str, int]]:
+    return [(lease.state, lease.uses) for lease in status.leases if lease.consumer == consumer]
 
 
 async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
@@ -74,7 +70,7 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
         assert result["status"] == "succeeded", result
         assert result["data"]["withheld"] == 0
         lease = await asyncio.wait_for(waiting, 60)
-        events = (await rival.history(kinds=("use_ended", "granted")))["events"]
+        events = (await rival.history(kinds=("use_ended", "granted"))).events
         story = [e["kind"] for e in events if e.get("label") == GRAB or e["consumer"] == "rival"]
         assert story == ["use_ended", "granted"], "not while the goal was running"
         assert leases(await rival.status(), "grab") == []
