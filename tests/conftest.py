@@ -45,7 +45,7 @@ def make_arbiter() -> Iterator[Callable[..., ArbiterProcess]]:
     def make(
         gpu: str = "fake:8GiB", arguments: tuple[str, ...] = (), config: str | None = None
     ) -> ArbiterProcess:
-        made.append(ArbiterProcess(gpu, arguments, config))
+        made.append(ArbiterProcess(gpu, arguments, config, prepared=True))
         return made[-1]
 
     yield make

@@ -236,7 +236,7 @@ def test_a_core_that_fails_ends_the_daemon_with_70(make_arbiter: Make) -> None:
     arbiter.program = [sys.executable, str(path)]
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
-        client.send("hello", version=1, name="n", instance="i")
+        client.send("hello", name="n", instance="i")
         assert arbiter.process is not None
         assert arbiter.process.wait(PATIENCE_S) == 70
     assert "invariant 1: planted" in arbiter.log

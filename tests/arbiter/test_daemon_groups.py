@@ -25,7 +25,7 @@ from tests.support.wire import WireClient
 endpoint, role, primary, other = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 os.setgroups([other]); os.setresgid(primary, primary, primary); os.setresuid(65534, 65534, 65534)
 with WireClient(endpoint) as client:
-    said = client.ask("hello", version=1, name="c", instance="c", role=role)
+    said = client.ask("hello", name="c", instance="c", role=role)
     if said["ok"]:
         client.granted("job", 1 << 30)
         said = client.ask("drain", reason="by hand")

@@ -70,7 +70,7 @@ def test_a_client_that_cannot_be_seen_is_refused_and_told_why(make_arbiter: Make
     arbiter.program = [*UNSHARE, *arbiter.program]
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
-        refused = client.ask("hello", version=1, name="outside", instance="o")
+        refused = client.ask("hello", name="outside", instance="o")
         assert not refused["ok"]
         assert refused["error"]["code"] == "not_permitted"
         assert "pid namespace" in refused["error"]["message"]

@@ -30,7 +30,7 @@ TAKE_ALL = (
 clients = [WireClient(endpoint) for _ in range(20)]
 codes = []
 for n, client in enumerate(clients):
-    said = client.ask("hello", version=1, name="greedy", instance=f"{os.getpid()}-{n}")
+    said = client.ask("hello", name="greedy", instance=f"{os.getpid()}-{n}")
     codes.append("ok" if said["ok"] else said["error"]["details"]["limit"])
 print(json.dumps(codes), flush=True)
 sys.stdin.read()
@@ -40,7 +40,7 @@ ASK = (
     AS_USER
     + """
 with WireClient(endpoint) as client:
-    said = client.ask("hello", version=1, name="other", instance="other")
+    said = client.ask("hello", name="other", instance="other")
     print(json.dumps(client.ask("status")["clients"] if said["ok"] else said))
 """
 )

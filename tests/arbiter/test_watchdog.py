@@ -103,7 +103,7 @@ def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(
     arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
     with WireClient(arbiter.endpoint) as holder, WireClient(arbiter.endpoint) as trigger:
         kept = holder.hello("holder").granted("holder", SMALL, ttl_s=60.0)
-        trigger.send("hello", version=1, name="trigger", instance="t")
+        trigger.send("hello", name="trigger", instance="t")
         if defect is JOURNAL:
             spec = {
                 "consumer": "trigger",
@@ -136,7 +136,7 @@ def test_what_was_stuck_for_a_while_feeds_it_again(make_arbiter: Make) -> None:
     pipe = planted(arbiter, CORE)
     arbiter.start({"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
     with WireClient(arbiter.endpoint) as trigger:
-        trigger.send("hello", version=1, name="trigger", instance="t")
+        trigger.send("hello", name="trigger", instance="t")
         writer = os.open(pipe, os.O_WRONLY)
         assert not feed(arbiter.heard(WATCHDOG_S))
         os.close(writer)

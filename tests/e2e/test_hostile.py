@@ -7,7 +7,6 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -23,15 +22,13 @@ GIB, MIB = 1 << 30, 1 << 20
 PATIENCE_S = 60.0
 LARGE_BYTES = 8192
 ATTACKER = """
-import sys
-sys.path.insert(0, sys.argv[1])
+import json, msgpack, os, sys, zmq
 from tests.support.wire import WireClient
-import json, msgpack, os, zmq
-endpoint, words = sys.argv[2], json.loads(sys.argv[3])
+from vram_arbiter.schemas.defaults import WIRE_VERSION
+endpoint, words = sys.argv[1], json.loads(sys.argv[2])
 def done(**facts):
     print(json.dumps(facts), flush=True)
 """
-ROOT = Path(__file__).parents[2]
 
 Connect = Callable[..., WireClient]
 
@@ -44,7 +41,7 @@ def honest(arbiter_daemon: ArbiterProcess, connect: Connect) -> Honest:
 def attack(arbiter: ArbiterProcess, script: str, **words: Any) -> "subprocess.Popen[str]":
     """Another process that attacks; what it prints last are its findings. It is ended by the caller or by itself, and by us with its stdin."""
     return subprocess.Popen(
-        [sys.executable, "-c", ATTACKER + script, str(ROOT), arbiter.endpoint, json.dumps(words)],
+        [sys.executable, "-c", ATTACKER + script, arbiter.endpoint, json.dumps(words)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -143,7 +140,8 @@ for number in range(1000):
     socket = context.socket(zmq.DEALER)
     socket.connect(endpoint)
     name = f"h{number}"
-    socket.send(msgpack.packb({"op": "hello", "id": 1, "version": 1, "name": name, "instance": name}))
+    hello = {"op": "hello", "id": 1, "version": WIRE_VERSION, "name": name, "instance": name}
+    socket.send(msgpack.packb(hello))
     if number % 2:
         socket.setsockopt(zmq.LINGER, 0)
         socket.close()
@@ -254,7 +252,7 @@ def test_a_pid_cannot_be_claimed_in_a_message(honest: Honest) -> None:
         honest.arbiter,
         """
 client = WireClient(endpoint)
-answer = client.ask("hello", version=1, name="liar", instance="i", pid=words["pid"])
+answer = client.ask("hello", name="liar", instance="i", pid=words["pid"])
 done(code=answer["error"]["code"])
 """,
         pid=os.getpid(),

@@ -12,8 +12,11 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from tests.support.prepared import Forked, start
+
 START_S = 60.0
 STOP_S = 60.0
+PROGRAM = (sys.executable, "-m", "vram_arbiter.arbiter")
 _ROOT = Path(__file__).parents[2]
 
 
@@ -21,11 +24,17 @@ class ArbiterProcess:
     """One runtime folder with at most one daemon in it at a time; it can be killed and started again on the same state.
 
     The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the simulated card `fakegpu/` and
-    `arbiter.log`. `environ` is what clients need to find it.
+    `arbiter.log`. `environ` is what clients need to find it. `prepared`: fork the daemon from an
+    interpreter that has imported it, unless it is started with variables or a program of its own.
     """
 
     def __init__(
-        self, gpu: str = "fake:8GiB", arguments: Sequence[str] = (), config: str | None = None
+        self,
+        gpu: str = "fake:8GiB",
+        arguments: Sequence[str] = (),
+        config: str | None = None,
+        *,
+        prepared: bool = False,
     ) -> None:
         self.runtime = Path(tempfile.mkdtemp(prefix="va"))
         self.gpu = gpu
@@ -33,9 +42,10 @@ class ArbiterProcess:
         if config is not None:
             (self.runtime / "arbiter.yaml").write_text(config)
             self.arguments += ["--config", str(self.runtime / "arbiter.yaml")]
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | Forked | None = None
+        self._prepared = prepared
         self.messages: list[str] = []
-        self.program = [sys.executable, "-m", "vram_arbiter.arbiter"]
+        self.program = list(PROGRAM)
         self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._notify.bind(str(self.runtime / "notify.sock"))
 
@@ -78,7 +88,9 @@ class ArbiterProcess:
         given = ["--gpu", self.gpu, "--state-dir", str(self.state)]
         return [*self.program, *given, *self.arguments, *more]
 
-    def spawn(self, extra_environ: Mapping[str, str] | None = None) -> "subprocess.Popen[bytes]":
+    def spawn(
+        self, extra_environ: Mapping[str, str] | None = None
+    ) -> "subprocess.Popen[bytes] | Forked":
         """Start the daemon without waiting for it."""
         assert self.process is None or self.process.poll() is not None, "already running"
         environ = {
@@ -87,6 +99,9 @@ class ArbiterProcess:
             **(extra_environ or {}),
         }
         with (self.runtime / "arbiter.log").open("ab") as log:
+            if self._prepared and not extra_environ and self.program == list(PROGRAM):
+                self.process = start(self.command()[len(PROGRAM) :], environ, log.fileno())
+                return self.process
             self.process = subprocess.Popen(
                 self.command(), env=environ, stdout=log, stderr=log, stdin=subprocess.DEVNULL
             )

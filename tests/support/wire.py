@@ -41,8 +41,10 @@ class WireClient:
         self._socket.send_multipart(frames)
 
     def send(self, op: str, **fields: Any) -> int:
-        """Send a request without waiting for its reply; returns its id."""
+        """Send a request without waiting for its reply; returns its id. A hello says the version."""
         self._id += 1
+        if op == "hello":
+            fields = {"version": d.WIRE_VERSION, **fields}
         self.send_raw(msgpack.packb({"op": op, "id": self._id, **fields}))
         return self._id
 
@@ -75,9 +77,7 @@ class WireClient:
 
     def hello(self, name: str = "test", **fields: Any) -> Self:
         """Say hello; raises AssertionError unless it is welcomed."""
-        welcome = self.ask(
-            "hello", **{"version": d.WIRE_VERSION, "name": name, "instance": f"{name}-1", **fields}
-        )
+        welcome = self.ask("hello", **{"name": name, "instance": f"{name}-1", **fields})
         assert welcome["ok"], welcome
         return self
 

@@ -14,13 +14,14 @@ from typing import Any
 import pytest
 
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.schemas.defaults import WIRE_VERSION
 from vram_arbiter.schemas.errors import LeaseLost, VramError
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 WAIT_S = 60.0
 WELCOME = {
-    "version": 1,
+    "version": WIRE_VERSION,
     "boot_id": "b",
     "server": "s",
     "role": "client",
