@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NoReturn, Self
 
+from pydantic_core import to_json
+
 from vram_arbiter.arbiter.core.events import DOUBT_KEY
 from vram_arbiter.arbiter.host.journal_files import (
     SCHEMA_VERSION,
@@ -51,7 +53,6 @@ _DELETE = [
 ]
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PASSING = frozenset((*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM))
-_text = json.JSONEncoder(separators=(",", ":")).encode
 
 
 Change = tuple[str, Mapping[str, Any] | None]
@@ -288,6 +289,10 @@ class Journal:
     def close(self) -> None:
         self._connection.close()
         self._seal.close()
+
+
+def _text(record: Mapping[str, Any]) -> str:
+    return to_json(record).decode()
 
 
 def _digests_of(records: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:

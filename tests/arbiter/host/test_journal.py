@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic_core import PydanticSerializationError
 
 from vram_arbiter.arbiter.core.events import DOUBT_KEY
 from vram_arbiter.arbiter.host.journal import AT_ONCE_MAX, Journal, Opened
@@ -203,7 +204,7 @@ def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:
 
 def test_one_failing_change_of_a_batch_undoes_all(tmp_path: Path) -> None:
     journal = Journal.open(tmp_path, "boot-1")
-    with pytest.raises(TypeError):
+    with pytest.raises(PydanticSerializationError):
         journal.apply([("lease:L1-1", {"a": 1}), ("lease:L1-2", {"a": object()})])
     assert Journal.open(tmp_path, "boot-1").opened.records == {}
 
