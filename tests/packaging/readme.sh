@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# Type the commands of README.md, one by one, in one shell, as a reader does.
+# Type the commands of README.md (or of PAGE), one by one, in one shell, as a reader does.
 #
 #   tests/packaging/readme.sh [SECTION...]     in a fresh clone; without a section all of them
 #
-# SKIP='regular expression' leaves lines out and says so. A line that ends in `&` goes on in the background: what comes next waits
-# until it serves. A line whose comment says `Ctrl-C` gets one after 3 s. Everything in the background ends with the script.
+# SKIP='regular expression' leaves lines out and says so. A line that ends in `&` goes on in the
+# background: what comes next waits until it serves. A line whose comment says `Ctrl-C` gets one
+# after 3 s. Everything in the background ends with the script.
 set -uo pipefail
 
-page=README.md
+page=${PAGE:-README.md}
 [ -f "$page" ] || { echo "readme.sh: no $page here: start it in a clone" >&2; exit 2; }
 sections=("$@")
 runtime=${XDG_RUNTIME_DIR:?readme.sh: XDG_RUNTIME_DIR is not set}

@@ -46,7 +46,7 @@ class Reader:
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(TREE / name, place, follow_symlinks=False)
 
-    def types(self, *sections: str, skip: str) -> str:
+    def types(self, *sections: str, skip: str, page: str = "README.md") -> str:
         """Everything that is printed. Fails the test at the first command that fails."""
         kept = {name: os.environ[name] for name in ("MUJOCO_GL", "LANG") if name in os.environ}
         done = subprocess.run(
@@ -54,7 +54,7 @@ class Reader:
             cwd=self._folder / "clone", timeout=LIMIT_S, text=True,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             env={
-                **kept, "SKIP": skip, "HOME": str(self._folder / "home"),
+                **kept, "SKIP": skip, "PAGE": page, "HOME": str(self._folder / "home"),
                 "XDG_RUNTIME_DIR": str(self._folder / "run"),
                 "PATH": f"{self._folder}/prefix/bin:/usr/local/bin:/usr/bin:/bin",
             },
@@ -83,6 +83,13 @@ def test_what_is_needed_is_said_before_the_first_command() -> None:
 def test_the_commands_of_the_base_install_work(reader: Reader) -> None:
     printed = reader.types("On your machine", skip=INSTALLS)
     assert re.search(r"^8 commands of README\.md work$", printed, re.MULTILINE)
+    assert "Traceback" not in printed
+
+
+def test_the_commands_of_the_tutorial_work(reader: Reader) -> None:
+    printed = reader.types(skip=INSTALLS, page="docs/tutorial.md")
+    assert "detector is held again, with 1 weights" in printed
+    assert printed.count("verdict=verified") >= 2, "each model left at least once"
     assert "Traceback" not in printed
 
 
