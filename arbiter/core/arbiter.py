@@ -141,7 +141,7 @@ class Arbiter:
         self._happened(event)  # 1
         recovery.serve_if_accounted(core)  # 2
         deadlock.resolve(core)  # 3
-        for feature in core.features:
+        for feature in core.hooked["settle"]:
             feature.settle(core)
         grants.schedule(core)
         requests.answer_queued(core)

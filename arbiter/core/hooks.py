@@ -1,8 +1,9 @@
 """Hooks through which an optional feature takes part in the engine.
 
-The rooms of the engine call the hooks of every registered feature (`Core.features`) and know no
-feature by name. A feature owns its records, keyed by lease id; `Arbiter` registers it. Without
-features the engine is whole.
+The rooms of the engine know no feature by name. What concerns one lease goes to the features of
+that lease (`Lease.features`: a feature adds itself with `watch`); everything else goes to the
+registered features that override the hook (`Core.hooked`). A plain lease costs no call.
+A feature owns its records, keyed by lease id. Without features the engine is whole.
 """
 
 from collections.abc import Iterable, Mapping
@@ -22,11 +23,31 @@ if TYPE_CHECKING:
     from vram_arbiter.arbiter.core.report.standing import Standing
 
 
+HOOKS = (
+    "on_acquire",
+    "on_refused",
+    "on_request",
+    "unplaced",
+    "serve",
+    "settle",
+    "on_sample",
+    "from_record",
+    "on_reattached",
+    "check",
+)
+"""Hooks that concern no lease, or one that no feature watches yet."""
+
+
 class Feature:
     """One optional feature. Each hook does nothing here; a feature overrides what it needs."""
 
     timers: ClassVar[frozenset[str]] = frozenset()
     """Kinds of timers that are due to this feature."""
+
+    def watch(self, lease: Lease) -> None:
+        """Take part in what concerns a lease from now on."""
+        if not any(feature is self for feature in lease.features):
+            lease.features = (*lease.features, self)
 
     # -- requests ----------------------------------------------------------------------------------
     def on_acquire(self, core: "Core", event: AcquireRequested, known: Lease | None) -> bool:
@@ -39,8 +60,8 @@ class Feature:
     def on_refused(self, core: "Core", spec: Spec, why: str) -> None:
         """A request was refused: no GPU can ever hold it."""
 
-    def hold_back(self, core: "Core", request: Lease) -> bool:
-        """Keep a new request out of the queues. Return whether it is kept."""
+    def on_request(self, core: "Core", request: Lease) -> bool:
+        """Watch a new request. Return whether this feature keeps it out of the queues."""
         return False
 
     def unplaced(self) -> Iterable[Lease]:
@@ -48,7 +69,10 @@ class Feature:
         return ()
 
     def on_release(self, core: "Core", event: ReleaseReported, lease: Lease) -> None:
-        """A resident lease is about to be released. May raise Refused."""
+        """A resident lease is about to be released. May raise Refused.
+
+        If it is to be parked, every feature is asked.
+        """
 
     def give_up(self, core: "Core", lease: Lease, to: LeaseState, code: str, why: str) -> bool:
         """End a lease that would outlive its release. Return whether it was one.
@@ -62,7 +86,7 @@ class Feature:
 
     # -- scheduling --------------------------------------------------------------------------------
     def blocks(self, gpu: "Gpu") -> str:
-        """Say why this feature keeps a GPU from the requests of all others; "" if it does not."""
+        """Say why this feature keeps a GPU from the requests of all others (`Gpu.keeper`)."""
         return ""
 
     def owns(self, request: Lease) -> bool:
@@ -70,7 +94,7 @@ class Feature:
         return False
 
     def serve(self, core: "Core", gpu: "Gpu", head: Lease | None) -> None:
-        """Serve a GPU that this feature blocks, whose head it owns, or that has no head."""
+        """Serve a GPU that this feature keeps, whose head it owns, or that has no head."""
 
     def grant(self, core: "Core", gpu: "Gpu", request: Lease) -> bool:
         """Grant a request in this feature's own way. Return whether it was granted."""
@@ -122,7 +146,7 @@ class Feature:
         """A lease was restored from its record."""
 
     def on_reattached(self, core: "Core", lease: Lease, item: ReattachedLease) -> None:
-        """A holder reattached, and tells how it knows its lease."""
+        """A holder reattached, and says how it knows its lease. The journal may not know it."""
 
     # -- reports and invariants --------------------------------------------------------------------
     def view(self, core: "Core", lease: Lease) -> Mapping[str, object]:
@@ -138,3 +162,9 @@ class Feature:
 
         `everything`: if any record is.
         """
+
+
+def overriding(features: Iterable[Feature], hook: str) -> tuple[Feature, ...]:
+    """Return the features that override a hook."""
+    default = getattr(Feature, hook)
+    return tuple(feature for feature in features if getattr(type(feature), hook) is not default)

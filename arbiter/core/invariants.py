@@ -46,7 +46,7 @@ def check(core: Core) -> None:
         _head(core, gpu)
     _tokens(core)
     _waiters(core)
-    for feature in core.features:
+    for feature in core.hooked["check"]:
         feature.check(core, everything=False)
 
 
@@ -68,7 +68,7 @@ def check_all(core: Core) -> None:
     )
     check(core)
     core.turn = turn
-    for feature in core.features:
+    for feature in core.hooked["check"]:
         feature.check(core, everything=True)
 
 
@@ -149,7 +149,7 @@ def _tokens(core: Core) -> None:
 
 def _counts(core: Core, queued: int) -> None:
     """Counted only when a number has changed: a feature may keep thousands of requests out of the queues."""
-    unqueued = (lease for feature in core.features for lease in feature.unplaced())
+    unqueued = (lease for feature in core.hooked["unplaced"] for lease in feature.unplaced())
     waiting = len(core.waiting) - sum(lease.state is LeaseState.QUEUED for lease in unqueued)
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")

@@ -78,7 +78,7 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
                 0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now
             ),
             "uses": len(holder.uses),
-            "park": any(feature.can_park(holder) for feature in core.features),
+            "park": any(feature.can_park(holder) for feature in holder.features),
             **({"traceparent": eviction.traceparent} if eviction.traceparent else {}),
         },
     )

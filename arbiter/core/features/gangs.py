@@ -113,7 +113,7 @@ class Gangs(Feature):
         if gang is not None and gang.phase == "gathering":
             self._break(core, gang, why)
 
-    def hold_back(self, core: Core, request: Lease) -> bool:
+    def on_request(self, core: Core, request: Lease) -> bool:
         """Keep a member out of the queues until all have asked."""
         if request.spec.gang is None:
             return False
@@ -125,6 +125,7 @@ class Gangs(Feature):
 
     def _join(self, core: Core, lease: Lease, name: str, size: int) -> Gang:
         gang = self.by_name.setdefault(name, Gang(name, size, core.now))
+        self.watch(lease)
         gang.members.append(lease)
         self.of[lease.id] = gang
         self.touched.add(name)
@@ -246,6 +247,7 @@ class Gangs(Feature):
         for gpu, some in _by_gpu(core, placement):
             gang.gpus.append(gpu.info.id)
             self.loading[gpu.info.id] = gang
+            gpu.keeper = self
             for lease in some:
                 for gpu_id in lease.request.gpus:
                     core.gpus[gpu_id].queue.discard(lease)
@@ -266,8 +268,7 @@ class Gangs(Feature):
 
     def blocks(self, gpu: Gpu) -> str:
         """Say which gang loads on a GPU."""
-        gang = self.loading.get(gpu.info.id)
-        return "" if gang is None else f"gang {gang.name} is loading"
+        return f"gang {self.loading[gpu.info.id].name} is loading"
 
     def _next_load(self, core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
         lease = next(iter(gang.waiting_on(gpu)), None)
@@ -392,6 +393,7 @@ class Gangs(Feature):
                     lease.gpu = None
             _set_headroom(core, gpu, gang, 0)
             del self.loading[gpu_id]
+            gpu.keeper = None
             core.wake(gpu)
         for lease in gang.members:
             if lease.state in EXPIRING:

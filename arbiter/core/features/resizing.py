@@ -130,6 +130,8 @@ class Resizing(Feature):
             ),
             story=[(core.now, LeaseState.QUEUED, f"growth of {lease.id}")],
         )
+        self.watch(growth)
+        self.watch(lease)
         core.add(growth)
         core.enqueue(growth)
         self.growths[lease.id] = growth.id
@@ -157,6 +159,7 @@ class Resizing(Feature):
     def _begin_shrink(self, core: Core, gpu: Gpu, lease: Lease, target_bytes: int) -> None:
         """Wait for readings that begin from now on: the bytes are freed already."""
         deadline_at = core.now + core.settings.verify_timeout_s
+        self.watch(lease)
         self.shrinks[lease.id] = Shrink(target_bytes, core.now, deadline_at)
         lease.observed.steady_bytes = 0  # seen under another declaration: no drift from the new one
         core.timers.set(("shrink", lease.id), core.now + core.settings.verify_poll_s[0])

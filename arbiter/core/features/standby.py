@@ -83,11 +83,15 @@ class Standby(Feature):
     def _of(self, lease: Lease) -> Absence:
         return self.absences.setdefault(lease.id, Absence())
 
+    def on_request(self, core: Core, request: Lease) -> bool:
+        """Watch a request whose lease may go on standby or be parked."""
+        if _concerns(request.spec):
+            self.watch(request)
+        return False
+
     # -- leaving -----------------------------------------------------------------------------------
     def on_release(self, core: Core, event: ReleaseReported, lease: Lease) -> None:
         """Decide whether a lease goes on standby or is parked. Raises Refused."""
-        if not (event.parked or lease.spec.standby):
-            return
         if event.parked:
             self._book(lease, exiting=event.exiting)
         absence = self._of(lease)
@@ -438,6 +442,10 @@ class Standby(Feature):
 
     def from_record(self, core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
         """Restore an absence. A lease comes back only after its holder reattached."""
+        parked_bytes = int(record.get("parked_bytes", 0))
+        if not (_concerns(lease.spec) or parked_bytes or lease.state in AWAY):
+            return
+        self.watch(lease)
         self.absences[lease.id] = Absence(
             left_for=str(record.get("left_for", "")),
             dismissed=bool(record.get("dismissed", False)),
@@ -445,7 +453,7 @@ class Standby(Feature):
             parks=bool(record.get("parks", False)),
             since=core.now,
         )
-        self.host.find(lease.id, int(record.get("parked_bytes", 0)))
+        self.host.find(lease.id, parked_bytes)
         if lease.state in AWAY:
             self.away[lease.id] = lease
             patience_s = lease.spec.ttl_s + core.settings.fence_grace_s
@@ -453,6 +461,8 @@ class Standby(Feature):
 
     def on_reattached(self, core: Core, lease: Lease, item: ReattachedLease) -> None:
         """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
+        if item.away or _concerns(lease.spec):
+            self.watch(lease)
         if not item.away:
             return
         if lease.state in AWAY:
@@ -537,6 +547,10 @@ class Standby(Feature):
         if due_at > core.now:
             return f": comes back in {due_at - core.now:.1f} s if the card stays quiet"
         return ": comes back with the next reading of the card, or after those before it"
+
+
+def _concerns(spec: Spec) -> bool:
+    return spec.standby or spec.park_bytes > 0
 
 
 def _still_waits(lease: Lease, event: AcquireRequested) -> bool:

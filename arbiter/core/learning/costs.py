@@ -32,7 +32,7 @@ def reload_s(core: Core, lease: Lease) -> float:
 
 def can_park(core: Core, lease: Lease) -> bool:
     """Would its weights find room in host RAM?"""
-    return any(feature.can_park(lease) for feature in core.features)
+    return any(feature.can_park(lease) for feature in lease.features)
 
 
 # -- thrash ------------------------------------------------------------------------------------------------------------

@@ -96,7 +96,7 @@ def measured_bytes(gpu: Gpu, lease: Lease) -> int:
 
 
 def _size_changes(core: Core, lease: Lease) -> bool:
-    return any(feature.size_changes(lease) for feature in core.features)
+    return any(feature.size_changes(lease) for feature in lease.features)
 
 
 def held_bytes(gpu: Gpu, lease: Lease) -> int:

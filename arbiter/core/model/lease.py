@@ -8,10 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from vram_arbiter.arbiter.core.events import MemorySampled, Spec
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+
+if TYPE_CHECKING:
+    from vram_arbiter.arbiter.core.hooks import Feature
 
 
 class LeaseState(StrEnum):
@@ -231,6 +234,7 @@ class Lease:
     observed: Observed = field(default_factory=Observed)
     story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # last STORY_MAX steps
     roster: Roster | None = field(default=None, repr=False, compare=False)  # of its GPU
+    features: tuple["Feature", ...] = field(default=(), repr=False, compare=False)  # concerned
 
     @classmethod
     def recovered(

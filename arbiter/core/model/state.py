@@ -20,7 +20,7 @@ from vram_arbiter.arbiter.core.effects import (
     Sample,
 )
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.hooks import HOOKS, Feature, overriding
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
 from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
 from vram_arbiter.arbiter.core.ledger.pending_free import PendingFree
@@ -140,6 +140,7 @@ class Gpu:
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
     changed_at: float = 0.0  # last grant, ready or verdict
     blocked: str = ""
+    keeper: Feature | None = None  # keeps it from the requests of all others
     pressed: bool = False  # a pressure note is out
 
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
@@ -163,6 +164,7 @@ class Core:
     def __init__(self, settings: Settings, now: float, features: tuple[Feature, ...]) -> None:
         self.settings = settings
         self.features = features
+        self.hooked = {hook: overriding(features, hook) for hook in HOOKS}
         self.started_at = now
         self.now = now
         self.turn = Turn()
@@ -369,7 +371,7 @@ class Core:
         lease.uses[use.process, use.id] = use
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
         self.turn.suspects.add(use.process)
-        for feature in self.features:
+        for feature in lease.features:
             feature.on_used(lease)
 
     def unmark(self, lease: Lease, use: Use) -> None:
@@ -381,15 +383,15 @@ class Core:
             del self.users[use.process]
 
     def move(self, lease: Lease, to: LeaseState, why: str) -> None:
-        """Move a lease to another state and tell the features. Raises IllegalTransition."""
+        """Move a lease to another state and tell its features. Raises IllegalTransition."""
         before = lease.state
         lease.move(to, self.now, why)
-        for feature in self.features:
+        for feature in lease.features:
             feature.on_moved(self, lease, before)
 
     def next_state(self, lease: Lease) -> LeaseState | None:
         """Where a released lease goes once its bytes are measured gone; None: it is over then."""
-        for feature in self.features:
+        for feature in lease.features:
             if (state := feature.next_state(lease)) is not None:
                 return state
         return None
@@ -487,7 +489,7 @@ class Core:
         )  # and not by this daemon yet
         features = {
             key: value
-            for feature in self.features
+            for feature in lease.features
             for key, value in feature.to_record(lease).items()
         }
         users = [[*astuple(use.process), use.id, use.label] for use in lease.users()]

@@ -138,7 +138,7 @@ def _holder_condition(core: Core, waiter: Lease, holder: Lease) -> str:
     if not holder.attached:
         left_s = holder.expires_at - core.now
         return f"has not come back since the restart, is given up in {left_s:.1f} s"
-    if protected := next(filter(None, (one.protects(holder) for one in core.features)), ""):
+    if protected := next(filter(None, (one.protects(holder) for one in holder.features)), ""):
         return protected
     if not holder.evictable:
         return f"is pinned by {holder.pinned}" if holder.pinned else "is pinned"

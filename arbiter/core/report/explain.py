@@ -86,7 +86,7 @@ def view(core: Core, lease: Lease) -> dict[str, Any]:
         shown["pinned"] = str(lease.pinned)
     if lease.uses.paused:
         shown["yielded"] = len(lease.uses.paused)
-    for feature in core.features:
+    for feature in lease.features:
         shown.update(feature.view(core, lease))
     if lease.state is LeaseState.QUEUED:
         shown["position"] = _best_position(core, lease)
@@ -206,7 +206,7 @@ def _listed(core: Core, after: PageKey | None, limit: int | None) -> Iterator[Le
 
 
 def _away(core: Core) -> Iterator[Lease]:
-    for feature in core.features:
+    for feature in core.hooked["unplaced"]:
         yield from (one for one in feature.unplaced() if one.state is not LeaseState.QUEUED)
 
 
@@ -218,7 +218,7 @@ def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
 
     unqueued = [
         lease
-        for feature in core.features
+        for feature in core.hooked["unplaced"]
         for lease in feature.unplaced()
         if lease.state is LeaseState.QUEUED and rank(lease) > after
     ]

@@ -23,7 +23,7 @@ class Standing:
 
 def standing_of(core: Core, lease: Lease) -> Standing:
     """Return the standing of a request, or of a granted lease whose group is not complete."""
-    for feature in core.features:
+    for feature in lease.features:
         told = feature.standing(core, lease)
         if told is not None:
             return told

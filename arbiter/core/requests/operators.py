@@ -112,7 +112,7 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
 def _dismiss(core: Core, lease: Lease, order: Order) -> None:
     if lease.departure.eviction is not None:
         lease.departure.eviction.order = order
-    for feature in core.features:
+    for feature in lease.features:
         feature.on_dismissed(core, lease, f"evicted by {order}")
 
 

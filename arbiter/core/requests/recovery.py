@@ -105,7 +105,7 @@ def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
 def _register(core: Core, lease: Lease, record: Mapping[str, Any]) -> None:
     core.add(lease)
     core.nonces[lease.process, lease.request.nonce] = lease.id
-    for feature in core.features:
+    for feature in core.hooked["from_record"]:
         feature.from_record(core, lease, record)
 
 
@@ -266,7 +266,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         lease.ready_at = core.now
         if lease.gpu is not None:
             core.gpu_of(lease).residents.recent[lease.id] = lease
-    for feature in core.features:
+    for feature in core.hooked["on_reattached"]:
         feature.on_reattached(core, lease, item)
     if lease.state is LeaseState.LOADING and item.held and not item.away:  # its `ready` was lost
         become_held(core, lease, item.measured_bytes)

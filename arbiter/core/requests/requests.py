@@ -120,7 +120,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     """Queue a lease; the scheduling after this event may grant it in the same breath, and answers either way."""
     client = client_of(core, event.client)
     known = _known_by(core, event, client)
-    if any(feature.on_acquire(core, event, known) for feature in core.features):
+    if any(feature.on_acquire(core, event, known) for feature in core.hooked["on_acquire"]):
         return
     if known is not None:
         _answer_again(core, event, known)
@@ -130,7 +130,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
     try:
         gpus = placement.places(core, spec, load_peak)
     except Refused as refused:
-        for feature in core.features:
+        for feature in core.hooked["on_refused"]:
             feature.on_refused(core, spec, refused.message)
         raise
     check_waiters(core, client, spec.priority)
@@ -138,7 +138,8 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         crashes.check(core, spec, load_peak, gpus)
     lease = new_lease(core, event, client, spec, load_peak, steady, gpus)
     core.turn.unanswered.append(lease)
-    if not any(feature.hold_back(core, lease) for feature in core.features):
+    kept = [feature.on_request(core, lease) for feature in core.hooked["on_request"]]
+    if not any(kept):
         core.enqueue(lease)
 
 
@@ -240,7 +241,7 @@ def cancel(core: Core, event: CancelRequested) -> None:
     why = "its holder gave up"
     if any(
         feature.give_up(core, lease, LeaseState.CANCELLED, "cancelled", why)
-        for feature in core.features
+        for feature in lease.features
     ):
         if lease.state is LeaseState.VERIFYING:  # over with its verdict
             core.record_lease(lease)
@@ -394,7 +395,7 @@ def release(core: Core, event: ReleaseReported) -> None:
         return
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
-        for feature in core.features:
+        for feature in core.features if event.parked else lease.features:
             feature.on_release(core, event, lease)
         why = "exits" if event.exiting else "let go"
         let_go(core, lease, exiting=event.exiting, why=why)

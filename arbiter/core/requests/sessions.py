@@ -80,7 +80,7 @@ def on_left(core: Core, event: ClientLeft) -> None:
 
 
 def _give_up(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
-    for feature in core.features:
+    for feature in lease.features:
         feature.give_up(core, lease, to, code, why)
 
 

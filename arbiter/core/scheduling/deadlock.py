@@ -69,7 +69,7 @@ class _Reduction:
         self.waits = {process: mine for process, mine in waits.items() if _is_looked_at(mine)}
         # a request in no queue waits for others of its feature, not for bytes
         self.served: set[LeaseId] = {
-            lease.id for feature in core.features for lease in feature.unplaced()
+            lease.id for feature in core.hooked["unplaced"] for lease in feature.unplaced()
         }
 
     def run(self) -> list[Lease]:

@@ -43,20 +43,19 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.recovering is None:  # 1
         _relieve(core, gpu)
         return
-    keeper = next((feature for feature in core.features if feature.blocks(gpu)), None)
-    if keeper is not None:  # 2
-        keeper.serve(core, gpu, None)
+    if gpu.keeper is not None:  # 2
+        gpu.keeper.serve(core, gpu, None)
         return
     if gpu.blocked:  # 3
         return
     if not len(gpu.queue):  # 4
-        for feature in core.features:
+        for feature in core.hooked["serve"]:
             feature.serve(core, gpu, None)
         return
     head = policy.front(core, gpu)
     if head is None:
         return
-    owner = _owner(core, head)
+    owner = _owner(head)
     if owner is not None:  # 4
         owner.serve(core, gpu, head)
         return
@@ -148,16 +147,16 @@ def _backfill(
     for lease in gpu.queue.behind_head():
         if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
             continue  # seen at a glance: thousands may wait
-        if lease is head or _owner(core, lease) or (stuck and not _may_be_asked(core, lease)):
+        if lease is head or _owner(lease) or (stuck and not _may_be_asked(core, lease)):
             continue
         if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
             grant_if_measured(core, gpu, lease)
             return
 
 
-def _owner(core: Core, request: Lease) -> Feature | None:
+def _owner(request: Lease) -> Feature | None:
     """Return the feature that alone grants a request."""
-    return next((feature for feature in core.features if feature.owns(request)), None)
+    return next((feature for feature in request.features if feature.owns(request)), None)
 
 
 def _may_be_asked(core: Core, lease: Lease) -> bool:
@@ -170,7 +169,7 @@ def _may_be_asked(core: Core, lease: Lease) -> bool:
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
     _collect_evictions(core, gpu, lease)
-    if any(feature.grant(core, gpu, lease) for feature in core.features):
+    if any(feature.grant(core, gpu, lease) for feature in lease.features):
         return
     core.dequeue(lease)
     by_itself = lease.state is not LeaseState.QUEUED

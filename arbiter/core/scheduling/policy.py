@@ -39,15 +39,11 @@ def blocked(core: Core, gpu: Gpu) -> str:
         return "the card has not been read yet"
     if loading := gpu.in_state(LeaseState.LOADING):
         return f"{loading[0].spec.consumer} is loading"
-    if reason := _kept_by_feature(core, gpu):
-        return reason
+    if gpu.keeper is not None:
+        return gpu.keeper.blocks(gpu)
     if gpu.pressed:
         return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
     return ""
-
-
-def _kept_by_feature(core: Core, gpu: Gpu) -> str:
-    return next(filter(None, (feature.blocks(gpu) for feature in core.features)), "")
 
 
 def _missing(core: Core, missing: Collection[LeaseId]) -> str:
@@ -234,7 +230,7 @@ def choose_victims(
     willing = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if may_ask(core, lease)
+        if may_ask(lease)
         and lease.id != waiter.request.extends
         and (not lease.in_use or lease.spec.priority <= priority)
     ]
@@ -256,9 +252,7 @@ def choose_relief(
     idle = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
-        if may_ask(core, lease)
-        and not lease.in_use
-        and residency_ends_at(core, lease, None) <= core.now
+        if may_ask(lease) and not lease.in_use and residency_ends_at(core, lease, None) <= core.now
     ]
     ledger = gpu.ledger
     total = ledger.total_if(going)
@@ -269,14 +263,14 @@ def choose_relief(
     return _search(core, idle, covers, _freed(gpu, going, idle)) if covers(_leave(idle)) else idle
 
 
-def may_ask(core: Core, lease: Lease) -> bool:
+def may_ask(lease: Lease) -> bool:
     """Return whether a holder may be revoked for others: not before it reattached after a restart, nor while a feature protects it.
 
     Processes that use a lease that has not reattached may be on their way back to it.
     """
     if not (lease.evictable and lease.attached):
         return False
-    return not any(feature.protects(lease) for feature in core.features)
+    return not any(feature.protects(lease) for feature in lease.features)
 
 
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
@@ -285,7 +279,7 @@ def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
     Who came back by itself and was not used since has no claim to stay: its return must cost nobody time. Two that keep throwing each
     other out stay longer, by what a switch of theirs costs.
     """
-    if any(feature.unclaimed(lease) for feature in core.features):
+    if any(feature.unclaimed(lease) for feature in lease.features):
         return lease.ready_at
     held_s = 0.0 if waiter is None else costs.hold_s(core, lease, waiter)
     return lease.ready_at + max(lease.spec.min_residency_s, held_s)
@@ -303,7 +297,7 @@ def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
     ageing_s = core.settings.ageing_s_per_point
     times: list[float] = []
     for lease in gpu.in_state(LeaseState.HELD):
-        if not may_ask(core, lease):
+        if not may_ask(lease):
             continue
         times.append(residency_ends_at(core, lease, waiter))
         if waiter is not None and lease.in_use:
@@ -345,7 +339,7 @@ def _load_ends_by(core: Core, gpu: Gpu) -> float:
         not loading
         or gpu.failed_at is not None
         or gpu.sample is None
-        or _kept_by_feature(core, gpu)
+        or gpu.keeper is not None
         or gpu.pressed
     ):
         return 0.0

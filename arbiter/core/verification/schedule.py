@@ -201,7 +201,7 @@ def on_reading(core: Core, reading: MemorySampled) -> None:
             _weigh(core, gpu, verification, reading)
     evidence.note_pressure(core, gpu)
     core.wake(gpu)
-    for feature in core.features:
+    for feature in core.hooked["on_sample"]:
         feature.on_sample(core, gpu, reading)
 
 
