@@ -22,6 +22,8 @@ CORE := .venv-core/bin
 TOOL := PYTHONPATH=. $(BIN)/python
 # Two workers: with more, tests of timing compete for the cores of a small machine.
 WORKERS ?= 2
+# One worker for each file, in the order of tests/conftest.py: the longest first.
+BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core demo test test-core nightly mutation lint format chaos sim bench \
@@ -40,11 +42,10 @@ demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8Gi
 	$(BIN)/vramctl demo --seed $(SEED) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)
 
 test: setup ## the whole product; ARGS goes to pytest
-	$(BIN)/pytest -q -n $(WORKERS) --dist loadfile -m "not e2e" $(ARGS)
-	$(BIN)/pytest -q -n $(WORKERS) --dist loadfile -m e2e $(ARGS)
+	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) $(ARGS)
 
 test-core: setup-core ## the base install alone, in seconds
-	$(CORE)/pytest -q -n $(WORKERS) --dist loadfile -m "not heavy and not e2e and not gpu" $(ARGS)
+	$(CORE)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not heavy and not e2e and not gpu" $(ARGS)
 
 nightly: setup ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n
 	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \

@@ -13,6 +13,7 @@ from tests.support import machines
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 
+pytest_plugins = ["tests.support.leftovers"]
 _ROOT = Path(__file__).parents[1]
 machines.register()
 # Programs that tests start import `tests.support` too.
@@ -24,6 +25,21 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts what runs in its background deaf to SIGINT, and so would be every program that a test interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+LONGEST = ("tests/e2e/test_demo.py", "tests/e2e/", "tests/arbiter/test_")
+"""Where the longest tests are: begun last, one worker would end minutes after the other."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files; the order within a file stays."""
+
+    def rank(item: pytest.Item) -> int:
+        path = item.path.relative_to(_ROOT).as_posix()
+        found = (place for place, prefix in enumerate(LONGEST) if path.startswith(prefix))
+        return next(found, len(LONGEST))
+
+    items.sort(key=rank)
 
 
 @pytest.fixture(autouse=True)

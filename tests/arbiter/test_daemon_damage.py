@@ -104,7 +104,7 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) -> None:
-    arbiter = ArbiterProcess(config="record:\n  enabled: false\n")
+    arbiter = ArbiterProcess(config="record:\n  enabled: false\n", prepared=True)
     with contextlib.closing(arbiter):
         arbiter.start()
         database = arbiter.state / "journal.sqlite"

@@ -89,7 +89,7 @@ class Programs:
     """The processes of one robot; those that a test killed are started again by `up`. `tell` makes the policy's model behave."""
 
     def __init__(self) -> None:
-        self.arbiter = ArbiterProcess().start()
+        self.arbiter = ArbiterProcess(prepared=True).start()
         self.runtime = self.arbiter.runtime
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         for name, manifest in MANIFESTS.items():

@@ -42,7 +42,7 @@ class Stage:
     """One daemon, one card and one fork server for all tests of this file."""
 
     def __init__(self) -> None:
-        self.arbiter = ArbiterProcess(config=CONFIG).start()
+        self.arbiter = ArbiterProcess(config=CONFIG, prepared=True).start()
         self.configure(release_lag_s=0.15)
         program = Path(__file__).with_name("neighbour.py")
         self.forks = ForkServer(program, self.arbiter.environ, self.arbiter.runtime / "errors.log")
@@ -272,7 +272,7 @@ def test_13_a_second_authority_on_the_same_card_does_not_give_away_what_the_firs
     """taOS#859: two VRAM authorities. Each arbiter sees the other's holders: bytes without a lease of its own."""
     holder = stage.spawn("holder-13", 5)
     holder.until("ready")
-    other = ArbiterProcess(gpu=f"fake:{stage.arbiter.card}", config=CONFIG).start()
+    other = ArbiterProcess(gpu=f"fake:{stage.arbiter.card}", config=CONFIG, prepared=True).start()
     try:
         with WireClient(other.endpoint) as client:
             assert client.hello("elsewhere").acquire("elsewhere", 5 * GIB)["state"] == "queued"

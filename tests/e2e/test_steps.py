@@ -86,7 +86,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    arbiter = ArbiterProcess(config="lease: {fence_grace_s: 1.0}\n").start()
+    arbiter = ArbiterProcess(config="lease: {fence_grace_s: 1.0}\n", prepared=True).start()
     set_lag(arbiter.card)
     forks = ForkServer(
         Path(__file__).with_name("stepper.py"), arbiter.environ, arbiter.runtime / "errors.log"

@@ -1,0 +1,56 @@
+"""Temporary folder of one test run: its own, and empty at the end.
+
+A pytest plugin. Whatever the tests and their programs leave in TMPDIR fails the run, with its name.
+"""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+
+_KEY = pytest.StashKey[Path]()
+_FAILED = pytest.StashKey[bool]()
+KEPT = ("pytest-of-", "torchinductor_")
+"""Folders of `tmp_path`, and of torch's compiler, which makes its own in every process."""
+
+
+def _is_worker() -> bool:
+    return "PYTEST_XDIST_WORKER" in os.environ
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Give the run, its workers and its programs a temporary folder of their own."""
+    if not _is_worker():
+        # Short: the path of a socket holds 107 bytes. Open: some programs become another user.
+        made = Path(tempfile.mkdtemp(prefix="t"))
+        made.chmod(0o1777)
+        config.stash[_KEY] = made
+        os.environ["TMPDIR"] = tempfile.tempdir = str(made)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail the run for what is left."""
+    folder = session.config.stash.get(_KEY, None)
+    if folder is not None and (left := leftovers(folder)):
+        writer = session.config.get_terminal_writer()
+        writer.line(f"\nleft in the temporary folder: {', '.join(left)}", red=True)
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+    if folder is not None and session.exitstatus == pytest.ExitCode.TESTS_FAILED:
+        session.config.stash[_FAILED] = True
+        session.config.get_terminal_writer().line(f"\ntemporary files of this run: {folder}")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove the folder; after a failed run it stays, to be looked at."""
+    folder = config.stash.get(_KEY, None)
+    if folder is not None and not config.stash.get(_FAILED, False):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Return the names of what lies there, but for what KEPT names."""
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(KEPT))
