@@ -13,7 +13,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import Episode, Note, Outcome, Status, Step
+from vram_arbiter.reasoner.planner import (
+    Episode,
+    JsonObject,
+    Note,
+    Outcome,
+    OutcomeData,
+    Status,
+    Step,
+)
 from vram_arbiter.schemas.tools import (
     ExecuteRskill,
     LocateInView,
@@ -66,7 +74,7 @@ class Called:
 
     id: str
     name: str
-    arguments: dict[str, Any]
+    arguments: JsonObject
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +130,7 @@ def _step(number: int, step: Step, palette: Palette) -> list[Turn]:
     ]
 
 
-def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
+def told(call: ToolCall, outcome: Outcome) -> JsonObject:
     """Return an outcome for a model: status, its meaning, source, text, numbers."""
     source = SOURCE.get(type(call), "reasoner")
     fields = {
@@ -136,11 +144,11 @@ def told(call: ToolCall, outcome: Outcome) -> dict[str, Any]:
     return fields | ({"data": _told_data(outcome.data)} if outcome.data else {})
 
 
-def _told_data(data: Mapping[str, Any]) -> dict[str, Any]:
+def _told_data(data: OutcomeData) -> JsonObject:
     """Return data of a skill or model as JSON within the limit of an answer; mark what is left
     out.
     """
-    fields: dict[str, Any] = {}
+    fields: JsonObject = {}
     left = 2 * ANSWER_MAX_CHARS
     for key, value in _sayable(data).items():
         length = len(json.dumps(value, ensure_ascii=False))

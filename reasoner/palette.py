@@ -10,9 +10,9 @@ come from the same fields; `check` is asked again for each call.
 import dataclasses
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
-from typing import Any
 
-from vram_arbiter.reasoner.params import misfits
+from vram_arbiter.reasoner.params import JsonSchema, misfits
+from vram_arbiter.reasoner.planner import Arguments, JsonObject
 from vram_arbiter.schemas.body import UNKNOWN_BODY, Body
 from vram_arbiter.schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from vram_arbiter.schemas.manifest import Role, RSkillManifest
@@ -57,7 +57,7 @@ class Skill:
     kind: str
     description: str
     actions: tuple[str, ...]
-    goal_params_schema: Mapping[str, Any] | None = None
+    goal_params_schema: JsonSchema | None = None
     barred: str = ""
     """Why it must not be used although its kind could be; empty: it may."""
     longest_s: float = 0.0
@@ -215,7 +215,7 @@ class Palette:
         return None
 
     # -- what is offered, and how it is read back
-    def functions(self, *, goal_runs: bool = False) -> list[dict[str, Any]]:
+    def functions(self, *, goal_runs: bool = False) -> list[JsonObject]:
         """Return OpenAI-style descriptions of the tools and executable skills that are allowed
         now.
         """
@@ -242,7 +242,7 @@ class Palette:
                 offered.append(function)
         return offered
 
-    def parse(self, name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
+    def parse(self, name: str, arguments: str | Arguments) -> ToolCall:
         """Read a call by the name of its offer, or by the tool's own.
 
         Raises UnknownOp and BadRequest.

@@ -19,6 +19,10 @@ _TYPES: dict[str, tuple[type, ...]] = {
 }
 
 
+type JsonSchema = Mapping[str, Any]
+"""A JSON Schema, as a manifest holds it."""
+
+
 def misfits(value: Any, schema: Any, path: str = "goal_params") -> list[str]:
     """What is wrong with a value, each with its path; empty if it fits."""
     if not isinstance(schema, Mapping):
@@ -50,7 +54,7 @@ def _is(value: Any, kind: Any) -> bool:
     )
 
 
-def _object(value: dict[str, Any], schema: Mapping[str, Any], path: str) -> list[str]:
+def _object(value: dict[str, Any], schema: JsonSchema, path: str) -> list[str]:
     known = schema.get("properties")
     known = known if isinstance(known, Mapping) else {}
     required = schema.get("required")
@@ -67,7 +71,7 @@ def _object(value: dict[str, Any], schema: Mapping[str, Any], path: str) -> list
     return wrong
 
 
-def _array(value: list[Any], schema: Mapping[str, Any], path: str) -> list[str]:
+def _array(value: list[Any], schema: JsonSchema, path: str) -> list[str]:
     wrong = []
     if isinstance(least := schema.get("minItems"), int) and len(value) < least:
         wrong.append(f"{path}: must have at least {least} items")
@@ -78,7 +82,7 @@ def _array(value: list[Any], schema: Mapping[str, Any], path: str) -> list[str]:
     return wrong
 
 
-def _number(value: float, schema: Mapping[str, Any], path: str) -> list[str]:
+def _number(value: float, schema: JsonSchema, path: str) -> list[str]:
     if isinstance(low := schema.get("minimum"), int | float) and value < low:
         return [f"{path}: must be at least {low}"]
     if isinstance(high := schema.get("maximum"), int | float) and value > high:

@@ -12,6 +12,13 @@ from typing import Any, Literal, Protocol
 from vram_arbiter.schemas.errors import SidecarUnavailable
 from vram_arbiter.schemas.tools import ExecuteRskill, QueryScene, ToolCall
 
+type JsonObject = dict[str, Any]
+"""A JSON object, as a model server's API or a tool exchanges it."""
+type Arguments = Mapping[str, Any]
+"""Arguments of a tool call, as the model wrote them."""
+type OutcomeData = Mapping[str, Any]
+"""Data of a tool's outcome: a JSON object that a planner may read."""
+
 UNSTARTABLE_MAX = 3
 
 Status = Literal[
@@ -36,7 +43,7 @@ class Outcome:
     status: Status
     text: str
     code: str = ""
-    data: Mapping[str, Any] = field(default_factory=dict)
+    data: OutcomeData = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

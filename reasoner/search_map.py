@@ -8,9 +8,9 @@ the best place wins. Pure: no sockets, no clock.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+
+from vram_arbiter.reasoner.planner import OutcomeData
 
 # two looks at one thing differ by less; the arm's gripper needs more room between two things
 SAME_M = 0.05
@@ -53,7 +53,7 @@ class Places:
     joined: bool = False
     """Whether odometry joins the newest look to the ones before."""
 
-    def add(self, data: Mapping[str, Any]) -> None:
+    def add(self, data: OutcomeData) -> None:
         """Add `data` of a locate that found something: `point_base_m`, optionally `seen` and
         `base_pose`.
         """

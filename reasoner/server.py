@@ -7,7 +7,6 @@ Speaks `schemas.reasoner`. Both ends are here: the server beside the loop, and `
 import asyncio
 import logging
 import os
-from collections.abc import Mapping
 from typing import Any, Self
 
 from pydantic import ValidationError
@@ -99,7 +98,7 @@ def _refusal(request_id: int | None, error: VramError) -> Message:
     return {"re": request_id, "ok": False, "error": error.to_wire()}
 
 
-async def send(endpoint: str, request: Mapping[str, Any], *, timeout_s: float = SEND_S) -> Message:
+async def send(endpoint: str, request: Message, *, timeout_s: float = SEND_S) -> Message:
     """Send one request to a running reasoner.
 
     Raises ReasonerUnreachable, UntrustedServer, or the typed error of its answer.

@@ -14,7 +14,7 @@ import uuid
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic
-from typing import Any, Protocol
+from typing import Any, Protocol, TypedDict
 
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -27,7 +27,7 @@ from vram_arbiter.clients.sidecar.perception import (
 )
 from vram_arbiter.reasoner.history import Past, Taken
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import Outcome
+from vram_arbiter.reasoner.planner import JsonObject, Outcome
 from vram_arbiter.reasoner.search_map import SAME_M
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -163,7 +163,7 @@ class Tools:
                 data={"camera": frame["camera"]},
             )
         best, *others = sorted(detections, key=lambda detection: -detection.score)
-        data: dict[str, Any] = {
+        data: JsonObject = {
             "camera": frame["camera"],
             "box": list(best.box),
             "score": best.score,
@@ -423,12 +423,20 @@ def point_on_plane(frame: FrameReply, box: tuple[float, float, float, float]) ->
     return None if point is None else list(point)
 
 
-def _things(frame: FrameReply, detections: Sequence[Detection]) -> list[dict[str, Any]]:
+class Thing(TypedDict):
+    """One thing of a look, in the base's frame."""
+
+    point_base_m: list[float]
+    score: float
+    box: list[float]
+
+
+def _things(frame: FrameReply, detections: Sequence[Detection]) -> list[Thing]:
     """Return detections as things with their places, best first.
 
     Several boxes may lie on one thing; its best box counts.
     """
-    things: list[dict[str, Any]] = []
+    things: list[Thing] = []
     for detection in detections:
         point = point_on_plane(frame, detection.box)
         if point is not None and all(

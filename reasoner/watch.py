@@ -7,9 +7,8 @@ that no other request delays it.
 
 import asyncio
 import logging
-from typing import Any
 
-from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.runner import Message, RunnerClient
 from vram_arbiter.reasoner.inbox import Danger, Inbox
 from vram_arbiter.schemas.errors import VramError
 
@@ -59,6 +58,6 @@ async def _watch(runner: RunnerClient, inbox: Inbox, period_s: float, answer_s: 
         await asyncio.sleep(period_s)
 
 
-def _stale(state: dict[str, Any]) -> set[str]:
+def _stale(state: Message) -> set[str]:
     diagnostics = (state.get("world") or {}).get("diagnostics") or {}
     return {name for name, said in diagnostics.items() if said in ("stale", "error")}

@@ -26,6 +26,8 @@ from vram_arbiter.schemas.world import (
 
 type GoalData = dict[str, Any]
 """Fields of a goal's or a run's result: a JSON object."""
+type GoalParams = Mapping[str, Any]
+"""Parameters of a goal, as its skill defines them: a JSON object."""
 
 
 class DeadlineMissed(TransientError):
@@ -85,7 +87,7 @@ class Goal:
     rskill_id: str
     revision: str = ""
     prompt: str = ""
-    params: Mapping[str, Any] = field(default_factory=dict)
+    params: GoalParams = field(default_factory=dict)
     deadline_s: float = 0.0
     max_ticks: int | None = None
     traceparent: str | None = None
@@ -117,7 +119,7 @@ class Hold:
 class Done:
     """The skill ran to its end; `data` goes into the goal's result."""
 
-    data: Mapping[str, Any] = field(default_factory=dict)
+    data: GoalData = field(default_factory=dict)
 
 
 StepOutcome = Act | Hold | Done
@@ -182,7 +184,7 @@ class Skill(Stepped, Protocol):
 class SkillEnded:
     """How a skill left the control thread: by itself (`error` None) or by a typed error."""
 
-    data: Mapping[str, Any]
+    data: GoalData
     error: VramError | None = None
 
 
@@ -225,7 +227,7 @@ class TickSink(Protocol):
         """After the goal's last tick. None: the arm was taken back (canceled, or the deadline)."""
         ...
 
-    def facts(self) -> Mapping[str, Any]:
+    def facts(self) -> GoalData:
         """Any thread: what became of the ticks so far, for the run's result."""
         ...
 

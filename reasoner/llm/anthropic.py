@@ -6,11 +6,12 @@ message; adjacent messages of one role are merged; no text may be empty. `tool_c
 a call, and `disable_parallel_tool_use` limits it to one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
 from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner
+from vram_arbiter.reasoner.planner import Arguments, JsonObject
 
 VERSION = "2023-06-01"
 
@@ -25,8 +26,8 @@ class AnthropicPlanner(LlmPlanner):
         return headers | {"x-api-key": self.config.api_key} if self.config.api_key else headers
 
     def _request(
-        self, turns: Sequence[Turn], functions: Sequence[Mapping[str, Any]]
-    ) -> tuple[str, dict[str, Any]]:
+        self, turns: Sequence[Turn], functions: Sequence[JsonObject]
+    ) -> tuple[str, JsonObject]:
         tools = [
             {
                 "name": function["function"]["name"],
@@ -44,7 +45,7 @@ class AnthropicPlanner(LlmPlanner):
             "tool_choice": {"type": "any", "disable_parallel_tool_use": True},
         }
 
-    def _read(self, body: Mapping[str, Any]) -> Answer:
+    def _read(self, body: JsonObject) -> Answer:
         if body["type"] != "message" or body["role"] != "assistant":
             raise ValueError(f"a {body['type']}, not a message of the assistant")
         blocks = body["content"]
@@ -59,12 +60,12 @@ class AnthropicPlanner(LlmPlanner):
         return Answer(" ".join(words), tuple(calls))
 
 
-def _input(value: Any) -> Mapping[str, Any] | str:
+def _input(value: Any) -> Arguments | str:
     return value if isinstance(value, dict) else str(value)
 
 
-def _messages(turns: Sequence[Turn]) -> list[dict[str, Any]]:
-    messages: list[dict[str, Any]] = []
+def _messages(turns: Sequence[Turn]) -> list[JsonObject]:
+    messages: list[JsonObject] = []
     for turn in turns:
         role, block = _block(turn)
         if messages and messages[-1]["role"] == role:
@@ -74,7 +75,7 @@ def _messages(turns: Sequence[Turn]) -> list[dict[str, Any]]:
     return messages
 
 
-def _block(turn: Turn) -> tuple[str, dict[str, Any]]:
+def _block(turn: Turn) -> tuple[str, JsonObject]:
     match turn:
         case Words(text):
             return "user", {"type": "text", "text": text.strip() or "…"}

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 from urllib.parse import urlsplit
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
@@ -21,7 +21,7 @@ from vram_arbiter.reasoner.llm.http import (
     without_credentials,
 )
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import Episode, Finish, benched
+from vram_arbiter.reasoner.planner import Arguments, Episode, Finish, JsonObject, benched
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, LlmError, NotPermitted, UnknownOp
 from vram_arbiter.schemas.tools import ToolCall, read_arguments
 
@@ -43,7 +43,8 @@ from the person in charge. Call `finish` when done."""
 
 NUDGE = "Answer with exactly one tool call."
 
-FINISH: dict[str, Any] = {
+
+FINISH: JsonObject = {
     "type": "function",
     "function": {
         "name": "finish",
@@ -136,7 +137,7 @@ class Call:
 
     id: str
     name: str
-    arguments: str | Mapping[str, Any]
+    arguments: str | Arguments
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,12 +183,12 @@ class LlmPlanner(ABC):
 
     @abstractmethod
     def _request(
-        self, turns: Sequence[Turn], functions: Sequence[Mapping[str, Any]]
-    ) -> tuple[str, dict[str, Any]]:
+        self, turns: Sequence[Turn], functions: Sequence[JsonObject]
+    ) -> tuple[str, JsonObject]:
         """Address and body of a request. `functions` are OpenAI-style descriptions."""
 
     @abstractmethod
-    def _read(self, body: Mapping[str, Any]) -> Answer:
+    def _read(self, body: JsonObject) -> Answer:
         """Read the API's answer. Raises ValueError, LookupError or TypeError for another body."""
 
     # -- a decision
@@ -220,7 +221,7 @@ class LlmPlanner(ABC):
             hint="try a model that is better at calling tools",
         )
 
-    async def _ask(self, turns: Sequence[Turn], functions: Sequence[Mapping[str, Any]]) -> Answer:
+    async def _ask(self, turns: Sequence[Turn], functions: Sequence[JsonObject]) -> Answer:
         url, body = self._request(turns, functions)
         answer = await self._http.post(url, body)
         try:
@@ -249,7 +250,7 @@ def _decision(
     return decoded
 
 
-def _finish(arguments: str | Mapping[str, Any]) -> Finish:
+def _finish(arguments: str | Arguments) -> Finish:
     fields = read_arguments("finish", arguments)
     success, reason = fields.get("success"), fields.get("reason")
     if not isinstance(success, bool) or not isinstance(reason, str):

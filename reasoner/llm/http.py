@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 from urllib.parse import urlsplit, urlunsplit
 
+from vram_arbiter.reasoner.planner import JsonObject
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.errors import ConfigError, LlmError
 
@@ -62,7 +63,7 @@ class JsonHttp:
         if self._http is not None:
             await self._http.aclose()
 
-    async def post(self, url: str, body: Mapping[str, Any]) -> dict[str, Any]:
+    async def post(self, url: str, body: JsonObject) -> JsonObject:
         """The answer's JSON object. Raises LlmError for everything that goes wrong."""
         shown = without_credentials(url)
         content = json.dumps(body, ensure_ascii=False).encode(errors="replace")
@@ -86,7 +87,7 @@ class JsonHttp:
             hint="is the server running, and does it keep up?",
         )
 
-    async def _once(self, url: str, content: bytes) -> dict[str, Any]:
+    async def _once(self, url: str, content: bytes) -> JsonObject:
         import httpx  # only installed with the reasoner's extra
 
         shown = without_credentials(url)

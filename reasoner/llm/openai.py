@@ -5,11 +5,12 @@ Facts: the wire is the public Chat Completions API (messages, tools, tool_calls)
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
 from vram_arbiter.reasoner.llm.base import Answer, Call, LlmConfig, LlmPlanner
+from vram_arbiter.reasoner.planner import JsonObject
 
 __all__ = ["LlmConfig", "OpenAiPlanner"]
 
@@ -21,8 +22,8 @@ class OpenAiPlanner(LlmPlanner):
         return {"authorization": f"Bearer {self.config.api_key}"} if self.config.api_key else {}
 
     def _request(
-        self, turns: Sequence[Turn], functions: Sequence[Mapping[str, Any]]
-    ) -> tuple[str, dict[str, Any]]:
+        self, turns: Sequence[Turn], functions: Sequence[JsonObject]
+    ) -> tuple[str, JsonObject]:
         messages = [{"role": "system", "content": self._system}, *map(_message, turns)]
         return f"{self.config.base_url}/chat/completions", {
             "model": self.config.model,
@@ -33,7 +34,7 @@ class OpenAiPlanner(LlmPlanner):
             "max_tokens": self.config.max_tokens,
         }
 
-    def _read(self, body: Mapping[str, Any]) -> Answer:
+    def _read(self, body: JsonObject) -> Answer:
         message = body["choices"][0]["message"]
         calls = message.get("tool_calls") or []
         if not isinstance(calls, list):
@@ -49,7 +50,7 @@ def _call(call: Any) -> Call:
     return Call(str(call.get("id") or ""), str(function["name"]), arguments or "{}")
 
 
-def _message(turn: Turn) -> dict[str, Any]:
+def _message(turn: Turn) -> JsonObject:
     match turn:
         case Words(text):
             return {"role": "user", "content": text}

@@ -36,7 +36,7 @@ from vram_arbiter.schemas.runtime.printable import printable_lines
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.protocols import Skill
-    from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, Contestant
+    from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, CellSummary, Contestant, Told
     from vram_arbiter.runner.sim.tasks import Task
     from vram_arbiter.runner.sim.worlds import World
 
@@ -179,7 +179,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
 
     world, task, arm = entry.world, entry.task, entry.world.arm
 
-    def told() -> tuple[str, dict[str, Any]]:
+    def told() -> Told:
         return ("", {}) if arm is None or task is None else task.told(arm)
 
     if arm is not None and task is not None and world.environment is not None:
@@ -330,7 +330,7 @@ def _write(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -
         raise ConfigError(f"{target} cannot be written: {error}") from error
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: Sequence[CellSummary]) -> str:
     """The cells for people."""
     lines = [COLUMNS, *(_row(row) for row in rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
@@ -340,7 +340,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def _row(row: dict[str, Any]) -> tuple[str, ...]:
+def _row(row: CellSummary) -> tuple[str, ...]:
     interval = row["interval_95"]
     rate = row["success_rate"]
     task = f" ({row['task']})" if row["task"] else ""

@@ -43,7 +43,7 @@ from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from vram_arbiter.runner.goals.server import GoalServer
-from vram_arbiter.runner.protocols import DeadlinePolicy, Skill
+from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData, Skill
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
@@ -224,7 +224,7 @@ class Deploy:
         arbiter = "none" if self._args.no_arbiter else self._args.arbiter or "the machine's own"
         return [*sidecars, ("goals", f"served on {self._endpoint}"), ("arbiter", arbiter)]
 
-    def _identity(self, parts: Parts, arbiter: Arbiter | None) -> dict[str, object]:
+    def _identity(self, parts: Parts, arbiter: Arbiter | None) -> GoalData:
         return {
             "robot": self._file.robot.robot_id,
             "simulated": parts.hal.description.simulated,

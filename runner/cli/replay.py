@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from vram_arbiter.runner.recording.reader import Recorded, read_frame
+from vram_arbiter.runner.recording.reader import Recorded, RecordedGoal, read_frame
 from vram_arbiter.runner.recording.rows import ROBOT
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable_lines
@@ -132,7 +132,7 @@ def as_text(recorded: Recorded, link: str | None) -> str:
     return "\n".join(f"{label:<8} {text}" for label, text in lines)
 
 
-def _outcome(goal: Mapping[str, object]) -> str:
+def _outcome(goal: RecordedGoal) -> str:
     status = str(goal.get("status", ""))
     return f"{status}: {goal['message']}" if goal.get("message") else status
 

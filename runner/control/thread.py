@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from vram_arbiter.runner.control.mailbox import Mailbox
-from vram_arbiter.runner.protocols import Goal, SkillEnded
+from vram_arbiter.runner.protocols import Goal, GoalData, SkillEnded
 from vram_arbiter.schemas.errors import InternalError, VramError
 from vram_arbiter.schemas.world import RunResult
 
@@ -37,7 +37,7 @@ class Controlled(Protocol):
 
     def begin_skill(self, skill: Any, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None: ...
 
-    def end_skill(self) -> dict[str, Any]: ...
+    def end_skill(self) -> GoalData: ...
 
 
 class ControlThread:
@@ -138,7 +138,7 @@ class ControlThread:
         skill: Any,
         goal: Goal,
         on_begun: Callable[[], None] = lambda: None,
-        taken_back: Callable[[dict[str, Any]], None] = lambda data: None,
+        taken_back: Callable[[GoalData], None] = lambda data: None,
     ) -> SkillEnded:
         """Give the robot to a started skill until it succeeds or fails. Canceling takes it back.
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
+from vram_arbiter.clients.net.server import Message
 from vram_arbiter.runner.protocols import Skill, SkillKey
 from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.errors import ManifestInvalid, UnknownSkill
@@ -160,11 +161,11 @@ class Catalogue:
             lines.append(f"{manifest.name} {manifest.version} ({manifest.license}){kind}")
         return lines + [f"{name} is not offered: {why}" for name, why in self._refused.items()]
 
-    def as_wire(self) -> list[dict[str, Any]]:
+    def as_wire(self) -> list[Message]:
         """All manifests as plain maps, for a reasoner's palette."""
         return [manifest.model_dump(mode="json") for manifest in self._manifests.values()]
 
-    def body_as_wire(self) -> dict[str, Any] | None:
+    def body_as_wire(self) -> Message | None:
         """The robot's body, for the same palette; None where any skill fits."""
         return None if self._body is None else self._body.model_dump(mode="json")
 

@@ -13,14 +13,14 @@ import logging
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.clients.net.server import Message, Peer
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
-from vram_arbiter.runner.protocols import Goal, Progress, Skill, SkillEnded, SkillKey
+from vram_arbiter.runner.protocols import Goal, GoalData, Progress, Skill, SkillEnded, SkillKey
 from vram_arbiter.runner.skills.residency import Residency
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -73,7 +73,7 @@ class _Running:
     stopped_by: VramError | None = None
     skill: Skill | None = None
     phase: str = "acquiring"
-    so_far: dict[str, Any] = field(
+    so_far: GoalData = field(
         default_factory=dict
     )  # what became of its actions, once the arm was taken back
     began_s: float = 0.0
@@ -233,7 +233,7 @@ class OneGoal:
         telling = asyncio.create_task(self._tell(running))
         status: Status = "failed"
         error: VramError | None = None
-        data: dict[str, Any] = {}
+        data: GoalData = {}
         try:
             if running.canceled:
                 raise asyncio.CancelledError
@@ -300,7 +300,7 @@ class OneGoal:
         return await self._control.run_skill(skill, goal, begun, running.so_far.update)
 
     async def _conclude(
-        self, running: _Running, status: Status, error: VramError | None, data: dict[str, Any]
+        self, running: _Running, status: Status, error: VramError | None, data: GoalData
     ) -> None:
         goal = running.goal
         message = {
@@ -362,7 +362,7 @@ def _identity(request: SendGoal) -> str:
     return request.model_dump_json(exclude={"id", "traceparent"})
 
 
-def _sendable(data: dict[str, Any]) -> dict[str, Any]:
+def _sendable(data: GoalData) -> GoalData:
     """Return the skill's data if a wire can carry it: a result must reach its client."""
     try:
         pack(data)

@@ -94,8 +94,8 @@ class GoalServer:
         catalogue: Catalogue,
         clock: Clock,
         *,
-        ground_truth: Callable[[], dict[str, Any]] | None = None,
-        identity: dict[str, Any] | None = None,
+        ground_truth: Callable[[], Message] | None = None,
+        identity: Message | None = None,
         on_bound: Callable[[], None] | None = None,
         stopping: asyncio.Event | None = None,
         estop_s: float = OBEY_S,
@@ -272,7 +272,7 @@ class GoalServer:
             "cameras": list(robot.camera_names()),
         }
 
-    def _world(self) -> dict[str, Any] | None:
+    def _world(self) -> Message | None:
         """Return the newest world state.
 
         While the control loop hangs nothing in it counts as fresh.

@@ -19,7 +19,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
 
@@ -35,7 +35,34 @@ SCRATCH = "tmp*"  # folders in which lerobot encodes videos
 LOCK_WAIT_S = 30.0  # a runner that was killed leaves a writer that still finishes its episode
 LOCK_POLL_S = 0.1
 
-Commit = dict[str, Any]
+
+class Commit(TypedDict):
+    """The file `commit.json`: everything that is finished."""
+
+    version: int
+    episodes: int
+    files: dict[str, int]  # bytes by path
+    notes_bytes: int
+    meta: dict[str, str]  # the files that do change, base64
+
+
+class EpisodeNote(TypedDict, total=False):
+    """What is noted of one episode, one line of JSON."""
+
+    episode: int
+    frames: int
+    goal_id: str
+    skill: str
+    task: str
+    trace_id: str
+    units: str
+    judged: bool | None
+    status: str
+    code: str
+    message: str
+    dropped: int
+    incomplete: int
+    reasons: dict[str, int]
 
 
 def check_folder(root: Path) -> None:
@@ -103,9 +130,9 @@ def begin(root: Path) -> None:
     _write(root / FOLDER / OPEN, b"")
 
 
-def commit(root: Path, episode: dict[str, Any] | None) -> None:
+def commit(root: Path, episode: EpisodeNote | None) -> None:
     """What lies there now is finished, an episode with it; on disk before this returns."""
-    before = last(root) or {"episodes": 0, "files": {}, "notes_bytes": 0}
+    before = last(root) or Commit(version=1, episodes=0, files={}, notes_bytes=0, meta={})
     files = _files(root)
     for name in files.keys() - before["files"].keys():
         _flush(root / name)
@@ -114,17 +141,17 @@ def commit(root: Path, episode: dict[str, Any] | None) -> None:
         line = json.dumps(episode, ensure_ascii=False).encode() + b"\n"
         _note(root / FOLDER / EPISODES, notes_bytes, line)
         notes_bytes += len(line)
-    record = {
-        "version": 1,
-        "episodes": before["episodes"] + (episode is not None),
-        "files": files,
-        "notes_bytes": notes_bytes,
-        "meta": {
+    record = Commit(
+        version=1,
+        episodes=before["episodes"] + (episode is not None),
+        files=files,
+        notes_bytes=notes_bytes,
+        meta={
             name: base64.b64encode((root / name).read_bytes()).decode()
             for name in MUTABLE
             if (root / name).exists()
         },
-    }
+    )
     _write(root / FOLDER / COMMIT, json.dumps(record).encode())
     (root / FOLDER / OPEN).unlink(missing_ok=True)
 
@@ -157,7 +184,7 @@ def repair(root: Path) -> list[str]:
     return said
 
 
-def notes(root: Path) -> list[dict[str, Any]]:
+def notes(root: Path) -> list[EpisodeNote]:
     """What was noted of each committed episode, by episode."""
     record = last(root)
     if record is None or not (root / FOLDER / EPISODES).exists():

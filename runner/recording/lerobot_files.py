@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from vram_arbiter.runner.recording import commit
-from vram_arbiter.runner.recording.rows import TIMINGS, Row
+from vram_arbiter.runner.recording.rows import TIMINGS, Row, RowFrame
 from vram_arbiter.runner.sensors.pictures import as_rgb
 from vram_arbiter.schemas.errors import ConfigError, InternalError
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
@@ -31,7 +31,19 @@ LENGTH_TOLERANCE = 0.5  # frames
 
 SUCCESS = "next.success"  # only of worlds that judge: a skill that says "done" does not know
 
-Features = dict[str, dict[str, Any]]
+Frame = dict[str, Any]
+"""One row as lerobot takes it: arrays and texts by column."""
+
+
+class Feature(TypedDict):
+    """One column of a LeRobotDataset."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: list[str] | None
+
+
+Features = dict[str, Feature]
 
 
 def features_of(row: Row) -> Features:
@@ -90,7 +102,7 @@ def features_of(row: Row) -> Features:
     }
 
 
-def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[str, Any]:
+def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> Frame:
     """Return the row as lerobot takes it.
 
     Raises ModelError and FrameStale for a picture without colors, ConfigError for one of another
@@ -98,7 +110,7 @@ def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[st
     """
     import numpy as np
 
-    values: dict[str, Any] = {
+    values: Frame = {
         "observation.state": row["state"],
         "action": row["action"],
         "base_pose": row["base_pose"],
@@ -120,7 +132,7 @@ def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[st
         "span_id": row["span_id"],
         "trace_sampled": row["sampled"],
     }
-    frame: dict[str, Any] = {"task": row["task"]}
+    frame: Frame = {"task": row["task"]}
     for name, feature in features.items():
         if feature["dtype"] == "video" or name not in values:
             continue
@@ -131,8 +143,9 @@ def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> dict[st
             frame[name] = np.atleast_1d(np.asarray(value, dtype=feature["dtype"]))
     for said, data in zip(row["frames"], pictures, strict=True):
         rgb = as_rgb(_picture(said, data))
-        wanted = features.get(_camera(said["camera"]), {}).get("shape")
-        if wanted is None or tuple(rgb.shape) != tuple(wanted):
+        column = features.get(_camera(said["camera"]))
+        wanted = None if column is None else tuple(column["shape"])
+        if tuple(rgb.shape) != wanted:
             raise ConfigError(
                 f"camera {said['camera']} gives pictures of {rgb.shape}, the dataset has {wanted}",
                 hint="record into a new folder",
@@ -209,7 +222,7 @@ class LerobotFiles:
         self._rows = 0
         return features
 
-    def add(self, frame: dict[str, Any]) -> None:
+    def add(self, frame: Frame) -> None:
         """Add a row. Raises InternalError when the encoder hangs, ValueError for a row that does
         not fit.
         """
@@ -217,7 +230,7 @@ class LerobotFiles:
         self._dataset.add_frame(frame)
         self._rows += 1
 
-    def finish(self, note: Mapping[str, Any]) -> int:
+    def finish(self, note: commit.EpisodeNote) -> int:
         """Close the episode's files, commit them with `note`, and return the episode's index.
 
         Raises InternalError for a video that lacks pictures.
@@ -236,7 +249,7 @@ class LerobotFiles:
                 )
         dataset.finalize()
         index = int(episode["episode_index"][0])
-        commit.commit(self._root, {"episode": index, "frames": self._rows, **note})
+        commit.commit(self._root, {**note, "episode": index, "frames": self._rows})
         self._rows = 0
         return index
 
@@ -292,7 +305,7 @@ class LerobotFiles:
             waited_s += ENCODER_POLL_S
 
 
-def _picture(said: Mapping[str, Any], data: bytes) -> SensorFrame:
+def _picture(said: RowFrame, data: bytes) -> SensorFrame:
     return SensorFrame(
         sensor_id=said["camera"],
         stamp_monotonic_ns=0,
@@ -308,19 +321,19 @@ def _camera(name: str) -> str:
     return f"observation.images.{name.replace('/', '_')}"
 
 
-def _vector(dtype: str, names: Sequence[str]) -> dict[str, Any]:
+def _vector(dtype: str, names: Sequence[str]) -> Feature:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
 
 
-def _one(dtype: str) -> dict[str, Any]:
+def _one(dtype: str) -> Feature:
     return {"dtype": dtype, "shape": (1,), "names": None}
 
 
-def _differences(there: Mapping[str, Any], wanted: Features) -> str:
+def _differences(there: Features, wanted: Features) -> str:
     """Columns that are not the same, but for those that lerobot adds itself."""
     from lerobot.utils.constants import DEFAULT_FEATURES
 
-    def essence(feature: Mapping[str, Any] | None) -> Any:
+    def essence(feature: Feature | None) -> Any:
         if feature is None:
             return None
         return feature["dtype"], tuple(feature["shape"]), feature["names"]

@@ -10,13 +10,61 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from vram_arbiter.runner.recording import commit
 from vram_arbiter.runner.recording.rows import NO_CHUNK, ROBOT
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
 
+if TYPE_CHECKING:
+    from vram_arbiter.runner.recording.lerobot_files import Features
+
 EPISODE_COLUMNS = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
+
+
+ParquetRow = dict[str, Any]
+"""One row of a table that lerobot wrote, by column."""
+
+
+class DatasetInfo(TypedDict):
+    """Part of `meta/info.json` that is read here."""
+
+    robot_type: str | None
+    data_path: str
+    video_path: str
+    features: Features
+
+
+class RecordedGoal(TypedDict, total=False):
+    """Goal of a recorded frame; its end is known once the episode is committed."""
+
+    goal_id: str
+    skill: str
+    status: str
+    code: str
+    message: str
+    dropped: int
+    incomplete: int
+
+
+class RecordedTick(TypedDict):
+    """Tick of a recorded frame. `success` None: the world did not judge."""
+
+    index: int
+    stamp_ns: int
+    chunk_index: int | None
+    action_applied: bool
+    deadline_missed: bool
+    violations: str
+    done: bool
+    success: bool | None
+
+
+class RecordedPicture(TypedDict):
+    """Place of a picture: its video and the second in it."""
+
+    path: str
+    at_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +83,17 @@ class Recorded:
     frame_in_episode: int
     at_s: float
     task: str
-    goal: Mapping[str, Any]
+    goal: RecordedGoal
     trace_id: str
     span_id: str
     trace_sampled: bool
-    tick: Mapping[str, Any]
+    tick: RecordedTick
     timings_ms: Mapping[str, float]
     state: Mapping[str, float]
     action: Mapping[str, float]
     units: str
-    base: Mapping[str, Any]
-    pictures: Mapping[str, Mapping[str, Any]]
+    base: Mapping[str, Mapping[str, float]]
+    pictures: Mapping[str, RecordedPicture]
     complete: bool  # False: a recording is under way, or was cut off
 
 
@@ -70,7 +118,7 @@ def read_frame(root: Path, frame: int, episode: int | None = None) -> Recorded:
     return _recorded(root, info, about, row, notes.get(about["episode_index"], {}))
 
 
-def _open(root: Path) -> tuple[dict[str, Any], commit.Commit]:
+def _open(root: Path) -> tuple[DatasetInfo, commit.Commit]:
     record = commit.last(root)
     if record is None:
         raise ConfigError(
@@ -78,7 +126,7 @@ def _open(root: Path) -> tuple[dict[str, Any], commit.Commit]:
             hint="name the folder that --record or save_dir named",
         )
     try:
-        info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+        info: DatasetInfo = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"{root / 'meta' / 'info.json'} cannot be read: {error}",
@@ -89,7 +137,7 @@ def _open(root: Path) -> tuple[dict[str, Any], commit.Commit]:
 
 def _rows(
     root: Path, names: list[str], where: tuple[str, str, int] | None = None
-) -> list[dict[str, Any]]:
+) -> list[ParquetRow]:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -97,7 +145,7 @@ def _rows(
         raise ConfigError(
             f"datasets are read with pyarrow: {error}", hint="pip install 'vram-arbiter[dataset]'"
         ) from error
-    rows: list[dict[str, Any]] = []
+    rows: list[ParquetRow] = []
     for name in sorted(names):
         try:
             table = pyarrow.parquet.read_table(
@@ -113,7 +161,7 @@ def _rows(
     return rows
 
 
-def _episode(episodes: list[dict[str, Any]], frame: int, wanted: int | None) -> dict[str, Any]:
+def _episode(episodes: list[ParquetRow], frame: int, wanted: int | None) -> ParquetRow:
     if wanted is not None:
         for about in episodes:
             if about["episode_index"] == wanted:
@@ -137,10 +185,10 @@ def _episode(episodes: list[dict[str, Any]], frame: int, wanted: int | None) -> 
 
 def _recorded(
     root: Path,
-    info: Mapping[str, Any],
-    about: Mapping[str, Any],
-    row: Mapping[str, Any],
-    note: Mapping[str, Any],
+    info: DatasetInfo,
+    about: ParquetRow,
+    row: ParquetRow,
+    note: commit.EpisodeNote,
 ) -> Recorded:
     features = info["features"]
 
@@ -150,13 +198,13 @@ def _recorded(
         values = row[column]  # of a single number lerobot makes a column of plain numbers
         return dict(
             zip(
-                features[column]["names"],
+                features[column]["names"] or [],
                 values if isinstance(values, list) else [values],
                 strict=True,
             )
         )
 
-    pictures = {}
+    pictures: dict[str, RecordedPicture] = {}
     for name, feature in features.items():
         if feature["dtype"] == "video":
             video = info["video_path"].format(
@@ -177,15 +225,7 @@ def _recorded(
         frame_in_episode=row["frame_index"],
         at_s=row["timestamp"],
         task=_task(root, row["task_index"]),
-        goal={
-            "goal_id": row["goal_id"],
-            "skill": row["skill"],
-            **{
-                key: note[key]
-                for key in ("status", "code", "message", "dropped", "incomplete")
-                if key in note
-            },
-        },
+        goal=_goal(row, note),
         trace_id=row["trace_id"],
         span_id=row["span_id"],
         trace_sampled=row["trace_sampled"],
@@ -207,6 +247,14 @@ def _recorded(
         pictures=pictures,
         complete=not (root / commit.FOLDER / commit.OPEN).exists(),
     )
+
+
+def _goal(row: ParquetRow, note: commit.EpisodeNote) -> RecordedGoal:
+    goal: RecordedGoal = {"goal_id": row["goal_id"], "skill": row["skill"]}
+    for key in ("status", "code", "message", "dropped", "incomplete"):
+        if key in note:
+            goal[key] = note[key]
+    return goal
 
 
 def _task(root: Path, index: int) -> str:

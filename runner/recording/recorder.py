@@ -19,9 +19,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded
+from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded
 from vram_arbiter.runner.recording import commit, wire
 from vram_arbiter.runner.recording.rows import Incomplete, row_of
 from vram_arbiter.schemas.errors import Cancelled, ConfigError, InternalError, VramError, from_wire
@@ -183,7 +182,7 @@ class DatasetRecorder:
             log.error("the dataset's writer ended with status %d", code)
         log.info("%s", self.summary())
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> GoalData:
         """Return the facts of `runner.protocols.TickSink`: `dropped` and `left_out` count ticks,
         `skipped` goals.
         """
@@ -287,7 +286,7 @@ class DatasetRecorder:
             return item
 
     @staticmethod
-    def _note(end: _End, reasons: Counter[str]) -> dict[str, Any]:
+    def _note(end: _End, reasons: Counter[str]) -> commit.EpisodeNote:
         error = end.ended.error if end.ended is not None else None
         status = (
             "taken_back" if end.ended is None else "failed" if error is not None else "succeeded"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TypedDict
 
 from vram_arbiter.runner.protocols import GoalTick, Transition
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
@@ -29,7 +29,43 @@ COLOURS = frozenset(
     }
 )
 
-Row = dict[str, Any]
+
+class RowFrame(TypedDict):
+    """One camera's picture of a row; its bytes follow the row."""
+
+    camera: str
+    encoding: str
+    width: int
+    height: int
+
+
+class Row(TypedDict):
+    """One tick on its way to the dataset."""
+
+    goal_id: str
+    skill: str
+    task: str
+    units: str
+    state_names: list[str]
+    state: list[float]
+    action_names: list[str]
+    action: list[float]
+    base_pose: list[float] | None
+    base_velocity: list[float] | None
+    frames: list[RowFrame]
+    ages_ms: list[float]
+    timings_ms: list[float]
+    tick_idx: int
+    stamp_ns: int
+    chunk_index: int
+    action_applied: bool
+    deadline_missed: bool
+    violations: str
+    reward: float | None
+    success: bool | None
+    trace_id: str
+    span_id: str
+    sampled: bool
 
 
 class Incomplete(Exception):

@@ -18,12 +18,13 @@ import socket
 import sys
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from vram_arbiter.runner.recording import commit, wire
 from vram_arbiter.runner.recording.lerobot_files import (
     SUCCESS,
     Features,
+    Frame,
     LerobotFiles,
     features_of,
     frame_of,
@@ -54,9 +55,7 @@ class EpisodeWriter:
         self._rows_max = rows_max
         self._goal: Row | None = None  # first row of the goal that is being recorded
         self._features: Features = {}
-        self._last: dict[str, Any] | None = (
-            None  # written when it is known whether it is the episode's last
-        )
+        self._last: Frame | None = None  # written when it is known whether it is the episode's last
         self._judged: bool | None = None  # verdict of the world with the last row; None: no verdict
         self._broken = 0  # rows of it with a picture that cannot be read
         self._refused = ""  # goal whose rows cannot be recorded
@@ -89,7 +88,7 @@ class EpisodeWriter:
         if self._files.rows + 1 >= self._rows_max:
             self._close({"status": "continued"})
 
-    def ended(self, note: dict[str, Any]) -> None:
+    def ended(self, note: commit.EpisodeNote) -> None:
         """End a goal, with or without rows. Raises what keeps its episode from being finished."""
         if self._goal is not None and self._goal["goal_id"] == note["goal_id"]:
             self._close(note)
@@ -112,7 +111,7 @@ class EpisodeWriter:
         self._tell({"kind": "failed", "goal_id": goal_id, "error": typed.to_wire()})
         self._forget()
 
-    def _close(self, note: dict[str, Any]) -> None:
+    def _close(self, note: commit.EpisodeNote) -> None:
         first, last = self._goal, self._last
         if first is None:
             return
@@ -131,10 +130,16 @@ class EpisodeWriter:
         if SUCCESS in last:
             last[SUCCESS][0] = note.get("status") == "succeeded" and self._judged is True
         self._files.add(last)
-        about = {key: first[key] for key in ("goal_id", "skill", "task", "trace_id", "units")}
-        about["judged"] = self._judged
-        broken = {"incomplete": note.get("incomplete", 0) + self._broken}
-        index = self._files.finish({**about, **note, **broken})
+        about: commit.EpisodeNote = {
+            "goal_id": first["goal_id"],
+            "skill": first["skill"],
+            "task": first["task"],
+            "trace_id": first["trace_id"],
+            "units": first["units"],
+            "judged": self._judged,
+        }
+        incomplete = note.get("incomplete", 0) + self._broken
+        index = self._files.finish({**about, **note, "incomplete": incomplete})
         self._goal = self._last = None
         self._tell(
             {"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows}
@@ -203,9 +208,9 @@ def _take(writer: EpisodeWriter, header: wire.Header, pictures: list[bytes]) -> 
     kind = header.pop("kind")
     try:
         if kind == "row":
-            writer.row(header, pictures)
+            writer.row(cast(Row, header), pictures)
         elif kind == "end":
-            writer.ended(header)
+            writer.ended(cast(commit.EpisodeNote, header))
         else:
             writer.close(header["status"])
     except Exception as error:

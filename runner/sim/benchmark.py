@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypedDict
 
-from vram_arbiter.runner.protocols import Goal, Skill, SkillEnded, Stepped
+from vram_arbiter.runner.protocols import Goal, GoalParams, Skill, SkillEnded, Stepped
 from vram_arbiter.runner.recording.video import VideoRecorder
 from vram_arbiter.runner.sim.environment import Environment
 from vram_arbiter.runner.sim.policies import Policy
@@ -35,7 +35,8 @@ ERRORS_IN_A_ROW_MAX: Final = (
 )
 VIDEO_HZ: Final = 30.0
 
-Told = tuple[str, dict[str, Any]]
+Told = tuple[str, GoalParams]
+"""Prompt and parameters of a goal."""
 
 
 def wilson(successes: int, of: int) -> tuple[float, float] | None:
@@ -75,6 +76,25 @@ class Played:
     @property
     def unjudged_error(self) -> bool:
         return bool(self.error) and self.success is None
+
+
+class CellSummary(TypedDict):
+    """Sums of a cell in the report."""
+
+    world: str
+    contestant: str
+    revision: str
+    task: str | None
+    complete: bool
+    why: str
+    played: int
+    judged: int
+    successes: int
+    errors: int
+    success_rate: float | None
+    interval_95: tuple[float, float] | None
+    mean_steps: float | None
+    mean_reward: float | None
 
 
 @dataclass(slots=True)
@@ -122,7 +142,7 @@ class Cell:
                 for one in self.episodes
             ]
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> CellSummary:
         """Sums, as they go into the report."""
         rewards = [
             played.total_reward for played in self.episodes if played.total_reward is not None

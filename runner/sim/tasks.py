@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
+from vram_arbiter.runner.protocols import GoalParams
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.config import REST_POSE
 from vram_arbiter.runner.sim.env import SimEnv
@@ -44,7 +45,7 @@ class Task:
     judge: Callable[[SimEnv], bool]
     steady: int
     prepare: Callable[[SimEnv, int], None] | None
-    told: Callable[[SimEnv], tuple[str, dict[str, Any]]]
+    told: Callable[[SimEnv], tuple[str, GoalParams]]
     """Prompt and goal parameters."""
 
 
@@ -73,7 +74,7 @@ def _stand(env: SimEnv, seed: int) -> None:
     stand_before(env, env.target, random.Random(f"benchmark-{seed}"))
 
 
-def _target_point(env: SimEnv) -> dict[str, Any]:
+def _target_point(env: SimEnv) -> GoalParams:
     x, y, z = env.ground_truth().objects[env.target].position_base
     return {"target_point": {"x": x, "y": y, "z": z}}
 

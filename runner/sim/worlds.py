@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vram_arbiter.runner.goals.catalogue import Maker, sidecar_endpoint
-from vram_arbiter.runner.protocols import MobileBase, Skill
+from vram_arbiter.runner.protocols import GoalData, MobileBase, Skill
 from vram_arbiter.runner.robots.body import SIMULATED
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
@@ -52,7 +52,7 @@ class World:
     joints: tuple[str, ...]
     rest: Mapping[str, float] | None
     body: Body | None
-    identity: Mapping[str, Any] = field(default_factory=dict)
+    identity: GoalData = field(default_factory=dict)
     scene: SceneConfig | None = None
     arm: SimEnv | None = None
     environment: ArmEnvironment | None = None

@@ -11,11 +11,12 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from vram_arbiter.runner.protocols import GoalParams
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.manifest import RSkillManifest
 
 
-def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merge(base: GoalParams, over: GoalParams) -> dict[str, Any]:
     """Deep merge: maps are merged, everything else of `over` replaces."""
     merged = dict(base)
     for key, value in over.items():
@@ -29,7 +30,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse_goal[Message: BaseModel](
-    message: type[Message], manifest: RSkillManifest, params: Mapping[str, Any]
+    message: type[Message], manifest: RSkillManifest, params: GoalParams
 ) -> Message:
     """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
     defaults = (
