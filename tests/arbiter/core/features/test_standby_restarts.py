@@ -222,6 +222,28 @@ def test_a_lost_journal_does_not_lose_it_either() -> None:
     assert driver.state(lease) == "loading"
 
 
+def test_a_held_lease_that_the_journal_lost_still_goes_on_standby() -> None:
+    """The feature watches what a holder brings back, not only what it saw asked for."""
+    driver = CoreDriver(8 * GIB)
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, standby=True)
+    det.load(lease)
+    token = det.token(lease)
+    driver.restart(keep_journal=False)
+    det.connect()
+    det.reattach(lease, token)
+    view = driver.view(lease)
+    assert view is not None
+    assert view["standby"] is True
+    driver.advance(20.0)  # holders that the lost journal did not name had their time
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "standby")
+    driver.until(lambda: driver.state(wanted) == "loading")
+
+
 def test_a_return_that_cannot_be_journalled_is_not_made() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease, policy, wanted = sent_away(driver, min_residency_s=1.0)
