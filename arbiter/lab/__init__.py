@@ -1,1 +1,1 @@
-"""The event log: what it looks like, how it is replayed, and what another policy would have made of it."""
+"""Laboratory: simulation and comparison of scheduling policies, offline."""

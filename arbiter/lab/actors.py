@@ -1,7 +1,7 @@
-"""Who stands on the simulator's stage: cards that lag, and consumers that behave as our clients do.
+"""Actors of a simulation: GPUs with late returns, and consumers that behave as clients do.
 
-A consumer acquires when there is work and its model is not there, marks a use per job, lets the running ones end when it is asked to
-leave, unloads, releases. Knows nothing of who decides.
+A consumer acquires when there is work and its model is not resident, marks a use per job, lets uses
+in progress end when it is revoked, unloads, releases. Must not know the scheduler.
 """
 
 from collections import deque
@@ -30,14 +30,14 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Reque
 START_S = 1000.0
 """The engine's clock at the beginning."""
 OOM_RETRY_S = 1.0
-"""A load that failed for lack of memory is tried again after this."""
+"""Pause before a load that failed for lack of memory is retried."""
 FOREVER_S = 1e9
-"""Simulated consumers never forget to renew."""
+"""TTL of simulated leases: simulated consumers never forget to renew."""
 STRANGERS_PID = 900_000
 
 
 class Stage(Protocol):
-    """What an actor stands on."""
+    """Surroundings of an actor."""
 
     now: float
     cards: dict[GpuId, "Card"]
@@ -52,7 +52,10 @@ class Stage(Protocol):
 
 @dataclass(slots=True)
 class Card:
-    """Bytes on one card. What is given up is shown until the lag is over; what does not fit is refused."""
+    """Bytes on one GPU.
+
+    Bytes that are given up show until the lag is over; an allocation that does not fit is refused.
+    """
 
     plan: CardPlan
     held: dict[ProcessKey, int] = field(default_factory=dict)
@@ -61,7 +64,7 @@ class Card:
     _late: list[tuple[float, ProcessKey, int]] = field(default_factory=list)
 
     def set(self, process: ProcessKey, count: int, now: float) -> bool:
-        """The process holds this many bytes from now on. False: the card has not that many, nothing changed."""
+        """Set the bytes of a process. Returns False, without a change, if the GPU lacks them."""
         before = self.held.get(process, 0)
         if count > before and self.used(now) + count - before > self.plan.total_bytes:
             return False
@@ -75,7 +78,7 @@ class Card:
         return True
 
     def others(self, now: float) -> list[tuple[str, int]]:
-        """Processes without a lease, by their newest entry."""
+        """Return the processes without a lease, by their newest entry."""
         newest = {name: count for since, name, count in self.plan.others if since <= now - START_S}
         return [(name, count) for name, count in newest.items() if count]
 
@@ -113,7 +116,7 @@ class _Work:
 
 
 class Actor:
-    """One process. At most one lease; jobs are done in their order."""
+    """One process with at most one lease; jobs are done in their order."""
 
     def __init__(self, stage: Stage, plan: Plan, number: int, tally: Tally) -> None:
         self.client = ClientId(f"s{number:04d}")
@@ -129,7 +132,7 @@ class Actor:
         self._gpu = GpuId("")
         self._job = (
             plan.jobs[0] if plan.jobs else None
-        )  # whose model, times and bytes the present lease has
+        )  # the plan with the model, times and bytes of the present lease
         self._held_at = 0.0
         self._revoked = False
         self._pending: deque[_Work] = deque()
@@ -137,11 +140,11 @@ class Actor:
         self._using: dict[UseId, _Work] = {}
         self._use_requests: dict[RequestId, UseId] = {}
         self._numbers = 0
-        self._round = 0  # of the lease: what was planned in an earlier one is void
+        self._round = 0  # number of the lease: plans of an earlier one are void
         self._given = 0  # jobs handed to followers
         self._departs = False
 
-    # -- work --------------------------------------------------------------------------------------------------------
+    # -- work
     def begin(self) -> None:
         stage, plan = self._stage, self._plan
         for card in stage.cards.values():
@@ -162,7 +165,7 @@ class Actor:
         self._go()
 
     def finish(self) -> None:
-        """The time is up: who still waits has waited so long."""
+        """End the run: jobs that still wait have waited so long."""
         if self._state == "held":
             return
         for work in self._pending:
@@ -226,7 +229,7 @@ class Actor:
             self._depart()
 
     def _pass_on(self) -> None:
-        """A job is over, well or not: whoever works after it gets his next."""
+        """End a job, done or failed: its followers get their next one."""
         for actor, jobs in self.followers:
             if self._given < len(jobs):
                 job = jobs[self._given]
@@ -247,7 +250,7 @@ class Actor:
             self._depart()
 
     def _depart(self) -> None:
-        """The process ends, as soon as it has nothing to do any more."""
+        """End the process as soon as it has nothing left to do."""
         self._departs = True
         if self._idle() and self._state in ("none", "held"):
             self._state = "gone"
@@ -256,7 +259,7 @@ class Actor:
                 card.set(self._process, 0, self._stage.now)
             self._stage.post(ProcessDied(self._process))
 
-    # -- the lease -----------------------------------------------------------------------------------------------------
+    # -- the lease
     def _acquire(self, job: Job) -> None:
         self._state, self._job = "waiting", job
         self._asked = self._stage.next_request()
@@ -266,7 +269,7 @@ class Actor:
         )
 
     def answered(self, request: RequestId, lease: Mapping[str, Any] | None) -> None:
-        """A reply. Only that of the acquire says anything new."""
+        """Handle a reply. Only the reply of the acquire matters."""
         if request != self._asked or lease is None:
             return
         self._asked = None
@@ -275,7 +278,7 @@ class Actor:
             self._granted(lease)
 
     def refused(self, request: RequestId, code: str) -> None:
-        """A refusal: of the acquire, or of a use that came after the revoke."""
+        """Handle a refusal of the acquire, or of a use that came after the revoke."""
         if request == self._asked:
             self._asked = None
             self._tally.denied += 1
@@ -284,7 +287,7 @@ class Actor:
             self._pending.appendleft(self._using.pop(use))
 
     def told(self, body: Mapping[str, Any]) -> None:
-        """A push."""
+        """Handle a push."""
         match body["push"]:
             case "granted":
                 self._granted(body["lease"])
@@ -324,7 +327,7 @@ class Actor:
         )
 
     def _out_of_memory(self, turn: int) -> None:
-        """The load failed: as a program that crashed and is started again."""
+        """Fail the load, as a program that crashed and is restarted."""
         if turn == self._round:
             self._release()
             self._stage.at(self._stage.now + OOM_RETRY_S, self._again)
@@ -363,7 +366,7 @@ class Actor:
             self._leave(self._plan.heed_s)
 
     def _leave(self, heed_s: float) -> None:
-        """To the way out: unloading, then released."""
+        """Leave: unloading, then released."""
         if self._state != "held":
             return
         self._state = "leaving"

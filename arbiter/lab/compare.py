@@ -1,4 +1,7 @@
-"""One workload under several policies: the engine's own, and the ports of other programs' rules. And the tables that tell."""
+"""One workload under several policies, and the tables that compare them.
+
+The policies are the engine's own and the ports of other programs' rules.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +19,7 @@ from vram_arbiter.schemas.sizes import format_bytes
 POLICIES = (*SCHEDULING, *RULES)
 """Every name that `--policy` takes: first the engine's, then the ports."""
 STARVED_S = 60.0
-"""Who waits longer than this is counted as starved."""
+"""A job that waits longer than this counts as starved."""
 
 
 class UnknownPolicy(CallerError):
@@ -24,13 +27,13 @@ class UnknownPolicy(CallerError):
 
 
 def under(workload: Workload, settings: Settings, policy: str) -> Outcome:
-    """Simulate it under one policy. Raises UnknownPolicy."""
+    """Simulate a workload under one policy. Raises UnknownPolicy."""
     if policy in SCHEDULING:
         scheduler: Scheduler = Engine.under(settings, policy)
     elif policy in RULES:
         scheduler = RULES[policy](workload.cards)
     else:
-        raise UnknownPolicy(f"there is no policy {policy!r}", hint=f"known: {', '.join(POLICIES)}")
+        raise UnknownPolicy(f"unknown policy {policy!r}", hint=f"known: {', '.join(POLICIES)}")
     return simulate(workload, scheduler, policy)
 
 
@@ -42,7 +45,7 @@ _COLUMNS = ("jobs", "unserved", "p50", "p99", "max", "loads", "evicted", "denied
 
 
 def total_lines(outcomes: Sequence[Outcome]) -> list[str]:
-    """One line per run: what matters for choosing."""
+    """Return one line per run with the figures for a choice."""
     rows = []
     for outcome in outcomes:
         total = outcome.total
@@ -78,7 +81,7 @@ def total_lines(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def consumer_lines(outcomes: Sequence[Outcome]) -> list[str]:
-    """Every consumer under every policy, side by side."""
+    """Return every consumer under every policy, side by side."""
     names = sorted({name for outcome in outcomes for name in outcome.consumers})
     rows = []
     for name in names:
@@ -89,13 +92,20 @@ def consumer_lines(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def check_lines(logged: Outcome, again: Outcome) -> list[str]:
-    """How far the simulator itself is off: the same policy simulated on what a log wanted, against what the log says came of it."""
+    """Return the simulator's own error.
+
+    The logged policy is simulated on the log's workload and compared with the log's outcome.
+    """
     then, now = logged.total, again.total
     return [
-        "this is a simulation: arrivals, uses and loads are the log's, everything that depends on a decision is simulated",
-        f"its own error, by simulating the logged policy ({logged.policy}): switches {again.switches} (logged {logged.switches}), "
-        f"loads {now.loads} ({then.loads}), p50 wait {now.wait_s(0.5):.2f} s ({then.wait_s(0.5):.2f} s), "
-        f"p99 {now.wait_s(0.99):.2f} s ({then.wait_s(0.99):.2f} s), max {now.wait_s(1.0):.2f} s ({then.wait_s(1.0):.2f} s)",
+        "this is a simulation: arrivals, uses and loads are the log's, everything that depends on "
+        "a decision is simulated",
+        f"its own error, by simulating the logged policy ({logged.policy}): switches "
+        f"{again.switches} (logged {logged.switches}), "
+        f"loads {now.loads} ({then.loads}), p50 wait {now.wait_s(0.5):.2f} s "
+        f"({then.wait_s(0.5):.2f} s), "
+        f"p99 {now.wait_s(0.99):.2f} s ({then.wait_s(0.99):.2f} s), max {now.wait_s(1.0):.2f} s "
+        f"({then.wait_s(1.0):.2f} s)",
     ]
 
 

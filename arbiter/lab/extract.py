@@ -1,8 +1,9 @@
-"""A log as a workload: what its consumers wanted, how long they took, and what came of it. For asking what another policy would have done.
+"""A log as a workload: what its consumers wanted, their durations, and the outcome.
 
-The log is run through the engine once more, and the engine's own notes tell the story of every lease. Future events depend on
-decisions (a holder releases because it was asked), so only what decisions do not change is taken over: arrivals, durations of loads, uses
-and unloads, footprints, who left by himself and when.
+The log is run through the engine once more, and the engine's own notes tell the story of every
+lease. Future events depend on decisions (a holder releases because it was revoked), so only what
+decisions do not change is taken over: arrivals, durations of loads, uses and unloads, footprints,
+voluntary releases and their times.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,10 +30,11 @@ from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan, Workload
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 POLLING_S = 0.05
-"""What a verification takes on a card without any lag: two readings that agree."""
+"""Duration of a verification on a GPU without lag: two readings that agree."""
 LEAST_PATIENCE_S = 0.001
 PENT_UP_S = 0.05
-"""A use that begins so soon after the one before it had waited for it: when its work really came is not in the log."""
+"""A use that begins so soon after the one before it had waited for it; its arrival is not in the
+log."""
 
 
 @dataclass(slots=True)
@@ -49,7 +51,7 @@ class _Story:
     spec: Spec
     acquired_at: float
     wait_timeout_s: float | None = None
-    inherited: bool = False  # it was there when the log began
+    inherited: bool = False  # it was resident when the log began
     granted_at: float | None = None
     ready_at: float | None = None
     measured_bytes: int | None = None
@@ -60,23 +62,24 @@ class _Story:
     released_at: float | None = None
     ended_at: float | None = None  # anyhow
     gave_up: bool = False
-    by_itself: bool = False  # it came back from standby; nobody had asked for it
+    by_itself: bool = False  # it came back from standby by itself
 
     @property
     def last_busy_at(self) -> float:
-        """When it was last needed."""
+        """Return when it was last needed."""
         ends = [use.ended_at for use in self.uses if use.ended_at is not None]
         return max([*ends, self.ready_at or self.acquired_at])
 
     def lasted(self, until: float) -> float:
-        """When its process was free for the next one: its bytes may still be measured away."""
+        """Return when its process was free for the next one: its bytes may still be under
+        verification."""
         ends = [at for at in (self.released_at, self.ended_at) if at is not None]
         return min(ends, default=until)
 
 
 @dataclass(slots=True)
 class Extract:
-    """A log's workload beside what really came of it."""
+    """A log's workload beside its real outcome."""
 
     workload: Workload
     logged: Outcome
@@ -85,7 +88,10 @@ class Extract:
 
 
 def extract(files: Sequence[LogFile]) -> Extract:
-    """Raises LogError. A log of another engine is taken as this engine decides on its events."""
+    """Read a log. Raises LogError.
+
+    A log of another engine is read as this engine decides on its events.
+    """
     reader = _Reader(files[0].header.settings)
     found = replay(files, reader.see, to_the_end=True)
     return reader.extract(found)
@@ -107,7 +113,7 @@ class _Reader:
         self._now_others: dict[GpuId, dict[str, int]] = {}
         self._odd: dict[str, int] = {}
 
-    # -- reading -----------------------------------------------------------------------------------------------------
+    # -- reading
     def see(self, arbiter: Arbiter, entry: Entry, effects: Sequence[Effect]) -> None:
         if self._began is None:
             self._began = entry.now
@@ -140,7 +146,7 @@ class _Reader:
                 )
 
     def _inherit(self, lease: Lease, now: float) -> None:
-        """Recovered, or there when the log began."""
+        """Note a lease that was recovered, or resident when the log began."""
         known = self._stories[lease.id] = _Story(lease.process, lease.spec, now, inherited=True)
         if lease.ready_at:
             known.granted_at = known.ready_at = now
@@ -236,7 +242,7 @@ class _Reader:
     def _count(self, what: str) -> None:
         self._odd[what] = self._odd.get(what, 0) + 1
 
-    # -- concluding --------------------------------------------------------------------------------------------------
+    # -- concluding
     def extract(self, found: Replayed) -> Extract:
         began = found.began_at if self._began is None else self._began
         until = found.ended_at
@@ -264,13 +270,19 @@ class _Reader:
         return Extract(workload, self.outcome, self._settings, found)
 
     def _overhead(self, gpu: GpuId) -> int:
-        """What the card showed at its emptiest; while somebody held bytes all the time nothing can be said, and nothing is assumed."""
+        """Return the GPU's bytes at its emptiest, the driver's own share.
+
+        While leases were held all the time nothing can be said, and nothing is assumed.
+        """
         resident = any(story.inherited for story in self._stories.values())
         others = sum(count for _, _, count in self._others.get(gpu, ()))
         return 0 if resident or others else self._least_used.get(gpu, 0)
 
     def _lanes(self, until: float) -> list[list[_Story]]:
-        """Leases that one actor may live through one after the other: of one process and consumer, not at the same time."""
+        """Return groups of leases that one actor may live through in order.
+
+        They are of one process and consumer, and not at the same time.
+        """
         lanes: dict[tuple[ProcessKey, str], list[list[_Story]]] = {}
         for story in sorted(self._stories.values(), key=lambda story: story.acquired_at):
             mine = lanes.setdefault((story.process, story.spec.consumer), [])
@@ -326,7 +338,7 @@ def _middle(values: Iterable[float]) -> float:
 
 
 def _jobs(story: _Story, began: float, until: float, typical: tuple[float, float]) -> list[Job]:
-    """The lease's uses, or one job that only holds."""
+    """Return the lease's uses, or one job that only holds."""
     load_s = _load_s(story)
     unload_s = (
         story.released_at - story.unloading_at

@@ -1,4 +1,7 @@
-"""What came of a run, logged or simulated: waits, switches, evictions, bytes moved, per consumer. Counts only, decides nothing."""
+"""Outcome of a run, logged or simulated: waits, switches, evictions and bytes, per consumer.
+
+It counts and decides nothing.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +12,7 @@ from vram_arbiter.arbiter.core.effects import Effect, Note
 
 @dataclass(slots=True)
 class Tally:
-    """One consumer."""
+    """Outcome of one consumer."""
 
     jobs: int = 0
     waits_s: list[float] = field(
@@ -23,7 +26,7 @@ class Tally:
     ooms: int = 0
 
     def wait_s(self, share: float) -> float:
-        """The wait that this share of the jobs does not exceed."""
+        """Return the wait that this share of the jobs does not exceed."""
         if not self.waits_s:
             return 0.0
         ordered = sorted(self.waits_s)
@@ -32,7 +35,7 @@ class Tally:
 
 @dataclass(slots=True)
 class Outcome:
-    """One run under one policy."""
+    """Outcome of one run under one policy."""
 
     policy: str
     seconds: float
@@ -45,7 +48,7 @@ class Outcome:
         return self.consumers.setdefault(consumer, Tally())
 
     def watch(self, at_s: float, effects: Sequence[Effect]) -> None:
-        """Take notes of the engine into account."""
+        """Count notes of the engine."""
         for effect in effects:
             if not isinstance(effect, Note):
                 continue
@@ -63,7 +66,7 @@ class Outcome:
                 case "switch" if data["switched"]:
                     self.switches += 1
 
-    # -- of all consumers ----------------------------------------------------------------------------------------------
+    # -- of all consumers
     @property
     def total(self) -> Tally:
         every = Tally()
@@ -75,7 +78,7 @@ class Outcome:
 
 
 def as_plain(outcome: Outcome) -> dict[str, Any]:
-    """For `--json`, without the timeline."""
+    """Return the outcome for `--json`, without the timeline."""
     return {
         "policy": outcome.policy,
         "seconds": outcome.seconds,

@@ -1,13 +1,18 @@
-"""Ports of other programs' scheduling rules, to be run against the same consumers and cards. For comparison only, never part of a daemon.
+"""Ports of other programs' scheduling rules, against the same consumers and GPUs.
 
-They hear the same events and answer with the same effects as the engine, but decide as their originals do, by the sources named below:
-`unmanaged`         nobody decides: whoever has work loads at once. What processes do without any of these programs.
-`ollama_rules`      ollama, server/sched.go: first come first served; a model that fits into free memory loads beside the others, else the first
-                    idle one (else the first) is unloaded, one at a time; free memory is waited for until 80 % of the estimate are back or
-                    5 s are over, then it goes on anyway. While one is unloaded everybody else waits. At most three models.
-`llama_swap_rules`  llama-swap without groups: one model at a time; the running requests of the present one end, its process ends, and the
-                    next one starts at once. Nobody looks at the card.
-All of them start and end model processes, so nothing stays on the card after an unload. None knows priorities, pins or load peaks.
+For comparison only, never part of a daemon. They get the same events and answer with the same
+effects as the engine, but decide as their originals do, by these sources:
+
+- `unmanaged`: no decision, every process loads at once, as without any of these programs.
+- `ollama_rules` (ollama, server/sched.go): first come first served. A model that fits into free
+  memory loads beside the others, else the first idle one (else the first) is unloaded, one at a
+  time. Free memory is awaited until 80 % of the estimate are back or 5 s are over, then it goes on
+  anyway. During an unload all other requests wait. At most three models.
+- `llama_swap_rules` (llama-swap without groups): one model at a time; the running requests of the
+  present one end, its process ends, and the next one starts at once, without a look at the GPU.
+
+All of them start and end model processes, so nothing stays on the GPU after an unload. None knows
+priorities, pins or load peaks.
 """
 
 from abc import ABC, abstractmethod
@@ -41,14 +46,14 @@ OLLAMA_PATIENCE_S = 5.0
 
 
 class OneCardOnly(CallerError):
-    """The ports know one card."""
+    """The ports know one GPU."""
 
     code = "bad_request"
 
 
 @dataclass(slots=True)
 class _Model:
-    """One lease, as these programs would see it: a model that is loaded or waits for it."""
+    """One lease as these programs would see it: a model that is loaded or waits to load."""
 
     id: LeaseId
     client: ClientId
@@ -56,20 +61,20 @@ class _Model:
     arrived_at: float
     state: str = "queued"  # queued, loading, held, leaving
     uses: set[str] = field(default_factory=set)
-    owed: bool = True  # whoever had it loaded has not been served yet: it is not idle
-    evicted: list[str] = field(default_factory=list)  # who left for it
-    wanted_by: "_Model | None" = None  # it is to leave, and hears so when it owes nothing
+    owed: bool = True  # the request that loaded it is not served yet: it is not idle
+    evicted: list[str] = field(default_factory=list)  # models that left for it
+    wanted_by: "_Model | None" = None  # it has to leave, and is revoked when it owes nothing
 
 
 class Rules(ABC):
-    """What the ports share: bookkeeping. `_serve` decides."""
+    """Bookkeeping that the ports share; `_serve` decides."""
 
     holders_exit = True
 
     def __init__(self, cards: Sequence[CardPlan]) -> None:
         if len(cards) != 1:
             raise OneCardOnly(
-                "the ports of other programs' rules know one card", hint="compare on one card"
+                "the ports of other programs' rules know one GPU", hint="compare on one GPU"
             )
         self._card = cards[0]
         self._now = 0.0
@@ -125,7 +130,7 @@ class Rules(ABC):
         self._serve()
         return self._out
 
-    # -- bookkeeping -------------------------------------------------------------------------------------------------
+    # -- bookkeeping
     def _asked(self, event: AcquireRequested) -> None:
         self._serial += 1
         model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
@@ -161,7 +166,7 @@ class Rules(ABC):
         self._out.append(Push(model.client, {"push": "granted", "lease": self._view(model)}))
 
     def _ask(self, model: _Model, wanted_by: _Model) -> None:
-        """It unloads when its requests are served, that for which it was loaded included."""
+        """Unload when its requests are served, including the one that it was loaded for."""
         if model.spec.consumer not in wanted_by.evicted:
             wanted_by.evicted.append(model.spec.consumer)
         self._note("revoke_asked", model, wanted_by=wanted_by.spec.consumer, uses=len(model.uses))
@@ -181,24 +186,24 @@ class Rules(ABC):
 
     @abstractmethod
     def _serve(self) -> None:
-        """Decide who loads and who is asked to leave."""
+        """Decide which model loads and which one is revoked."""
 
 
 class Unmanaged(Rules):
-    """Nobody decides."""
+    """No decision: every model loads at once."""
 
     def _serve(self) -> None:
         for model in list(self._queue):
-            self._load(model, "nobody is asked")
+            self._load(model, "no model is revoked")
 
 
 class OllamaRules(Rules):
-    """One pending request at a time."""
+    """ollama: one pending request at a time."""
 
     def __init__(self, cards: Sequence[CardPlan]) -> None:
         super().__init__(cards)
         self._leaving: _Model | None = None
-        self._released_at: float | None = None  # it has gone; its memory is waited for
+        self._released_at: float | None = None  # it has gone; its memory is awaited
         self._used_before = 0
 
     def _gone(self, lease: LeaseId) -> None:
@@ -213,7 +218,7 @@ class OllamaRules(Rules):
             return
         head = self._queue[0]
         if any(model.state == "loading" for model in self._models.values()):
-            return  # loads are not mixed; the end of this one comes back here
+            return  # loads are not mixed; the end of this one returns here
         free = self._card.total_bytes - max(
             self._used_bytes, sum(model.spec.steady_bytes for model in self._models.values())
         )
@@ -229,7 +234,8 @@ class OllamaRules(Rules):
         self._ask(self._leaving, head)
 
     def _recovered(self, model: _Model) -> bool:
-        """Is 80 % of the estimate back, or the patience over? Looked at four times a second."""
+        """Return whether 80 % of the estimate is back, or the time is over; checked four times a
+        second."""
         if self._released_at is None:
             return False
         enough = self._used_before - self._used_bytes > OLLAMA_RECOVERED * model.spec.steady_bytes
@@ -243,7 +249,7 @@ class OllamaRules(Rules):
 
 
 class LlamaSwapRules(Rules):
-    """One model at a time."""
+    """llama-swap: one model at a time."""
 
     def _serve(self) -> None:
         if not self._queue:

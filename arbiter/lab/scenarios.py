@@ -1,4 +1,7 @@
-"""A scenario as a workload: every arrival and every duration drawn beforehand, so that all policies meet the very same work."""
+"""A scenario as a workload.
+
+Every arrival and every duration is drawn beforehand, so that all policies get the same work.
+"""
 
 from collections.abc import Iterator
 from random import Random
@@ -11,12 +14,12 @@ from vram_arbiter.schemas.ids import GpuId, ModelKey
 
 
 def settings_of(scenario: Scenario) -> Settings:
-    """The engine's, with its usual constants."""
+    """Settings of the engine with its default constants."""
     return Settings(epoch=1, gpus=tuple(card.info for card in workload_of(scenario).cards))
 
 
 def workload_of(scenario: Scenario) -> Workload:
-    """The same scenario always gives the same workload."""
+    """Return the workload of a scenario; the same scenario always gives the same one."""
     cards = [
         CardPlan(
             GpuInfo(GpuId(f"GPU-{index}"), index, f"card {index}", card.capacity, card.reserve),
@@ -49,7 +52,7 @@ def workload_of(scenario: Scenario) -> Workload:
 
 
 def _most(scenario: Scenario) -> int:
-    """More jobs of a chain than that do not fit into the time."""
+    """Most jobs of a chain; more do not fit into the time."""
     quickest = min(max(0.05, consumer.use_s[0]) for consumer in scenario.consumers.values())
     return min(JOBS_MAX, 1 + int(scenario.seconds / quickest))
 

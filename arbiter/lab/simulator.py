@@ -1,8 +1,8 @@
-"""A small discrete-event simulation: consumers, cards that lag, and whoever decides (the engine, or rules of other programs).
+"""Discrete-event simulation: consumers, GPUs with late returns, and a scheduler.
 
-Consumers behave as our clients do: they acquire when there is work and the model is not there, mark uses, let the running ones end when
-they are asked to leave, unload, release. Everything that takes time is an entry in one heap; the same workload and scheduler
-give the same outcome. No clock, no threads, no randomness (that is in the workload).
+The scheduler is the engine, or rules of other programs. Everything that takes time is an entry in
+one heap; the same workload and scheduler give the same outcome. No clock, no threads, no randomness
+(that is in the workload).
 """
 
 from collections import deque
@@ -21,16 +21,16 @@ from vram_arbiter.arbiter.lab.workload import Workload
 from vram_arbiter.schemas.ids import ClientId, GpuId, RequestId
 
 READING_S = 0.001
-"""How long a reading of a card takes."""
+"""Duration of a reading."""
 EVENTS_MAX = 5_000_000
-"""A run that needs more goes in circles."""
+"""Most steps of a run; one that needs more does not end."""
 
 
 class Scheduler(Protocol):
-    """Who decides: the engine, or a port of somebody else's rules."""
+    """Interface of a scheduler: the engine, or a port of another program's rules."""
 
     holders_exit: bool
-    """Models are processes that end when they are unloaded: nothing stays on the card."""
+    """Whether models are processes that end when they are unloaded: nothing stays on the GPU."""
 
     def handle(self, event: Event, now: float) -> Sequence[Effect]: ...
 
@@ -38,7 +38,7 @@ class Scheduler(Protocol):
 
 
 class Circling(Exception):
-    """The simulation does not come to its end."""
+    """The simulation does not end."""
 
 
 @dataclass(slots=True)
@@ -60,14 +60,14 @@ class Engine:
 
 
 def simulate(workload: Workload, scheduler: Scheduler, policy: str) -> Outcome:
-    """Run it to its end. Raises Circling for one that has none."""
+    """Run a simulation to its end. Raises Circling for one that has none."""
     world = _World(workload, scheduler, Outcome(policy, workload.seconds))
     world.run()
     return world.outcome
 
 
 class _World:
-    """Time, cards and consumers of one run; the stage that the actors stand on."""
+    """Time, GPUs and consumers of one run."""
 
     def __init__(self, workload: Workload, scheduler: Scheduler, outcome: Outcome) -> None:
         self.scheduler = scheduler
@@ -91,7 +91,7 @@ class _World:
             followers = [(by_plan[id(follower.plan)], follower.jobs) for follower in plan.followers]
             by_plan[id(plan)].followers = followers
 
-    # -- time --------------------------------------------------------------------------------------------------------
+    # -- time
     def at(self, when: float, call: Callable[[], None]) -> None:
         self._count += 1
         heappush(self._heap, (when, self._count, call))
@@ -120,9 +120,9 @@ class _World:
             actor.finish()
         self.outcome.peak_bytes = max(card.peak_bytes for card in self.cards.values())
 
-    # -- the scheduler -------------------------------------------------------------------------------------------------
+    # -- the scheduler
     def post(self, event: Event) -> None:
-        """Hand an event over; what follows from its effects comes after it."""
+        """Pass an event to the scheduler; what follows from its effects comes after it."""
         self._posting.append(event)
         if self._busy:
             return

@@ -39,7 +39,8 @@ def timeline_lines(
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> list[str]:
-    """Return rows in columns as wide as their longest cell, all but the first `left` to the right."""
+    """Return rows in columns as wide as their longest cell, all but the first `left` to
+    the right."""
     cells = [[printable(cell) for cell in row] for row in [columns, *rows]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
     return [

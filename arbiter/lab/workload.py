@@ -1,6 +1,7 @@
-"""What consumers want, apart from what any arbiter decides: the input of a simulation.
+"""Workload of a simulation: what consumers want, independent of any decision.
 
-Made from a scenario (`scenarios`) or from a log (`extract`). Times are seconds since the beginning. Data only.
+Made from a scenario (`scenarios`) or from a log (`extract`). Times are seconds since the beginning.
+Data only.
 """
 
 from dataclasses import dataclass, field
@@ -21,15 +22,13 @@ class Job:
     measured_bytes: int | None = None
     settle_s: float = 0.0  # between ready and the beginning of the use
     wait_timeout_s: float | None = None
-    release_after_s: float | None = (
-        None  # lets go by itself so long after this job, if there is no other
-    )
-    alongside: bool = False  # may begin before the one before it is over
+    release_after_s: float | None = None  # releases so long after this job, if there is no other
+    alongside: bool = False  # may begin before the previous one is over
 
 
 @dataclass(slots=True)
 class Plan:
-    """One process with one model at a time: what it will want, in order of arrival."""
+    """One process with one model at a time: its jobs in order of arrival."""
 
     consumer: str
     jobs: list[Job]
@@ -41,7 +40,10 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Follower:
-    """Another plan gets its next job when one of this plan is over; `jobs` holds them, `due_s` is the pause."""
+    """Link to another plan: it gets its next job when one of this plan is over.
+
+    `jobs` holds them, `due_s` is the pause.
+    """
 
     plan: Plan
     jobs: list[Job]
@@ -49,7 +51,7 @@ class Follower:
 
 @dataclass(frozen=True, slots=True)
 class CardPlan:
-    """One card, and how it behaves."""
+    """One GPU and its behavior."""
 
     info: GpuInfo
     total_bytes: int
@@ -62,11 +64,11 @@ class CardPlan:
 
 @dataclass(slots=True)
 class Workload:
-    """All of it."""
+    """A whole workload."""
 
     cards: list[CardPlan]
     plans: list[Plan]
     seconds: float
     approximations: list[str] = field(
         default_factory=list
-    )  # what of a log could not be taken over, in words
+    )  # parts of a log that could not be taken over, in words

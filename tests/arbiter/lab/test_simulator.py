@@ -187,5 +187,5 @@ def test_the_ports_know_one_card_and_names_are_checked() -> None:
         with pytest.raises(OneCardOnly):
             under(made, policy)
     assert under(made).total.unserved == 0
-    with pytest.raises(compare.UnknownPolicy, match="there is no policy 'best'"):
+    with pytest.raises(compare.UnknownPolicy, match="unknown policy 'best'"):
         compare.under(workload_of(made), Settings(1, ()), "best")
