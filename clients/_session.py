@@ -1,9 +1,9 @@
 """One connection of a client: its socket, its protocol, its background tasks, its leases.
 
 It joins the sans-IO protocol (`clients._protocol.protocol`: what to say) to a socket
-(`clients.net.dealer`: how) and to leases (`clients.lease`: what the holder sees). Renewal, reconnect,
-reattachment, acknowledgement and fencing are tasks of its task group. It must not know how callers
-ask for things; that is `clients.client`.
+(`clients.net.dealer`: how) and to leases (`clients.lease`: what the holder sees). Renewal,
+reconnect, reattachment, acknowledgement and fencing are tasks of its task group. It must not know
+how callers ask for things; that is `clients.client`.
 """
 
 import contextlib
@@ -227,7 +227,7 @@ class Session:
         finally:
             self._subscribers.remove(subscriber)
 
-    # -- for leases (`clients.eviction.Driver`) -----------------------------------------------------------------
+    # -- for leases (`clients.eviction.Driver`) ----------------------------------------------------
     def check_open(self) -> None:
         if not self._open:
             raise ArbiterUnreachable("this client is closed", hint="use it inside `async with`")
@@ -250,7 +250,7 @@ class Session:
                 self.protocol.connection.forget(request_id)
 
     def pump(self) -> None:
-        """Perform what the protocol wants: send, tell, move the alarm. Call it after every change."""
+        """Do what the protocol wants: send, tell, move the alarm. Call it after every change."""
         if not self._open:
             return
         connection = self.protocol.connection
@@ -377,8 +377,8 @@ class Session:
         self.pump()
 
     def _refused(self, error: VramError) -> None:
-        """Another user's process listens there. It was told nothing; the deadline of the hello leads
-        to the next attempt."""
+        """Another user's process listens there. It was told nothing; the deadline of the hello
+        leads to the next attempt."""
         if not self._greeted.done:
             self._greeted.fail(error)
         elif not self._distrusted:
@@ -429,7 +429,7 @@ class Session:
                     subscriber.put(event.event)
 
     def _note_lost_contact(self, reason: str) -> None:
-        """Say it once, however often a reconnect fails; entering says it before the first contact."""
+        """Log it once, however often a reconnect fails. Before the first contact, entering raises."""
         if not self._closing:
             quiet = self._lost or not self._greeted.done
             log.log(

@@ -45,8 +45,9 @@ class AsyncClient:
     """One connection to the arbiter, open inside `async with`. For one event loop and one process.
 
     `name` is what `vramctl` shows, and the consumer of leases that name none. Entering raises
-    ArbiterUnreachable after `connect_timeout_s` without an answer, UntrustedServer, or the arbiter's
-    refusal (VersionMismatch, NotPermitted, LimitExceeded). A later loss of contact is ridden out.
+    ArbiterUnreachable after `connect_timeout_s` without an answer, UntrustedServer, or the
+    arbiter's refusal (VersionMismatch, NotPermitted, LimitExceeded). A later loss of contact is
+    ridden out.
     """
 
     def __init__(
@@ -283,8 +284,8 @@ class AsyncClient:
         )
 
     async def status(self) -> StatusReply:
-        """Return the state of everything, with the leases of all pages. A lease that moves meanwhile
-        is listed once, or not at all."""
+        """Return the state of everything, with the leases of all pages. A lease that moves
+        meanwhile is listed once, or not at all."""
         first = page = await self._asked(StatusReply, "status")
         leases = {lease.lease_id: lease for lease in page.leases}
         while page.next is not None:
@@ -293,7 +294,7 @@ class AsyncClient:
         return replace(first, leases=tuple(leases.values()), next=None)
 
     async def why(self, consumer: str) -> WhyReply:
-        """Return what blocks this consumer: by how many bytes, on which condition, what comes next."""
+        """Return what blocks a consumer, by how many bytes, on which condition, and what is next."""
         return await self._asked(WhyReply, "why", {"consumer": consumer})
 
     async def history(

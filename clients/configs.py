@@ -1,4 +1,4 @@
-"""Where the shipped data is: skills, models, scenes. One answer for every program."""
+"""Folder of the shipped data: skills, robots, models, scenes."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ def configs_folder(environ: Mapping[str, str]) -> Path:
 
 
 def shipped(path: Path, kind: Literal["rskills", "robots"], configs: Path) -> Path:
-    """The shipped file that a bare name such as `so101-detector` stands for; any other path as it is."""
+    """Return the shipped file of a bare name such as `so101-detector`; any other path as it is."""
     named = (
         configs / kind / path / "rskill.yaml"
         if kind == "rskills"

@@ -1,4 +1,4 @@
-"""Which GPU CUDA shows a process: set before CUDA is initialized, because CUDA reads it only once."""
+"""Which GPU CUDA shows a process. Set it before CUDA is initialized: CUDA reads it once."""
 
 from collections.abc import Mapping
 
@@ -12,8 +12,8 @@ _FAKE = "GPU-fake-"
 def visible(gpu: str, environ: Mapping[str, str]) -> dict[str, str]:
     """Return the variables that limit CUDA to a granted GPU.
 
-    Empty where the environment names devices itself, and for a GPU that CUDA does not know by this id: a simulated one, or
-    the only one of a machine with unified memory.
+    Empty where the environment names devices itself, and for a GPU that CUDA does not know by this
+    id: a simulated one, or the only one of a machine with unified memory.
     """
     known = gpu.startswith(("GPU-", "MIG-")) and not gpu.startswith(_FAKE)
     if VISIBLE in environ or not known:

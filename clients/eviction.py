@@ -1,5 +1,5 @@
-"""How a lease leaves the GPU: never inside a use, whether the arbiter revokes it, its holder gives it
-up, or it is lost.
+"""How a lease leaves the GPU: never inside a use, whether the arbiter revokes it, its holder gives
+it up, or it is lost.
 
 One `Departure` for each lease, made by `clients.lease`. A background task (`_leave`) waits for the
 safe point, lets the holder free its bytes and tells the arbiter, through the `Driver`. The module
@@ -23,11 +23,12 @@ from vram_arbiter.schemas.wire.requests import LeaseSpec
 log = logging.getLogger(__name__)
 
 RETRY_UNLOADING_S: Final = 0.25
-"""While another process uses the lease: the arbiter pushes when that ends; this covers a lost push."""
+"""While another process uses the lease: the arbiter pushes when that ends; this covers a lost push.
+"""
 ANNOUNCE_TIMEOUT_S: Final = 5.0
 RELEASE_TIMEOUT_S: Final = 5.0
-"""How long a holder waits until the arbiter heard its release. A lease that left for good ends by its
-TTL then; the release of one that is to come back is repeated (`clients._protocol.leases`)."""
+"""How long a holder waits until the arbiter heard its release. A lease that left for good ends by
+its TTL then; the release of one that is to come back is repeated (`clients._protocol.leases`)."""
 
 
 class Driver(Protocol):
@@ -138,8 +139,8 @@ class Departure:
             await self.progress.wait()
 
     async def release(self, *, exiting: bool = False) -> None:
-        """Report bytes that are freed already. Idempotent. Raises what the arbiter refuses with; the
-        lease is over all the same."""
+        """Report bytes that are freed already. Idempotent. Raises what the arbiter refuses with;
+        the lease is over all the same."""
         self.asked = True
         if self.gone:
             return
@@ -225,7 +226,7 @@ class Departure:
         return "standby" if self._spec.standby and push is not None and not self.own_will else ""
 
     async def _announced(self) -> bool:
-        """Report `unloading`. False: not now; another process uses the lease, or contact is lost."""
+        """Report `unloading`. False: another process uses the lease, or contact is lost."""
         if self.own_will and not self._driver.connected:
             return True  # no arbiter, so no process can begin a use or be granted the room
         request = self._driver.protocol.holdings.unloading(

@@ -37,7 +37,7 @@ class Handlers[L]:
     """Estimate the seconds until the next safe point. A plain function; must not block."""
 
     def merged(self, **named: object) -> "Handlers[L]":
-        """Return these handlers with those that were given by name. Raises TypeError for a clash."""
+        """Return these handlers with those given by name. Raises TypeError for a clash."""
         given = {name: handler for name, handler in named.items() if handler is not None}
         for name in given:
             if getattr(self, name) is not None:

@@ -1,7 +1,7 @@
 """A lease as its holder sees it, for async programs; made by `clients.client`.
 
-It owns no socket: everything that goes over the wire goes through the `Driver`. How a lease leaves the
-GPU is `clients.eviction`.
+It owns no socket: everything that goes over the wire goes through the `Driver`. How a lease leaves
+the GPU is `clients.eviction`.
 """
 
 import logging
@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 LeaseState = Literal["loading", "held", "revoking", "unloading", "standby", "parked", "gone"]
 
 _restored_here: ContextVar["AsyncLease | None"] = ContextVar("restored_here", default=None)
-"""The lease whose `restore` handler the caller is part of: a use there does not wait for its end."""
+"""The lease whose `restore` handler the caller is part of: a use there does not wait for its end.
+"""
 
 
 class AsyncLease:
@@ -112,7 +113,8 @@ class AsyncLease:
 
     # -- the holder's part -------------------------------------------------------------------------
     async def ready(self, measured_bytes: int | None = None) -> None:
-        """Report that the model is loaded. `measured_bytes`: what the holder sees of its allocation.
+        """Report that the model is loaded. `measured_bytes`: what the holder sees of its
+        allocation.
 
         Raises: LeaseLost, BadState.
         """
@@ -127,8 +129,8 @@ class AsyncLease:
         """Mark a busy interval: the holder is not evicted inside it.
 
         The first use marks the lease ready, if `ready` was not called. A lease can be *lost* within
-        a use (expired, fenced): check `state` in a long one. A use that waits for something that may
-        need this very room pauses meanwhile: `async with use.yielded(): …`.
+        a use (expired, fenced): check `state` in a long one. A use that waits for something that
+        may need this very room pauses meanwhile: `async with use.yielded(): …`.
 
         Raises: LeaseRevoking or LeaseLost before the block begins.
         """
@@ -144,7 +146,7 @@ class AsyncLease:
             self._departure.progress.changed()
 
     async def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
-        """Report an allocation that failed: the arbiter raises the learned footprint of the model."""
+        """Report an allocation that failed: the arbiter raises the model's learned footprint."""
         await self._driver.reply(
             self._driver.protocol.holdings.oom(
                 self._record, requested_bytes, allocated_bytes, self._driver.now()
@@ -152,8 +154,8 @@ class AsyncLease:
         )
 
     async def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
-        """Hold more (returns when there is room: allocate then) or less (free first; returns when it
-        is measured gone).
+        """Hold more (returns when there is room: allocate then) or less (free first; returns when
+        it is measured gone).
 
         Raises: VramInsufficient, WaitTimeout, WouldDeadlock, LeaseLost: the lease keeps its size.
             LeaseRevoking: it was evicted meanwhile.
@@ -189,8 +191,8 @@ class AsyncLease:
         await self._departure.park()
 
     async def reacquire(self, wait_timeout_s: float | None = None) -> None:
-        """Come back from `standby` or `parked` as a waiter like any other. The `restore` handler has
-        begun when this returns.
+        """Come back from `standby` or `parked` as a waiter like any other. The `restore` handler
+        has begun when this returns.
 
         Raises: WaitTimeout, VramInsufficient: the lease is over then.
         """

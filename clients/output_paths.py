@@ -7,7 +7,8 @@ from vram_arbiter.schemas.errors import ConfigError
 
 
 def check_output(flag: str, path: Path | None) -> None:
-    """Before a run, not behind it: whether its file can be written. Makes the folder, touches no file. Raises ConfigError."""
+    """Before a run, not behind it: whether its file can be written. Makes the folder, touches no
+    file. Raises ConfigError."""
     if path is None:
         return
     try:

@@ -1,4 +1,5 @@
-"""Client of the runner: goals with feedback and result, frames, state. Speaks `schemas.goals`; knows no robot and no GPU."""
+"""Client of the runner: goals with feedback and result, frames, state. Speaks `schemas.goals`;
+knows no robot and no GPU."""
 
 import asyncio
 import os
@@ -48,7 +49,8 @@ class Goal:
         self._feedback.put_nowait(None)  # a second reader ends too
 
     async def result(self, timeout_s: float | None = None) -> ResultPush:
-        """Raises TimeoutError (the goal goes on), RunnerUnreachable when the runner is gone, BadRequest when it forgot the goal."""
+        """Raises TimeoutError (the goal goes on), RunnerUnreachable when the runner is gone,
+        BadRequest when it forgot the goal."""
         async with asyncio.timeout(timeout_s):
             while not self._result.done():
                 await asyncio.wait({self._result}, timeout=RESULT_POLL_S)
@@ -72,7 +74,8 @@ class Goal:
 
 
 class RunnerClient:
-    """`async with RunnerClient() as runner`. Connects at the first call; replaces its socket after a loss of contact."""
+    """`async with RunnerClient() as runner`. Connects at the first call; replaces its socket after
+    a loss of contact."""
 
     def __init__(
         self,
@@ -97,7 +100,7 @@ class RunnerClient:
         """Goals go on without us."""
         self._rpc.drop(self._lost("the client was closed"))
 
-    # -- goals -------------------------------------------------------------------------------------------------------
+    # -- goals -------------------------------------------------------------------------------------
     async def send_goal(
         self,
         rskill_id: str,
@@ -110,8 +113,9 @@ class RunnerClient:
         goal_id: str | None = None,
         traceparent: str | None = None,
     ) -> Goal:
-        """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's; `max_ticks` None sets no limit in ticks.
-        The goal's spans join the present trace, or the one of `traceparent`.
+        """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's;
+        `max_ticks` None sets no limit in ticks. The goal's spans join the present trace, or the one
+        of `traceparent`.
 
         Raises GoalRejected (another goal runs), EstopRequested, UnknownSkill, RunnerUnreachable.
         """
@@ -145,11 +149,11 @@ class RunnerClient:
         try:
             reply = await self.call("result", {"goal_id": goal.goal_id})
         except BadState:
-            return  # it runs; a runner that does not know the goal (any more) is the caller's to hear
+            return  # it runs; the error of a runner that forgot the goal is the caller's
         if reply.get("status") in ENDED:
             self._end(cast(ResultPush, reply))
 
-    # -- reads -------------------------------------------------------------------------------------------------------
+    # -- reads -------------------------------------------------------------------------------------
     async def frame(
         self,
         camera: str = "",
@@ -175,8 +179,8 @@ class RunnerClient:
         return await self._exchange("ping", {}, timeout_s)
 
     async def estop(self, reason: str = "") -> Stopped:
-        """Emergency stop, on its own socket and a thread of its own. Returns once the motors have been told; raises what
-        `clients.estop.stop` raises."""
+        """Emergency stop, on its own socket and a thread of its own. Returns once the motors have
+        been told; raises what `clients.estop.stop` raises."""
         executor = ThreadPoolExecutor(1, "estop")
         try:
             loop = asyncio.get_running_loop()
@@ -192,7 +196,8 @@ class RunnerClient:
     async def call(
         self, op: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float | None = None
     ) -> Message:
-        """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer before anything is said."""
+        """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer
+        before anything is said."""
         if not self._rpc.proven:
             await self._exchange("ping", {}, self._connect_timeout_s)
         return await self._exchange(

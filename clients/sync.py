@@ -7,9 +7,9 @@
             with lease.use("detect"):
                 ...
 
-An event loop in a background thread (anyio's blocking portal) runs the async client, so renewals and
-revocations are answered whatever the program does. Any thread may call. A client does not survive a
-fork. Every class has the methods of its async twin; a test compares them.
+An event loop in a background thread (anyio's blocking portal) runs the async client, so renewals
+and revocations are answered whatever the program does. Any thread may call. A client does not
+survive a fork. Every class has the methods of its async twin; a test compares them.
 """
 
 import os

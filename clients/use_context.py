@@ -1,9 +1,11 @@
-"""Which uses the code that runs now is in the middle of.
+"""Which uses the running code is inside of.
 
-A wait from inside a use may be a wait for oneself: the arbiter looks for a circle and refuses it (`would_deadlock`). A wait beside one, in
-another task or thread of the same process (a prefetch, the next request of a server), is nobody's circle, because the use ends without
-it. The kernel shows the arbiter processes only; a context variable knows better. Tasks inherit it from who made them, as whoever makes one
-mostly awaits it; one that does not says `independent`. Threads do not inherit it.
+A wait from inside a use may wait for itself: the arbiter looks for a cycle and refuses it
+(`would_deadlock`). A wait beside the use, in another task or thread of the same process (a
+prefetch, the next request of a server), closes no cycle, because the use ends without it. The
+kernel shows the arbiter processes only; a context variable shows more. A task inherits it from the
+task that made it, which mostly awaits it; one that is not awaited says `independent`. Threads do
+not inherit it.
 """
 
 from contextvars import ContextVar
@@ -13,16 +15,16 @@ _running: set[str] = set()  # a use may be ended by another task than the one th
 
 
 def enter(use_id: str) -> None:
-    """A use has begun, by the task or thread that calls."""
+    """Note that the calling task or thread began a use."""
     _running.add(use_id)
     _entered.set((_entered.get() & _running) | {use_id})
 
 
 def leave(use_id: str) -> None:
-    """It is over, or pauses. Whoever says so."""
+    """Note that a use is over, or pauses. Any task or thread may call."""
     _running.discard(use_id)
 
 
 def a_use() -> bool:
-    """Is the caller in the middle of a use?"""
+    """Return whether the caller is inside a use."""
     return not _running.isdisjoint(_entered.get())

@@ -7,8 +7,9 @@ import msgpack
 
 
 def pack(message: Mapping[str, Any]) -> bytes:
-    """Texts that UTF-8 has no bytes for (halves of surrogate pairs: undecodable file names, arguments) are sent as `\\udcff`: an emergency stop
-    is not lost for its words. Raises TypeError, ValueError and OverflowError for what msgpack does not carry."""
+    """Texts that UTF-8 has no bytes for (halves of surrogate pairs: undecodable file names,
+    arguments) are sent as `\\udcff`: an emergency stop is not lost for its words. Raises TypeError,
+    ValueError and OverflowError for what msgpack does not carry."""
     try:
         packed: bytes = msgpack.packb(message, use_bin_type=True)
     except UnicodeEncodeError:

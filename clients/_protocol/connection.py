@@ -1,11 +1,13 @@
-"""One connection to the arbiter, sans-IO: hello and its repetition, requests and their replies, silence.
+"""One connection to the arbiter, sans-IO: hello, requests and their replies, silence.
 
-It knows no sockets, no asyncio and no clock (messages are maps, time is passed in as `now`, monotonic seconds), and no leases: what
-lives on it is the `Above` (`clients._protocol.protocol`), which gets the pushes. The owner (`clients.client`) feeds `receive`, performs what
-`take_outgoing` and `take_events` hand out, and on `ContactLost` opens a fresh socket and calls `connected`.
+It knows no sockets, no event loop, no clock (messages are maps; time is passed in as `now`, in
+monotonic seconds) and no leases: those are the `Above` (`clients._protocol.protocol`), which gets
+the pushes. The owner (`clients._session`) feeds `receive`, performs what `take_outgoing` and
+`take_events` return, and on `ContactLost` opens a fresh socket and calls `connected`.
 
-`phase`: `down` → `greeting` (hello is said) → `reattaching` (if something has to be attached again) → `up`. On the way up every request
-whose reply is missing is said again, which is safe because every op is idempotent. No request waits for ever: each has a deadline.
+`phase`: `down` → `greeting` (hello is sent) → `reattaching` (if a lease has to be reattached) →
+`up`. On the way up every request without a reply is sent again, which is safe because every op is
+idempotent. Each request has a deadline.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -44,26 +46,27 @@ WAIT_SLACK_S = 5.0  # the arbiter ends waits; we only do if it does not
 
 
 class Above(Protocol):
-    """What lives on a connection."""
+    """The part of the protocol that uses the connection."""
 
     def reattachments(self) -> list[Message]:
-        """What the arbiter has to hear of before anything else (`schemas.wire.ReattachLease`); empty: nothing."""
+        """Return what the arbiter needs first (`ReattachLease`); empty: nothing."""
         ...
 
     def reattached(self, reply: ReattachReply) -> None:
-        """Its verdict on them."""
+        """Apply the arbiter's answer to them."""
         ...
 
     def say_again(self, now: float) -> None:
-        """We are up: ask again for what the arbiter may not know (of requests without a reply the connection takes care)."""
+        """The phase is `up`: repeat what the arbiter may not know. Requests without a reply are the
+        connection's."""
         ...
 
     def pushed(self, push: AnyPush, now: float) -> None:
-        """The arbiter said something unasked."""
+        """Apply a push."""
         ...
 
     def expects_grants(self) -> bool:
-        """Then the connection asks often enough to know how old a grant is."""
+        """Return whether a grant may come: then its age has to be known, by pings."""
         ...
 
 
@@ -77,7 +80,7 @@ class Connection:
         self.heartbeat_s = d.HEARTBEAT_S
         self.grace_s = d.FENCE_GRACE_S
         self.asked_at = 0.0
-        """When the newest request that this connection answered was *sent*: whatever we read now was said after that."""
+        """When the newest answered request was *sent*: what is read now was sent after that."""
         self._above = above
         self._hello = {
             "op": "hello",
@@ -96,7 +99,7 @@ class Connection:
         self._heard_at = 0.0
         self._pinged = False
 
-    # -- for the owner -----------------------------------------------------------------------------------------------
+    # -- for the owner -----------------------------------------------------------------------------
     def take_outgoing(self) -> list[Message]:
         taken, self._outgoing = self._outgoing, []
         return taken
@@ -106,14 +109,14 @@ class Connection:
         return taken
 
     def connected(self, now: float) -> None:
-        """A fresh socket is there: say hello on it."""
+        """Send hello on a fresh socket."""
         self._outgoing.clear()
         self._pinged = False
         self.phase = "greeting"
         self._send_handshake(self._hello, now)
 
     def contact_lost(self, reason: str) -> None:
-        """The transport says so, or silence does."""
+        """Note a broken socket, or a silent arbiter."""
         if self.phase == "down":
             return
         self.phase = "down"
@@ -145,16 +148,17 @@ class Connection:
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> int:
-        """Ask anything; its end comes as `Replied` or `Failed`. Without contact it is kept and sent after the next greeting."""
+        """Queue a request; it ends as `Replied` or `Failed`. Without contact it is kept until the
+        next hello."""
         return self.ask({"op": op, **fields}, now, timeout_s)
 
     def forget(self, request_id: int) -> None:
-        """Nobody waits for this reply any more."""
+        """Stop reporting the end of a request: its caller waits no more."""
         request = self._pending.get(request_id)
         if request is not None:
             request.quiet = True
 
-    # -- for what is above -------------------------------------------------------------------------------------------
+    # -- for what is above -------------------------------------------------------------------------
     def ask(
         self,
         message: Message,
@@ -165,7 +169,8 @@ class Connection:
         on_error: OnError | None = None,
         quiet: bool = False,
     ) -> int:
-        """A request whose end is heard by `on_reply` or `on_error` (also at its deadline) first, then told unless it is `quiet`."""
+        """Queue a request. Its end (also its deadline) goes to `on_reply` or `on_error`, then to
+        the owner unless `quiet`."""
         request_id = self._new_id()
         request = Pending(
             {**message, "id": request_id},
@@ -180,21 +185,21 @@ class Connection:
         return request_id
 
     def awaits(self, request_id: int | None) -> bool:
-        """Is its reply still missing? Then it is said again after a reconnect."""
+        """Return whether the reply is missing; then the request is sent again after a reconnect."""
         return request_id in self._pending
 
     def drop_unsent(self, matches: Callable[[Message], bool]) -> None:
-        """What was not sent yet and has no meaning any more."""
+        """Drop requests that were not sent yet and have no meaning any more."""
         for request_id in [
             i for i, r in self._pending.items() if r.sent_at is None and matches(r.message)
         ]:
             del self._pending[request_id]
 
     def tell(self, event: Event) -> None:
-        """Let the owner know."""
+        """Report an event to the owner."""
         self._events.append(event)
 
-    # -- time --------------------------------------------------------------------------------------------------------
+    # -- time --------------------------------------------------------------------------------------
     def deadlines(self) -> Iterator[float]:
         for request in self._pending.values():
             yield request.deadline
@@ -204,19 +209,20 @@ class Connection:
             yield self._silent_at() if self._pinged else self._ping_at()
 
     def wait_ends_at(self, deadline: float | None) -> float:
-        """When a wait is ended here. While we are in contact the arbiter has the first word."""
+        """Return when a wait ends here. While in contact, the arbiter ends it first."""
         if deadline is None:
             return float("inf")
         return deadline + (WAIT_SLACK_S if self.phase == "up" else 0.0)
 
     def end_requests(self, now: float) -> None:
-        """Those past their deadline fail."""
+        """Fail the requests past their deadline."""
         for request_id in [i for i, r in self._pending.items() if now >= r.deadline]:
             if request_id in self._pending:  # one's end may drop another
                 self._fail(request_id, _unreachable(self._pending[request_id].message["op"]), now)
 
     def stays_up(self, now: float) -> bool:
-        """Declare contact lost if a hello or a ping had no answer. Are we up?"""
+        """Declare contact lost if a hello or a ping had no answer. Returns whether the phase is
+        `up`."""
         if self._phase_deadline is not None and now >= self._phase_deadline:
             self.contact_lost("no answer to hello")
         if self.phase == "up" and self._pinged and now >= self._silent_at():
@@ -232,13 +238,14 @@ class Connection:
         return self._heard_at + SILENCE_BEATS * self.heartbeat_s
 
     def _ping_at(self) -> float:
-        """After a silence; and while we wait for a grant, so that its age is known, also if pushes keep coming."""
+        """Ping after a silence; while a grant may come also beside pushes, so that its age is
+        known."""
         waits = self._above.expects_grants()
         return (min(self._heard_at, self.asked_at) if waits else self._heard_at) + self.heartbeat_s
 
-    # -- steps: greeting ---------------------------------------------------------------------------------------------
+    # -- steps: greeting ---------------------------------------------------------------------------
     def _send_handshake(self, message: Message, now: float) -> None:
-        """Hello or re-attachment: not a request like others, a fresh socket begins with the first of them."""
+        """Send hello or the reattachment, which come before any request."""
         self._handshake_id, self._handshake_at = self._new_id(), now
         self._phase_deadline = now + HELLO_TIMEOUT_S
         self._outgoing.append({**message, "id": self._handshake_id})
@@ -274,7 +281,7 @@ class Connection:
         for request in unanswered:
             self._send(request, now)
 
-    # -- steps: requests ---------------------------------------------------------------------------------------------
+    # -- steps: requests ---------------------------------------------------------------------------
     def _reply(self, message: Message, now: float) -> None:
         request_id = message.get("re")
         request = self._pending.get(request_id) if isinstance(request_id, int) else None

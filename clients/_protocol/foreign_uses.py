@@ -1,7 +1,8 @@
-"""Uses that this client has on leases of other processes, whose tokens were handed to it.
+"""Uses that this client has on leases of other processes, by their tokens.
 
-A use that has begun is begun again after every reconnect until it ends; if the arbiter refuses that, the owner hears `UseLost`. It must
-know nothing of the client's own leases: their uses are part of what is re-attached (`clients._protocol.leases`).
+A use that has begun is resumed after every reconnect until it ends; if the arbiter refuses that,
+the owner gets `UseLost`. The module must not know the client's own leases: their uses are part of
+what is reattached (`clients._protocol.leases`).
 """
 
 from vram_arbiter.clients._protocol.connection import Connection

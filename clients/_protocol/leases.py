@@ -1,11 +1,13 @@
-"""Leases that were granted to this client: held, or evicted and asleep until they come back.
+"""Leases that were granted to this client: held, or evicted and asleep until they return.
 
-A held lease is renewed every ttl/3. Without the arbiter's word for ttl + grace it is *fenced*: the client gives it up by itself, because
-the arbiter may have given its bytes away. A lease on standby or parked is `asleep`: nothing is renewed, nothing is fenced; it is granted
-again by a push, or by the reply to `reacquire`, and the same record goes on under a new token. However a lease ends without
-our doing, the owner hears `Gone`.
+A held lease is renewed every ttl/3. Without the arbiter's word for ttl + grace it is *fenced*: the
+client ends it, because the arbiter may have granted its bytes to another. A lease on standby, or
+parked, is `asleep`: it is neither renewed nor fenced. A push, or the reply to `reacquire`, grants
+it again, and the same record goes on under a new token. Where a lease ends without the holder's
+doing, the owner gets `Gone`.
 
-It must not know how the first grant came about (`clients._protocol.waits`), nor callbacks (`clients.lease`) and safe points (`clients.eviction`).
+The module must not know how the first grant came about (`clients._protocol.waits`), handlers
+(`clients.lease`) and safe points (`clients.eviction`).
 """
 
 from collections.abc import Iterable, Iterator
@@ -42,7 +44,7 @@ from vram_arbiter.schemas.wire.replies import (
 from vram_arbiter.schemas.wire.views import LeaseView
 
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
-"""Replies that say that the lease is no longer ours."""
+"""Codes of replies to a request on a lease that this client no longer holds."""
 AWAY = ("standby", "parked")
 
 
@@ -54,7 +56,7 @@ class Holdings:
         self.asleep: dict[str, LeaseRecord] = {}
         self._connection = connection
 
-    # -- asked by the holder -----------------------------------------------------------------------------------------
+    # -- requests of the holder --------------------------------------------------------------------
     def ready(self, record: LeaseRecord, measured_bytes: int | None, now: float) -> int:
         def held(_: AnyReply, __: float) -> None:
             record.held, record.measured_bytes = True, measured_bytes
@@ -63,7 +65,7 @@ class Holdings:
         return self._ask(record, message, now, on_reply=held)
 
     def use_begin(self, record: LeaseRecord, use_id: str, label: str, now: float) -> int:
-        """It counts from now on, so that a re-attachment on the way tells of it."""
+        """The use counts from now on, so that a reattachment on the way names it."""
         record.uses.add(use_id)
 
         def refused(_: VramError, __: float) -> None:
@@ -78,14 +80,14 @@ class Holdings:
         return self._connection.ask(message, now, quiet=True)
 
     def use_yield(self, record: LeaseRecord, use_id: str, now: float) -> int:
-        """The use goes on, but no longer keeps the lease: `use_begin` with the same id takes it up again."""
+        """Pause the use: `use_begin` with the same id resumes it."""
         record.uses.discard(use_id)
         return self._ask(record, {"op": "yield", **record.ref(), "use_id": use_id}, now)
 
     def resize(
         self, record: LeaseRecord, footprint: Message, wait_timeout_s: float | None, now: float
     ) -> int:
-        """Hold more, or less. The reply says `held` when it is done; else its end comes as `Resized`."""
+        """Hold more, or less. The reply is `held` when it is done; else `Resized` comes."""
 
         record.resizing = footprint
         record.resizing_until = None if wait_timeout_s is None else now + wait_timeout_s
@@ -114,15 +116,17 @@ class Holdings:
     def release(
         self, record: LeaseRecord, exiting: bool, now: float, timeout_s: float, *, asleep: str = ""
     ) -> int:
-        """From here on nothing is held: no renewal. A lease that is gone already counts as released.
+        """Report freed bytes; the lease is not renewed any more. One that is gone counts as
+        released.
 
-        `asleep`: how it waits to come back (`standby`, `parked`), if the arbiter agrees; "" means never again. Nobody else would let go of
-        the room of one that sleeps, so it is said again until the arbiter has heard it, however long that takes.
+        `asleep`: how the lease waits for its return (`standby`, `parked`) if the arbiter agrees;
+        "" for none. The release of a lease that is asleep is repeated until the arbiter has
+        answered, because it does not end by its TTL.
         """
         record.released = True
         self.held.pop(record.lease_id, None)
-        if record.resizing is not None:  # the arbiter drops it too, and says nothing of it
-            left = f"{record.lease_id} left the card before it had the size that was asked for"
+        if record.resizing is not None:  # the arbiter drops it too, without a push
+            left = f"{record.lease_id} left the GPU before it had the size that was asked for"
             self._resized(record, LeaseRevoking(left, hint="ask again when it is granted again"))
         if asleep:
             record.asleep = asleep
@@ -150,23 +154,24 @@ class Holdings:
         now: float,
         traceparent: str | None = None,
     ) -> int:
-        """A lease that is asleep wants in now, as a waiter like any other. Its grant comes as `Returned`."""
+        """Ask for a lease that is asleep, as a waiter like any other. Its grant comes as
+        `Returned`."""
         record.wanted, record.wanted_by = True, traceparent
         record.wanted_until = None if wait_timeout_s is None else now + wait_timeout_s
         return self._send_reacquire(record, now)
 
     def give_up_asleep(self, record: LeaseRecord, now: float) -> None:
-        """A lease that is asleep is not wanted any more."""
+        """End a lease that is asleep."""
         self._wake(record)
         self._cancel(record, now)
 
-    # -- said by the arbiter -----------------------------------------------------------------------------------------
+    # -- from the arbiter --------------------------------------------------------------------------
     def hold(self, record: LeaseRecord) -> None:
-        """It is granted."""
+        """Keep a lease that is granted."""
         self.held[record.lease_id] = record
 
     def returned(self, view: LeaseView) -> None:
-        """Granted again? The same record goes on under the new token."""
+        """Apply the grant of a lease that is asleep: its record goes on under the new token."""
         record = self.asleep.get(view.lease_id)
         if record is None or view.token is None or view.state != "loading":
             return
@@ -184,7 +189,7 @@ class Holdings:
         self._connection.tell(Returned(record))
 
     def denied(self, lease_id: str, error: VramError) -> None:
-        """A wait that ended without a grant: of a resize, or of a lease that wanted to come back."""
+        """Apply the end of a wait without a grant: of a resize, or of a reacquire."""
         if record := self.held.get(lease_id):
             self._resized(record, error)
         elif record := self.asleep.get(lease_id):
@@ -205,7 +210,7 @@ class Holdings:
         if record is not None and record.token == token_of(push.token):
             self._gone(record, error_of(push.error))
 
-    # -- contact -----------------------------------------------------------------------------------------------------
+    # -- contact -----------------------------------------------------------------------------------
     def reattachments(self) -> list[Message]:
         return [record.reattachment() for record in (*self.held.values(), *self.asleep.values())]
 
@@ -219,12 +224,12 @@ class Holdings:
                     self.returned(entry.lease)  # if its grant was lost on the way
             elif entry.kept:
                 record.confirmed_at = record.renewed_at = self._connection.asked_at
-                record.revoke = None  # a push that is still meant comes again
+                record.revoke = None  # the arbiter repeats a revoke that still holds
             else:
                 self._gone(record, error_of(entry.error))
 
     def say_again(self, now: float) -> None:
-        """A new daemon knows from the re-attachment that a lease is away or held, not that it is wanted, or at another size."""
+        """Repeat what a reattachment does not say: that a lease is wanted, or another size."""
         for record in self.asleep.values():
             if record.wanted and not self._connection.awaits(record.reacquire_id):
                 self._send_reacquire(record, now, quiet=True)
@@ -232,7 +237,7 @@ class Holdings:
             if record.resizing is not None and not self._connection.awaits(record.resize_id):
                 self._send_resize(record, record.resizing, now, quiet=True)
 
-    # -- time --------------------------------------------------------------------------------------------------------
+    # -- time --------------------------------------------------------------------------------------
     def deadlines(self) -> Iterator[float]:
         for record in self.held.values():
             yield self.fence_at(record)
@@ -256,7 +261,7 @@ class Holdings:
             self._gone(record, error, fenced=True)
 
     def end_overdue(self, now: float) -> None:
-        """Leases that wanted to come back, and the arbiter did not say in time that they will not: it is out of reach."""
+        """End waits for a return that are over while the arbiter cannot be reached."""
         ends_at = self._connection.wait_ends_at
         for record in [
             r for r in self.asleep.values() if r.wanted and now >= ends_at(r.wanted_until)
@@ -270,7 +275,7 @@ class Holdings:
             for batch in _batches(self.held.values(), d.LEASES_PER_CLIENT_MAX):
                 self._renew(batch, now)
 
-    # -- steps -------------------------------------------------------------------------------------------------------
+    # -- steps -------------------------------------------------------------------------------------
     def _record(self, lease_id: str) -> LeaseRecord | None:
         return self.held.get(lease_id) or self.asleep.get(lease_id)
 
@@ -285,7 +290,7 @@ class Holdings:
         on_error: OnError | None = None,
         quiet: bool = False,
     ) -> int:
-        """A request on a lease; an answer that this grant is not ours any more ends it."""
+        """Queue a request on a lease; an answer that this client no longer holds it ends it."""
         token = record.token
 
         def refused(error: VramError, at: float) -> None:
@@ -307,8 +312,8 @@ class Holdings:
         *,
         quiet: bool = False,
     ) -> int:
-        """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease. An answer that comes when it sleeps no more,
-        or again, is none to what it does now."""
+        """`quiet`: a repetition, so a refusal is reported as the end of the lease. An answer that
+        comes when the lease sleeps no more, or again, is ignored."""
         token = record.token
 
         def sleeps() -> bool:
@@ -342,7 +347,7 @@ class Holdings:
         )
 
     def _send_reacquire(self, record: LeaseRecord, now: float, *, quiet: bool = False) -> int:
-        """`quiet`: said again by ourselves, so that a refusal is told as the end of the lease."""
+        """`quiet`: a repetition, so a refusal is reported as the end of the lease."""
 
         def replied(reply: AnyReply, _: float) -> None:
             assert isinstance(reply, AcquireReply)
@@ -365,7 +370,7 @@ class Holdings:
     def _send_resize(
         self, record: LeaseRecord, footprint: Message, now: float, *, quiet: bool = False
     ) -> int:
-        """`quiet`: said again by ourselves, so that its end is told whatever it is."""
+        """`quiet`: a repetition, so its end is reported whatever it is."""
 
         def replied(reply: AnyReply, _: float) -> None:
             assert isinstance(reply, AcquireReply)
@@ -413,7 +418,7 @@ class Holdings:
         self._connection.ask(message, now, on_reply=renewed, quiet=True)
 
     def _wake(self, record: LeaseRecord) -> bool:
-        """It waits no longer. Did it?"""
+        """Stop waiting for its return. Returns whether it did wait."""
         record.asleep, record.wanted = "", False
         return self.asleep.pop(record.lease_id, None) is not None
 
@@ -428,10 +433,10 @@ class Holdings:
 
 
 def waited_in_vain(spec: Message, what: str, waited_s: float | None = None) -> WaitTimeout:
-    """A wait whose end the arbiter did not tell."""
+    """Return the error of a wait whose end the arbiter did not report."""
     within = "in time" if waited_s is None else f"within {waited_s:.1f} s"
     return WaitTimeout(
-        f"no word on {what} for {spec.get('consumer')} {within}, and no contact to the arbiter",
+        f"no answer on {what} for {spec.get('consumer')} {within}, and no contact to the arbiter",
         hint="is the arbiter running? see `vramctl status`",
         details={} if waited_s is None else {"waited_s": waited_s},
     )

@@ -1,12 +1,12 @@
-"""The client's side of the arbiter's wire, sans-IO, put together: what to send, what it means, what is due when.
+"""The client's side of the arbiter's wire, sans-IO: its parts, and the order in which they are
+served.
 
-- `connection` (`clients._protocol.connection`): hello, requests and replies, silence, reconnects; what to send, what to tell the owner.
+- `connection` (`clients._protocol.connection`): hello, requests and replies, silence, reconnects.
 - `waits` (`clients._protocol.waits`): acquires that are not granted yet.
 - `holdings` (`clients._protocol.leases`): leases from their grant to their end, asleep or not.
-- `foreign_uses` (`clients._protocol.foreign_uses`): uses on leases of others.
+- `foreign_uses` (`clients._protocol.foreign_uses`): uses on leases of other processes.
 
-Each says what the owner may ask of it; this is only the order in which they are served: which push is whose, what is said again
-first, what a tick does first. It knows no sockets, no asyncio and no clock.
+It knows no sockets, no event loop and no clock.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,8 @@ from vram_arbiter.schemas.wire.replies import ReattachReply
 
 
 class ClientProtocol:
-    """One client. Whoever called anything on it or its parts looks at `connection.take_outgoing` and `take_events`, and at `next_deadline`."""
+    """One client. After each call on it or its parts, perform `connection.take_outgoing` and
+    `take_events`, and wake up at `next_deadline`."""
 
     def __init__(self, *, name: str, instance: str, role: str = "client") -> None:
         self.connection = Connection(self, name=name, instance=instance, role=role)
@@ -47,13 +48,14 @@ class ClientProtocol:
 
         return self.connection.ask({"op": "subscribe"}, now, on_reply=subscribed)
 
-    # -- time --------------------------------------------------------------------------------------------------------
+    # -- time --------------------------------------------------------------------------------------
     def next_deadline(self) -> float | None:
-        """When `tick` has something to do at the latest."""
+        """Return when `tick` is due at the latest."""
         return min(self._deadlines(), default=None)
 
     def tick(self, now: float) -> None:
-        """1. Fence leases. 2. End requests and waits past their deadline. 3. Hello again, or declare silence. 4. Renew, ping."""
+        """1. Fence leases. 2. End requests and waits past their deadline. 3. Declare silence. 4.
+        Renew, ping."""
         self.holdings.fence(now)  # 1
         self.connection.end_requests(now)  # 2
         self.waits.end_overdue(now)
@@ -67,7 +69,7 @@ class ClientProtocol:
         yield from self.waits.deadlines()
         yield from self.holdings.deadlines()
 
-    # -- for the connection (`clients._protocol.connection.Above`) -------------------------------------------------------------
+    # -- for the connection (`clients._protocol.connection.Above`) ---------------------------------
     def expects_grants(self) -> bool:
         return bool(self.waits) or bool(self.holdings.asleep)
 

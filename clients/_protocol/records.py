@@ -1,4 +1,6 @@
-"""What the client's protocol tells its owner, and what it remembers of leases, waits, requests and uses. Plain data, no behaviour."""
+"""What the client's protocol reports to its owner, and what it keeps of leases, waits, requests and
+uses. Plain data.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -38,7 +40,8 @@ class Eviction:
     cause: str
     """`waiter`, `pressure` or `operator`; "" where the arbiter does not say."""
     by: str
-    """The consumer that needs the room, or the operator with uid and pid; "" where there is neither."""
+    """The consumer that needs the room, or the operator with uid and pid; "" where there is
+    neither."""
     reason: str
     """The same in words."""
     priority: int | None = None
@@ -50,7 +53,7 @@ class Eviction:
         return cls(push.cause, by, push.reason, push.priority)
 
 
-# -- what the owner is told -----------------------------------------------------------------------------------------
+# -- events for the owner --------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Up:
     """Greeted and re-attached; requests flow. `epoch` changes with every start of the daemon."""
@@ -67,7 +70,7 @@ class ContactLost:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The arbiter does not want this client (version, role, full)."""
+    """The arbiter refuses this client (version, role, limit)."""
 
     error: VramError
 
@@ -98,7 +101,7 @@ class Denied:
 
 @dataclass(frozen=True, slots=True)
 class RevokeAsked:
-    """Asked to leave, or told again."""
+    """The arbiter asks for the room, or repeats it."""
 
     record: "LeaseRecord"
     push: RevokePush
@@ -107,7 +110,8 @@ class RevokeAsked:
 
 @dataclass(frozen=True, slots=True)
 class Gone:
-    """A lease that ended without our doing. `fenced`: we ended it, the arbiter may not know."""
+    """A lease that its holder did not end. `fenced`: this client ended it, and the arbiter may not
+    know."""
 
     record: "LeaseRecord"
     error: VramError
@@ -123,7 +127,7 @@ class Returned:
 
 @dataclass(frozen=True, slots=True)
 class Resized:
-    """A resize came to its end: the bytes that are charged now, or why they did not change."""
+    """The end of a resize; `error`: why the size did not change."""
 
     record: "LeaseRecord"
     error: VramError | None = None
@@ -131,7 +135,7 @@ class Resized:
 
 @dataclass(frozen=True, slots=True)
 class UseLost:
-    """A use on somebody else's lease could not be renewed after a reconnect."""
+    """A use on the lease of another process could not be resumed after a reconnect."""
 
     use_id: str
     error: VramError
@@ -159,10 +163,10 @@ Event = (
 )
 
 
-# -- what it remembers ----------------------------------------------------------------------------------------------
+# -- state -----------------------------------------------------------------------------------------
 @dataclass(slots=True)
 class LeaseRecord:
-    """One granted lease, as this client believes it."""
+    """One granted lease, as this client knows it."""
 
     lease_id: str
     token: TokenPair
@@ -177,12 +181,12 @@ class LeaseRecord:
     revoke: RevokePush | None = None
     released: bool = False
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
-    wanted: bool = False  # asleep, and its owner waits for its return
-    wanted_until: float | None = None  # None: for ever
-    wanted_by: str | None = None  # the traceparent of whoever called it back
+    wanted: bool = False  # asleep, and reacquired
+    wanted_until: float | None = None  # None: no limit
+    wanted_by: str | None = None  # traceparent of the reacquire
     reacquire_id: int | None = None  # the newest request that asked for it
     resizing: Message | None = None  # the footprint that its owner waits for
-    resizing_until: float | None = None  # None: for ever
+    resizing_until: float | None = None  # None: no limit
     resize_id: int | None = None  # the newest request that asked for it
 
     @property
@@ -227,12 +231,12 @@ class Pending:
     sent_at: float | None = None
     on_reply: OnReply | None = None  # our own bookkeeping, before the owner hears
     on_error: OnError | None = None
-    quiet: bool = False  # nobody waits for it
+    quiet: bool = False  # its end is not reported
 
 
 @dataclass(slots=True)
 class ForeignUseRecord:
-    """A use on somebody else's lease; begun again after a reconnect."""
+    """A use on the lease of another process; resumed after a reconnect."""
 
     lease_id: str
     token: TokenPair

@@ -1,6 +1,7 @@
 """The caller's trace, for the clients: what they send along, and where an answer's work belongs.
 
-A program that has not imported OpenTelemetry can have no present span: it pays nothing for this, not even the import.
+A program that has not imported OpenTelemetry has no present span, and pays nothing here, not even
+the import.
 """
 
 import sys
@@ -27,16 +28,18 @@ def along(fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
 
 
 def environ() -> dict[str, str]:
-    """For the environment of a program that is started here: it joins the present trace (`schemas.runtime.telemetry.commands`)."""
+    """Return the variables by which a program that is started here joins the present trace."""
     traceparent = present()
     return {} if traceparent is None else {"TRACEPARENT": traceparent}
 
 
 @contextmanager
 def joined(traceparent: object) -> Iterator[None]:
-    """Within the block (and in the tasks made there) the present span is the one that a message named, or none.
+    """Within the block (and in the tasks made there) the present span is the one that a message
+    named, or none.
 
-    What a message makes us do belongs to its sender, not to whoever happened to read the socket.
+    Work that a message causes belongs to the trace of its sender, not to the task that read the
+    socket.
     """
     if "opentelemetry.trace" not in sys.modules:
         yield

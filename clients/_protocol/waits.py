@@ -1,11 +1,12 @@
-"""Acquires that are not granted yet: asked, queued, then granted, denied, cancelled, or ended here.
+"""Acquires that are not granted yet: sent, queued, then granted, denied, canceled, or ended here.
 
-One acquire: `acquire` asks, with a nonce that makes the question repeatable → the reply says that it waits (`queued`, under a lease id) or is
-granted (`loading`) → a push says `granted` or `denied`. A grant becomes a `LeaseRecord` in `clients._protocol.leases`, and the owner hears
-`Granted` or `Denied` with the nonce. Whoever turns away (`cancel`) is remembered until the arbiter knows, so that a grant that crosses
-the cancel is handed back. After a reconnect the same acquire is asked again, with the time that is left.
+`acquire` carries a nonce that makes it repeatable. Its reply is `queued`, with a lease id, or
+`loading`: granted. A push `granted` or `denied` ends a queued one. A grant becomes a `LeaseRecord`
+in `clients._protocol.leases`; the owner gets `Granted` or `Denied` with the nonce. A canceled
+acquire is kept until the arbiter has answered, so that a grant that crosses the cancel is released.
+After a reconnect the same acquire is sent again, with the time that is left.
 
-It must not know what becomes of a lease once it is granted.
+The module must not know what becomes of a lease once it is granted.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,7 +28,7 @@ from vram_arbiter.schemas.wire.views import LeaseView
 
 
 class Waits:
-    """False if nobody waits."""
+    """False while there is none."""
 
     def __init__(self, connection: Connection, holdings: Holdings) -> None:
         self._connection = connection
@@ -37,7 +38,7 @@ class Waits:
     def __bool__(self) -> bool:
         return bool(self._waiters)
 
-    # -- asked by the owner ------------------------------------------------------------------------------------------
+    # -- requests of the owner ---------------------------------------------------------------------
     def acquire(
         self,
         nonce: str,
@@ -55,7 +56,7 @@ class Waits:
         self._ask(waiter, now)
 
     def cancel(self, nonce: str, now: float) -> None:
-        """Give up a wait. If the grant is on its way already, it is released when it comes."""
+        """Give up a wait. A grant that is on its way already is released when it comes."""
         waiter = self._waiters.get(nonce)
         if waiter is None:
             return
@@ -63,22 +64,22 @@ class Waits:
         if waiter.lease_id is not None:
             self._ask_to_cancel(waiter, now)
 
-    # -- said by the arbiter -----------------------------------------------------------------------------------------
+    # -- from the arbiter --------------------------------------------------------------------------
     def pushed_grant(self, view: LeaseView, now: float) -> bool:
-        """Was it for one of these?"""
+        """Apply a push. Returns whether it was for one of these."""
         waiter = self._of(view.lease_id)
         if waiter is not None:
             self._granted(waiter, view, now)
         return waiter is not None
 
     def pushed_denial(self, lease_id: str, error: VramError) -> bool:
-        """Was it for one of these?"""
+        """Apply a push. Returns whether it was for one of these."""
         waiter = self._of(lease_id)
         if waiter is not None:
             self._denied(waiter, error)
         return waiter is not None
 
-    # -- contact and time --------------------------------------------------------------------------------------------
+    # -- contact and time --------------------------------------------------------------------------
     def say_again(self, now: float) -> None:
         for waiter in self._waiters.values():
             if not self._connection.awaits(waiter.request_id):
@@ -90,7 +91,7 @@ class Waits:
                 yield self._connection.wait_ends_at(waiter.deadline)
 
     def end_overdue(self, now: float) -> None:
-        """Their time is over and the arbiter did not say so: it is out of reach."""
+        """End waits that are over while the arbiter cannot be reached."""
         ends_at = self._connection.wait_ends_at
         for waiter in [w for w in self._waiters.values() if now >= ends_at(w.deadline)]:
             if not waiter.abandoned:
@@ -100,7 +101,7 @@ class Waits:
             if waiter.lease_id is not None:
                 self._ask_to_cancel(waiter, now)
 
-    # -- steps -------------------------------------------------------------------------------------------------------
+    # -- steps -------------------------------------------------------------------------------------
     def _of(self, lease_id: str) -> Waiter | None:
         return next((w for w in self._waiters.values() if w.lease_id == lease_id), None)
 
@@ -137,8 +138,8 @@ class Waits:
             self._ask_to_cancel(waiter, now)
 
     def _granted(self, waiter: Waiter, view: LeaseView, now: float) -> None:
-        """The message may have waited for us longer than the lease lives: what is sure is only that it was sent after the arbiter
-        heard the newest request that it has answered."""
+        """Keep a grant. The message may have waited longer than the TTL: it is known only that it
+        was sent after the newest request that the arbiter has answered."""
         self._waiters.pop(waiter.nonce, None)
         heard_at = self._connection.asked_at
         record = LeaseRecord(
@@ -150,9 +151,7 @@ class Waits:
             confirmed_at=heard_at,
             renewed_at=heard_at,
         )
-        if (
-            waiter.abandoned
-        ):  # granted while we turned away: hand it back at once, nothing was loaded
+        if waiter.abandoned:  # release it at once: nothing was loaded
             self._connection.ask(
                 {"op": "release", **record.ref(), "exiting": False}, now, quiet=True
             )

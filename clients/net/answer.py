@@ -1,7 +1,7 @@
 """The answer to one request, and a time limit that counts only the time in which this process ran.
 
-A loop that stood still (an import, SIGSTOP, a busy machine) finds the answer and the end of its time
-limit at once. The module must not know what is asked.
+A loop that stood still (an import, SIGSTOP, a busy machine) finds the answer and the end of its
+time limit at once. The module must not know what is asked.
 """
 
 from typing import Final, cast

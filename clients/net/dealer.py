@@ -1,8 +1,8 @@
 """A DEALER socket on anyio: messages in and out as maps, and a call when the server hangs up.
 
 libzmq's file descriptor is edge-triggered: the socket is drained after every wake-up, and a send
-that found something to read wakes the reader. The socket's monitor tells of a hang-up at once, where
-heartbeats would take seconds. The module must not know what messages mean.
+that found something to read wakes the reader. The socket's monitor tells of a hang-up at once,
+where heartbeats would take seconds. The module must not know what messages mean.
 """
 
 import logging
@@ -68,7 +68,7 @@ class Dealer:
         return sent
 
     async def run(self) -> None:
-        """Serve one connection to its end. Raises ConfigError for a text that is not an endpoint."""
+        """Serve one connection to its end. A text that is not an endpoint is `refused` too."""
         try:
             link = await self._connect()
             try:

@@ -1,7 +1,7 @@
 """What the kernel says at once about a socket that does not answer.
 
-libzmq connects in silence, again and again: a forbidden socket or a killed arbiter looks like an arbiter that
-is slow.
+libzmq connects in silence, again and again: a forbidden socket or a killed arbiter looks like an
+arbiter that is slow.
 """
 
 import errno
@@ -19,7 +19,8 @@ PATIENCE_S: Final = 1.0
 
 
 def obstacle(endpoint: str) -> tuple[str, str] | None:
-    """What is wrong with an endpoint and what to do; None if it can be connected to, or only trying can tell."""
+    """What is wrong with an endpoint and what to do; None if it can be connected to, or only trying
+    can tell."""
     try:
         path = socket_path(endpoint)
     except ConfigError as error:
@@ -37,7 +38,7 @@ def obstacle(endpoint: str) -> tuple[str, str] | None:
         except ConnectionRefusedError:
             if stat.S_ISSOCK(os.stat(path).st_mode):
                 return f"no arbiter at {endpoint}: it was killed, its socket is left over", START
-            return f"{endpoint} is no socket", START
+            return f"{endpoint} is not a socket", START
         except TimeoutError:
             return None  # its queue of connections is full: it lives
         except OSError as error:

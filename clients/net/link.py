@@ -1,9 +1,11 @@
-"""One DEALER on one connection to a server of a checked user: nothing is sent to, or read from, another one.
+"""One DEALER on one connection to a server of a checked user.
 
-libzmq connects in its own thread and would reconnect without a word, to whatever listens by then. So that is put off, and nothing is
-handed to it before its monitor names the connection's descriptor, of which the kernel names the user (SO_PEERCRED). The number of a
-descriptor is reused, so the first frame has to carry the same user (libzmq's `Peer-Address`, read from the connection itself).
-A link that has ended is replaced. It needs no loop and must not know what messages mean.
+libzmq connects in its own thread and would reconnect without a word, to whatever listens by then.
+So its own reconnect is put off, and no message is given to it before its monitor names the
+connection's descriptor, whose user the kernel names (SO_PEERCRED). The number of a descriptor is
+reused, so the first frame has to carry the same user (libzmq's `Peer-Address`, read from the
+connection itself). A link that has ended is replaced. It needs no event loop and must not know what
+messages mean.
 """
 
 import math
@@ -22,7 +24,8 @@ from vram_arbiter.schemas.runtime.trust import Program, check_uid, frame_uid, se
 MESSAGE_LIMIT_BYTES: Final = 64 * 1024 * 1024  # a reply is never near it; libzmq hangs up beyond
 
 NEVER_MS: Final = 2**31 - 1
-"""Pause before libzmq's own reconnect: 24 days. Its -1 ("none") discards what was received and not read yet at a hang-up."""
+"""Pause before libzmq's own reconnect: 24 days. Its -1 ("none") discards what was received and not
+read yet at a hang-up."""
 
 _WATCHED: Final = zmq.EVENT_CONNECTED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
 _EVENT: Final = struct.Struct("=HI")  # zmq_socket_monitor(3): event, value
@@ -31,7 +34,8 @@ State = Literal["connecting", "open", "ended"]
 
 
 class Link:
-    """Connects at construction; `advance` when `monitor` is readable, until `state` is `open`. Then `send` and `receive`.
+    """Connects at construction; `advance` when `monitor` is readable, until `state` is `open`. Then
+    `send` and `receive`.
 
     Raises ConfigError for an endpoint that is not one.
     """
@@ -68,13 +72,15 @@ class Link:
         return self.state
 
     def wait(self, deadline: float) -> State:
-        """Block until it is open or has ended, or until `deadline` (monotonic seconds). Raises UntrustedServer."""
+        """Block until it is open or has ended, or until `deadline` (monotonic seconds). Raises
+        UntrustedServer."""
         while self.advance() == "connecting" and self.monitor.poll(ms_until(deadline)):
             pass
         return self.state
 
     def send(self, payload: bytes) -> bool:
-        """Queue one message. False: the queue is full, the server does not read. Only while `state` is `open`."""
+        """Queue one message. False: the queue is full, the server does not read. Only while `state`
+        is `open`."""
         assert self.state == "open", "nothing is said before the server is known"
         try:
             self.socket.send(payload, zmq.NOBLOCK)
@@ -88,7 +94,8 @@ class Link:
         return bool(int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
     def receive(self) -> bytes | None:
-        """The last frame of the next message; None: there is none yet. Raises UntrustedServer; the link has ended then."""
+        """The last frame of the next message; None: there is none yet. Raises UntrustedServer; the
+        link has ended then."""
         try:
             if self._heard:
                 return self.socket.recv_multipart(zmq.NOBLOCK)[-1]
@@ -129,7 +136,8 @@ class Link:
 
 
 def ms_until(deadline: float) -> int:
-    """Milliseconds that a poll may take, so that it does not end before `deadline` (monotonic seconds) for rounding."""
+    """Milliseconds that a poll may take, so that it does not end before `deadline` (monotonic
+    seconds) for rounding."""
     return max(0, math.ceil(1000 * (deadline - time.monotonic())))
 
 

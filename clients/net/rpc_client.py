@@ -18,8 +18,8 @@ Message = dict[str, Any]
 
 
 class RpcClient:
-    """`lost(reason)` makes the error that requests fail with when contact is lost; `pushed(message)`
-    gets what is not a reply."""
+    """`lost(reason)` makes the error that requests fail with when contact is lost;
+    `pushed(message)` gets what is not a reply."""
 
     def __init__(
         self,

@@ -8,8 +8,8 @@
             with lease.use("detect"):
                 ...
 
-The names below are loaded when they are first used, so that importing a part of the package, such as
-`vram_arbiter.schemas`, loads nothing else.
+The names below are loaded when they are first used, so that importing a part of the package, such
+as `vram_arbiter.schemas`, loads nothing else.
 """
 
 from importlib import import_module

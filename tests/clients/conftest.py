@@ -1,4 +1,5 @@
-"""What the tests of the clients share: a scripted arbiter, a way to write specs, and waiting for a condition with a deadline."""
+"""What the tests of the clients share: a scripted arbiter, a way to write specs, and waiting for a
+condition with a deadline."""
 
 from collections.abc import AsyncIterator, Callable, Iterator
 
@@ -14,7 +15,8 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 
 DEADLINE_S = 60.0
 TTL_S = 120.0
-"""A daemon that is started again on a busy machine is away for seconds: nobody is to fence himself meanwhile."""
+"""A daemon that is started again on a busy machine is away for seconds: nobody is to fence himself
+meanwhile."""
 
 
 @pytest.fixture

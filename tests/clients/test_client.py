@@ -72,7 +72,8 @@ async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: S
 async def test_an_evicted_holder_hears_by_whom_and_why(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    """After an eviction every call on the lease said that it "was released", as if its holder had wanted that."""
+    """After an eviction every call on the lease said that it "was released", as if its holder had
+    wanted that."""
     async with (
         AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
         AsyncClient("ops", endpoint=arbiter_daemon.endpoint, role="operator") as ops,
@@ -96,7 +97,8 @@ async def test_an_evicted_holder_hears_by_whom_and_why(
 async def test_status_is_whole_though_it_comes_in_pages(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    """The daemon answers `status` in pages: thousands of waiters in one reply held its loop for seconds."""
+    """The daemon answers `status` in pages: thousands of waiters in one reply held its loop for
+    seconds."""
     waiters = STATUS_PAGE + 40
     async with contextlib.AsyncExitStack() as stack:
         clients = [
@@ -143,7 +145,8 @@ async def test_a_block_unloads_and_releases_also_when_it_raises(
 async def test_a_plain_function_may_unload(
     arbiter_daemon: ArbiterProcess, spec: Spec, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The README's example does it so: its end was a traceback, and a lease whose bytes nobody had freed."""
+    """The README's example does it so: its end was a traceback, and a lease whose bytes nobody had
+    freed."""
     unloaded: list[str] = []
     async with (
         AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
@@ -345,7 +348,8 @@ async def test_callbacks_that_raise_do_not_keep_the_lease(
 async def test_a_word_that_the_arbiter_refuses_is_said_again(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Regression: one `unloading` beyond the client's rate ended the task that leaves, and the holder stayed until it was killed for it."""
+    """Regression: one `unloading` beyond the client's rate ended the task that leaves, and the
+    holder stayed until it was killed for it."""
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
@@ -376,7 +380,8 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
 async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
     arbiter_daemon: ArbiterProcess, spec: Spec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Regression: its holder renewed nothing any more, and waited for ever for a lease that was neither held nor over."""
+    """Regression: its holder renewed nothing any more, and waited for ever for a lease that was
+    neither held nor over."""
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5))
         reply = client._session.reply
@@ -470,7 +475,8 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
         await anyio.to_thread.run_sync(arbiter.start)
         await until(lambda: client.connected and client.epoch > pinned.token[0])
         assert (await asked).epoch == client.epoch
-        # the card is empty in this test: whatever the daemon decides about the old lease, the waiter's place was renewed
+        # the GPU is empty here: whatever the daemon decides about the old lease, the waiter kept
+        # its place
         if pinned.state == "loading":
             await pinned.ready()
         lease = await waiting
@@ -528,7 +534,8 @@ async def test_a_hung_daemon_is_noticed_by_silence(
 RUNNER = """
 import sys
 from vram_arbiter.clients.sync import Client
-with Client(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
+token = (int(sys.argv[2]), int(sys.argv[3]))
+with Client("runner") as client, client.use(sys.argv[1], token, "goal") as use:
     print("in use", flush=True)
     sys.stdin.readline()
     print(use.lost, flush=True)

@@ -1,5 +1,5 @@
-"""Leases that leave and come back, pause, park and lend: the async client against a real daemon, on asyncio
-and on trio.
+"""Leases that leave and come back, pause, park and lend: the async client against a real daemon, on
+asyncio and on trio.
 """
 
 from collections.abc import Awaitable, Callable
@@ -209,7 +209,8 @@ async def test_weights_are_parked_where_the_budget_has_room(
 async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, beside: Start
 ) -> None:
-    """Regression: whatever happened on the lease while the arbiter was asked ended the wait, and it was `parked`, and gone a moment later."""
+    """Regression: whatever happened on the lease while the arbiter was asked ended the wait, and it
+    was `parked`, and gone a moment later."""
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 0\n").start()
     model = Model()
     async with AsyncClient("t", endpoint=arbiter.endpoint) as client, within(WAIT_S):
@@ -281,7 +282,8 @@ def five_gib() -> Footprint:
 async def test_a_resize_ends_with_the_stay_on_the_card(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
 ) -> None:
-    """Regression: what a lease that was asked to leave had waited for was dropped, and its `resize` never returned."""
+    """Regression: what a lease that was asked to leave had waited for was dropped, and its `resize`
+    never returned."""
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2, standby=True))
         await cache.ready()
@@ -332,7 +334,8 @@ async def until_growing(client: AsyncClient) -> None:
 async def test_a_job_that_waits_for_its_own_room_is_told(
     arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
-    """It holds in use what it would itself have to give up: that would never end. Another task of the process may wait."""
+    """It holds in use what it would itself have to give up: that would never end. Another task of
+    the process may wait."""
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         job = await client.acquire(spec("job", 5))
         await job.ready()

@@ -1,4 +1,5 @@
-"""`vram_arbiter` as its users see it: what it exports, what importing costs, one surface for both clients."""
+"""`vram_arbiter` as its users see it: what it exports, what importing costs, one surface for both
+clients."""
 
 import ast
 import inspect
@@ -48,7 +49,8 @@ def surface(kind: type) -> dict[str, str]:
 
 
 def parameters(function: Callable[..., object]) -> str:
-    """Names, kinds, defaults and types; the types of the two surfaces differ by the word Async only."""
+    """Names, kinds, defaults and types; the types of the two surfaces differ by the word Async
+    only."""
     listed = list(inspect.signature(function).parameters.values())[1:]
     return re.sub(r"vram_arbiter\.[a-z_.]+|Async", "", ", ".join(str(one) for one in listed))
 
@@ -92,7 +94,10 @@ def test_the_names_for_type_checkers_are_the_exported_ones() -> None:
 
 
 def test_importing_the_package_loads_nothing_else() -> None:
-    look = "import sys; before = set(sys.modules); import vram_arbiter, json; print(json.dumps(sorted(set(sys.modules) - before)))"
+    look = (
+        "import sys; before = set(sys.modules); import vram_arbiter, json; "
+        "print(json.dumps(sorted(set(sys.modules) - before)))"
+    )
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
     loaded = {name.partition(".")[0] for name in json.loads(done.stdout)}
     assert loaded & {"anyio", "asyncio", "zmq", "pydantic", "msgpack"} == set()

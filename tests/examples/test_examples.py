@@ -94,7 +94,8 @@ def test_a_wrapped_program_runs_to_its_end(arbiter_daemon: ArbiterProcess) -> No
 
 def test_a_wrapped_program_is_ended_for_another(arbiter_daemon: ArbiterProcess) -> None:
     wrapper = subprocess.Popen(
-        [sys.executable, str(EXAMPLES / "wrap_program.py"), "5GB", "sh", "-c", "echo up; exec sleep 600"],
+        [sys.executable, str(EXAMPLES / "wrap_program.py"), "5GB",
+         "sh", "-c", "echo up; exec sleep 600"],
         env=environ(arbiter_daemon), stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

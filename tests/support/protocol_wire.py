@@ -1,4 +1,5 @@
-"""For tests of the client's protocol: both ends of its wire, with an arbiter that says what the test tells it to."""
+"""For tests of the client's protocol: both ends of its wire, with an arbiter that says what the
+test tells it to."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -70,7 +71,8 @@ PLAIN: Mapping[str, Mapping[str, Any]] = {
 
 
 class Wire:
-    """Both ends: the protocol and an arbiter that says what the test tells it to. Every request must be valid on the wire."""
+    """Both ends: the protocol and an arbiter that says what the test tells it to. Every request
+    must be valid on the wire."""
 
     def __init__(self) -> None:
         self.protocol = ClientProtocol(name="test", instance="1-a")

@@ -193,7 +193,7 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     (arbiter_daemon.runtime / "arbiter.sock").unlink()
     assert "there is no such socket" in one_line(vramctl("resume", environ=environ))
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")
-    assert "is no socket" in one_line(vramctl("resume", environ=environ))
+    assert "is not a socket" in one_line(vramctl("resume", environ=environ))
     assert "Linux allows 107" in one_line(
         vramctl("resume", "--endpoint", f"ipc:///{'x' * 200}", environ=environ)
     )
