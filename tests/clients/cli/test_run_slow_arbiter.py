@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.support import protocol_wire
 from vram_arbiter.clients.net.server import Message, Peer, RouterServer
 from vram_arbiter.schemas.defaults import WIRE_VERSION
 from vram_arbiter.schemas.errors import LeaseLost, VramError
@@ -28,7 +29,7 @@ WELCOME = {
     "heartbeat_s": 60.0,
     "grace_s": 60.0,
 }
-VIEW = {"lease_id": "L1-1", "token": [1, 2], "state": "loading", "gpu": "GPU-1"}
+VIEW = protocol_wire.view(token=[1, 2])
 PROGRAM = "import os, signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print(os.getpid(), flush=True); signal.pause()"
 
 
@@ -73,7 +74,7 @@ class GrantsAtOnce:
                 return {"ok": True, "state": "loading", "lease": VIEW}
             case "ready":
                 return None if self.ready is None else {"ok": False, "error": self.ready.to_wire()}
-        return {"ok": True}
+        return {"ok": True, **protocol_wire.PLAIN.get(message["op"], {})}
 
 
 @asynccontextmanager

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.support import protocol_wire
 from tests.support.paths import ROOT
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.answer import Answer
@@ -20,13 +21,12 @@ from vram_arbiter.clients.net.server import Message, Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.reasoner import server as reasoner
-from vram_arbiter.schemas import defaults as d
 
 PATIENCE_S = 60.0
 LIMIT_S = 0.5
 STOPPED_LIMIT_S = 3.0
 """Of a process of its own, which a busy machine may hold up before and after it is stopped, too."""
-WELCOME = {"ok": True, "epoch": 1, "version": d.WIRE_VERSION}
+WELCOME = {"ok": True, "epoch": 1, **protocol_wire.WELCOME}
 CLIENT = f"""
 import asyncio, sys
 from vram_arbiter.clients.sidecar.base import SidecarClient
