@@ -162,7 +162,7 @@ def _main(arguments: argparse.Namespace) -> None:
 
 
 def _check_task(task: str) -> None:
-    """Raises BadRequest for one that no planner could work with."""
+    """Return the task's text. Raises BadRequest for one that no planner could work with."""
     if len(task) > TASK_MAX_CHARS:
         raise BadRequest(
             f"the task has more than {TASK_MAX_CHARS} characters", hint="say it shorter"

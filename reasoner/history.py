@@ -76,12 +76,12 @@ class Past:
             self._kept.popleft()
 
     def since(self, start_s: float) -> list[Taken]:
-        """What was taken from then on, oldest first, thinned out evenly to `SHOWN_MAX`."""
+        """Return the pictures since then, oldest first, thinned out evenly to `SHOWN_MAX`."""
         return spread([taken for taken in self._kept if taken.at_s >= start_s], SHOWN_MAX)
 
 
 def spread[T](items: Sequence[T], most: int) -> list[T]:
-    """At most so many, evenly; the first and the last stay (of one: the last)."""
+    """Return at most `most` items, evenly; the first and the last stay (of one: the last)."""
     if len(items) <= most:
         return list(items)
     if most == 1:

@@ -55,11 +55,11 @@ class Inbox:
         self._there.set()
 
     async def wait(self) -> None:
-        """Until there is something to take."""
+        """Wait until there is something to take."""
         await self._there.wait()
 
     def take(self) -> list[Message]:
-        """All there is, cancels and dangers first."""
+        """Take everything, cancels and dangers first."""
         taken = [*self._urgent, *self._words]
         self._urgent, self._words = [], []
         self._there.clear()

@@ -169,7 +169,7 @@ class _Loop:
 
     # -- 1
     def _ask(self) -> bool:
-        """Whether the episode goes on."""
+        """Return whether the episode continues."""
         if self._finish is not None:
             return False
         if self._thinking is not None or (self._acting is not None and not self._news):
@@ -344,7 +344,7 @@ class _Loop:
             self._acting.cancel()
 
     async def _stop_acting(self) -> None:
-        """A goal does not outlive its episode."""
+        """End the goal with its episode."""
         if self._acting is None or self._call is None:
             return
         self._call_off()
@@ -389,7 +389,7 @@ def _looks_in_a_row(episode: Episode) -> int:
 
 
 def describe(call: ToolCall) -> str:
-    """A call's arguments on one line, for logs and displays."""
+    """Return a call's arguments on one line, for logs and displays."""
     fields = call.model_dump(exclude={"tool", "rationale"}, exclude_defaults=True)
     text = ", ".join(f"{key}={value!r}" for key, value in fields.items())
     return f"({text})" + (f": {call.rationale}" if call.rationale else "")

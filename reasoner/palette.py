@@ -113,7 +113,7 @@ class Palette:
         return names if self.only is None else names & self.only
 
     def first(self, action: str) -> Skill:
-        """The first executable skill that offers an action verb. Raises UnknownSkill."""
+        """Return the first executable skill that offers an action verb. Raises UnknownSkill."""
         for skill in self.executable.values():
             if action in skill.actions:
                 return skill
@@ -128,7 +128,7 @@ class Palette:
         )
 
     def without(self, benched: Set[str]) -> "Palette":
-        """The same palette with these skills not to be had."""
+        """Return the same palette without these skills."""
         return (
             self
             if benched == self.benched
@@ -137,7 +137,7 @@ class Palette:
 
     # -- is a call allowed?
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
-        """Why a call is not allowed, or None."""
+        """Return why a call is not allowed, or None."""
         if isinstance(call, Wait | StopGoal):
             return (
                 None

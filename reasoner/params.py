@@ -24,7 +24,7 @@ type JsonSchema = Mapping[str, Any]
 
 
 def misfits(value: Any, schema: Any, path: str = "goal_params") -> list[str]:
-    """What is wrong with a value, each with its path; empty if it fits."""
+    """Return the mistakes of a value, each with its path; empty if it fits."""
     if not isinstance(schema, Mapping):
         return []
     kinds = schema.get("type", [])

@@ -84,11 +84,11 @@ class Episode:
     """
 
     def attempts(self, manipulation: frozenset[str]) -> int:
-        """How many goals of the skills named in `manipulation` were executed."""
+        """Return how many goals of the skills named in `manipulation` were executed."""
         return sum(_executed(step, manipulation) for step in self.steps)
 
     def confirmed(self, manipulation: frozenset[str]) -> bool:
-        """Whether the scene VLM's newest yes or no after the newest manipulation was a yes."""
+        """Return whether the scene VLM's newest answer after the newest manipulation was a yes."""
         for step in reversed(self.steps):
             asked = isinstance(step.call, QueryScene) and step.outcome.status == "answered"
             if asked and step.outcome.text.strip().lower().startswith(("yes", "no")):
@@ -99,7 +99,7 @@ class Episode:
 
 
 def _executed(step: Step, manipulation: frozenset[str]) -> bool:
-    """Whether the robot was asked to do it: what was refused here never was."""
+    """Return whether the robot was asked to do it: what was refused here never was."""
     call = step.call
     return (
         isinstance(call, ExecuteRskill)

@@ -80,7 +80,7 @@ def load_playbook(file: Path) -> Playbook:
 
 
 def _body(file: Path, uri: str) -> str:
-    """The text, from the manifest's own folder: nothing outside of it is ever read to a model."""
+    """Return the text from the manifest's own folder; nothing outside of it is read to a model."""
     folder = file.resolve().parent
     path = (folder / uri.removeprefix("local://")).resolve()
     if not path.is_relative_to(folder):

@@ -82,11 +82,11 @@ class Places:
             same.x, same.y, same.z, same.seen_from_m = seen.x, seen.y, seen.z, seen.seen_from_m
 
     def best(self) -> Place | None:
-        """The likeliest place; None before anything was seen."""
+        """Return the likeliest place; None before anything was seen."""
         return max(self.known, key=lambda place: place.score, default=None)
 
     def from_base(self, place: Place) -> Point:
-        """Where it is from the base as it stood at the newest look."""
+        """Return its position relative to the base at the newest look."""
         x0, y0, yaw = self.base_pose
         dx, dy = place.x - x0, place.y - y0
         return Point(

@@ -382,7 +382,7 @@ async def _look[P, A](
 
 
 def _good_for_s(age_ms: float) -> float:
-    """How much longer a picture may wait to be looked at."""
+    """Return how much longer a picture may wait to be looked at."""
     return max(0.0, LOOKED_AT_MAX_S - age_ms / 1e3)
 
 

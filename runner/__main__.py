@@ -25,7 +25,7 @@ URGENT = "estop"  # it imports nothing of the others: a second of imports is a s
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    """The flags of `vram-runner`; `args.run` is the command."""
+    """Return the parser of `vram-runner`; `args.run` is the command."""
     parser = argparse.ArgumentParser(
         prog="vram-runner", description="Runs a robot's skills and serves goals and frames."
     )

@@ -228,7 +228,7 @@ class TickSink(Protocol):
         ...
 
     def facts(self) -> GoalData:
-        """Any thread: what became of the ticks so far, for the run's result."""
+        """Return the counts so far, for the run's result. Any thread."""
         ...
 
 

@@ -31,7 +31,7 @@ class _Busy(Exception):
 
 
 def check_installed() -> None:
-    """Raises ConfigError without the reasoner's extra."""
+    """Raise ConfigError without the reasoner's extra."""
     if importlib.util.find_spec("httpx") is None:
         raise ConfigError("httpx is not installed", hint="pip install 'vram-arbiter[reasoner]'")
 
@@ -64,7 +64,7 @@ class JsonHttp:
             await self._http.aclose()
 
     async def post(self, url: str, body: JsonObject) -> JsonObject:
-        """The answer's JSON object. Raises LlmError for everything that goes wrong."""
+        """Return the answer's JSON object. Raises LlmError for every failure."""
         shown = without_credentials(url)
         content = json.dumps(body, ensure_ascii=False).encode(errors="replace")
         problem = ""
@@ -137,13 +137,13 @@ class JsonHttp:
 
 
 def without_credentials(url: str) -> str:
-    """The address as it may stand in a log or a result: without user, password and query."""
+    """Return the address for a log or a result: without user, password and query."""
     parts = urlsplit(url)
     return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
 
 def _complaint(answer: bytes) -> str:
-    """The server's own words, short and on one line. Both APIs put them under `error.message`."""
+    """Return the server's own error text on one line. Both APIs put it under `error.message`."""
     text = answer.decode(errors="replace")
     try:
         error = json.loads(text)["error"]

@@ -49,7 +49,7 @@ COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "reward",
 def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """The flags of `vram-runner benchmark`."""
+    """Add the parser of `vram-runner benchmark`."""
     bench = commands.add_parser(
         "benchmark", help="success rates of skills and policies, with videos"
     )
@@ -213,7 +213,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
 
 # -- what is to be played
 def worlds_of(args: argparse.Namespace) -> list[World]:
-    """Raises ConfigError for worlds that there are not, and files that could belong to several."""
+    """Return the worlds. Raises ConfigError for unknown ones, and for ambiguous files."""
     from vram_arbiter.runner.sim.worlds import SO101, world_of
 
     names = list(dict.fromkeys(args.env or [SO101]))
@@ -331,7 +331,7 @@ def _write(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -
 
 
 def table(rows: Sequence[CellSummary]) -> str:
-    """The cells for people."""
+    """Format the cells as a table."""
     lines = [COLUMNS, *(_row(row) for row in rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
     return "\n".join(

@@ -30,7 +30,7 @@ AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
 
 
 def positive(text: str) -> float:
-    """An argument that must be a positive number of seconds."""
+    """Parse a positive number of seconds."""
     value = float(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not positive")
@@ -38,7 +38,7 @@ def positive(text: str) -> float:
 
 
 def positive_int(text: str) -> int:
-    """An argument that counts something."""
+    """Parse a positive count."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
@@ -46,7 +46,7 @@ def positive_int(text: str) -> int:
 
 
 def share(text: str) -> float:
-    """An argument from 0 to 1."""
+    """Parse a number from 0 to 1."""
     value = float(text)
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
@@ -54,7 +54,7 @@ def share(text: str) -> float:
 
 
 def not_negative(text: str) -> float:
-    """An argument that must be 0 or more."""
+    """Parse a number of 0 or more."""
     value = float(text)
     if not 0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
@@ -128,7 +128,7 @@ def check_endpoint(endpoint: str) -> None:
 
 
 def warm_up() -> None:
-    """The first picture would otherwise wait for OpenCV's import."""
+    """Import and warm OpenCV before the first picture needs it."""
     import cv2
     import numpy as np
 

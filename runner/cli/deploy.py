@@ -70,7 +70,7 @@ MakeMakers = Callable[[Parts, Arbiter | None], Mapping[Kind, Maker]]
 def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """The flags of `vram-runner deploy`."""
+    """Add the parser of `vram-runner deploy`."""
     deploy = commands.add_parser("deploy", help="a robot, as a deployment file describes it")
     deploy.add_argument(
         "--config",
@@ -252,7 +252,9 @@ class Deploy:
     async def _start(
         self, runner: HardwareRunner, stack: contextlib.AsyncExitStack
     ) -> ControlThread | None:
-        """The control thread with robot and cameras at work; None when a signal came first."""
+        """Return the control thread with robot and cameras at work; None when a signal came
+        first.
+        """
         async with _stop_on(self._stopping, runner):
             try:
                 return await stack.enter_async_context(
@@ -339,7 +341,7 @@ def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:
 
 
 def _robot_file(kind: str, key: str, suffix: str) -> Path:
-    """A file of this robot, or port, in the runtime folder, which is made."""
+    """Return a file of this robot, or port, in the runtime folder, which is created."""
     folder = Path(runtime_dir(os.environ, os.getuid()))
     private_folder(folder, shared=True)
     return folder / f"{kind}-{re.sub(r'[^A-Za-z0-9._-]', '_', key)}.{suffix}"
@@ -352,7 +354,7 @@ def _claim(what: str, key: str, stack: contextlib.AsyncExitStack) -> None:
 
 
 def summary(result: RunResult, runner: HardwareRunner, success: bool | None, robot_id: str) -> str:
-    """The run as one line of JSON."""
+    """Return the run as one line of JSON."""
     facts = {
         "robot": robot_id,
         "robot_model": runner.robot.hal.description.name,

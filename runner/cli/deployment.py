@@ -70,7 +70,7 @@ class DeploymentFile:
 
 
 def read_deployment(path: Path) -> DeploymentFile:
-    """Raises ConfigError: the file cannot be read, or every mistake in it by line and field."""
+    """Read a file. Raises ConfigError: it cannot be read, or every mistake by line and field."""
     source = parse_yaml(read_text(path, hint="--config takes a deployment file"), path.name)
     return DeploymentFile(robot_of(source), source)
 

@@ -21,7 +21,7 @@ from vram_arbiter.schemas.runtime.printable import printable
 def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """The flags of `vram-runner estop`."""
+    """Add the parser of `vram-runner estop`."""
     estop = commands.add_parser(
         "estop", help="stop a robot's motors; its runner refuses goals until it is started again"
     )
@@ -57,7 +57,7 @@ async def run(args: argparse.Namespace) -> int:
 
 
 def _there() -> list[str]:
-    """The endpoints of runners that may be there: this login's, and the system service's."""
+    """Return the endpoints of possible runners: this login's, and the system service's."""
     system = f"ipc://{SYSTEM_RUNTIME}/runner.sock"
     try:
         own = program_endpoint("runner", os.environ, os.getuid())

@@ -22,7 +22,7 @@ TRACE_FIELDS = ("{trace_id}", "{span_id}")
 def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """The flags of `vram-runner replay`."""
+    """Add the parser of `vram-runner replay`."""
     replay = commands.add_parser("replay", help="a recorded frame, its tick and its trace")
     replay.add_argument("--dataset", type=Path, required=True, help="folder that was recorded into")
     replay.add_argument("--frame", type=_index, required=True, help="from 0 on, over all episodes")
@@ -65,14 +65,14 @@ def trace_template(given: str | None, environ: Mapping[str, str]) -> str | None:
 
 
 def trace_link(recorded: Recorded, template: str | None) -> str | None:
-    """The trace's address; None without a template or without a trace."""
+    """Return the trace's URL; None without a template or without a trace."""
     if template is None or not recorded.trace_id:
         return None
     return template.replace("{trace_id}", recorded.trace_id).replace("{span_id}", recorded.span_id)
 
 
 def as_text(recorded: Recorded, link: str | None) -> str:
-    """For people, a line a fact."""
+    """Format a frame for people, one line per fact."""
     goal, tick = recorded.goal, recorded.tick
     lines = [
         ("frame", f"{recorded.frame} of {recorded.root} ({recorded.robot})"),

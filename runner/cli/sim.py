@@ -59,7 +59,7 @@ def add_world_flags(parser: argparse.ArgumentParser) -> None:
 def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """The flags of `vram-runner sim`."""
+    """Add the parser of `vram-runner sim`."""
     sim = commands.add_parser("sim", help="the simulated SO-101 on a mobile base, or another world")
     add_world_flags(sim)
     sim.add_argument(

@@ -58,9 +58,10 @@ def leaves_room(rate_hz: float) -> bool:
 
 
 def hasten(*, realtime: bool = False) -> Promptness:
-    """For the calling thread: real time if asked for and allowed, else a low nice value if allowed.
+    """Raise the priority of the calling thread.
 
-    Threads and programs that a thread in real time starts do not inherit it.
+    Real time if asked for and allowed, else a low nice value if allowed. Threads and programs that
+    a real-time thread starts do not inherit it.
     """
     if realtime:
         with contextlib.suppress(OSError):  # EPERM: the limits say no

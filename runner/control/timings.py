@@ -80,7 +80,7 @@ class Timings:
         return [row[1] for row in self._snapshot() if not row[5]]
 
     def write(self, path: Path) -> None:
-        """One JSON line a tick. Raises OSError."""
+        """Write one JSON line per tick. Raises OSError."""
         names = ("started_s", "late_ms", "tick_ms", "inference_ms", "hal_ms")
         with path.open("w") as file:
             file.writelines(
@@ -89,5 +89,5 @@ class Timings:
             )
 
     def _snapshot(self) -> Iterable[tuple[float, ...]]:
-        """A copy at once, in one step of the interpreter: the control thread goes on adding."""
+        """Copy in one step of the interpreter: the control thread keeps adding."""
         return self._rows.copy()

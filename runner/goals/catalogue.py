@@ -44,7 +44,7 @@ class Selective(Protocol):
     """A maker that cannot make every skill of its kind."""
 
     def refuses(self, manifest: RSkillManifest) -> str:
-        """Why it cannot make this one; empty: it can."""
+        """Return why it cannot make this skill; empty: it can."""
         ...
 
 
@@ -140,7 +140,7 @@ class Catalogue:
         return asked_s or (manifest.latency_budget.max_execution_s or MOTION_S) + START_S
 
     def executable(self) -> list[RSkillManifest]:
-        """What a goal may ask for."""
+        """Return the skills that a goal may execute."""
         return [
             manifest
             for manifest in self._manifests.values()
@@ -162,11 +162,11 @@ class Catalogue:
         return lines + [f"{name} is not offered: {why}" for name, why in self._refused.items()]
 
     def as_wire(self) -> list[Message]:
-        """All manifests as plain maps, for a reasoner's palette."""
+        """Return all manifests as plain maps, for a reasoner's palette."""
         return [manifest.model_dump(mode="json") for manifest in self._manifests.values()]
 
     def body_as_wire(self) -> Message | None:
-        """The robot's body, for the same palette; None where any skill fits."""
+        """Return the robot's body, for the same palette; None where any skill fits."""
         return None if self._body is None else self._body.model_dump(mode="json")
 
 

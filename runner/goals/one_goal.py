@@ -120,17 +120,17 @@ class OneGoal:
         return self._residency.resident
 
     def result_of(self, goal_id: str) -> ResultPush | None:
-        """How a goal ended; None while it has not, or if it never was accepted."""
+        """Return how a goal ended; None while it has not, or if it never was accepted."""
         return self._results.get(goal_id)
 
     def stop(self, error: VramError) -> None:
-        """The goal that runs, if one does, fails with this."""
+        """Fail the active goal, if there is one, with this error."""
         if (running := self._running) is not None:
             running.stopped_by = error
             self._stop(running)
 
     async def close(self) -> None:
-        """The goal that runs is canceled and answered."""
+        """Cancel and answer the active goal."""
         if (running := self._running) is not None and running.task is not None:
             self._stop(running)
             await asyncio.gather(running.task, return_exceptions=True)
@@ -181,7 +181,7 @@ class OneGoal:
         return {"goal_id": goal.goal_id, "accepted": True}
 
     def cancel(self, goal_id: str) -> Message:
-        """The reply; the result still comes. Raises BadRequest."""
+        """Cancel a goal and return the reply; the result still comes. Raises BadRequest."""
         running = self._running
         if running is None or running.goal.goal_id != goal_id:
             if goal_id in self._results:
@@ -203,7 +203,7 @@ class OneGoal:
                 running.task.cancel()
 
     def result(self, goal_id: str) -> Message:
-        """The reply. Raises BadState while it runs, BadRequest."""
+        """Return a goal's result as a reply. Raises BadState while it runs, BadRequest."""
         if (result := self._results.get(goal_id)) is not None:
             return {key: value for key, value in result.items() if key != "push"}
         if self._running is not None and self._running.goal.goal_id == goal_id:
@@ -283,7 +283,10 @@ class OneGoal:
             log.exception("%s did not finish cleanly", skill.key)
 
     async def _run(self, running: _Running, make: Callable[[], Skill]) -> SkillEnded:
-        """Raises what acquiring and starting raise; the arm is taken back whenever this ends."""
+        """Run the skill to its end; the robot is taken back in any case.
+
+        Raises what acquiring and starting raise.
+        """
         goal = running.goal
         key, _, _ = self._catalogue.find(goal.rskill_id, goal.revision)
         self._caption(running)
@@ -358,7 +361,7 @@ class OneGoal:
 
 
 def _identity(request: SendGoal) -> str:
-    """What makes a repeated goal the same goal."""
+    """Return what makes a repeated goal the same goal."""
     return request.model_dump_json(exclude={"id", "traceparent"})
 
 

@@ -118,7 +118,7 @@ class GoalServer:
         self.bound = asyncio.Event()
 
     async def serve(self) -> None:
-        """Raises AlreadyRunning when another runner serves the endpoint."""
+        """Serve until the end. Raises AlreadyRunning when another runner serves the endpoint."""
         loop = asyncio.get_running_loop()
 
         def on_stop(reason: str, pid: int, uid: int) -> None:
@@ -170,7 +170,7 @@ class GoalServer:
                 raise error
 
     def result_of(self, goal_id: str) -> ResultPush | None:
-        """How a goal ended; None while it has not, or if it never was accepted."""
+        """Return how a goal ended; None while it has not, or if it never was accepted."""
         return self._goals.result_of(goal_id)
 
     # -- requests

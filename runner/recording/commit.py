@@ -112,7 +112,7 @@ def locked(root: Path, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
 
 
 def last(root: Path) -> Commit | None:
-    """The last commit; None when there was none yet. Raises ConfigError when it cannot be read."""
+    """Return the last commit; None before the first. Raises ConfigError when it cannot be read."""
     try:
         commit: Commit = json.loads((root / FOLDER / COMMIT).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -126,12 +126,12 @@ def last(root: Path) -> Commit | None:
 
 
 def begin(root: Path) -> None:
-    """From now on files change; until the next commit a crash would leave them unfinished."""
+    """Mark that files change; until the next commit a crash would leave them unfinished."""
     _write(root / FOLDER / OPEN, b"")
 
 
 def commit(root: Path, episode: EpisodeNote | None) -> None:
-    """What lies there now is finished, an episode with it; on disk before this returns."""
+    """Commit what is there, with an episode if given; on disk before this returns."""
     before = last(root) or Commit(version=1, episodes=0, files={}, notes_bytes=0, meta={})
     files = _files(root)
     for name in files.keys() - before["files"].keys():
@@ -185,7 +185,7 @@ def repair(root: Path) -> list[str]:
 
 
 def notes(root: Path) -> list[EpisodeNote]:
-    """What was noted of each committed episode, by episode."""
+    """Return the notes of the committed episodes, in order."""
     record = last(root)
     if record is None or not (root / FOLDER / EPISODES).exists():
         return []
@@ -248,7 +248,7 @@ def _note(path: Path, at: int, line: bytes) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Whole or not at all, and on disk."""
+    """Write a file atomically and sync it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.name}.new")
     with open(beside, "wb") as file:

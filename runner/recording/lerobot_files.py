@@ -278,7 +278,9 @@ class LerobotFiles:
             ) from error
 
     def _create(self, features: Features) -> None:
-        """Beside its place, then moved there at once: a crash leaves nothing half."""
+        """Create the dataset beside its place and move it there, so that a crash leaves nothing
+        half.
+        """
         from lerobot.datasets import LeRobotDatasetMetadata
 
         creating = self._root / commit.FOLDER / "creating"

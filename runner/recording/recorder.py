@@ -196,7 +196,7 @@ class DatasetRecorder:
         }
 
     def summary(self) -> str:
-        """What was recorded, and what was not, in one line."""
+        """Describe what was recorded, and what was not, in one line."""
         parts = [f"recorded {self.episodes} episodes, {self.frames} frames into {self.root}"]
         if self.skipped:
             parts.append(f"{self.skipped} goals were too short for an episode")

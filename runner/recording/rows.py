@@ -73,7 +73,7 @@ class Incomplete(Exception):
 
 
 def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
-    """The row and its pictures, in the order of `cameras`. Raises Incomplete."""
+    """Return the row and its pictures, in the order of `cameras`. Raises Incomplete."""
     world, result, goal = tick.world, tick.result, tick.goal
     state, action = _joints(tick) if tick.transition is None else _step(tick.transition)
     frames = [_colours(world.image_frames or {}, camera) for camera in cameras]

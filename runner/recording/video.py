@@ -117,7 +117,7 @@ class VideoRecorder:
 
 
 def _whole(path: Path) -> bool:
-    """Whether an MP4 file has its index, and ends where its last part does."""
+    """Return whether an MP4 file has its index, and ends where its last part does."""
     try:
         with path.open("rb") as file:
             at, indexed, end = 0, False, path.stat().st_size
@@ -137,7 +137,7 @@ def _whole(path: Path) -> bool:
 
 
 def _caption(rgb: Any, lines: tuple[str, ...]) -> Any:
-    """A copy of the picture with a dark strip above and the lines on it."""
+    """Return a copy of the picture with the lines on a dark strip at the top."""
     import cv2
     import numpy as np
 

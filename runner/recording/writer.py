@@ -101,7 +101,7 @@ class EpisodeWriter:
             self.ended({"goal_id": self._goal["goal_id"], "status": status})
 
     def failed(self, goal_id: str, error: Exception) -> None:
-        """The goal's rows are lost, and said to be; the next goal is tried again."""
+        """Drop the goal's rows and report it; the next goal is tried again."""
         typed = (
             error
             if isinstance(error, VramError)
@@ -154,7 +154,7 @@ class EpisodeWriter:
 
 
 def serve(peer: socket.socket) -> int:
-    """Until the runner says that it is over, or is gone. 0: everything that came is finished."""
+    """Write until the runner ends or disappears. Returns 0 if everything that came is finished."""
     opening = wire.receive(peer)
     if opening is None:
         return 0
@@ -204,7 +204,7 @@ def _typed(root: Path, error: Exception) -> VramError:
 
 
 def _take(writer: EpisodeWriter, header: wire.Header, pictures: list[bytes]) -> None:
-    """One message. Whatever it meets, the process goes on: the next goal may be recorded again."""
+    """Handle one message. Errors never end the process: the next goal may be recorded again."""
     kind = header.pop("kind")
     try:
         if kind == "row":
@@ -222,7 +222,7 @@ def _take(writer: EpisodeWriter, header: wire.Header, pictures: list[bytes]) -> 
 
 
 def main(argv: list[str]) -> int:
-    """The socket's file descriptor is the only argument."""
+    """Run the writer; the socket's file descriptor is the only argument."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     warnings.filterwarnings(

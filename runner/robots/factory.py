@@ -192,7 +192,7 @@ def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
 
 
 def _robot(config: HalConfig, source: str) -> Any:
-    """A lerobot robot, not connected."""
+    """Return a lerobot robot, not connected."""
     kind = config.adapter.removeprefix(LEROBOT)
     try:
         from lerobot.robots import RobotConfig, make_robot_from_config
@@ -288,7 +288,7 @@ def _joint(
 
 
 def _bus_unit(robot: Any, name: str) -> JointUnit | None:
-    """What lerobot's motor bus turns this motor's counts into."""
+    """Return what lerobot's motor bus turns this motor's counts into."""
     motor = getattr(getattr(robot, "bus", None), "motors", {}).get(name)
     return (
         {

@@ -24,7 +24,7 @@ RANGES_RAD = {
 
 
 def so101(*, simulated: bool, base: MobileBase | None = None) -> RobotDescription:
-    """The arm, or its twin; with `base` on a platform that drives."""
+    """Return the arm, or its twin; with `base` on a platform that drives."""
     return RobotDescription(
         name=NAME,
         joints=tuple(

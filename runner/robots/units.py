@@ -45,7 +45,7 @@ class JointScale:
         )
 
     def from_rad(self, angle_rad: float) -> float:
-        """What to send for a target in rad."""
+        """Return the number to send for a target in rad."""
         match self.unit:
             case JointUnit.DEG:
                 return math.degrees((angle_rad - self.offset_rad) * self.sign)

@@ -155,9 +155,7 @@ class EstopServer:
             os.close(self._spare)
 
     def _wake_up(self) -> None:
-        """Any thread. The control thread may obey after the server has ended: the descriptor's
-        number may be another file's by then.
-        """
+        """Wake the server's thread. Any thread; safe after the server has ended."""
         with self._waking:
             if self._wake >= 0:
                 os.eventfd_write(self._wake, 1)
@@ -370,7 +368,7 @@ class EstopServer:
             self._close(connection)
 
     def _reply(self, connection: _Connection, answer: Answer, text: str) -> None:
-        """A peer that does not read or is gone goes without."""
+        """Send a reply. A peer that does not read or is gone gets none."""
         reply = Reply(answer, self._robot.estop_ns, self._robot_id, text)
         with contextlib.suppress(OSError):
             connection.socket.send(reply.encode())
@@ -383,9 +381,7 @@ class EstopServer:
         connection.socket.close()
 
     def _check_file(self) -> None:
-        """A socket file that was deleted or replaced is made again: nothing else tells that no stop
-        can be heard.
-        """
+        """Recreate a socket file that was deleted or replaced: stops must stay possible."""
         if self._is_ours():
             return
         log.error("%s is gone; it is made again", self.path)

@@ -21,7 +21,7 @@ class EstopMark:
         self._path = path
 
     def refuse_if_left(self) -> None:
-        """Raises EstopRequested when an earlier run has left it."""
+        """Raise EstopRequested when an earlier run has left the mark."""
         try:
             reason = self._path.read_text(encoding="utf-8", errors="replace").strip()
         except FileNotFoundError:

@@ -155,7 +155,7 @@ class RobotGate:
 
     # -- one action
     def check(self, action: Action, world: WorldState) -> Verdict:
-        """The action to apply, possibly shortened, or None; and what was wrong with it."""
+        """Return the action to apply, possibly shortened, or None; and the violations."""
         problems: list[str] = []
         try:
             allowed = self._judge(action, world, problems)
@@ -284,7 +284,7 @@ class RobotGate:
         return self.limits.torque_nm
 
     def _last(self, name: str, measured: Mapping[str, float]) -> float:
-        """The joint's last target, or where it is when it never had one."""
+        """Return the joint's last target, or its position if it never had one."""
         if self._sent is not None:
             return self._sent().get(name, measured[name])
         return self._memory.last.get(name, (measured[name], 0))[0]
@@ -310,7 +310,7 @@ class RobotGate:
         return _Motion(measured, start, max(min(elapsed_s, unused_s), EPSILON), unused_s, yielding)
 
     def _used_s(self, targets: Targets, motion: _Motion) -> float:
-        """How long the steps take at the greatest speeds."""
+        """Return how long the steps take at the greatest speeds."""
         used = [
             abs(value - motion.start[name]) / self.limits.speeds_rad_s[name]
             for name, value in targets.items()
@@ -391,7 +391,10 @@ class RobotGate:
 
     # -- places
     def _workspace(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
-        """The target and the way half there. A robot that is already outside may come back in."""
+        """Check the target and the way half there.
+
+        A robot that is already outside may come back in.
+        """
         if self._kinematics is None or (self.limits.box == EVERYWHERE and not self.limits.zones):
             return
         now = self._kinematics.points(motion.measured)

@@ -84,7 +84,7 @@ class BoxZone(_Zone):
         return self
 
     def depth_m(self, point: Vector3) -> float:
-        """How far inside; negative or 0 outside."""
+        """Return how far inside a point is; negative or 0 outside."""
         sides = zip(point, self.min_xyz, self.max_xyz, strict=True)
         return min(min(value - low, high - value) for value, low, high in sides)
 
@@ -104,7 +104,7 @@ _ZONE: TypeAdapter[Zone] = TypeAdapter(Zone)
 
 
 def outside_m(box: tuple[Vector3, Vector3], point: Vector3) -> float:
-    """How far a point is outside a box; 0 inside."""
+    """Return how far outside a box a point is; 0 inside."""
     sides = zip(point, *box, strict=True)
     return math.hypot(*(max(low - value, value - high, 0.0) for value, low, high in sides))
 
@@ -137,7 +137,7 @@ class Limits:
 
 
 def own_limits(robot: RobotDescription) -> Limits:
-    """What the robot itself allows."""
+    """Return what the robot itself allows."""
     return Limits(
         joints_rad={joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints},
         speeds_rad_s={joint.name: joint.max_speed_rad_s for joint in robot.joints},

@@ -123,12 +123,12 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
 
 
 def without_credentials(text: str) -> str:
-    """A message of GStreamer without the users and passwords of the URLs in it."""
+    """Return a message of GStreamer without the users and passwords of its URLs."""
     return re.sub(r"(?<=://)[^/\s@\"']+@", "", text)
 
 
 def _parse(libraries: Libraries, text: str) -> tuple[Any, Any]:
-    """The pipeline and its appsink. Raises ValueError with words for the operator."""
+    """Return the pipeline and its appsink. Raises ValueError with a message for the operator."""
     gst = libraries.gst
     try:
         pipeline = gst.parse_launch_full(text, None, gst.ParseFlags.FATAL_ERRORS)

@@ -96,7 +96,7 @@ _NEEDED = {
 
 
 def without_credentials(url: str) -> str:
-    """The URL as it may stand in a log: without user, password and query."""
+    """Return the URL for a log: without user, password and query."""
     parts = urlsplit(url)
     return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
@@ -161,7 +161,7 @@ class OpenCvReader(SlotReader):
             )  # if nothing else was said before
 
     def _watch(self, cv2: Any, feed: Feed, stopping: threading.Event) -> None:
-        """A device or a stream: read until it breaks off, open it again."""
+        """Read a device or a stream until it breaks off, and open it again."""
         params, failures = self._params, 0
         while True:
             capture = self._open(cv2)

@@ -39,12 +39,12 @@ def read_params[P: BackendParams](config: SensorReaderConfig, model: type[P]) ->
 
 
 def refuse(config: SensorReaderConfig, field: str, problem: str) -> ConfigError:
-    """An error about one parameter, by its name below `backend_params` ("" for all of them)."""
+    """Return an error about one parameter, by its name below `backend_params` ("" for all)."""
     return _error(config, [(field, problem)])
 
 
 def refuse_field(config: SensorReaderConfig, field: str, problem: str) -> ConfigError:
-    """An error about one field of the camera itself."""
+    """Return an error about one field of the camera itself."""
     return _named(config, [Problem(0, field, problem)])
 
 

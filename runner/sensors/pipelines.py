@@ -184,13 +184,13 @@ _LATEST_ONLY = "queue leaky=downstream max-size-buffers=1 max-size-bytes=0 max-s
 
 
 def quoted(text: str) -> str:
-    """As one value in a pipeline's text, whatever stands in it."""
+    """Quote a value for a pipeline's text."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 
 
 def demuxer(path: str, codec: Codec) -> str:
-    """The element that opens this kind of file. Raises ValueError for other kinds."""
+    """Return the element that opens this kind of file. Raises ValueError for other kinds."""
     suffix = PurePath(path).suffix.lower()
     if suffix not in _DEMUXERS:
         raise ValueError(
@@ -204,7 +204,7 @@ def demuxer(path: str, codec: Codec) -> str:
 
 
 def framerate(fps: float) -> str:
-    """As GStreamer's fraction; 29.97 is what video people mean by it, 30000/1001."""
+    """Return GStreamer's fraction; 29.97 means 30000/1001."""
     for whole in (24, 30, 60, 120):
         if abs(fps - whole * 1000 / 1001) < 0.005:
             return f"{whole * 1000}/1001"

@@ -37,12 +37,12 @@ def full_topic(name: str) -> str:
 
 
 def dds_topic(name: str) -> str:
-    """The name of a ROS topic in DDS: `rt` for topic, then the full name."""
+    """Return the DDS name of a ROS topic: `rt` for topic, then the full name."""
     return "rt" + full_topic(name)
 
 
 def domain_of(environment: Mapping[str, str] = os.environ) -> int:
-    """The domain that the environment asks for; 0 without one. Raises ValueError."""
+    """Return the domain of the environment; 0 without one. Raises ValueError."""
     text = environment.get(DOMAIN_VARIABLE, "") or "0"
     if not text.isascii() or not text.isdigit() or int(text) > DOMAIN_MAX:
         raise ValueError(f"{DOMAIN_VARIABLE} is {text!r}, not a number from 0 to {DOMAIN_MAX}")
@@ -81,14 +81,14 @@ def dds_type(kind: MessageKind) -> Any:
 
 
 def sample_of(dds_type: Any, cdr: bytes) -> Any:
-    """A sample of that type with these bytes."""
+    """Return a sample of that type with these bytes."""
     sample = dds_type.__new__(dds_type)
     sample.cdr = cdr
     return sample
 
 
 def cdr_of(sample: Any) -> bytes:
-    """The bytes of a sample that came in or was made by `sample_of`."""
+    """Return the bytes of a received sample, or of one made by `sample_of`."""
     cdr: bytes = sample.cdr
     return cdr
 

@@ -75,7 +75,7 @@ class RosImageParams(BackendParams):
 
 
 def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
-    """A reader, not started. Raises ConfigError: parameters, Cyclone DDS not installed."""
+    """Return a reader, not started. Raises ConfigError: wrong parameters, missing Cyclone DDS."""
     params = read_params(config, RosImageParams)
     require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
     try:
@@ -92,7 +92,7 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
 
 
 def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
-    """What publishes a camera's frames on its `publish_topic`. Raises ConfigError."""
+    """Return the publisher of a camera's frames on its `publish_topic`. Raises ConfigError."""
     require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
     try:
         return RosImagePublisher(
@@ -124,7 +124,7 @@ class RosImageReader(SlotReader):
         self._thread: threading.Thread | None = None
 
     def _run_begins(self, feed: Feed) -> None:
-        """Raises ConfigError if DDS cannot be started."""
+        """Start reading. Raises ConfigError if DDS cannot be started."""
         from cyclonedds.core import (
             DDSStatus,
             GuardCondition,
@@ -184,7 +184,7 @@ class RosImageReader(SlotReader):
             )  # if nothing else was said before
 
     def _attend(self, feed: Feed, reader: Any) -> None:
-        """What has come since the last time: publishers that came or went, then pictures."""
+        """Handle what has come since the last time: changes of publishers, then pictures."""
         self._look_at_publishers(feed, reader)
         self._take(feed, reader)
 
@@ -235,7 +235,7 @@ class RosImageReader(SlotReader):
     def _frame(
         self, message: RosImage | RosCompressedImage, picture: ImageContent, sent_ns: int
     ) -> SensorFrame:
-        """Raises ValueError for a stamp of the future."""
+        """Return a frame. Raises ValueError for a stamp of the future."""
         now_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
         taken_ns = (message.stamp_ns or sent_ns) if self._params.stamp == "header" else wall_ns
         if taken_ns < 0:

@@ -209,7 +209,7 @@ class _Reader:
 
 
 def write_cdr(message: RosImage | RosCompressedImage) -> bytes:
-    """The message's bytes on the wire, with the four bytes before it that name their encoding."""
+    """Return the message's bytes on the wire, after the four bytes that name their encoding."""
     writer = _Writer()
     writer.header(message.stamp_ns, message.frame_id)
     if isinstance(message, RosImage):
@@ -224,7 +224,7 @@ def write_cdr(message: RosImage | RosCompressedImage) -> bytes:
 
 
 def read_image(data: bytes) -> RosImage:
-    """The inverse for `sensor_msgs/Image`. Raises ValueError."""
+    """Read `sensor_msgs/Image`. Raises ValueError."""
     reader = _Reader(data)
     stamp_ns, frame_id = reader.header()
     height, width = reader.number("I"), reader.number("I")
@@ -234,7 +234,7 @@ def read_image(data: bytes) -> RosImage:
 
 
 def read_compressed(data: bytes) -> RosCompressedImage:
-    """The inverse for `sensor_msgs/CompressedImage`. Raises ValueError."""
+    """Read `sensor_msgs/CompressedImage`. Raises ValueError."""
     reader = _Reader(data)
     stamp_ns, frame_id = reader.header()
     return RosCompressedImage(stamp_ns, frame_id, reader.text(), reader.blob())

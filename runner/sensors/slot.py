@@ -158,11 +158,11 @@ class Feed:
         return self._slot._put(self, frame)
 
     def interrupt(self, reason: str) -> bool:
-        """The source is away for now: its last frame is served no more, the next one will be."""
+        """Report that the source is away for now: its last frame is not served any more."""
         return self._slot._lose(self, reason, ended=False)
 
     def end(self, reason: str) -> bool:
-        """The source is away for good. The first reason stays."""
+        """Report that the source is away for good. The first reason stays."""
         return self._slot._lose(self, reason, ended=True)
 
 

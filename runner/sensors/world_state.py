@@ -136,7 +136,9 @@ class WorldStateAggregator:
             self._components[name].latch(why)
 
     def note(self, name: str, why: str) -> None:
-        """An update failed. Its last value stands until it is too old; then this is why."""
+        """Note a failed update. The last value stands until it is too old; then this is the
+        reason.
+        """
         with self._lock:
             component = self._components[name]
             component.note = why
@@ -167,6 +169,6 @@ class WorldStateAggregator:
             )
 
     def why(self, name: str) -> str:
-        """Why a component is stale, or was last."""
+        """Return why a component is stale, or was last."""
         with self._lock:
             return self._components[name].why

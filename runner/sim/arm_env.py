@@ -111,7 +111,7 @@ class ArmEnvironment:
     def about(
         self, *, prepare: Callable[[int], None] | None, judge: Callable[[], bool], steady: int
     ) -> None:
-        """From the next reset on episodes are about this."""
+        """Set the task of the episodes from the next reset on."""
         self._prepare, self._judge, self._steady = prepare, judge, steady
 
     def reset(self, seed: int) -> None:
@@ -147,7 +147,7 @@ class ArmEnvironment:
         )
 
     def shown(self) -> None:
-        """Its joint state says all."""
+        """Return None: the joint state is recorded."""
 
     @property
     def acted(self) -> dict[str, float]:
@@ -182,7 +182,7 @@ class ArmEnvironment:
         return self._gate.for_skill(manifest, ()).limits
 
     def action_of(self, raw: Any) -> Action:
-        """Joint targets (rad): a map by joint name, or a row in the order of the joints."""
+        """Convert joint targets (rad): a map by joint name, or a row in the order of the joints."""
         names = tuple(self._limits)
         try:
             if isinstance(raw, Mapping):
@@ -196,7 +196,7 @@ class ArmEnvironment:
         return _joint_action(names, row)
 
     def sample(self) -> Action:
-        """From where the joints were last sent, as far as the gate lets them go in one step."""
+        """Return random targets near the last ones, within one step of the gate."""
         row = []
         for name, (low, high) in self._limits.items():
             reach = REACH_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
@@ -210,7 +210,7 @@ class ArmEnvironment:
         return self._targets
 
     def sent(self) -> Mapping[str, float]:
-        """The targets that the servos were really given."""
+        """Return the targets that the servos really got."""
         return self._targets
 
     def toward(self, row: Sequence[float]) -> list[float]:

@@ -250,7 +250,7 @@ class Benchmark:
         self.runner.request_stop()
 
     async def run(self, contestant: Contestant, seeds: Iterable[int]) -> Cell:
-        """Raises what making the world raises; everything later is an episode's error."""
+        """Play the seeds. Raises what making the world raises; later errors are an episode's."""
         cell = Cell(self._world, contestant.name, self._task, contestant.revision)
         with ThreadPoolExecutor(1, thread_name_prefix="benchmark") as worker:
             await self._on(worker, self.runner.activate)
@@ -371,7 +371,7 @@ class Benchmark:
         return await asyncio.get_running_loop().run_in_executor(worker, work)
 
     async def _unless_stopped(self, work: Any) -> None:
-        """Raises Cancelled when the benchmark is stopped meanwhile."""
+        """Await, but raise Cancelled when the benchmark is stopped meanwhile."""
         task, stopping = asyncio.ensure_future(work), asyncio.ensure_future(self._stopping.wait())
         try:
             await asyncio.wait([task, stopping], return_when=asyncio.FIRST_COMPLETED)
@@ -390,7 +390,7 @@ class Benchmark:
 
 
 def file_name(text: str) -> str:
-    """What can be a file's name of any text."""
+    """Return a file name for any text."""
     return re.sub(r"[^A-Za-z0-9.-]+", "-", text).strip("-.")
 
 

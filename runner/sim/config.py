@@ -159,10 +159,10 @@ class ObjectSpec:
 
 
 def vocabulary() -> list[str]:
-    """All object names a scene can hold, in a fixed order."""
+    """Return all object names a scene can hold, in a fixed order."""
     return [f"{colour} {shape}" for colour in COLOURS for shape in SHAPES]
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same angle in (-pi, pi]."""
+    """Return the same angle in (-pi, pi]."""
     return math.atan2(math.sin(angle_rad), math.cos(angle_rad))

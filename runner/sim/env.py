@@ -238,7 +238,7 @@ class SimEnv:
         return x, y, wrap_angle(yaw)
 
     def gripper_position(self) -> tuple[float, float, float]:
-        """The grasp point between the fingers, in the base frame (forward kinematics)."""
+        """Return the grasp point between the fingers, in the base frame (forward kinematics)."""
         return self._to_base(self._data.site(ARM_PREFIX + GRASP_SITE).xpos)
 
     # -- cameras
@@ -307,7 +307,7 @@ class SimEnv:
 
     # -- truth
     def ground_truth(self) -> GroundTruth:
-        """Where everything really is, and what the gripper really holds."""
+        """Return where everything really is, and what the gripper really holds."""
         objects = {o.name: self._truth(o.name, o.rest_z_m) for o in self.layout.objects}
         held = [t for t in objects.values() if t.touching_fingers == 2 and t.lift_m >= HELD_LIFT_M]
         name = max(held, key=lambda t: t.lift_m).name if held else None

@@ -65,7 +65,7 @@ class Environment(Protocol):
         ...
 
     def step(self, action: Action | None) -> EnvStep:
-        """One period with a one-step action that has passed `gate`; None holds."""
+        """Step one period with a one-step action that has passed `gate`; None holds."""
         ...
 
     def gate(self, skill: Stepped) -> SafetyGate:

@@ -74,7 +74,7 @@ class EpisodeView:
 
 
 def episodes_of(ticks: Iterable[TickResult]) -> list[Episode]:
-    """The finished episodes of a recorded run."""
+    """Return the finished episodes of a recorded run."""
     view = EpisodeView()
     for tick in ticks:
         view.add(tick)

@@ -82,7 +82,7 @@ class GrabExpert:
         return x + self._offset[0], y + self._offset[1], z
 
     def act(self) -> list[float]:
-        """The next joint target (six angles, rad)."""
+        """Return the next joint target (six angles, rad)."""
         self._in_phase += 1
         if self.phase in (Phase.APPROACH, Phase.DESCEND):
             self._object = self._believed()
@@ -137,7 +137,7 @@ class GrabExpert:
         self.phase, self._in_phase = phase, 0
 
     def _carry(self) -> list[float]:
-        """Joint-space move to the pose in which a held thing is shown to the cameras."""
+        """Move in joint space to the pose in which a held thing is shown to the cameras."""
         here = list(self._env.joint_state().values())[:5]
         if self.phase is Phase.LIFT and all(
             abs(a - b) < CARRY_REACHED_RAD for a, b in zip(here, CARRY_POSE, strict=True)
@@ -170,7 +170,7 @@ class RestController:
         self._stride = speed_rad_s * CONTROL_DT_S
 
     def act(self) -> list[float]:
-        """The next joint target; the same pose again once at rest."""
+        """Return the next joint target; the same pose again once at rest."""
         self._target = [
             bounded(here, there, self._stride)
             for here, there in zip(self._target, REST_POSE, strict=True)

@@ -93,11 +93,11 @@ class GymConfig(BaseModel):
 
     @classmethod
     def load(cls, path: Path) -> GymConfig:
-        """Raises ConfigError with the file's name, line and field."""
+        """Read the file. Raises ConfigError with the file's name, line and field."""
         return validated(cls, read_yaml(path))
 
     def with_success(self, rule: str) -> GymConfig:
-        """Raises ConfigError for a rule that is none."""
+        """Return a copy with this rule of success. Raises ConfigError for an invalid one."""
         try:
             return GymConfig.model_validate({**self.model_dump(), "success": rule})
         except ValidationError as error:

@@ -74,7 +74,7 @@ class SpaceGate:
         return action.model_copy(update=update), tuple(problems)
 
     def in_order(self, action: Action) -> tuple[float, ...] | str:
-        """The row in the environment's order, or why there is none."""
+        """Return the row in the environment's order, or why there is none."""
         if self.mode is ControlMode.COMPOSITE_MODE:
             return (action.rows[0],)
         row: tuple[float, ...] = action.rows[0]
@@ -200,7 +200,7 @@ class GymEnv:
         return views or {**found}
 
     def _state_parts(self) -> tuple[Leaf, ...]:
-        """Where the joints are. Raises ConfigError when they are nowhere."""
+        """Return the places of the joints. Raises ConfigError when they are nowhere."""
         if not self.config.joints:
             return ()
         at, hint = (
@@ -233,7 +233,7 @@ class GymEnv:
         return parts
 
     def _shown_parts(self) -> tuple[Leaf, ...]:
-        """Whatever is made of numbers, but for pictures of any kind."""
+        """Return every part that is made of numbers, except pictures."""
         shown = []
         for part in self._observed.values():
             with contextlib.suppress(NoNumbers):
@@ -263,7 +263,7 @@ class GymEnv:
             self._views.setdefault(RENDER, None)
 
     def _check_observation(self) -> None:
-        """What is read of it must be what its space promised. Raises EnvironmentFailed."""
+        """Check that what is read fits its space. Raises EnvironmentFailed."""
         try:
             for part in self._state:
                 part.numbers(self._observation)

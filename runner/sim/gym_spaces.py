@@ -160,7 +160,7 @@ class ActionRow:
         return [number for leaf in self._leaves for number in _row_of(leaf, element)]
 
     def element(self, row: Sequence[float]) -> Any:
-        """What the space takes of a row of as many numbers as it has names."""
+        """Return what the space takes of a row of as many numbers as it has names."""
         numbers = iter(row)
         return _element(self.space, numbers)
 
@@ -177,7 +177,7 @@ def _bounds(box: Any) -> list[tuple[Any, Any]]:
 
 
 def _limits(leaf: Leaf) -> list[tuple[float, float]]:
-    """Of every number."""
+    """Return the limits of every number."""
     from gymnasium import spaces
 
     size, space = leaf.size, leaf.space
@@ -201,7 +201,7 @@ def _limits(leaf: Leaf) -> list[tuple[float, float]]:
 
 
 def _check_keys(space: Any, element: Any, where: str) -> None:
-    """Raises NoNumbers for an action that lacks a part, or has one too many."""
+    """Raise NoNumbers for an action that lacks a part, or has one too many."""
     from gymnasium import spaces
 
     if isinstance(space, spaces.Dict):
@@ -236,7 +236,7 @@ def _row_of(leaf: Leaf, element: Any) -> list[float]:
 
 
 def _middle(leaf: Leaf, value: float, start: int, n: int) -> float:
-    """The middle of a choice's share of [-1, 1]."""
+    """Return the middle of a choice's share of [-1, 1]."""
     if not value.is_integer() or not start <= int(value) < start + n:
         raise NoNumbers(
             f"{value:g} is not a choice of {leaf.path or leaf.space}: {start} to {start + n - 1}"

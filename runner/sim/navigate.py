@@ -26,13 +26,13 @@ class Pose2D:
 
 
 def to_map(base: Pose2D, x_m: float, y_m: float) -> tuple[float, float]:
-    """A point of the base frame in the map frame."""
+    """Convert a point of the base frame to the map frame."""
     cos, sin = math.cos(base.yaw_rad), math.sin(base.yaw_rad)
     return base.x_m + cos * x_m - sin * y_m, base.y_m + sin * x_m + cos * y_m
 
 
 def front_reach_m(config: SceneConfig, yaw_rad: float) -> float:
-    """How far the base's box reaches along the map's x from its origin, at this yaw."""
+    """Return how far the base's box reaches along the map's x from its origin, at this yaw."""
     front = config.mount_in_base_m[0] + 0.05
     return front * abs(math.cos(yaw_rad)) + config.base_half_size_m[1] * abs(math.sin(yaw_rad))
 

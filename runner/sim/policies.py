@@ -75,7 +75,9 @@ class Policy:
 
 
 def policy_of(name: str) -> Policy:
-    """Raises ConfigError for a policy that there is not, or a module that cannot be imported."""
+    """Return a policy. Raises ConfigError for an unknown one, or a module that cannot be
+    imported.
+    """
     if name == RANDOM:
         return Policy(name, lambda env, seed: lambda world: env.sample())
     where = name.removeprefix(SCRIPTED)

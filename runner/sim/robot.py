@@ -192,7 +192,7 @@ class SimRobot:
 
     # -- safety
     def admit(self, skill: Stepped) -> SafetyGate:
-        """As `Robot.admit`, for whatever can be stepped."""
+        """Return the gate for whatever can be stepped; otherwise as `Robot.admit`."""
         if missing := [camera for camera in skill.cameras if camera not in self._cameras]:
             raise GoalRejected(
                 f"{skill.key} needs the cameras {', '.join(missing)};"

@@ -44,9 +44,9 @@ class ArmModelMissing(RuntimeError):
 
 
 def load_mujoco() -> Any:
-    """The `mujoco` module, set up for rendering without a display unless MUJOCO_GL says otherwise.
+    """Return the `mujoco` module, set up for rendering without a display by default.
 
-    The variable is read when the module is first imported, hence one place for all imports of this
+    MUJOCO_GL is read when the module is first imported, hence one place for all imports of this
     package.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")

@@ -104,7 +104,7 @@ TASKS: Final = {task.name: task for task in (GRAB, NAVIGATE)}
 
 
 def task_of(manifest: RSkillManifest) -> Task:
-    """The task that fits what a skill can do. Raises ConfigError when none does, or several."""
+    """Return the task that fits a skill. Raises ConfigError when none does, or several."""
     fitting = [task for task in TASKS.values() if task.actions & set(manifest.actions)]
     if len(fitting) != 1:
         raise ConfigError(

@@ -59,7 +59,7 @@ class World:
 
 
 def so101_world(scene_file: Path | None) -> World:
-    """Raises ConfigError for a scene that cannot be read."""
+    """Return our own scene as a world. Raises ConfigError for a scene that cannot be read."""
     scene = SceneConfig.load(scene_file)
     arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
     cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)

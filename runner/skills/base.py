@@ -75,7 +75,7 @@ class SkillBase(ABC):
         return self._step(world)
 
     async def finish(self) -> None:
-        """The goal is over, however it ended. Repeatable."""
+        """End the goal, however it went. Repeatable."""
         if self.state is SkillState.ACTIVE:
             try:
                 await self._finish()

@@ -62,7 +62,7 @@ class ChunkPlayer:
         self.played = 0
 
     def wants_observation(self) -> bool:
-        """Whether the next `next_row` will ask for a chunk and so needs an observation."""
+        """Return whether the next `next_row` will ask for a chunk and so needs an observation."""
         return self._under_way is None and len(self._rows) <= self._prefetch_at
 
     def next_row(self, observation: Any) -> Played | None:

@@ -29,7 +29,7 @@ def joint_positions(world: WorldState, names: tuple[str, ...]) -> dict[str, floa
 
 
 def bounded(here: float, there: float, reach: float) -> float:
-    """From `here` towards `there`, `reach` at most."""
+    """Return `here` moved towards `there`, by `reach` at most."""
     return here + min(max(there - here, -reach), reach)
 
 
@@ -53,7 +53,7 @@ class JointRamp:
         self._settling = 0
 
     def next_target(self) -> dict[str, float]:
-        """The next joint targets; the goal itself once they are there."""
+        """Return the next joint targets; the goal itself once they are there."""
         self._target = {
             name: bounded(here, self._goal[name], self._stride)
             for name, here in self._target.items()
@@ -61,7 +61,7 @@ class JointRamp:
         return dict(self._target)
 
     def done(self, measured: Mapping[str, float]) -> bool:
-        """Whether the motion is over, given where the joints are."""
+        """Return whether the motion is over, given the joints' positions."""
         if self._target != self._goal:
             return False
         self._settling += 1
@@ -72,5 +72,5 @@ class JointRamp:
 
 
 def is_at(measured: Mapping[str, float], goal: Mapping[str, float]) -> bool:
-    """Whether every joint of `goal` is where it should be."""
+    """Return whether every joint of `goal` is at its target."""
     return all(abs(measured[name] - value) <= REACHED_RAD for name, value in goal.items())

@@ -112,7 +112,7 @@ def base_pose(world: WorldState) -> Pose2D:
 
 
 def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose2D:
-    """Where to stand, on the map."""
+    """Return the pose to stand at, on the map."""
     if params.target_point is not None:
         point = to_map(here, params.target_point.x, params.target_point.y)
         return standoff_pose(point, config)
@@ -185,7 +185,7 @@ class Navigate(SkillBase):
         )
 
     def _fold_arm(self, world: WorldState) -> Action | None:
-        """The next step towards the folded pose, or None once the arm is there."""
+        """Return the next step towards the folded pose, or None once the arm is there."""
         rest = {
             name: value
             for name, value in zip(ARM_JOINTS, REST_POSE, strict=True)

@@ -32,7 +32,9 @@ def merge(base: GoalParams, over: GoalParams) -> dict[str, Any]:
 def parse_goal[Message: BaseModel](
     message: type[Message], manifest: RSkillManifest, params: GoalParams
 ) -> Message:
-    """The goal's parameters over the manifest's defaults. Raises BadRequest, field by field."""
+    """Merge the goal's parameters over the manifest's defaults. Raises BadRequest, field by
+    field.
+    """
     defaults = (
         json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
     )

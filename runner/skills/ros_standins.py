@@ -38,7 +38,7 @@ class StandIns:
         return self._known[interface_of(manifest)].make(manifest)
 
     def refuses(self, manifest: RSkillManifest) -> str:
-        """Why a skill cannot be made here; empty: it can."""
+        """Return why a skill cannot be made here; empty: it can."""
         wanted = interface_of(manifest)
         stand_in = self._known.get(wanted)
         if stand_in is None:

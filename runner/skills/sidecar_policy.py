@@ -302,7 +302,9 @@ class SidecarPolicy(SkillBase):
     async def _fetch(
         self, observation: Mapping[str, Any], token: tuple[int, ...] | None
     ) -> list[Row]:
-        """The tick that asked is the span's parent; the goal, where that tick is not recorded."""
+        """Request a chunk; the tick that asked is the span's parent, or the goal if it is not
+        recorded.
+        """
         parent = None if tracing.recorded() else self._traceparent
         with tracing.span(telemetry.SPAN_CHUNK, parent, {telemetry.ATTR_SKILL: self.key.rskill_id}):
             answer = await self._client.get_action(
@@ -338,7 +340,7 @@ class SidecarPolicy(SkillBase):
         return Act(action, chunk_index=played.chunk, prefetched=played.prefetched)
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
-        """Whether the arm is at the start pose; sets the next target when not."""
+        """Return whether the arm is at the start pose; set the next target when not."""
         if self._wiring.start_pose is None:
             return True
         goal = {name: self._wiring.start_pose[name] for name in self._wiring.joints}
@@ -352,7 +354,7 @@ class SidecarPolicy(SkillBase):
         return False
 
     def _step_towards(self, row: Row, measured: Mapping[str, float]) -> Row:
-        """The policy's targets, or as much of the way there as one period allows."""
+        """Return the policy's targets, or as much of the way there as one period allows."""
         if self._longest is None:
             return row
         start = self._commanded or tuple(measured[name] for name in self._wiring.joints)

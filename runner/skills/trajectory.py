@@ -138,7 +138,7 @@ def too_fast(
     gap_s: float,
     limits: Limits,
 ) -> str:
-    """Which joint would have to be faster than it may; empty: none."""
+    """Return the joint that would have to exceed its speed; empty: none."""
     if gap_s <= 0:
         return "time_from_start must grow from point to point"
     for name, a, b in zip(names, start, end, strict=True):

@@ -47,7 +47,7 @@ class Capture:
 
 
 def policy_view(image: Any, camera: str) -> Any:
-    """The crop of an RGB image that the grab policy sees, averaged down; uint8."""
+    """Return the crop of an RGB image that the grab policy sees, averaged down; uint8."""
     import cv2
 
     (x0, y0, x1, y1), size = VIEWS[camera]
@@ -192,7 +192,7 @@ class Demonstration:
     point: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
 
     def in_reach(self) -> bool:
-        """Whether the object stayed where the arm can grab it."""
+        """Return whether the object stayed where the arm can grab it."""
         return all(0.24 < x < 0.41 and abs(y) < 0.09 and z > 0.2 for x, y, z in self.point)
 
 

@@ -64,7 +64,7 @@ def progress_of(truth: GroundTruth, gripper: tuple[float, float, float], name: s
 
 
 def record(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Grab:
-    """One try, from the folded pose to the carried one, or to an empty gripper."""
+    """Record one try, from the folded pose to the carried one, or to an empty gripper."""
     rng = random.Random(f"progress-{seed}")
     env.reset(seed)
     name = rng.choice(env.layout.objects).name
