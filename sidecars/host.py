@@ -108,7 +108,8 @@ class SidecarHost:
 
     @staticmethod
     async def _end_at_once() -> NoReturn:
-        """End a sidecar whose model thread hangs: it can neither be ended nor asked to unload.
+        """End a sidecar with a hanging model thread: the thread can neither be ended nor asked to
+        unload.
 
         Only the end of the process frees the lease and its bytes; systemd, or the next request,
         starts another.

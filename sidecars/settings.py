@@ -59,7 +59,7 @@ class Settings:
     endpoint: str
     device: str  # fake:FOLDER | cuda[:N] | none
     arbiter: str | None
-    stands_for: str = ""  # the production model whose footprint is simulated
+    stands_for: str = ""  # the production model of the simulated footprint
     throttle_bytes_per_s: int | None = None
     gpu: str = "any"
     priority: int = d.PRIORITY

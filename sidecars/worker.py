@@ -126,7 +126,7 @@ class Worker:
 
 
 def _seen(done: asyncio.Future[Any]) -> None:
-    """Keep asyncio from logging a failure whose caller is gone."""
+    """Keep asyncio from logging a failure that has no caller any more."""
     if not done.cancelled():
         done.exception()
 
