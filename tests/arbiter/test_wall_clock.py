@@ -13,7 +13,7 @@ READERS = {
     "host/telemetry/spans.py": "dates of spans",
     "eventlog/writer.py": "dates in the event log",
     "eventlog/logfile.py": "names of its files",
-    "lab/text.py": "dates for people",
+    "eventlog/text.py": "dates for people",
     "log.py": "dates for people",
 }
 WALL = {

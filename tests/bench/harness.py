@@ -23,6 +23,7 @@ import msgpack
 import zmq
 
 from tests.support.process import ArbiterProcess
+from vram_arbiter.schemas.defaults import WIRE_VERSION
 
 HERE = Path(__file__).parent
 ANSWER_TIMEOUT_S = 30.0
@@ -278,7 +279,10 @@ class Peer:
 
     def greet(self) -> int:
         return self.send(
-            "hello", name=self.name, instance=f"{self.name}-{os.getpid()}-{id(self)}", version=1
+            "hello",
+            name=self.name,
+            instance=f"{self.name}-{os.getpid()}-{id(self)}",
+            version=WIRE_VERSION,
         )
 
     def hello(self) -> "Peer":

@@ -20,8 +20,8 @@ def test_a_local_place_is_looked_up_in_the_configs_folder_and_nowhere_else(tmp_p
     assert resolve("local://models/x", configs) == Weights(str(configs / "models/x"), local=True)
     for uri, told in (
         ("local://models/y", "no weights in"),
-        ("local://../../etc", "not a place"),
-        ("ftp://x/y", "not a place"),
+        ("local://../../etc", "not a source of weights"),
+        ("ftp://x/y", "not a source of weights"),
     ):
         with pytest.raises(ConfigError, match=told):
             resolve(uri, configs)
