@@ -1,18 +1,20 @@
-"""What must always be true, checked after every event, also in production. A violation stops the daemon: it is not handled.
+"""Invariants of the engine, checked after every event, also in production. A violation stops the
+daemon.
 
-`check` looks at what the event can have changed, by the tables that the ledger and the residents keep of themselves, so its cost does not
-grow with the number of leases. `check_all` looks at everybody and at those tables too; whatever it finds that `check` did not is a
-defect of the tables. Tests' drivers and the simulation run it after every event.
+`check` looks at the GPUs that the event touched and, there, at what changed, so its cost does not
+grow with the number of leases. `check_all` looks at everything, also at the tables that `check`
+relies on. The drivers of the tests and the simulation run it after every event.
 
-Numbers are those of ARCHITECTURE.md:
-  1. approved bytes never exceed capacity − reserve, and a grant fits together with stowaways at its moment
-  2. nobody is resident beside an exclusive lease, nor comes before its bytes are measured gone; one lease at a time loads on a card
-  3. nothing that is in use unloads
-  4. bytes stay charged until a verdict: whoever is resident is charged, whoever is charged is resident, under measurement or reserved by
-     a feature; a lease that is away is neither, and parked weights never exceed the budget of host RAM (`features.standby`)
+Public: `check`, `check_all`, `InvariantViolation`. By number:
+  1. approved bytes never exceed capacity − reserve; a grant fits beside stowaways at its moment
+  2. an exclusive lease has no other resident beside it, none is granted before its bytes are measured
+     gone; one lease at a time loads on a GPU
+  3. a lease in use is not unloaded
+  4. bytes stay charged until a verdict: a resident is charged, a charged lease is resident, under
+     measurement or reserved; a lease on standby is neither; parked weights fit the host RAM budget
   5. tokens only grow
-  6. every waiter is in a queue, has a timer if it has a bound, and its card has a next reading scheduled
-  7. of a gang, until it is complete or broken, all waiting members are charged or none (`features.gangs`)
+  6. every waiter is in a queue, a bounded one has a timer, and its GPU has a next reading planned
+  7. of a gang that is not complete, all waiting members are charged, or none
 """
 
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
@@ -22,9 +24,9 @@ from vram_arbiter.arbiter.core.model.turn import Turn
 _UNUSED = tuple(
     state for state in LeaseState if state not in (LeaseState.HELD, LeaseState.REVOKING)
 )
-"""States in which nobody may use a lease."""
+"""States in which a lease has no uses."""
 _UNUSED_HERE = (LeaseState.LOADING, LeaseState.UNLOADING, LeaseState.VERIFYING)
-"""Those of them that a resident can be in."""
+"""Those that a resident can be in."""
 
 
 class InvariantViolation(Exception):
@@ -36,7 +38,7 @@ class InvariantViolation(Exception):
 
 
 def check(core: Core) -> None:
-    """Raise InvariantViolation unless everything holds that the event of this turn can have broken."""
+    """Raise InvariantViolation if the event of this turn broke something."""
     granted_on = {gpu_id for _, gpu_id in core.turn.granted}
     for gpu in core.turn.touched.values():
         granted = gpu.info.id in granted_on
@@ -51,7 +53,7 @@ def check(core: Core) -> None:
 
 
 def check_all(core: Core) -> None:
-    """The same for everybody, whoever was touched, and for the tables that `check` stands on."""
+    """Check every GPU and lease, and the tables that `check` relies on. O(leases): for tests."""
     if problem := core.disagreement():
         raise InvariantViolation(0, problem)
     for gpu in core.gpus.values():
@@ -98,7 +100,7 @@ def _residents(gpu: Gpu, *, granted: bool) -> None:
         if debts:
             raise InvariantViolation(
                 2,
-                f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet somebody came",
+                f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet a lease came",
             )
         loading = [lease.id for lease in residents.in_state(LeaseState.LOADING)]
         if len(loading) > 1:
@@ -115,7 +117,7 @@ def _unused(lease: Lease) -> None:
 
 
 def _charges(gpu: Gpu) -> None:
-    """Whoever came, went, was charged or was dropped since the last time is looked at; who stayed stays sound."""
+    """Only leases that came, went, were charged or dropped since the last check are examined."""
     ledger, residents = gpu.ledger, gpu.residents
     if ledger.touched or residents.touched:
         touched = ledger.touched | residents.touched
@@ -148,7 +150,9 @@ def _tokens(core: Core) -> None:
 
 
 def _counts(core: Core, queued: int) -> None:
-    """Counted only when a number has changed: a feature may keep thousands of requests out of the queues."""
+    """Counted only when a number has changed: a feature may keep thousands of requests out of the
+    queues.
+    """
     unqueued = (lease for feature in core.hooked["unplaced"] for lease in feature.unplaced())
     waiting = len(core.waiting) - sum(lease.state is LeaseState.QUEUED for lease in unqueued)
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):

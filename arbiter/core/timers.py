@@ -1,4 +1,7 @@
-"""Deadlines by name. Setting a later time for a name is cheap (renewals do it all the time); nothing here reads a clock."""
+"""Deadlines by name.
+
+Setting a later time is cheap, as renewals do it all the time. Reads no clock.
+"""
 
 from heapq import heapify, heappop, heappush
 
@@ -10,7 +13,7 @@ SLACK = 256
 
 
 class Timers:
-    """A heap with lazy corrections: an entry is checked against the true time only when it comes up."""
+    """Heap of deadlines; an entry that was moved later is corrected when it comes up."""
 
     def __init__(self) -> None:
         self._due: dict[TimerKey, float] = {}

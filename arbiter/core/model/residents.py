@@ -1,8 +1,9 @@
-"""Who is resident on one card, and the few of them that a question is about, without looking at everybody.
+"""Residents of one GPU, with tables of the few that a decision asks about.
 
-A card may have ten thousand small leases while one is loading and two are leaving. What follows from a lease's state is kept as it
-changes (`Lease.move` tells its `roster`), so that a decision and the invariants cost what has changed and not what is there.
-Knows nothing of bytes or order. Every change must come through `[id] = lease`, `del [id]` or `pop`; `disagreement` finds what did not.
+A GPU may have ten thousand small leases while one loads and two leave. The tables are kept as
+leases change state (`Lease.move` tells its `roster`), so that a decision costs what has changed and
+not what is there. Every change comes through `[id] = lease`, `del [id]` or `pop`; `disagreement`
+finds what did not. Must not depend on bytes or order.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,22 +15,22 @@ _MISSING = object()
 
 
 class Residents(dict[LeaseId, Lease]):
-    """Leases of one card by id, oldest grant first, with sub-tables by state and by what they forbid."""
+    """Leases of one GPU by id, oldest grant first, with tables by state and by what they forbid."""
 
     def __init__(self) -> None:
         super().__init__()
         self._by_state: dict[LeaseState, dict[LeaseId, Lease]] = {state: {} for state in LeaseState}
         self.exclusive: dict[LeaseId, Lease] = {}
         self.pinned: dict[LeaseId, Lease] = {}
-        """Never asked to leave, by their own wish or an operator's."""
+        """Never revoked: the holder or an operator forbids it."""
         self.recent: dict[LeaseId, Lease] = {}
-        """All that were granted or became ready since the newest reading began, and perhaps some more."""
+        """Leases granted, enlarged or ready since the newest reading began; may hold more."""
         self.enlarged: dict[LeaseId, float] = {}
         """When a resident was last granted more bytes."""
         self.touched: set[LeaseId] = set()
-        """Came or went since the invariants were checked last."""
+        """Leases that came or went since the last check of the invariants."""
 
-    # -- changing --------------------------------------------------------------------------------------------------
+    # -- changing ----------------------------------------------------------------------------------
     def __setitem__(self, lease_id: LeaseId, lease: Lease) -> None:
         self.pop(lease_id, None)
         super().__setitem__(lease_id, lease)
@@ -45,7 +46,7 @@ class Residents(dict[LeaseId, Lease]):
         self.pop(lease_id)
 
     def pop(self, lease_id: LeaseId, default: object = _MISSING) -> Lease | None:  # type: ignore[override]  # reason: one default
-        """Take a lease off the card. Raises KeyError without a default, as any dict."""
+        """Take a lease off the GPU. Raises KeyError without a default, as any dict."""
         lease = self.get(lease_id)
         if lease is None:
             if default is _MISSING:
@@ -60,14 +61,14 @@ class Residents(dict[LeaseId, Lease]):
         return lease
 
     def moved(self, lease: Lease, before: LeaseState) -> None:
-        """A lease of this card went to another state."""
+        """A lease of this GPU came to another state."""
         self._by_state[before].pop(lease.id, None)
         self._by_state[lease.state][lease.id] = lease
         if lease.state is LeaseState.HELD:
             self.recent[lease.id] = lease
 
     def refresh(self, lease: Lease) -> None:
-        """Whether it may be asked to leave has changed."""
+        """Whether a lease may be revoked has changed."""
         if lease.evictable:
             self.pinned.pop(lease.id, None)
         else:
@@ -79,11 +80,11 @@ class Residents(dict[LeaseId, Lease]):
         self.recent[lease.id] = lease
 
     def seen(self, taken_at: float) -> None:
-        """A reading that began then knows of everything that happened before."""
+        """Forget recent leases that a reading that began at `taken_at` has seen."""
         for lease in [lease for lease in self.recent.values() if not self._after(lease, taken_at)]:
             del self.recent[lease.id]
 
-    # -- reading ---------------------------------------------------------------------------------------------------
+    # -- reading -----------------------------------------------------------------------------------
     def in_state(self, *states: LeaseState) -> list[Lease]:
         """Leases in these states, in the order in which they came to them."""
         return [lease for state in states for lease in self._by_state[state].values()]
@@ -96,14 +97,19 @@ class Residents(dict[LeaseId, Lease]):
         return False
 
     def unseen(self, taken_at: float) -> list[Lease]:
-        """Granted or become ready after a reading began (the newest, or one after it): it cannot have seen them."""
+        """Return leases granted, enlarged or ready after a reading began: it cannot show their
+        bytes.
+        """
         return [lease for lease in self.recent.values() if self._after(lease, taken_at)]
 
     def _after(self, lease: Lease, taken_at: float) -> bool:
         return max(lease.granted_at, lease.ready_at, self.enlarged.get(lease.id, 0.0)) > taken_at
 
     def filling(self, since: float) -> Iterator[Lease]:
-        """Who loads, or became ready after that moment. Leases are held in the order in which they became ready."""
+        """Yield leases that load, or became ready after `since`.
+
+        HELD lists them in the order of `ready_at`.
+        """
         for lease in reversed(self._by_state[LeaseState.HELD].values()):
             if lease.ready_at <= since:
                 break
@@ -114,7 +120,7 @@ class Residents(dict[LeaseId, Lease]):
                 yield lease
 
     def ready_since(self, moment: float) -> Iterator[Lease]:
-        """Who has become ready no earlier than that, and has not begun to leave."""
+        """Yield leases that became ready at `moment` or later and do not unload yet."""
         for lease in reversed(self._by_state[LeaseState.HELD].values()):
             if lease.ready_at < moment:
                 break
@@ -124,7 +130,7 @@ class Residents(dict[LeaseId, Lease]):
                 yield lease
 
     def disagreement(self) -> str:
-        """Where the sub-tables and the leases disagree; "" if nowhere. Looks at everybody: for tests."""
+        """Return where tables and leases disagree, "" if nowhere. O(leases): for tests."""
         for state, table in self._by_state.items():
             if table.keys() != {lease.id for lease in self.values() if lease.state is state}:
                 return f"{sorted(table)} are listed as {state}"

@@ -1,4 +1,7 @@
-"""What one step of an event tells the next ones. A turn begins and ends with its event; nothing of it is state."""
+"""What one step of an event tells the next ones.
+
+A turn begins and ends with its event; nothing of it is state.
+"""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -20,7 +23,9 @@ class Turn:
     dirty: dict[int, "Gpu"] = field(default_factory=dict)
     """GPUs by index whose queue must be served."""
     touched: dict[int, "Gpu"] = field(default_factory=dict)
-    """GPUs by index whose records may have changed: their next reading is planned, their invariants are checked."""
+    """GPUs by index whose records may have changed: their next reading is planned, their invariants
+    are checked.
+    """
     suspects: set[ProcessKey] = field(default_factory=set)
     """Processes that began to use or to wait: they may be in a circle (`scheduling.deadlock`)."""
     unanswered: list[Lease] = field(default_factory=list)
@@ -33,7 +38,7 @@ class Turn:
         self.touched[gpu.info.index] = gpu
 
     def next_dirty(self, after: "Gpu | None") -> "Gpu | None":
-        """Take the first dirty GPU behind another one, or the first of all; None: no GPU is dirty."""
+        """Take the first dirty GPU behind another, or the first of all; None: none is dirty."""
         if not self.dirty:
             return None
         behind = -1 if after is None else after.info.index

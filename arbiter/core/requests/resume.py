@@ -1,7 +1,8 @@
-"""The machine slept and woke up (a laptop's lid). The monotonic clock stood still meanwhile, so no ttl ran and nobody expired; but what was
-measured before is of another day: drivers may have moved or dropped memory, and holders wake up in any order.
+"""Resume of the machine from suspend, such as a laptop's lid.
 
-So: every holder gets its full ttl anew, every card is unknown until it is read, and verifications begin again. Nothing is given up.
+The monotonic clock stood still, so no TTL ran out. Readings from before do not count: drivers may
+have moved or dropped memory, and holders wake up in any order. Every holder gets its full TTL,
+every GPU is unknown until it is read, and verifications begin again.
 """
 
 from vram_arbiter.arbiter.core.events import Resumed

@@ -1,7 +1,8 @@
 """Scheduling policies by name: what `Settings.policy` may say and what each changes in the engine.
 
-A policy only chooses *who is next* and *who leaves*. Bytes, safe points, verdicts and invariants are the same under every one
-of them: no name in this table can overfill a card. Data only; `queue`, `policy`, `grants` and `requests` each ask for their flag.
+A policy chooses which request is next and which holder is revoked. Bytes, safe points, verdicts and
+invariants are the same under each: none can overfill a GPU. Data only; `queue`, `victims`,
+`backfill` and `requests` each read their flag.
 """
 
 from collections.abc import Mapping
@@ -21,7 +22,9 @@ class Scheduling:
     backfill: bool = True
     """A small waiter may pass the head if that cannot delay it."""
     least_recent: bool = False
-    """Victims by least recent use alone, until enough is covered; False: the cheapest set that covers the need."""
+    """Victims by least recent use alone, until enough is covered; False: the cheapest set that
+    covers the need.
+    """
     alone: bool = False
     """Every lease is exclusive: one model at a time per card."""
 

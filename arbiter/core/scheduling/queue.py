@@ -1,8 +1,9 @@
-"""Order of the waiters of one card.
+"""Wait queue of one GPU, ordered by effective priority.
 
-Effective priority is priority + waited/ageing. Both sides of any comparison age at the same rate, so the order of two
-waiters is fixed when they arrive: `arrival time − priority × ageing` (smaller first), then arrival. That makes the queue a
-sorted list that time never disturbs, bounds every wait, and never reorders equals. Without ageing (0) it is the order of arrival.
+Effective priority is priority + waited/ageing. All requests age at the same rate, so the order of
+two is fixed when they arrive: `arrival time − priority × ageing` (smaller first), then arrival. The
+queue is a sorted list that time never disturbs; every wait is bounded. Without ageing (0) it is the
+order of arrival.
 """
 
 from bisect import bisect_left, bisect_right, insort
@@ -16,7 +17,7 @@ type Rank = tuple[float, int]
 
 
 class WaitQueue:
-    """Sorted waiters; the smallest need is known without looking at all of them."""
+    """Sorted requests; keeps the smallest need, so that a full GPU is seen at a glance."""
 
     def __init__(self, ageing_s_per_point: float) -> None:
         self._ageing_s = ageing_s_per_point
@@ -39,7 +40,7 @@ class WaitQueue:
         self._leases[lease.request.arrival] = lease
 
     def discard(self, lease: Lease) -> None:
-        """Take a waiter out; one that is not here is fine."""
+        """Take a request out, if it is here."""
         if lease.request.arrival not in self._leases:
             return
         del self._leases[lease.request.arrival]
@@ -54,29 +55,29 @@ class WaitQueue:
             yield self._leases[self._ranks[index][1]]
 
     def smallest_need_bytes(self) -> int:
-        """Of a queue that is not empty."""
+        """Return the smallest load peak of a queue that is not empty."""
         return self._needs[0]
 
     def precedes(self, first: Lease, second: Lease) -> bool:
-        """Is, or was, the one before the other? Neither has to wait still."""
+        """Return whether `first` is, or was, before `second`. Neither has to wait still."""
         return self.rank(first) < self.rank(second)
 
     def position(self, lease: Lease) -> int:
-        """1 is the head."""
+        """Return the place of a request; 1 is the head."""
         return bisect_left(self._ranks, self.rank(lease)) + 1
 
     def ahead_of(self, lease: Lease) -> LeaseId | None:
-        """Who stands directly before this waiter."""
+        """Return the request directly before this one."""
         index = self.position(lease) - 2
         return self._leases[self._ranks[index][1]].id if index >= 0 else None
 
     def after(self, rank: Rank) -> Iterator[Lease]:
-        """Waiters behind a place in the order, whether or not one stands there now."""
+        """Yield the requests behind a rank, whether or not a request has it now."""
         first = bisect_right(self._ranks, rank)
         return (self._leases[arrival] for _, arrival in islice(self._ranks, first, None))
 
     def rank(self, lease: Lease) -> Rank:
-        """Its place in the order of any queue."""
+        """Return the key by which any queue orders this request."""
         if lease.request.rank is not None:
             return (lease.request.rank, lease.request.arrival)
         return (
