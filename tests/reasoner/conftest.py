@@ -1,4 +1,6 @@
-"""A runner and a perception sidecar that speak the real wires on real sockets, without robot and models."""
+"""A runner and a perception sidecar that speak the real wires on real sockets, without robot and
+models.
+"""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -52,8 +54,15 @@ class Runner:
         assert self.goal is not None, "no goal runs"
         goal, self.goal = self.goal, None
         assert self.peer is not None, "somebody sent it"
-        push = {"push": "result", "goal_id": goal.goal_id, "status": status, "success": status == "succeeded",
-                "code": code, "message": message, "data": {}}  # fmt: skip
+        push = {
+            "push": "result",
+            "goal_id": goal.goal_id,
+            "status": status,
+            "success": status == "succeeded",
+            "code": code,
+            "message": message,
+            "data": {},
+        }
         await self._server.send(self.peer, push)
 
     async def feed(self, progress: float, state: str = "running") -> None:
@@ -101,8 +110,16 @@ class Runner:
                 if self.frame_error is not None:
                     raise self.frame_error
                 model = {} if self.camera_model is None else {"camera_model": self.camera_model}
-                return {"camera": request.camera or "front", "encoding": "png", "data": b"\x89PNG\r\n\x1a\n", "width": 4,
-                        "height": 4, "stamp_monotonic_ns": 1, "age_ms": 1.0, **model}  # fmt: skip
+                return {
+                    "camera": request.camera or "front",
+                    "encoding": "png",
+                    "data": b"\x89PNG\r\n\x1a\n",
+                    "width": 4,
+                    "height": 4,
+                    "stamp_monotonic_ns": 1,
+                    "age_ms": 1.0,
+                    **model,
+                }
             case GetState():
                 return {
                     "goal": self.goal.goal_id if self.goal else None,
@@ -148,8 +165,15 @@ class Sidecar:
         self.messages.append(message)
         reply: Message = {"re": message["id"], "ok": True}
         if op == "ping":
-            reply |= {"model": "m", "revision": "", "kind": "vlm", "rskill": self.rskill, "pid": 1, "boot_id": "b",
-                      "state": "unloaded"}  # fmt: skip
+            reply |= {
+                "model": "m",
+                "revision": "",
+                "kind": "vlm",
+                "rskill": self.rskill,
+                "pid": 1,
+                "boot_id": "b",
+                "state": "unloaded",
+            }
         elif (error := self.error) is not None or (op != "load" and self.late):
             if error is None:
                 error, self.late = FrameStale("it waited"), self.late - 1

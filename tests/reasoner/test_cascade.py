@@ -87,7 +87,9 @@ def test_a_skill_is_benched_after_three_starts_in_a_row_that_failed_and_for_good
 
 
 def test_what_a_skill_or_a_model_says_can_always_be_told_and_has_an_end() -> None:
-    """Regression: bytes in a goal's own data ended the reasoner, and a detector's label of a megabyte was told whole, again with every question."""
+    """Regression: bytes in a goal's own data ended the reasoner, and a detector's label of a
+    megabyte was told whole, again with every question.
+    """
     data = {
         "raw": b"\x00\xff",
         7: {b"key": {1, 2}},
@@ -106,7 +108,9 @@ def test_what_a_skill_or_a_model_says_can_always_be_told_and_has_an_end() -> Non
 
 
 def test_what_was_refused_was_no_attempt_and_disproves_nothing() -> None:
-    """Regression: a grab that was refused counted as one, and took back what the scene model had confirmed."""
+    """Regression: a grab that was refused counted as one, and took back what the scene model had
+    confirmed.
+    """
     steps = [
         Step(GRAB, Outcome("succeeded", "")),
         Step(QueryScene(question="held?"), Outcome("answered", "Yes.")),

@@ -1,4 +1,7 @@
-"""The loop never waits for its planner: results, cancels, words and dangers pass it by. Every wait here is for an event."""
+"""The loop never waits for its planner: results, cancels, words and dangers pass it by.
+
+Every wait here is for an event.
+"""
 
 import asyncio
 from collections.abc import Callable

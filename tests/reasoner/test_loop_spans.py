@@ -1,4 +1,6 @@
-"""An episode's spans: one tick from the question to what came of the answer, with every decision and the tool's work in it."""
+"""An episode's spans: one tick from the question to what came of the answer, with every decision
+and the tool's work in it.
+"""
 
 import json
 import subprocess

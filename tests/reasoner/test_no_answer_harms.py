@@ -1,8 +1,9 @@
 """No answer of a language model makes a holder in use leave, or fills the card past its capacity.
 
-Real: decoding, nudges, palette, loop, tools, and the arbiter's core on a simulated card of 8 GiB whose memory comes back late.
-Hypothesis plays the model, and other people who use the same robot beside it. The processes between (runner, sidecars) are
-played as the client library behaves: they load when granted, leave when asked and idle, and never in the middle of a use.
+Real: decoding, nudges, palette, loop, tools, and the arbiter's core on a simulated card of 8 GiB
+whose memory comes back late. Hypothesis plays the model, and other people who use the same robot
+beside it. The processes between (runner, sidecars) are played as the client library behaves: they
+load when granted, leave when asked and idle, and never in the middle of a use.
 """
 
 import asyncio
@@ -68,7 +69,7 @@ class World:
         ]
         assert not lost, f"a lease was taken away: {lost}"
 
-    # -- what everybody does while time passes -------------------------------------------------------------------
+    # -- what everybody does while time passes
     def step(self, seconds: float = STEP_S) -> None:
         self.driver.advance(seconds)
         for lease, (who, use, until) in list(self.uses.items()):
@@ -157,7 +158,9 @@ class Goal:
 
 
 class Runner:
-    """Executes the policy as uses of its lease; whatever else it is told moves nothing on the card."""
+    """Executes the policy as uses of its lease; whatever else it is told moves nothing on the
+    card.
+    """
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -241,18 +244,24 @@ PALETTE = Palette(
     tuple(
         Skill(f"lab/{name}", kind, "", (action,))
         for name, kind, action in (
-            ("grab", "vla", "grasp"), ("navigate", "ros_action", "navigate"), ("detector", "detector", "detect"),
-            ("scene-vlm", "vlm", "query"), ("judge", "reward", "monitor"), ("tidy", "playbook", "plan"),
+            ("grab", "vla", "grasp"),
+            ("navigate", "ros_action", "navigate"),
+            ("detector", "detector", "detect"),
+            ("scene-vlm", "vlm", "query"),
+            ("judge", "reward", "monitor"),
+            ("tidy", "playbook", "plan"),
         )
     ),
     managed=frozenset({"detector", "scene-vlm"}),
     topics=frozenset({OPERATOR}),
-)  # fmt: skip
+)
 EXECUTABLE = {"lab/grab", "lab/navigate"}
 
 
 class Model(LlmPlanner):
-    """Answers what Hypothesis wrote, with the decoding of the real backends; other people act before each answer."""
+    """Answers what Hypothesis wrote, with the decoding of the real backends; other people act
+    before each answer.
+    """
 
     def __init__(self, answers: list[tuple[Answer, str]], world: World) -> None:
         super().__init__(LlmConfig("http://127.0.0.1:1", "m"), PALETTE)

@@ -1,4 +1,6 @@
-"""What may be used: by kind, licence, flag and parameter, whatever a manifest's role or a planner says."""
+"""What may be used: by kind, license, flag and parameter, whatever a manifest's role or a planner
+says.
+"""
 
 import json
 from typing import Any
@@ -21,9 +23,15 @@ from vram_arbiter.schemas.tools import (
     Wait,
 )
 
-BASE = 'version: "1.0.0"\nembodiment_tags: ["any"]\nchunk_size: 1\nlatency_budget: {per_chunk_ms: 10}\ndescription: "x"\n'
+BASE = (
+    'version: "1.0.0"\nembodiment_tags: ["any"]\nchunk_size: 1\n'
+    'latency_budget: {per_chunk_ms: 10}\ndescription: "x"\n'
+)
 ARM = "actuators_required: [{kind: joint_position, control_mode_semantics: {mode: absolute}}]\n"
-ROS = 'ros_integration: {package: p, interface_type: T, interface_name: /t, default_goal_json: "{}"}\n'
+ROS = (
+    "ros_integration: {package: p, interface_type: T, interface_name: /t,"
+    ' default_goal_json: "{}"}\n'
+)
 WEIGHTS = "weights_uri: local://models/x\n"
 BY_KIND = {
     "vla": ARM + WEIGHTS + "model_family: act\nactions: [grasp]\n",
@@ -34,7 +42,10 @@ BY_KIND = {
     "segmenter": WEIGHTS + "segmenter: {engine: sam2_hf}\nactions: [detect]\n",
     "vlm": WEIGHTS + "actions: [query]\n",
     "reward": WEIGHTS + "reward: {frame_window_s: 8, target_fps: 1}\nactions: [monitor]\n",
-    "playbook": "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [locate_in_view], done_predicate: d, max_steps: 3}\nactions: [plan]\n",
+    "playbook": (
+        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [locate_in_view],"
+        " done_predicate: d, max_steps: 3}\nactions: [plan]\n"
+    ),
 }
 
 
@@ -93,10 +104,17 @@ def test_looking_and_asking_are_independent(can_locate: bool, can_query: bool) -
 @pytest.mark.parametrize(
     ("license", "commercial"),
     [
-        ("apache-2.0", True), ("mit", True), ("bsd", True), ("nvidia_open_model", True), ("permissive_research", False),
-        ("nvidia_non_commercial", False), ("rlwrld_non_commercial", False), ("proprietary", False), ("unknown", False),
+        ("apache-2.0", True),
+        ("mit", True),
+        ("bsd", True),
+        ("nvidia_open_model", True),
+        ("permissive_research", False),
+        ("nvidia_non_commercial", False),
+        ("rlwrld_non_commercial", False),
+        ("proprietary", False),
+        ("unknown", False),
     ],
-)  # fmt: skip
+)
 def test_a_licence_that_forbids_commercial_use_bars_a_skill(license: str, commercial: bool) -> None:
     skill, eye = manifest("vla", license=license), manifest("vlm", license=license)
     gated, open_ = palette(skill, eye), palette(skill, eye, allow_noncommercial=True)
@@ -149,7 +167,9 @@ def test_a_robot_that_does_not_say_what_it_is_gets_what_is_made_for_any() -> Non
 
 @pytest.mark.parametrize(("kg", "fits"), [(0.2, True), (0.25, True), (0.5, False)])
 def test_capabilities_count_by_value(kg: float, fits: bool) -> None:
-    """The defect of the field: any arm that can lift at all was offered skills that lift fifty kilograms."""
+    """The defect of the field: any arm that can lift at all was offered skills that lift fifty
+    kilograms.
+    """
     found = palette(
         skill_for("any", name="lab/lift", needs=f"{{can_lift_kg: {kg}, has_vision: true}}"),
         body=ARM,

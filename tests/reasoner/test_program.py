@@ -61,13 +61,19 @@ def test_usage(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["--task", " "], "--task says nothing"),
-        (["--task", "x", "--result", "/proc/none/result.json"], "--result /proc/none/result.json cannot be written"),
-        (["--task", "x", "--planner", "openai"], "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set"),
+        (
+            ["--task", "x", "--result", "/proc/none/result.json"],
+            "--result /proc/none/result.json cannot be written",
+        ),
+        (
+            ["--task", "x", "--planner", "openai"],
+            "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set",
+        ),
         (["--task", "x", "--runner", "runner.sock"], "'runner.sock' is not an endpoint"),
         (["--task", "x", "--listen", "tcp://127.0.0.1:7"], "any user of the machine"),
         (["--say", "x", "--listen", "reasoner.sock"], "'reasoner.sock' is not an endpoint"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_from_the_start_is_said_at_the_start(
     tmp_path: Path, arguments: list[str], said: str
 ) -> None:
@@ -81,20 +87,40 @@ def test_what_is_wrong_from_the_start_is_said_at_the_start(
 
 def written(folder: Path) -> None:
     (folder / "rskill.yaml").write_text(
-        'name: acme/search\nversion: "0.1.0"\nlicense: mit\nrole: s2\nkind: playbook\nembodiment_tags: [any]\nchunk_size: 1\n'
+        'name: acme/search\nversion: "0.1.0"\nlicense: mit\nrole: s2\nkind:'
+        " playbook\nembodiment_tags: [any]\nchunk_size: 1\n"
         "latency_budget: {per_chunk_ms: 5000}\ndescription: x\nactions: [plan]\n"
-        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [execute_rskill], done_predicate: d, max_steps: 4}\n"
+        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [execute_rskill],"
+        " done_predicate: d, max_steps: 4}\n"
     )
     (folder / "P.md").write_text("Turn left first.")
 
 
 def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: Any) -> None:
-    """The runner knows one skill; the language model's server takes the connection and never answers."""
+    """The runner knows one skill; the language model's server takes the connection and never
+    answers.
+    """
     pytest.importorskip("httpx", reason="needs the reasoner extra")
-    manifest = {"name": "lab/go", "version": "1.0.0", "license": "mit", "kind": "ros_action", "embodiment_tags": ["any"], "chunk_size": 1,
-                "latency_budget": {"per_chunk_ms": 1}, "description": "drive", "actions": ["navigate"],
-                "actuators_required": [{"kind": "body_twist", "control_mode_semantics": {"mode": "absolute"}}],
-                "ros_integration": {"package": "p", "interface_type": "T", "interface_name": "/t", "default_goal_json": "{}"}}  # fmt: skip
+    manifest = {
+        "name": "lab/go",
+        "version": "1.0.0",
+        "license": "mit",
+        "kind": "ros_action",
+        "embodiment_tags": ["any"],
+        "chunk_size": 1,
+        "latency_budget": {"per_chunk_ms": 1},
+        "description": "drive",
+        "actions": ["navigate"],
+        "actuators_required": [
+            {"kind": "body_twist", "control_mode_semantics": {"mode": "absolute"}}
+        ],
+        "ros_integration": {
+            "package": "p",
+            "interface_type": "T",
+            "interface_name": "/t",
+            "default_goal_json": "{}",
+        },
+    }
 
     asked_for: list[bytes] = []
 
@@ -124,9 +150,24 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
         async with a_runner() as runner, asyncio.timeout(200):
             runner.skills = [manifest]
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "vram_arbiter.reasoner", "--task", "drive home", "--planner", "anthropic", "--detector", "none",
-                "--scene-vlm", "none", "--playbook", str(tmp_path / "rskill.yaml"), "--result", str(tmp_path / "result.json"), env=environ, stderr=asyncio.subprocess.PIPE,
-            )  # fmt: skip
+                sys.executable,
+                "-m",
+                "vram_arbiter.reasoner",
+                "--task",
+                "drive home",
+                "--planner",
+                "anthropic",
+                "--detector",
+                "none",
+                "--scene-vlm",
+                "none",
+                "--playbook",
+                str(tmp_path / "rskill.yaml"),
+                "--result",
+                str(tmp_path / "result.json"),
+                env=environ,
+                stderr=asyncio.subprocess.PIPE,
+            )
             try:
                 await asked.wait()
                 told = await asyncio.to_thread(reasoner, tmp_path, "--cancel", "lunch")
@@ -151,8 +192,9 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
 def test_a_task_that_is_no_text_and_a_result_that_has_no_place_are_said_before_anything_moves(
     tmp_path: Path,
 ) -> None:
-    """Regression: an undecodable byte, or a task of many pages, ended in a traceback; a result file that could not be written in one
-    behind the episode."""
+    """Regression: an undecodable byte, or a task of many pages, ended in a traceback; a result file
+    that could not be written in one behind the episode.
+    """
     for task in ("grab the \udcff cube", "grab the " + "very " * 2000 + "red cube"):
         ended = reasoner(tmp_path, "--task", task, *UNKNOWN_BODY)
         assert (ended.returncode, "Traceback" in ended.stderr) == (2, False), ended.stderr

@@ -26,7 +26,9 @@ NO = Outcome("answered", "No, the gripper is empty.")
 def play(
     world: Callable[[ToolCall, int], Outcome], palette: Palette = PALETTE
 ) -> tuple[Result, list[ToolCall]]:
-    """Run the script against a world that answers (call, how many calls of this tool came before)."""
+    """Run the script against a world that answers (call, how many calls of this tool came
+    before).
+    """
     calls: list[ToolCall] = []
 
     async def dispatch(call: ToolCall) -> Outcome:
@@ -50,8 +52,14 @@ def test_finds_drives_corrects_grabs_and_asks() -> None:
 
     result, calls = play(world)
     assert [call.tool for call in calls] == [
-        "query_scene", "locate_in_view", "execute_rskill", "locate_in_view", "execute_rskill", "execute_rskill", "query_scene",
-    ]  # fmt: skip
+        "query_scene",
+        "locate_in_view",
+        "execute_rskill",
+        "locate_in_view",
+        "execute_rskill",
+        "execute_rskill",
+        "query_scene",
+    ]
     drive, correct, grab = (call for call in calls if isinstance(call, ExecuteRskill))
     assert drive.rskill_id == correct.rskill_id == NAVIGATE.id
     assert drive.goal_params == {"target_point": {"x": 0.4, "y": 0.1, "z": 0.2}}
@@ -97,7 +105,9 @@ def test_looks_around_when_not_seen_and_gives_up_without_grabbing() -> None:
 
 
 def test_evicted_is_not_absent() -> None:
-    """The defect of the field: an evicted detector that answers as if the object were not there makes the robot turn away."""
+    """The defect of the field: an evicted detector that answers as if the object were not there
+    makes the robot turn away.
+    """
 
     def world(call: ToolCall, before: int) -> Outcome:
         match call:
@@ -222,7 +232,9 @@ def test_a_planner_that_repeats_itself_or_fails_ends_the_episode() -> None:
 
 
 def sees(base_pose: list[float] | None, *things: tuple[float, float, float]) -> Outcome:
-    """What `locate_in_view` says of things at (x, y) from the base, with their scores, best first."""
+    """What `locate_in_view` says of things at (x, y) from the base, with their scores, best
+    first.
+    """
     seen = [
         {"point_base_m": [x, y, 0.2], "score": score, "box": [0, 0, 9, 9]} for x, y, score in things
     ]
@@ -255,7 +267,9 @@ def drives(calls: list[ToolCall]) -> list[tuple[float, float]]:
 
 
 def test_a_look_from_near_at_another_thing_is_no_correction() -> None:
-    """Regression: from near a ball got a little more than the cube before which the robot stood, and it drove 23 cm away to the ball."""
+    """Regression: from near a ball got a little more than the cube before which the robot stood,
+    and it drove 23 cm away to the ball.
+    """
     far = sees([0.0, 0.0, 0.0], (0.7, -0.3, 0.62))
     near = sees([0.375, -0.3, 0.0], (0.285, 0.23, 0.63), (0.33, 0.01, 0.60))
     result, calls = play(looks_of(far, near))
@@ -307,7 +321,9 @@ def grabs_and_places(answer: Outcome) -> list[str]:
 
 
 def test_what_the_hand_holds_is_put_down_before_it_looks_again() -> None:
-    """Regression: it looked with the thing in the hand, found that, drove to where it seemed to stand and dropped it into the way of the next grasp."""
+    """Regression: it looked with the thing in the hand, found that, drove to where it seemed to
+    stand and dropped it into the way of the next grasp.
+    """
     holds = Outcome("answered", "No, the gripper holds the red ball.")
     assert grabs_and_places(holds) == [GRAB.id, PLACE.id, GRAB.id, PLACE.id, GRAB.id]
 

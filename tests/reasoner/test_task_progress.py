@@ -1,4 +1,6 @@
-"""`query_task_progress`: what it looks at, what each answer becomes, and that an opinion neither begins nor ends anything."""
+"""`query_task_progress`: what it looks at, what each answer becomes, and that an opinion neither
+begins nor ends anything.
+"""
 
 import asyncio
 import dataclasses
@@ -36,7 +38,7 @@ ASK = QueryTaskProgress()
 TASK = "grab the red cube"
 
 
-# -- the pictures -------------------------------------------------------------------------------------------------------
+# -- the pictures
 class Camera:
     """Gives what the test says, or raises it."""
 
@@ -118,7 +120,7 @@ def test_a_camera_that_shows_nothing_leaves_a_gap_and_is_looked_at_again() -> No
     play(story)
 
 
-# -- the tool -----------------------------------------------------------------------------------------------------------
+# -- the tool
 PALETTE = Palette((Skill("lab/grab", "vla", "", ("grasp",)),), can_judge=True)
 
 
@@ -204,12 +206,17 @@ def test_no_answer_is_never_no_progress(
 @pytest.mark.parametrize(
     "judgement",
     [
-        {}, {"progress": [], "success": [], "success_threshold": 0.5}, {"progress": [1.5], "success": [], "success_threshold": 0.5},
-        {"progress": [0.5], "success": [float("nan")], "success_threshold": 0.5}, {"progress": "half", "success": [], "success_threshold": 0.5},
-        {"progress": [0.1, 0.2, 0.9], "success": [], "success_threshold": 0.5}, {"progress": [0.5], "success": [0.9, 0.9], "success_threshold": 0.5},
-        {"progress": [0.5], "success": [0.9], "success_threshold": float("nan")}, {"progress": [0.5], "success": [0.9], "success_threshold": -1.0},
+        {},
+        {"progress": [], "success": [], "success_threshold": 0.5},
+        {"progress": [1.5], "success": [], "success_threshold": 0.5},
+        {"progress": [0.5], "success": [float("nan")], "success_threshold": 0.5},
+        {"progress": "half", "success": [], "success_threshold": 0.5},
+        {"progress": [0.1, 0.2, 0.9], "success": [], "success_threshold": 0.5},
+        {"progress": [0.5], "success": [0.9, 0.9], "success_threshold": 0.5},
+        {"progress": [0.5], "success": [0.9], "success_threshold": float("nan")},
+        {"progress": [0.5], "success": [0.9], "success_threshold": -1.0},
     ],
-)  # fmt: skip
+)
 def test_a_strange_answer_is_an_error(
     a_runner: Any, a_sidecar: Any, judgement: dict[str, Any]
 ) -> None:
@@ -254,7 +261,9 @@ def test_its_flag_is_its_own() -> None:
 
 
 class Believes:
-    """A planner that asks for progress, then grabs, then asks again and again, whatever it hears."""
+    """A planner that asks for progress, then grabs, then asks again and again, whatever it
+    hears.
+    """
 
     def __init__(self) -> None:
         self.calls: list[ToolCall] = [ASK, ExecuteRskill(rskill_id="lab/grab", prompt=TASK), ASK]
@@ -269,7 +278,9 @@ class Believes:
 
 
 def test_an_opinion_begins_and_ends_nothing(a_runner: Any, a_sidecar: Any) -> None:
-    """It says *done* before, while and after a goal runs: the goal runs to its own end, and the episode to the planner's."""
+    """It says *done* before, while and after a goal runs: the goal runs to its own end, and the
+    episode to the planner's.
+    """
 
     async def story() -> Any:
         async with (

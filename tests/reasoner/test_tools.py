@@ -1,4 +1,6 @@
-"""What each tool does on the wire, and which outcome each answer becomes: real sockets, real clients."""
+"""What each tool does on the wire, and which outcome each answer becomes: real sockets, real
+clients.
+"""
 
 import asyncio
 import contextlib
@@ -145,25 +147,47 @@ def test_patience_counts_motion_and_not_the_wait_for_the_card(a_runner: Any) -> 
 
 
 def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
-    """Regression: the time was up and the feedback there, both at once; the goal was called off for no progress."""
+    """Regression: the time was up and the feedback there, both at once; the goal was called off for
+    no progress.
+    """
 
     async def story() -> bool:
         loop, goal = asyncio.get_running_loop(), Goal(RunnerClient("ipc:///nobody"), "g")
 
         def feed(progress: float) -> None:
-            goal.fed({"push": "feedback", "goal_id": "g", "progress": progress, "state": "running", "tick_idx": 0, "detail": ""})  # fmt: skip
+            goal.fed(
+                {
+                    "push": "feedback",
+                    "goal_id": "g",
+                    "progress": progress,
+                    "state": "running",
+                    "tick_idx": 0,
+                    "detail": "",
+                }
+            )
 
         patient = ExecuteRskill(rskill_id="lab/grab", patience_s=5.0, progress_tolerance=0.05)
         watching = asyncio.create_task(_stands_still(goal, patient))
         feed(0.2)
         for _ in range(5):  # it has heard of it
             await asyncio.sleep(0)
-        loop.time = lambda now=loop.time: now() + 6.0  # type: ignore[method-assign,misc]  # nothing ran for six seconds
+        # type: ignore[method-assign,misc]  # nothing ran for six seconds
+        loop.time = lambda now=loop.time: now() + 6.0
         loop.call_soon_threadsafe(feed, 0.4)
         for _ in range(5):
             await asyncio.sleep(0)
         assert not watching.done()
-        goal.ended({"push": "result", "goal_id": "g", "status": "succeeded", "success": True, "code": "", "message": "", "data": {}})  # fmt: skip
+        goal.ended(
+            {
+                "push": "result",
+                "goal_id": "g",
+                "status": "succeeded",
+                "success": True,
+                "code": "",
+                "message": "",
+                "data": {},
+            }
+        )
         return await watching
 
     assert play(story) is False
@@ -173,7 +197,9 @@ def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
 async def looking(
     a_runner: Any, a_sidecar: Any
 ) -> AsyncIterator[tuple[Any, Any, DetectorClient, Tools]]:
-    """A runner with a camera, one sidecar that is both models, its detector's client, and the tools over all of them."""
+    """A runner with a camera, one sidecar that is both models, its detector's client, and the tools
+    over all of them.
+    """
     async with (
         a_runner() as runner,
         RunnerClient(runner.endpoint) as client,
@@ -187,10 +213,15 @@ async def looking(
 @pytest.mark.parametrize(
     ("error", "status"),
     [
-        (Evicted("it left"), "evicted"), (NotResident("not there"), "evicted"), (LeaseRevoking("leaving"), "evicted"),
-        (OutOfMemory("full"), "error"), (Loading("soon"), "error"), (ModelError("broken"), "error"), (WaitTimeout("busy"), "error"),
+        (Evicted("it left"), "evicted"),
+        (NotResident("not there"), "evicted"),
+        (LeaseRevoking("leaving"), "evicted"),
+        (OutOfMemory("full"), "error"),
+        (Loading("soon"), "error"),
+        (ModelError("broken"), "error"),
+        (WaitTimeout("busy"), "error"),
     ],
-)  # fmt: skip
+)
 def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
     a_runner: Any, a_sidecar: Any, error: VramError, status: str
 ) -> None:
@@ -329,7 +360,9 @@ def test_a_picture_that_waited_for_the_card_is_not_looked_at_and_a_new_one_is(
 def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Regression: a detector that waited two minutes for the card told where the thing had stood when it was asked."""
+    """Regression: a detector that waited two minutes for the card told where the thing had stood
+    when it was asked.
+    """
     now = [100.0]
     monkeypatch.setattr("vram_arbiter.reasoner.tools.monotonic", lambda: now[0])
 
@@ -370,7 +403,9 @@ def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: 
 
 
 def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_sidecar: Any) -> None:
-    """The defect of the field: a language model could activate the detector in the middle of a grab."""
+    """The defect of the field: a language model could activate the detector in the middle of a
+    grab.
+    """
 
     async def story() -> tuple[list[str], list[str], list[str]]:
         async with (
@@ -482,7 +517,9 @@ class Stopper:
 
 
 def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(a_runner: Any) -> None:
-    """Regression: the second cancel (a person's, behind the planner's) ended the wait for its end."""
+    """Regression: the second cancel (a person's, behind the planner's) ended the wait for its
+    end.
+    """
 
     async def story() -> tuple[str, list[str]]:
         async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
@@ -553,7 +590,9 @@ def test_a_model_whose_licence_is_barred_is_not_loaded_either(
 
 
 def test_a_skill_may_take_as_long_as_its_manifest_says() -> None:
-    """Regression: a goal without a deadline of its own was called off after ten minutes, also where its manifest allows an hour."""
+    """Regression: a goal without a deadline of its own was called off after ten minutes, also where
+    its manifest allows an hour.
+    """
     skills = (
         Skill("lab/dig", "vla", "", ("grasp",), longest_s=3600.0),
         Skill("lab/grab", "vla", "", ("grasp",)),
@@ -566,7 +605,9 @@ def test_a_skill_may_take_as_long_as_its_manifest_says() -> None:
 
 
 def test_nobody_looking_after_the_robot_ends_the_episode() -> None:
-    """Regression: an answer that nobody had thought of ended the watch without a word, and an emergency stop behind it was not noticed."""
+    """Regression: an answer that nobody had thought of ended the watch without a word, and an
+    emergency stop behind it was not noticed.
+    """
 
     class Strange:
         async def call(self, op: str, **_: Any) -> dict[str, Any]:

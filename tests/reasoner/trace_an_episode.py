@@ -1,6 +1,8 @@
-"""Prints the spans of one episode as JSON: a program of its own, because a process has one tracer provider for good.
+"""Prints the spans of one episode as JSON: a program of its own, because a process has one tracer
+provider for good.
 
-A call that is refused; a goal beside which an operator speaks, so that a second decision is asked for and thrown away by the goal's end; an end.
+A call that is refused; a goal beside which an operator speaks, so that a second decision is asked
+for and thrown away by the goal's end; an end.
 """
 
 import asyncio

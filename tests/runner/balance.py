@@ -1,4 +1,6 @@
-"""A scripted policy of the tests: pushes the cart to where the pole falls, for as many steps as wanted."""
+"""A scripted policy of the tests: pushes the cart to where the pole falls, for as many steps as
+wanted.
+"""
 
 from typing import Any
 

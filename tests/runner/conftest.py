@@ -1,4 +1,6 @@
-"""Small real parts for the runner's tests: a clock that moves only when told, a robot without physics."""
+"""Small real parts for the runner's tests: a clock that moves only when told, a robot without
+physics.
+"""
 
 import asyncio
 import math
@@ -40,7 +42,9 @@ KINEMATIC = RobotDescription(
 
 
 class KinematicEnv:
-    """Joints go where they are told at once, the base integrates its velocity, cameras see nothing but know their size."""
+    """Joints go where they are told at once, the base integrates its velocity, cameras see nothing
+    but know their size.
+    """
 
     def __init__(self) -> None:
         self.joints = dict.fromkeys(JOINTS, 0.0)
@@ -94,9 +98,12 @@ class KinematicEnv:
         return CameraModel(
             K=((30.0, 0.0, 16.0), (0.0, 30.0, 12.0), (0.0, 0.0, 1.0)),
             T_base_camera=(
-                (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.0), (0.0, 0.0, 0.0, 1.0),
+                (1.0, 0.0, 0.0, 0.0),
+                (0.0, -1.0, 0.0, 0.0),
+                (0.0, 0.0, -1.0, 1.0),
+                (0.0, 0.0, 0.0, 1.0),
             ),
-        )  # fmt: skip
+        )
 
     def close(self) -> None:
         self.closed += 1
@@ -125,7 +132,9 @@ def env() -> KinematicEnv:
 
 @pytest.fixture
 def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
-    """A SimRunner on the kinematic robot; no cameras unless asked for, so that no picture library is needed. `judge` looks at the robot."""
+    """A SimRunner on the kinematic robot; no cameras unless asked for, so that no picture library
+    is needed. `judge` looks at the robot.
+    """
 
     def make(**options: Any) -> SimRunner:
         options.setdefault("cameras", ())

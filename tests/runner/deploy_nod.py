@@ -1,4 +1,7 @@
-"""`vram-runner deploy` with skills of this process instead of sidecars: `python deploy_nod.py deploy --config …`."""
+"""`vram-runner deploy` with skills of this process instead of sidecars:
+
+`python deploy_nod.py deploy --config …`.
+"""
 
 import asyncio
 import logging

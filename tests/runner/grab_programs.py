@@ -1,4 +1,6 @@
-"""The grab policy's sidecar and a runner as real processes beside a real daemon, and a scenario that is played against them."""
+"""The grab policy's sidecar and a runner as real processes beside a real daemon, and a scenario
+that is played against them.
+"""
 
 import asyncio
 import subprocess
@@ -16,7 +18,8 @@ SKILLS = ROOT / "configs/rskills"
 SKILL = SKILLS / "so101-grab/rskill.yaml"
 GRAB = "vram-arbiter/so101-grab"
 SCENARIO_S = 280.0
-GOAL_S = 200.0  # of a goal, with its policy's first load: on a busy machine importing torch alone takes a minute
+# of a goal, with its policy's first load: on a busy machine importing torch alone takes a minute
+GOAL_S = 200.0
 
 
 def need_checkpoint() -> None:

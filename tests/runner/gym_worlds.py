@@ -1,5 +1,6 @@
-"""Small gymnasium environments of the tests: a point that is driven to a mark, with named joints, a camera and a word on success; and a hand, whose
-actions and observations are of all kinds."""
+"""Small gymnasium environments of the tests: a point that is driven to a mark, with named joints, a
+camera and a word on success; and a hand, whose actions and observations are of all kinds.
+"""
 
 from typing import Any
 
@@ -9,7 +10,9 @@ from gymnasium import spaces
 
 
 class Point(gymnasium.Env[Any, Any]):
-    """Two joints take their targets at once; success is both within 0.05 of the mark, and ends the episode. The mark follows from the seed."""
+    """Two joints take their targets at once; success is both within 0.05 of the mark, and ends the
+    episode. The mark follows from the seed.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 — gymnasium's own way
 
@@ -72,8 +75,11 @@ gymnasium.register("test/Point-v0", Point, max_episode_steps=20)
 
 
 class Hand(gymnasium.Env[Any, Any]):
-    """An arm of two numbers, a gripper of three positions, two lamps, and a gait and a gear. Success is the arm within 0.3 of the target and the
-    gripper closed (1). It tells what it was given in the next observation."""
+    """An arm of two numbers, a gripper of three positions, two lamps, and a gait and a gear.
+
+    Success is the arm within 0.3 of the target and the gripper closed (1). It tells what it was
+    given in the next observation.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 — gymnasium's own way
 

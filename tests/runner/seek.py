@@ -1,4 +1,6 @@
-"""A scripted policy of the tests: drives the point to its mark; with a seed of 13 it has a bug, with one of 14 it gives up."""
+"""A scripted policy of the tests: drives the point to its mark; with a seed of 13 it has a bug,
+with one of 14 it gives up.
+"""
 
 from typing import Any
 

@@ -1,4 +1,6 @@
-"""Real small parts of a robot for tests: a camera that shows what the test feeds it, a twin whose bus can fail, a skill that nods."""
+"""Real small parts of a robot for tests: a camera that shows what the test feeds it, a twin whose
+bus can fail, a skill that nods.
+"""
 
 import asyncio
 from collections.abc import Callable
@@ -16,7 +18,10 @@ from vram_arbiter.schemas.world import Action, FrameEncoding, JointState, Sensor
 
 
 class FedCamera(SlotReader):
-    """Its source is the test: `show` is the camera's thread. With `always` it shows a new picture whenever it is looked at."""
+    """Its source is the test:
+
+    `show` is the camera's thread. With `always` it shows a new picture whenever it is looked at.
+    """
 
     def __init__(
         self, sensor_id: str, clock: Clock, max_age_ms: float = 100.0, *, always: bool = True
@@ -103,7 +108,9 @@ class Twin(KinematicTwin):
 
 
 class Nod(SkillBase):
-    """Moves the wrist a little with every step (`all_joints`: tells the others to stay); ends after `steps`. `on_step` is asked first, with the world that the skill sees."""
+    """Moves the wrist a little with every step (`all_joints`: tells the others to stay); ends after
+    `steps`. `on_step` is asked first, with the world that the skill sees.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,6 @@
-"""Prints the spans of one tick on a robot as JSON: a program of its own, because a process has one tracer provider for good."""
+"""Prints the spans of one tick on a robot as JSON: a program of its own, because a process has one
+tracer provider for good.
+"""
 
 import json
 import sys

@@ -1,4 +1,6 @@
-"""Prints what a robot's ticks record when one in four is to be traced: a program of its own, a process has one tracer provider for good."""
+"""Prints what a robot's ticks record when one in four is to be traced: a program of its own, a
+process has one tracer provider for good.
+"""
 
 import json
 import sys

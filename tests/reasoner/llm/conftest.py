@@ -1,4 +1,6 @@
-"""A local server that speaks HTTP: scripted answers, and the misbehaviour of real ones: silence, drips, floods, hang-ups."""
+"""A local server that speaks HTTP: scripted answers, and the misbehavior of real ones: silence,
+drips, floods, hang-ups.
+"""
 
 import json
 import threading

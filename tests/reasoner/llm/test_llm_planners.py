@@ -1,4 +1,6 @@
-"""Both language-model planners against a local server that speaks their wire, or nonsense: real HTTP."""
+"""Both language-model planners against a local server that speaks their wire, or nonsense: real
+HTTP.
+"""
 
 import asyncio
 import json
@@ -64,7 +66,9 @@ class OpenAi:
 
     @staticmethod
     def told(body: dict[str, Any]) -> list[str]:
-        """Everything that is said to the model after the instructions, in order: words, calls, results."""
+        """Everything that is said to the model after the instructions, in order: words, calls,
+        results.
+        """
         found = []
         for message in body["messages"]:
             if message["role"] == "system":
@@ -147,8 +151,12 @@ def test_a_call_is_decoded_and_only_what_may_be_used_is_offered(
     assert stand_in.paths == [api.path]
     offered = api.offered(stand_in.asked[0])
     assert set(offered) == {
-        "execute_rskill__lab__navigate", "execute_rskill__lab__grab", "locate_in_view", "query_scene", "finish",
-    }  # fmt: skip
+        "execute_rskill__lab__navigate",
+        "execute_rskill__lab__grab",
+        "locate_in_view",
+        "query_scene",
+        "finish",
+    }
     navigate = offered["execute_rskill__lab__navigate"]["properties"]
     assert navigate["goal_params"] == SCHEMA
     assert "rskill_id" not in navigate
@@ -181,9 +189,12 @@ def test_parameters_that_do_not_fit_the_skill_are_told_back(
 def test_the_episode_is_told_as_a_conversation(api: Any, stand_in: Any, decide: Any) -> None:
     stand_in.json(api.says(("finish", '{"success": true, "reason": "done"}')))
     steps = [
-        Step(ExecuteRskill(rskill_id="lab/navigate", goal_params_json='{"turn_rad":1}'), Outcome("failed", "blocked", data={"at": 1})),
+        Step(
+            ExecuteRskill(rskill_id="lab/navigate", goal_params_json='{"turn_rad":1}'),
+            Outcome("failed", "blocked", data={"at": 1}),
+        ),
         Step(LocateInView(query="cube"), Outcome("evicted", "it left", "evicted")),
-    ]  # fmt: skip
+    ]
     episode = Episode("grab it", steps, [Note("operator", "mind the cat", 1)])
     assert decide(episode) == Finish(True, "done")
     task, call, result, note, look, seen = api.told(stand_in.asked[0])
@@ -289,7 +300,7 @@ def test_a_perception_model_called_as_a_skill_goes_to_the_loop_to_be_refused(
     assert refusal.code == "not_permitted"
 
 
-# -- servers that misbehave ----------------------------------------------------------------------------------------
+# -- servers that misbehave
 @pytest.mark.parametrize("how", ["hangs", "drips"])
 def test_a_server_that_never_ends_its_answer_is_given_up(
     stand_in: Any, decide: Any, how: str
@@ -337,13 +348,24 @@ def test_a_wrong_request_is_not_repeated_and_the_key_stays_secret(
 @pytest.mark.parametrize(
     "body",
     [
-        b"", b"<html>", b"[]", b"3", b"{}", b'{"choices": []}', b'{"choices": [{"message": 3}]}', b"[" * 100_000,
-        b'{"choices": [{"message": {"tool_calls": [3]}}]}', b'{"choices": [{"message": {"tool_calls": {"a": 1}}}]}',
-        b'{"type": "error", "error": {}}', b'{"type": "message", "role": "user", "content": []}',
+        b"",
+        b"<html>",
+        b"[]",
+        b"3",
+        b"{}",
+        b'{"choices": []}',
+        b'{"choices": [{"message": 3}]}',
+        b"[" * 100_000,
+        b'{"choices": [{"message": {"tool_calls": [3]}}]}',
+        b'{"choices": [{"message": {"tool_calls": {"a": 1}}}]}',
+        b'{"type": "error", "error": {}}',
+        b'{"type": "message", "role": "user", "content": []}',
         b'{"type": "message", "role": "assistant", "content": [{"type": "tool_use"}]}',
-        b'{"type": "message", "role": "assistant", "content": "words"}', b"\xff\xfe", b'{"choices": NaN}',
+        b'{"type": "message", "role": "assistant", "content": "words"}',
+        b"\xff\xfe",
+        b'{"choices": NaN}',
     ],
-)  # fmt: skip
+)
 def test_garbage_is_a_typed_error(stand_in: Any, decide: Any, body: bytes) -> None:
     stand_in.body(body)
     with pytest.raises(LlmError):
@@ -361,7 +383,7 @@ def test_nobody_there_is_a_typed_error(api: Any) -> None:
         asyncio.run(ask())
 
 
-# -- what only one of the two does ------------------------------------------------------------------------------------
+# -- what only one of the two does
 def test_the_messages_api_gets_what_it_demands(stand_in: Any) -> None:
     stand_in.json(Anthropic.says(("locate_in_view", "{}")))
     stand_in.json(Anthropic.says(("locate_in_view", '{"query": "cube"}')))
@@ -411,7 +433,9 @@ def test_the_environment_is_checked() -> None:
 def test_a_password_in_the_address_stands_in_no_message(
     api: Any, stand_in: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Regression: each request was a line of httpx's in the log of a reasoner at its usual level, with the whole address."""
+    """Regression: each request was a line of httpx's in the log of a reasoner at its usual level,
+    with the whole address.
+    """
     address = stand_in.url.replace("http://", "http://me:secret@") + api.base
     caplog.set_level(logging.DEBUG)
 
@@ -430,7 +454,9 @@ def test_a_password_in_the_address_stands_in_no_message(
 
 
 def test_a_key_that_no_header_carries_is_refused_and_not_shown() -> None:
-    """Regression: a key with an odd byte stood in the log, or ended the reasoner with a traceback; so did an address that is none."""
+    """Regression: a key with an odd byte stood in the log, or ended the reasoner with a traceback;
+    so did an address that is none.
+    """
     complete = {"VRAM_REASONER_LLM_BASE_URL": "http://x/v1/", "VRAM_REASONER_LLM_MODEL": "m"}
     for key in ("secret\nkey", "sécret", "secret\x00", "secret\udcff", "my secret\rkey"):
         with pytest.raises(ConfigError, match="VRAM_REASONER_LLM_API_KEY") as caught:

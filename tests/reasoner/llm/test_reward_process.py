@@ -1,4 +1,6 @@
-"""The reward kind end to end: a real arbiter, the shipped model in its sidecar, the simulator's runner, and a reasoner whose model asks for progress."""
+"""The reward kind end to end: a real arbiter, the shipped model in its sidecar, the simulator's
+runner, and a reasoner whose model asks for progress.
+"""
 
 import asyncio
 import json
@@ -71,9 +73,19 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             f"fake:{arbiter_daemon.card}",
         )
         think = (
-            "vram_arbiter.reasoner", "--task", "grab the red cube", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
-            "--reward", "--result", str(result),
-        )  # fmt: skip
+            "vram_arbiter.reasoner",
+            "--task",
+            "grab the red cube",
+            "--planner",
+            "openai",
+            "--detector",
+            "none",
+            "--scene-vlm",
+            "none",
+            "--reward",
+            "--result",
+            str(result),
+        )
         async with (
             program(environ, *serve) as sidecar,
             program(
@@ -114,7 +126,8 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                     0
                 ] < 0.5
 
-                # somebody needs the card: it leaves, and says *evicted* to whoever still speaks of the old lease
+                # somebody needs the card: it leaves, and says *evicted* to whoever still speaks of
+                # the old lease
                 granted = await asyncio.to_thread(
                     arbiter.acquire, "vla", 6 * GB, wait_timeout_s=60.0
                 )
@@ -136,8 +149,10 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
     asyncio.run(bounded())
     steps = json.loads(result.read_text())["steps"]
     assert [(step["call"]["tool"], step["status"], step["code"]) for step in steps] == [
-        ("query_task_progress", "answered", ""), ("query_task_progress", "error", "bad_request"), ("execute_rskill", "refused", "not_permitted"),
-    ]  # fmt: skip
+        ("query_task_progress", "answered", ""),
+        ("query_task_progress", "error", "bad_request"),
+        ("execute_rskill", "refused", "not_permitted"),
+    ]
     assert "it judges through query_task_progress and moves nothing" in steps[2]["text"]
     offered = {tool["function"]["name"] for tool in stand_in.asked[0]["tools"]}
     assert "query_task_progress" in offered

@@ -1,4 +1,6 @@
-"""The reasoner's process with the simulator's runner and a language model's server that hangs: nothing waits for the model."""
+"""The reasoner's process with the simulator's runner and a language model's server that hangs:
+nothing waits for the model.
+"""
 
 import asyncio
 import json
@@ -71,9 +73,18 @@ class Programs:
 
     def reasoner(self, planner: str) -> Any:
         return self.run(
-            "vram_arbiter.reasoner", "--task", "turn round", "--planner", planner, "--detector", "none", "--scene-vlm", "none",
-            "--result", str(self.folder / "result.json"),
-        )  # fmt: skip
+            "vram_arbiter.reasoner",
+            "--task",
+            "turn round",
+            "--planner",
+            planner,
+            "--detector",
+            "none",
+            "--scene-vlm",
+            "none",
+            "--result",
+            str(self.folder / "result.json"),
+        )
 
     def result(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads((self.folder / "result.json").read_text())
@@ -106,7 +117,8 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             async def goal() -> Any:
                 return (await client.state())["goal"]
 
-            # an operator speaks while a goal runs; the model is asked and hangs; the goal's result passes it by
+            # an operator speaks while a goal runs; the model is asked and hangs; the goal's result
+            # passes it by
             stand_in.json(openai(TURN, goal_params={"turn_rad": 6.2}))
             stand_in.hangs()
             stand_in.json(openai("finish", success=True, reason="turned"))

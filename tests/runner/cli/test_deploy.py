@@ -1,4 +1,7 @@
-"""`vram-runner deploy` as a process: MuJoCo's twin, a camera that plays a file, goals over a socket, signals, the emergency stop."""
+"""`vram-runner deploy` as a process:
+
+MuJoCo's twin, a camera that plays a file, goals over a socket, signals, the emergency stop.
+"""
 
 import asyncio
 import contextlib
@@ -58,7 +61,8 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
     ) -> subprocess.Popen[str]:
         config = tmp_path / "robot.yaml"
         config.write_text(
-            "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter: so101_mujoco}\n"
+            "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter:"
+            " so101_mujoco}\n"
             f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}, fps: {fps}}}}}\n"
             + more
         )
@@ -115,7 +119,10 @@ async def all_fresh(client: RunnerClient) -> None:
 
 
 async def stopped(client: RunnerClient, reason: str) -> None:
-    """Until the motors have been told. A loop that stands still for a second is told of as one that hangs, and obeys when it goes on."""
+    """Until the motors have been told.
+
+    A loop that stands still for a second is told of as one that hangs, and obeys when it goes on.
+    """
     await client.call("ping")  # it may have to come up first
     while True:
         try:

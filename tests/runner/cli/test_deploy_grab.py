@@ -1,4 +1,7 @@
-"""The grab policy on a deployed robot: its own sidecar, a real arbiter, MuJoCo's twin, two cameras. The goal is a use of the lease."""
+"""The grab policy on a deployed robot: its own sidecar, a real arbiter, MuJoCo's twin, two cameras.
+
+The goal is a use of the lease.
+"""
 
 import asyncio
 import random
@@ -29,7 +32,9 @@ def deployed(arbiter: ArbiterProcess) -> GrabPrograms:
 
 
 def _videos(folder: Path) -> dict[str, Path]:
-    """A second of what both cameras see when the base stands before the object, arm at rest: the policy knows such pictures."""
+    """A second of what both cameras see when the base stands before the object, arm at rest: the
+    policy knows such pictures.
+    """
     import cv2
 
     from vram_arbiter.runner.sim.env import SimEnv

@@ -1,4 +1,6 @@
-"""A `ros_action` in deploy that this runner plays itself: the real program on the kinematic twin, through its gate."""
+"""A `ros_action` in deploy that this runner plays itself: the real program on the kinematic twin,
+through its gate.
+"""
 
 import asyncio
 import os
@@ -37,9 +39,17 @@ def test_the_arm_goes_where_the_trajectory_says(tmp_path: Path) -> None:
     )
     environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"}
     command = [
-        sys.executable, "-m", "vram_arbiter.runner", "deploy", "--config", str(config), "--no-arbiter",
-        "--skills", str(ROOT / "configs/rskills/so101-move"), str(ROOT / "configs/rskills/so101-navigate"),
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "vram_arbiter.runner",
+        "deploy",
+        "--config",
+        str(config),
+        "--no-arbiter",
+        "--skills",
+        str(ROOT / "configs/rskills/so101-move"),
+        str(ROOT / "configs/rskills/so101-navigate"),
+    ]
     process = subprocess.Popen(command, cwd=ROOT, env=environ, stderr=subprocess.PIPE, text=True)
 
     async def story() -> None:

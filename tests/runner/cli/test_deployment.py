@@ -1,4 +1,6 @@
-"""`vram-runner deploy` before anything is opened: every mistake by line and field, licences, what fits the robot, the dry run."""
+"""`vram-runner deploy` before anything is opened: every mistake by line and field, licenses, what
+fits the robot, the dry run.
+"""
 
 import re
 from collections.abc import Callable
@@ -34,7 +36,9 @@ def test_the_shipped_twin_passes(capsys: pytest.CaptureFixture[str]) -> None:
 def dry_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> DryRun:
-    """Exit code, stdout and stderr of a dry run of this text; fails when it leaves anything behind."""
+    """Exit code, stdout and stderr of a dry run of this text; fails when it leaves anything
+    behind.
+    """
     runtime = tmp_path / "runtime"
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(runtime))
 
@@ -78,8 +82,8 @@ def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> N
     assert any(line.startswith("unused    thumbnail_hz") for line in lines)
     assert "body      so101_follower; has_vision False, has_gripper True" in lines
     assert (
-        "skill     vram-arbiter/so101-navigate is not offered: it is made for mobile_base; this robot is so101_follower"
-        in lines
+        "skill     vram-arbiter/so101-navigate is not offered: it is made for mobile_base; this"
+        " robot is so101_follower" in lines
     )
     assert lines[-1] == "dry run: nothing was opened"
 
@@ -99,7 +103,9 @@ def test_the_mark_of_a_stop_that_nobody_looked_at_refuses_the_start_for_good(
 def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_robot_moves(
     dry_run: DryRun, tmp_path: Path
 ) -> None:
-    """Regression: only the deployment file's own block was searched for limits that cannot be kept."""
+    """Regression: only the deployment file's own block was searched for limits that cannot be
+    kept.
+    """
     folder = tmp_path / "skills" / "careful"
     folder.mkdir(parents=True)
     text = (
@@ -127,7 +133,10 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
             r"robot\.yaml:3: hal\.adapter: unknown adapter 'so100'",
         ),
         (
-            "robot_id: bench\nhal:\n  adapter: so101_kinematic\n  params:\n    start_pose_rad: {elbow: 1}\n",
+            (
+                "robot_id: bench\nhal:\n  adapter: so101_kinematic\n  params:\n    start_pose_rad:"
+                " {elbow: 1}\n"
+            ),
             r"robot\.yaml:5: hal\.params\.start_pose_rad\.elbow: no such joint",
         ),
         (
@@ -137,7 +146,10 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
         (TWIN + "save_dir: /\n", r"robot\.yaml:3: save_dir: / is not empty, and no dataset"),
         (
             TWIN + "save_dir: /tmp/none\nrate_hz: 12.5\n",
-            r"robot\.yaml:3: save_dir: a recording needs a whole number of ticks a second, not 12\.5",
+            (
+                r"robot\.yaml:3: save_dir: a recording needs a whole number of ticks a second, not"
+                r" 12\.5"
+            ),
         ),
         (
             TWIN + "sensors:\n  - {sensor_id: joint_state, backend_params: {device: 0}}\n",
@@ -150,7 +162,11 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
         ),
         (
             TWIN + "task: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
-            r"robot\.yaml:5: vla\.id: vram-arbiter/so101-navigate is not offered here: it is made for mobile_base; this robot is so101_follower",
+            (
+                r"robot\.yaml:5: vla\.id: vram-arbiter/so101-navigate is not offered here: it is"
+                r" made"
+                r" for mobile_base; this robot is so101_follower"
+            ),
         ),
         (
             TWIN
@@ -239,11 +255,17 @@ def test_the_fields_own_files_are_read_as_the_field_means_them(dry_run: DryRun) 
         assert "task      grab: vram-arbiter/so101-grab ''" in out
         assert "unused    embodiment_tags: 'our_lab_3', which no manifest can name" in out
     wrong = {
-        vla.replace("id: act", "id: smolvla").replace("{uri}", "rskills/so101-grab"): "vla.id: smolvla is not what",
-        task.replace("{dtype}", "int4").replace("{uri}", "rskills/so101-grab"): "vla.quantization: dtype int4 is not",
+        vla.replace("id: act", "id: smolvla").replace(
+            "{uri}", "rskills/so101-grab"
+        ): "vla.id: smolvla is not what",
+        task.replace("{dtype}", "int4").replace(
+            "{uri}", "rskills/so101-grab"
+        ): "vla.quantization: dtype int4 is not",
         vla.replace("{uri}", "rskills/none"): "vla.id: no skill 'act' is installed",
-        vla.replace("{uri}", "rskills/so101-grab").replace("dtype:", "dtyp:"): "vla.quantization.dtyp: unknown key; did you mean dtype?",
-    }  # fmt: skip
+        vla.replace("{uri}", "rskills/so101-grab").replace(
+            "dtype:", "dtyp:"
+        ): "vla.quantization.dtyp: unknown key; did you mean dtype?",
+    }
     for block, told in wrong.items():
         code, _, err = dry_run(text + block, skills=GRAB)
         assert (code, told in err) == (2, True), err
@@ -306,7 +328,9 @@ def test_serving_goals_offers_only_what_is_licensed_and_fits(
 def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(
     dry_run: DryRun, tmp_path: Path
 ) -> None:
-    """By tag, and by the value of a capability; the file may say more of the robot than its adapter does."""
+    """By tag, and by the value of a capability; the file may say more of the robot than its adapter
+    does.
+    """
     folder = tmp_path / "skills"
     folder.mkdir()
     needs = "capabilities_required: {can_lift_kg: 0.5, has_vision: true}\nkind: "
@@ -332,17 +356,42 @@ def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(
 
 
 VALUES = [
-    "[]", "{}", "{a: 1}", "null", "true", "-1", "0", ".nan", ".inf", "1e400", "''", "x", "[null]", "2020-01-01", "'\\0'", "[x, x]",
-]  # fmt: skip
+    "[]",
+    "{}",
+    "{a: 1}",
+    "null",
+    "true",
+    "-1",
+    "0",
+    ".nan",
+    ".inf",
+    "1e400",
+    "''",
+    "x",
+    "[null]",
+    "2020-01-01",
+    "'\\0'",
+    "[x, x]",
+]
 PLACES = [
-    "hal: {adapter: %s}", "hal: {adapter: so101_mujoco, transport: %s}", "hal: {adapter: so101_kinematic, params: {x: %s}}",
-    "hal: {adapter: 'lerobot:so101_follower', transport: {port: %s, id: x}}", "sensors: [{sensor_id: a, backend_params: %s}]",
-    "sensors: [{sensor_id: a, backend_params: {device: %s, width: 640}}]", "sensors: [{sensor_id: a, backend_params: {device: 0, fps: %s}}]",
-    "sensors: [{sensor_id: a, backend: gstreamer, backend_params: {pipeline: %s}}]", "sensors: [{sensor_id: a, backend: %s}]",
-    "sensors: [{sensor_id: a, backend: ros2_image, backend_params: {topic: %s}}]", "safety: {max_joint_speed_factor: %s}",
-    "safety: {workspace_box_min_xyz: %s, workspace_box_max_xyz: [1, 1, 1]}", "save_dir: %s", "rate_hz: %s", "capabilities: {a: %s}",
-    "vla: {id: act, weights_uri: %s, quantization: {dtype: %s}}\ntask: {id: t}", "task: {id: %s, max_steps: %s}\nvla: {id: x}",
-]  # fmt: skip
+    "hal: {adapter: %s}",
+    "hal: {adapter: so101_mujoco, transport: %s}",
+    "hal: {adapter: so101_kinematic, params: {x: %s}}",
+    "hal: {adapter: 'lerobot:so101_follower', transport: {port: %s, id: x}}",
+    "sensors: [{sensor_id: a, backend_params: %s}]",
+    "sensors: [{sensor_id: a, backend_params: {device: %s, width: 640}}]",
+    "sensors: [{sensor_id: a, backend_params: {device: 0, fps: %s}}]",
+    "sensors: [{sensor_id: a, backend: gstreamer, backend_params: {pipeline: %s}}]",
+    "sensors: [{sensor_id: a, backend: %s}]",
+    "sensors: [{sensor_id: a, backend: ros2_image, backend_params: {topic: %s}}]",
+    "safety: {max_joint_speed_factor: %s}",
+    "safety: {workspace_box_min_xyz: %s, workspace_box_max_xyz: [1, 1, 1]}",
+    "save_dir: %s",
+    "rate_hz: %s",
+    "capabilities: {a: %s}",
+    "vla: {id: act, weights_uri: %s, quantization: {dtype: %s}}\ntask: {id: t}",
+    "task: {id: %s, max_steps: %s}\nvla: {id: x}",
+]
 
 
 @settings(

@@ -1,4 +1,6 @@
-"""Frames of the simulator through a (simulated) card: a real arbiter, sidecar and runner; under a lease, and the arm keeps still."""
+"""Frames of the simulator through a (simulated) card: a real arbiter, sidecar and runner; under a
+lease, and the arm keeps still.
+"""
 
 import asyncio
 import subprocess
@@ -25,8 +27,14 @@ def programs(
 ) -> Iterator[list["subprocess.Popen[bytes]"]]:
     environ = arbiter_daemon.environ | {"OMP_NUM_THREADS": "1"}
     sidecar = [
-        "vram_arbiter.sidecars", "--name", "passthrough", "--rskill", str(RSKILL), "--device", f"fake:{arbiter_daemon.card}"
-    ]  # fmt: skip
+        "vram_arbiter.sidecars",
+        "--name",
+        "passthrough",
+        "--rskill",
+        str(RSKILL),
+        "--device",
+        f"fake:{arbiter_daemon.card}",
+    ]
     runner = ["vram_arbiter.runner", "sim", "--seed", "1", "--skills", str(RSKILL)]
     log = tmp_path / "programs.log"
     with log.open("ab") as sink:

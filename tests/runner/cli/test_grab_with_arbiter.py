@@ -1,6 +1,8 @@
-"""A grab goal through the real parts: daemon, policy sidecar with the shipped checkpoint, runner with the simulator.
+"""A grab goal through the real parts: daemon, policy sidecar with the shipped checkpoint, runner
+with the simulator.
 
-One use spans the goal: a rival that needs the whole card waits for the goal's end, not for a moment between two chunks.
+One use spans the goal: a rival that needs the whole card waits for the goal's end, not for a moment
+between two chunks.
 """
 
 import asyncio

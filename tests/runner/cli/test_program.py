@@ -1,4 +1,6 @@
-"""`python -m vram_arbiter.runner sim` as a process: ready means ready, signals end it in order, mistakes are said."""
+"""`python -m vram_arbiter.runner sim` as a process: ready means ready, signals end it in order,
+mistakes are said.
+"""
 
 import fcntl
 import os

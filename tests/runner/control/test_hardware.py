@@ -1,4 +1,6 @@
-"""The loop on a robot: what reaches the motors, what is withheld and why, and how it begins and ends. Time moves only when told."""
+"""The loop on a robot: what reaches the motors, what is withheld and why, and how it begins and
+ends. Time moves only when told.
+"""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -385,7 +387,9 @@ def test_everything_is_stopped_whatever_one_of_them_raises(
 
 
 class Distant(FedCamera):
-    """A camera over a network: each picture arrives later than one slice of the wait for the first is long."""
+    """A camera over a network: each picture arrives later than one slice of the wait for the first
+    is long.
+    """
 
     def deliver(self, feed: Feed, frame: SensorFrame) -> None:
         taken_ns = frame.stamp_monotonic_ns - round(1.5 * FIRST_DATA_SLICE_S * 1e9)

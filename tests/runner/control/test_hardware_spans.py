@@ -1,4 +1,6 @@
-"""A tick on a robot in its goal's trace: one span a stage, in order, and what was withheld as events."""
+"""A tick on a robot in its goal's trace: one span a stage, in order, and what was withheld as
+events.
+"""
 
 import json
 import subprocess
@@ -43,7 +45,9 @@ def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(navigate_manifest: Pa
 
 
 def test_a_share_of_a_goals_ticks_is_traced_from_its_first_tick_on(navigate_manifest: Path) -> None:
-    """The first action is always in the trace, then one tick in four; what is left out names the goal. Without a goal nothing is traced."""
+    """The first action is always in the trace, then one tick in four; what is left out names the
+    goal. Without a goal nothing is traced.
+    """
     said = said_by("trace_some_ticks.py", navigate_manifest)
     assert said["idle_spans"] == 0
     assert said["ticks"][:2] == [None, None]

@@ -1,4 +1,6 @@
-"""The control loop on a clock that moves only when told: rates, deadline policies, resynchronisation, figures."""
+"""The control loop on a clock that moves only when told: rates, deadline policies,
+resynchronization, figures.
+"""
 
 import json
 import threading

@@ -1,4 +1,6 @@
-"""The control loop goes before other programs where the machine allows it, and works where it does not."""
+"""The control loop goes before other programs where the machine allows it, and works where it does
+not.
+"""
 
 import asyncio
 import os
@@ -105,7 +107,9 @@ def test_both_threads_are_asked_for_unless_the_loop_is_unpaced(
 
 
 def test_a_loop_that_hardly_sleeps_does_not_go_first() -> None:
-    """Its wait's last millisecond is spent awake: at 1000 Hz all of it, and a real-time thread would keep its core to itself."""
+    """Its wait's last millisecond is spent awake: at 1000 Hz all of it, and a real-time thread
+    would keep its core to itself.
+    """
     slept: list[float] = []
     precise_sleep(1 / 1000, sleep=slept.append)
     assert slept == []

@@ -1,4 +1,6 @@
-"""The control thread: work between ticks, failures that reach who asked, an end that leaves nobody waiting."""
+"""The control thread: work between ticks, failures that reach who asked, an end that leaves nobody
+waiting.
+"""
 
 import asyncio
 import threading

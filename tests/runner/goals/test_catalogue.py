@@ -1,4 +1,6 @@
-"""What a goal may execute: every kind runs or is refused as its kind says, and only on the robot it was made for."""
+"""What a goal may execute: every kind runs or is refused as its kind says, and only on the robot it
+was made for.
+"""
 
 import pytest
 
@@ -46,11 +48,18 @@ REASON = {
 def manifest(kind: Kind, tag: str = "any") -> RSkillManifest:
     return RSkillManifest.model_validate(
         {
-            "name": f"lab/{kind}", "version": "1.0.0", "kind": kind, "license": "mit", "embodiment_tags": [tag], "chunk_size": 1,
-            "latency_budget": {"per_chunk_ms": 1}, "description": "d", "actions": ["plan" if kind is Kind.PLAYBOOK else "grasp"],
+            "name": f"lab/{kind}",
+            "version": "1.0.0",
+            "kind": kind,
+            "license": "mit",
+            "embodiment_tags": [tag],
+            "chunk_size": 1,
+            "latency_budget": {"per_chunk_ms": 1},
+            "description": "d",
+            "actions": ["plan" if kind is Kind.PLAYBOOK else "grasp"],
             **BY_KIND[kind],
         }
-    )  # fmt: skip
+    )
 
 
 def make(manifest: RSkillManifest) -> Skill:

@@ -1,4 +1,6 @@
-"""Frames over the goal socket: the right camera, encoding and stamp, and a refusal instead of an old picture."""
+"""Frames over the goal socket: the right camera, encoding and stamp, and a refusal instead of an
+old picture.
+"""
 
 import asyncio
 import threading

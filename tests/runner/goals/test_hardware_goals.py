@@ -1,4 +1,7 @@
-"""Goals on a robot over a real socket: the emergency stop, cancels, pictures. Control thread and server as `vram-runner deploy` has them."""
+"""Goals on a robot over a real socket: the emergency stop, cancels, pictures.
+
+Control thread and server as `vram-runner deploy` has them.
+"""
 
 import asyncio
 import subprocess
@@ -63,7 +66,10 @@ class Bench:
 
 @pytest.fixture
 def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
-    """`estop_s`: short only where the control loop hangs. A machine that stands still for a second is no loop that hangs."""
+    """`estop_s`: short only where the control loop hangs.
+
+    A machine that stands still for a second is no loop that hangs.
+    """
 
     @asynccontextmanager
     async def serving(estop_s: float = 60.0) -> AsyncIterator[tuple[Bench, RunnerClient]]:
@@ -122,7 +128,10 @@ def play(
 
 
 async def diagnosed(client: RunnerClient, as_what: str) -> None:
-    """Until the joints and the camera are called this. What is fresh is stale for some ticks wherever the machine stood still."""
+    """Until the joints and the camera are called this.
+
+    What is fresh is stale for some ticks wherever the machine stood still.
+    """
     while (await client.state())["world"]["diagnostics"] != {
         "front": as_what,
         "joint_state": as_what,
@@ -132,7 +141,9 @@ async def diagnosed(client: RunnerClient, as_what: str) -> None:
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command waits as long as the tests do: whether the motors are told is what counts here, not how soon."""
+    """The command waits as long as the tests do: whether the motors are told is what counts here,
+    not how soon.
+    """
     monkeypatch.setattr("vram_arbiter.runner.cli.estop.ANSWER_S", 60.0)
 
 
@@ -325,8 +336,10 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
     code = (
         "import sys; from vram_arbiter.runner.__main__ import main; "
-        "code = main(['estop', '--endpoint', sys.argv[1]]); "
-        "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim', 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
+        "code = main(['estop', '--endpoint', sys.argv[1]]); "(
+            "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim',"
+            " 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
+        )
     )
     argv = [sys.executable, "-c", code, endpoint]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True)

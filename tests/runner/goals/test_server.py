@@ -1,4 +1,6 @@
-"""The goal server over real sockets with the real client: one goal at a time, exactly one result, whatever happens."""
+"""The goal server over real sockets with the real client: one goal at a time, exactly one result,
+whatever happens.
+"""
 
 import asyncio
 import threading
@@ -540,7 +542,9 @@ def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
 def test_a_goal_runs_when_it_has_the_arm_and_not_before(
     bench: Any, endpoint: str, run_async: Run
 ) -> None:
-    """Regression: until the control thread took it up, a goal was fed back with the progress of the goal before: ended, all of it done."""
+    """Regression: until the control thread took it up, a goal was fed back with the progress of the
+    goal before: ended, all of it done.
+    """
 
     async def body(b: Bench, client: RunnerClient) -> None:
         first = await client.send_goal(RSKILL, prompt="end")

@@ -1,4 +1,6 @@
-"""The folder after a crash: exactly what the last commit had, or a refusal; never half an episode."""
+"""The folder after a crash: exactly what the last commit had, or a refusal; never half an
+episode.
+"""
 
 import os
 import subprocess
@@ -121,7 +123,7 @@ def test_a_broken_commit_is_said(dataset: Path) -> None:
         commit.repair(dataset)
 
 
-# -- whose folder --------------------------------------------------------------------------------------------------------
+# -- whose folder
 def test_only_ones_own_or_an_empty_folder_is_recorded_into(dataset: Path, tmp_path: Path) -> None:
     commit.check_folder(dataset)
     commit.check_folder(tmp_path / "new" / "deep")

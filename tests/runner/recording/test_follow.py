@@ -1,4 +1,6 @@
-"""Whoever follows a runner's goals hears of every tick in which a skill was asked, in order, and of the end after the last one."""
+"""Whoever follows a runner's goals hears of every tick in which a skill was asked, in order, and of
+the end after the last one.
+"""
 
 from collections.abc import Callable
 from typing import Any

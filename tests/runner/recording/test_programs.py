@@ -1,4 +1,6 @@
-"""`vram-runner sim --record` and `deploy` with `save_dir`, as processes: goals become episodes, also the one that the runner was killed in."""
+"""`vram-runner sim --record` and `deploy` with `save_dir`, as processes: goals become episodes,
+also the one that the runner was killed in.
+"""
 
 import asyncio
 import json
@@ -107,7 +109,8 @@ def test_a_deployment_records_into_its_save_dir(start: Start, tmp_path: Path) ->
     root = tmp_path / "set"
     config = tmp_path / "robot.yaml"
     config.write_text(
-        "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter: so101_kinematic}\n"
+        "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter:"
+        " so101_kinematic}\n"
         f"task: {{id: nod, instruction: nod twice, max_steps: 400}}\nvla: {{id: {RSKILL}}}\nsave_dir: {root}\n"
     )
     process = start(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")

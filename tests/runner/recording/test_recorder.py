@@ -1,4 +1,6 @@
-"""Recording for real: a writer's process, lerobot's files on disk, lerobot's own reader; and what is left when something is killed."""
+"""Recording for real: a writer's process, lerobot's files on disk, lerobot's own reader; and what
+is left when something is killed.
+"""
 
 import io
 import json
@@ -78,7 +80,9 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """Two goals in a first run, whose writer is killed in a third; then a second run with goals that fit and goals that do not."""
+    """Two goals in a first run, whose writer is killed in a third; then a second run with goals
+    that fit and goals that do not.
+    """
     root = tmp_path_factory.mktemp("recorded") / "set"
     first = recorder(root)
     first.start()
@@ -212,7 +216,7 @@ def test_a_damaged_dataset_is_said_and_not_touched(recorded: Recorded, tmp_path:
         read_frame(root, 0)
 
 
-# -- replay ----------------------------------------------------------------------------------------------------------
+# -- replay
 def test_a_frame_leads_back_to_its_tick_and_trace(recorded: Recorded) -> None:
     found = read_frame(recorded.root, 8)
     assert (found.episode, found.frame_in_episode, found.task) == (1, 2, "put it down")
@@ -345,7 +349,7 @@ def test_a_world_of_nothing_but_pictures_has_no_state() -> None:
     assert "observation.state" not in features_of(row)
 
 
-# -- what cannot be recorded -----------------------------------------------------------------------------------------------
+# -- what cannot be recorded
 @pytest.mark.parametrize("rate_hz", [0.0, 12.5, 0.5])
 def test_only_whole_rates_are_recorded(rate_hz: float) -> None:
     with pytest.raises(ConfigError, match="a whole number of ticks a second"):
@@ -353,7 +357,9 @@ def test_only_whole_rates_are_recorded(rate_hz: float) -> None:
 
 
 def test_a_slow_writer_costs_ticks_never_time(tmp_path: Path) -> None:
-    """Nobody takes from the queue: what does not fit is dropped and counted, and the control thread goes on."""
+    """Nobody takes from the queue: what does not fit is dropped and counted, and the control thread
+    goes on.
+    """
     made = recorder(tmp_path / "set")
     for index in range(QUEUE_TICKS + 5):
         made.tick(tick(index))

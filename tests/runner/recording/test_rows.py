@@ -1,4 +1,6 @@
-"""A tick as a row: every value is one that was measured or commanded, and what lacks one is no row."""
+"""A tick as a row: every value is one that was measured or commanded, and what lacks one is no
+row.
+"""
 
 import socket
 import sys
@@ -107,7 +109,7 @@ def test_an_unsampled_trace_keeps_its_ids() -> None:
     assert trace_of(f"00-{TRACE}-{span_of(0)}-00") == (TRACE, span_of(0), False)
 
 
-# -- the socket ------------------------------------------------------------------------------------------------------
+# -- the socket
 def test_messages_come_over_whole_and_in_order() -> None:
     ours, theirs = socket.socketpair()
     large = bytes(range(256)) * 4096  # more than a socket takes at once

@@ -1,4 +1,6 @@
-"""`vram-runner sim --record` in any world: what it showed and what it was sent, by name, frame by frame; by policies and for goals."""
+"""`vram-runner sim --record` in any world: what it showed and what it was sent, by name, frame by
+frame; by policies and for goals.
+"""
 
 import json
 import os
@@ -57,7 +59,9 @@ def record(
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Three episodes of random actions in a world whose actions and observations have parts of all kinds; and the run's result."""
+    """Three episodes of random actions in a world whose actions and observations have parts of all
+    kinds; and the run's result.
+    """
     folder = tmp_path_factory.mktemp("worlds")
     flags = ("--env", f"gym:{HAND}", "--policy", "random", "--episodes", "3", "--seed", str(SEED))
     ran = record(folder / "set", folder, *flags, **DEAF)

@@ -1,4 +1,6 @@
-"""Ticks as a runner hands them to its recorder, made by hand: two joints, cameras of one colour, a trace."""
+"""Ticks as a runner hands them to its recorder, made by hand: two joints, cameras of one color, a
+trace.
+"""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,5 @@
-"""Six STS3215 servos on the other end of a pseudo-terminal: the bytes of Feetech's protocol, and registers that behave.
+"""Six STS3215 servos on the other end of a pseudo-terminal: the bytes of Feetech's protocol, and
+registers that behave.
 
 A servo goes where it is told while its torque is on. `cut` pulls the cable.
 """
@@ -63,7 +64,7 @@ class ServoBus:
         """From now on nobody answers."""
         self._silent.set()
 
-    # -- the wire ----------------------------------------------------------------------------------------------------------
+    # -- the wire
     def _serve(self) -> None:
         heard = b""
         while True:

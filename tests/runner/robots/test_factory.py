@@ -1,4 +1,6 @@
-"""The `hal` section of a deployment file → an adapter: every mistake names its field, nothing is opened."""
+"""The `hal` section of a deployment file → an adapter: every mistake names its field, nothing is
+opened.
+"""
 
 from typing import Any
 

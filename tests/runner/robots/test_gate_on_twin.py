@@ -1,4 +1,6 @@
-"""The gate on the arm with physics: what passes can be followed, what is kept away from stays away."""
+"""The gate on the arm with physics: what passes can be followed, what is kept away from stays
+away.
+"""
 
 import math
 from typing import Any
@@ -36,7 +38,9 @@ def gate_of(hal: Hal, **envelope: Any) -> RobotGate:
 def drive(
     hal: Hal, gate: RobotGate, clock: Any, ticks: int, wanted: dict[str, float]
 ) -> tuple[list[tuple[str, ...]], list[dict[str, float]]]:
-    """A policy that always wants the same pose, a little nearer each tick, as a chunk of steps would have it."""
+    """A policy that always wants the same pose, a little nearer each tick, as a chunk of steps
+    would have it.
+    """
     said, states = [], []
     names = hal.description.joint_names
     step = dict(zip(names, hal.read_state().position, strict=True))
@@ -46,8 +50,10 @@ def drive(
         for name, value in wanted.items():
             step[name] += min(max(value - step[name], -0.08), 0.08)
         action = Action(
-            control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(step[n] for n in names),), joint_names=names
-        )  # fmt: skip
+            control_mode=ControlMode.JOINT_POSITION,
+            joint_targets=(tuple(step[n] for n in names),),
+            joint_names=names,
+        )
         allowed, problems = gate.check(
             action, WorldState(stamp_ns=clock.now_ns(), joint_state=state)
         )
@@ -124,8 +130,10 @@ def test_a_table_is_not_pressed_into(hal: Hal, clock: Any) -> None:
         step["shoulder_lift"] = min(step["shoulder_lift"] + 0.03, 1.4)
         step["elbow_flex"] = max(step["elbow_flex"] - 0.02, 0.2)
         action = Action(
-            control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(step[n] for n in names),), joint_names=names
-        )  # fmt: skip
+            control_mode=ControlMode.JOINT_POSITION,
+            joint_targets=(tuple(step[n] for n in names),),
+            joint_names=names,
+        )
         allowed, _ = gate.check(action, WorldState(stamp_ns=clock.now_ns(), joint_state=state))
         if allowed is not None:
             hal.send_action(allowed)

@@ -1,4 +1,7 @@
-"""Any lerobot robot in rad: units, what it really did, faults, stop. The robot is one that lerobot itself finds and makes."""
+"""Any lerobot robot in rad: units, what it really did, faults, stop.
+
+The robot is one that lerobot itself finds and makes.
+"""
 
 import math
 import termios
@@ -125,13 +128,21 @@ def test_the_files_word_goes_before_lerobots(make: Make) -> None:
         ({"bus": False}, {"joints": JOINTS}, "hal.params.joints.motor_1", "unit"),
         (
             {"bus": False},
-            {"joints": {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()}, "estop": "torque_off"},
+            {
+                "joints": {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()},
+                "estop": "torque_off",
+            },
             "hal.params.estop",
             "use hold",
         ),
-        ({}, {"joints": JOINTS, "rest_pose_rad": {"elbow": 0}}, "hal.params.rest_pose_rad.elbow", "no such"),
+        (
+            {},
+            {"joints": JOINTS, "rest_pose_rad": {"elbow": 0}},
+            "hal.params.rest_pose_rad.elbow",
+            "no such",
+        ),
     ],
-)  # fmt: skip
+)
 def test_each_mistake_names_its_field(
     make: Make, transport: Any, params: Any, field: str, said: str
 ) -> None:

@@ -1,4 +1,6 @@
-"""lerobot's own SO-101 driver, byte for byte over a serial port, behind our adapter: the arm as it is shipped, but for the motors."""
+"""lerobot's own SO-101 driver, byte for byte over a serial port, behind our adapter: the arm as it
+is shipped, but for the motors.
+"""
 
 import json
 import math
@@ -26,7 +28,9 @@ COUNTS_PER_RAD = 4095 / (2 * math.pi)  # as lerobot counts
 
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServoBus]:
-    """The driver waits for a servo as long as it may answer; the 50 ms of real ones say nothing on a busy machine."""
+    """The driver waits for a servo as long as it may answer; the 50 ms of real ones say nothing on
+    a busy machine.
+    """
     pytest.importorskip(
         "scservo_sdk", reason="Feetech's driver is missing: pip install 'vram-arbiter[so101]'"
     )
@@ -107,7 +111,9 @@ def test_targets_reach_the_servos(hal: Hal, bus: ServoBus) -> None:
 def test_a_range_that_the_file_narrows_limits_a_joint_and_does_not_stretch_it(
     bus: ServoBus, calibrated: Path
 ) -> None:
-    """lerobot counts the gripper in percent of its calibrated range: 0.8 rad are 0.8 rad, however far it may open here."""
+    """lerobot counts the gripper in percent of its calibrated range: 0.8 rad are 0.8 rad, however
+    far it may open here.
+    """
     hal = make_hal(config(bus, calibrated, joints={"gripper": {"upper_rad": 0.8}}))
     hal.connect()
     assert hal.description.joints[5].upper_rad == 0.8

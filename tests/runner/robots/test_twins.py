@@ -1,4 +1,6 @@
-"""The twins: joints move by the clock, at most as fast as the servos; stop means stop, and stays."""
+"""The twins: joints move by the clock, at most as fast as the servos; stop means stop, and
+stays.
+"""
 
 import importlib.util
 from collections.abc import Callable
@@ -148,13 +150,16 @@ def test_an_emergency_stop_latches(adapter: str, make: MakeHal, clock: Any) -> N
     "action",
     [
         Action(
-            control_mode=ControlMode.JOINT_POSITION, horizon=2, joint_targets=((0.0,), (1.0,)), joint_names=("gripper",)
+            control_mode=ControlMode.JOINT_POSITION,
+            horizon=2,
+            joint_targets=((0.0,), (1.0,)),
+            joint_names=("gripper",),
         ),
         Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.1, 0.0, 0.0, 0.0, 0.0, 0.0),)),
         to(sixth_finger=1.0),
         Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0, 1.0),)),
     ],
-)  # fmt: skip
+)
 def test_what_no_gate_lets_through_is_not_sent(
     adapter: str, action: Action, make: MakeHal, clock: Any
 ) -> None:

@@ -187,7 +187,8 @@ def test_a_process_with_one_connection_keeps_it_beside_one_with_many(
     crowd = (
         "import socket, sys; peers = []\n"
         "for _ in range(int(sys.argv[2])):\n"
-        "    peers.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)); peers[-1].connect(sys.argv[1])\n"
+        "    peers.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET));"
+        " peers[-1].connect(sys.argv[1])\n"
         "print(len(peers), flush=True); sys.stdin.read()"
     )
     argv = [sys.executable, "-c", crowd, path_of(endpoint), str(4 * CONNECTIONS_PER_UID)]

@@ -1,4 +1,6 @@
-"""A robot's gate: speed, workspace, zones, effort, freshness; envelopes only tighten; nothing switches it off."""
+"""A robot's gate: speed, workspace, zones, effort, freshness; envelopes only tighten; nothing
+switches it off.
+"""
 
 import dataclasses
 import math
@@ -34,7 +36,9 @@ STEP = 3.0 / 30  # rad a tick at 30 Hz
 
 
 class Planar:
-    """An arm that turns about the vertical and reaches out: the tool at `reach` metres in the direction of `turn`."""
+    """An arm that turns about the vertical and reaches out: the tool at `reach` meters in the
+    direction of `turn`.
+    """
 
     gripper_lever_m = 0.1
 
@@ -80,7 +84,7 @@ def row_of(verdict: tuple[Action | None, tuple[str, ...]]) -> tuple[float, ...]:
 HERE = (0.0, 1.0, 0.5)
 
 
-# -- what passes and what does not ---------------------------------------------------------------------------------------
+# -- what passes and what does not
 @pytest.mark.parametrize("names", [NAMES, None])
 def test_what_is_inside_passes_unchanged(names: tuple[str, ...] | None) -> None:
     action = to(0.05, 1.05, 0.6, joint_names=names)
@@ -135,7 +139,7 @@ def test_a_target_that_is_no_number_is_withheld_however_it_was_built(
     assert "expected a number of rad" in problems[0]
 
 
-# -- freshness ---------------------------------------------------------------------------------------------------------
+# -- freshness
 @pytest.mark.parametrize("state", ["stale", "error"])
 @pytest.mark.parametrize(
     ("component", "needs", "stops"),
@@ -172,7 +176,7 @@ def test_a_joint_that_is_not_measured_stops() -> None:
     assert "grip" in problems[0]
 
 
-# -- speed ---------------------------------------------------------------------------------------------------------------
+# -- speed
 def test_a_step_a_little_too_long_is_shortened_and_said() -> None:
     verdict = gate().check(to(STEP + 0.9 * CLAMP_TOLERANCE_RAD, 1.0, 0.5), at(*HERE))
     assert row_of(verdict) == pytest.approx((STEP, 1.0, 0.5))
@@ -210,7 +214,9 @@ def test_steps_are_measured_from_the_last_target_while_it_is_young() -> None:
 
 @pytest.mark.parametrize("early", [0.0, 0.03, 0.3, 0.5, 0.9])
 def test_ticks_that_come_late_and_then_early_make_no_joint_faster(early: float) -> None:
-    """A late tick may go farther, and the next one, which is in time, less far by as much: else a jittering loop moves faster than the limit."""
+    """A late tick may go farther, and the next one, which is in time, less far by as much: else a
+    jittering loop moves faster than the limit.
+    """
     motors = {"turn": -2.9}
     checked = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
     ms, begun = 1000.0, -2.9
@@ -236,7 +242,9 @@ def test_a_withheld_step_is_no_reference_for_the_next_one() -> None:
 
 
 def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
-    """Everything passes, nothing is applied (the deadline policy drops it), then one action is: it is one step long, not ten."""
+    """Everything passes, nothing is applied (the deadline policy drops it), then one action is: it
+    is one step long, not ten.
+    """
     motors = {"turn": 0.0}
     checked = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
     wanted, seen = 0.0, at(*HERE)
@@ -255,7 +263,10 @@ def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
 
 
 def test_a_joint_that_does_not_follow_is_let_go_and_not_pushed_again() -> None:
-    """Blocked at 0, by somebody perhaps. Whoever only stops sending leaves the motor pulling towards the last target."""
+    """Blocked at 0, by somebody perhaps.
+
+    Whoever only stops sending leaves the motor pulling towards the last target.
+    """
     motors = dict(zip(NAMES, HERE, strict=True))
     checked = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
     farthest, turn, withheld = 0.0, 0.0, 0
@@ -293,7 +304,7 @@ def test_the_tool_keeps_its_speed() -> None:
     assert allowed is None  # a quarter of what was asked is not what was asked
 
 
-# -- places ----------------------------------------------------------------------------------------------------------------
+# -- places
 BOX = {"workspace_box_min_xyz": (0.2, -0.5, -0.1), "workspace_box_max_xyz": (1.05, 0.5, 0.5)}
 
 
@@ -339,9 +350,11 @@ def test_a_thin_zone_is_not_stepped_over() -> None:
     assert gate(no_go_zones=(wall,)).check(to(0.0, 1.1, 0.5), at(*HERE))[0] is None
 
 
-# -- effort ----------------------------------------------------------------------------------------------------------------
+# -- effort
 def test_a_grip_eases_to_its_limit_and_keeps_it() -> None:
-    """A servo with 10 N·m/rad against a thing of 0.5 rad: 10 N at 0.1 m are 1 N·m, so 0.1 rad of squeeze."""
+    """A servo with 10 N·m/rad against a thing of 0.5 rad: 10 N at 0.1 m are 1 N·m, so 0.1 rad of
+    squeeze.
+    """
     checked = gate(max_force_n=10.0, max_torque_nm=100.0)
     target, efforts = 0.5, []
     for tick in range(40):
@@ -376,7 +389,7 @@ def test_a_collision_stops() -> None:
     assert "wrist: 50.0 N" in problems[0]
 
 
-# -- envelopes ---------------------------------------------------------------------------------------------------------------
+# -- envelopes
 def test_envelopes_only_tighten() -> None:
     wide = SafetyEnvelope(
         max_joint_speed_factor=9.0,
@@ -547,7 +560,7 @@ def test_whatever_is_asked_for_what_passes_is_inside(
         here = row
 
 
-# -- a base that drives -------------------------------------------------------------------------------------------------
+# -- a base that drives
 def driving(**envelope: Any) -> RobotGate:
     robot = dataclasses.replace(ROBOT, base=MobileBase(max_speed_m_s=0.5, max_turn_rad_s=1.2))
     asked = SafetyEnvelope(**envelope) if envelope else None

@@ -17,7 +17,9 @@ PACKET = 188  # bytes of one packet of an MPEG transport stream
 
 @pytest.fixture
 def make_video(tmp_path: Path) -> Callable[..., Path]:
-    """`make_video(greys, fps=25.0, name="v.avi", fourcc="MJPG")`: a video of 64 × 48 whose pictures are plain grey."""
+    """`make_video(greys, fps=25.0, name="v.avi", fourcc="MJPG")`: a video of 64 × 48 whose pictures
+    are plain gray.
+    """
 
     def make(
         greys: list[int], fps: float = 25.0, name: str = "video.avi", fourcc: str = "MJPG"
@@ -37,7 +39,9 @@ def make_video(tmp_path: Path) -> Callable[..., Path]:
 
 
 class Server(ABC):
-    """Accepts connections one after another on loopback and gives each to `serve`, until it is closed."""
+    """Accepts connections one after another on loopback and gives each to `serve`, until it is
+    closed.
+    """
 
     def __init__(self) -> None:
         self._socket = socket.create_server(("127.0.0.1", 0))
@@ -92,10 +96,12 @@ class Server(ABC):
 
 
 class RtspServer(Server):
-    """A small RTSP server: one transport stream, in RTP packets inside the RTSP connection (what a firewall-friendly camera does).
+    """A small RTSP server: one transport stream, in RTP packets inside the RTSP connection (what a
+    firewall-friendly camera does).
 
-    Each play sends the whole stream again, at once, then waits until it is cut or the client leaves. With `hold`, it keeps back the second half
-    until that is set: a network that stands still, then delivers in a rush.
+    Each play sends the whole stream again, at once, then waits until it is cut or the client
+    leaves. With `hold`, it keeps back the second half until that is set: a network that stands
+    still, then delivers in a rush.
     """
 
     def __init__(self, stream: bytes) -> None:

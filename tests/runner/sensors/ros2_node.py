@@ -1,10 +1,12 @@
-"""A ROS-like node in a process of its own, with types and codec of Cyclone DDS alone: nothing of the product is imported here.
+"""A ROS-like node in a process of its own, with types and codec of Cyclone DDS alone: nothing of
+the product is imported here.
 
-    python ros2_node.py publish|subscribe TOPIC image|compressed reliable|best_effort
+python ros2_node.py publish|subscribe TOPIC image|compressed reliable|best_effort
 
-`publish` reads one picture a line as JSON and writes it: fields of the message, `stamp` in seconds and nanoseconds, `data` in base64. Before the first
-it waits for a reader, unless asked not to (`"wait": false`). `subscribe` prints the pictures that come in, as such lines. Both say `ready` first
-and end with their standard input.
+`publish` reads one picture a line as JSON and writes it: fields of the message, `stamp` in seconds
+and nanoseconds, `data` in base64. Before the first it waits for a reader, unless asked not to
+(`"wait": false`). `subscribe` prints the pictures that come in, as such lines. Both say `ready`
+first and end with their standard input.
 """
 
 import base64

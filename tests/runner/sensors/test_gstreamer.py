@@ -1,4 +1,6 @@
-"""Cameras through the real GStreamer: what arrives, when it was taken, and how a source's end is told."""
+"""Cameras through the real GStreamer: what arrives, when it was taken, and how a source's end is
+told.
+"""
 
 import contextlib
 import itertools
@@ -104,7 +106,7 @@ class Recorder:
         self.closed = True
 
 
-# -- pictures -----------------------------------------------------------------------------------------------------
+# -- pictures
 @pytest.mark.parametrize(
     ("encoding", "pixel"),
     [("bgr8", b"\x00\x00\xff"), ("rgb8", b"\xff\x00\x00")],
@@ -113,7 +115,9 @@ class Recorder:
 def test_colours_and_rows(
     reader: Callable[..., SlotReader], encoding: str, pixel: bytes, width: int
 ) -> None:
-    """GStreamer pads rows to four bytes; a width of 101 came out slanted wherever that was forgotten."""
+    """GStreamer pads rows to four bytes; a width of 101 came out slanted wherever that was
+    forgotten.
+    """
     frame = frame_of(reader(source="test", pattern="red", width=width, height=7, encoding=encoding))
     assert (frame.width, frame.height, frame.channels, frame.encoding) == (width, 7, 3, encoding)
     assert frame.data == pixel * (width * 7)
@@ -161,10 +165,15 @@ def test_every_frame_goes_to_the_tee_too(reader: Callable[..., SlotReader]) -> N
     assert tee.closed
 
 
-# -- time -----------------------------------------------------------------------------------------------------------
+# -- time
 def test_a_picture_is_as_old_as_its_stamp_says(reader: Callable[..., SlotReader]) -> None:
-    """The reference took the moment of arrival for the moment of the picture: what hung in a decoder counted as fresh."""
-    slow = "videotestsrc is-live=true ! video/x-raw,width=16,height=16,framerate=30/1 ! identity sleep-time=200000"
+    """The reference took the moment of arrival for the moment of the picture: what hung in a
+    decoder counted as fresh.
+    """
+    slow = (
+        "videotestsrc is-live=true ! video/x-raw,width=16,height=16,framerate=30/1"
+        " ! identity sleep-time=200000"
+    )
     source = reader(pipeline=slow, max_age_ms=150.0)
     frame = frame_of(source)
     assert CLOCK.now_ns() - frame.stamp_monotonic_ns >= 200_000_000
@@ -206,7 +215,9 @@ def run_of(clock: SystemClock, pipeline: str) -> _Run:
 
 
 def test_a_thread_that_is_stopped_makes_no_picture_younger() -> None:
-    """Regression: the age was taken first and the time later; a stop in between was missing in the age."""
+    """Regression: the age was taken first and the time later; a stop in between was missing in the
+    age.
+    """
     clock = Halted()
     run = run_of(clock, "videotestsrc is-live=true ! video/x-raw,width=16,height=16")
     run.open()
@@ -222,7 +233,7 @@ def test_a_thread_that_is_stopped_makes_no_picture_younger() -> None:
         run.close()
 
 
-# -- files ----------------------------------------------------------------------------------------------------------
+# -- files
 def brightness(frame: SensorFrame) -> int:
     return (frame.data or b"\0")[len(frame.data or b"\0") // 2]
 
@@ -276,10 +287,11 @@ def test_a_file_that_is_no_video(reader: Callable[..., SlotReader], tmp_path: Pa
     assert caught.value.details["ended"]
 
 
-# -- ends -----------------------------------------------------------------------------------------------------------
+# -- ends
 def test_an_error_on_the_bus_ends_the_reader(reader: Callable[..., SlotReader]) -> None:
     source = reader(
-        pipeline="videotestsrc is-live=true ! video/x-raw,width=16,height=16 ! identity name=cable error-after=4"
+        pipeline="videotestsrc is-live=true ! video/x-raw,width=16,height=16 ! identity name=cable"
+        " error-after=4"
     )
     assert end_of(source).startswith("cable: ")
     assert source.slot.ended is not None
@@ -325,7 +337,7 @@ def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(
     assert frame_of(source).data == b"\x00\x00\xff" * 256
 
 
-# -- refused before anything is opened ------------------------------------------------------------------------------
+# -- refused before anything is opened
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
@@ -366,7 +378,7 @@ def test_no_password_in_messages() -> None:
     )
 
 
-# -- beside the other heavy packages ----------------------------------------------------------------------------------
+# -- beside the other heavy packages
 TAKE_ONE = """
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.gstreamer import make
@@ -402,8 +414,9 @@ def test_it_lives_with_opencv_and_torch(order: str) -> None:
     "before", ["import zmq, msgpack, yaml", "import zmq, numpy", "import zmq, cv2, numpy"]
 )
 def test_what_throws_in_cpp_lives_on_after_it(before: str) -> None:
-    """Regression: with GStreamer's libunwind in the process, the next C++ exception (matplotlib throws and catches one as it is imported)
-    ended it with a segmentation fault."""
+    """Regression: with GStreamer's libunwind in the process, the next C++ exception (matplotlib
+    throws and catches one as it is imported) ended it with a segmentation fault.
+    """
     pytest.importorskip("matplotlib")
     draws = "import matplotlib; matplotlib.use('Agg'); import matplotlib.pyplot as p; p.figure().savefig('/dev/null', format='png')"
     fresh(f"{before}\n{TAKE_ONE}\n{draws}")

@@ -1,4 +1,6 @@
-"""Where GStreamer's binding is not installed, a camera that wants it is refused with what to install."""
+"""Where GStreamer's binding is not installed, a camera that wants it is refused with what to
+install.
+"""
 
 import subprocess
 import sys

@@ -1,4 +1,6 @@
-"""Streams of network cameras through the real rtspsrc: a server on loopback sends GStreamer's own RTP packets."""
+"""Streams of network cameras through the real rtspsrc: a server on loopback sends GStreamer's own
+RTP packets.
+"""
 
 import contextlib
 import socket
@@ -28,7 +30,9 @@ FORMATS = {"h264": "96 H264/90000", "mjpeg": "26 JPEG/90000"}
 
 
 class NetworkCamera:
-    """A small RTSP server on loopback: one client after another, RTP inside the connection, an unending stream by `source`."""
+    """A small RTSP server on loopback: one client after another, RTP inside the connection, an
+    unending stream by `source`.
+    """
 
     def __init__(self, codec: str, source: str, password: str = "") -> None:
         self.codec, self.source, self.password = codec, source, password

@@ -1,4 +1,6 @@
-"""A camera through GStreamer whose frames are published on a ROS 2 topic as well, read back there over DDS on loopback."""
+"""A camera through GStreamer whose frames are published on a ROS 2 topic as well, read back there
+over DDS on loopback.
+"""
 
 import uuid
 

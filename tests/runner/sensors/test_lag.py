@@ -1,4 +1,6 @@
-"""The lag of pictures by the source's own stamps: queues, rushes, drifting clocks, sources without stamps."""
+"""The lag of pictures by the source's own stamps: queues, rushes, drifting clocks, sources without
+stamps.
+"""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,7 +28,9 @@ def test_a_rush_after_a_standstill_is_old() -> None:
 
 
 def test_what_a_camera_sends_first_in_a_rush_is_not_taken_for_the_usual() -> None:
-    """A recorder begins with what it has since its last key frame; from then on pictures come as they are taken."""
+    """A recorder begins with what it has since its last key frame; from then on pictures come as
+    they are taken.
+    """
     lag = LagMeter()
     for index in range(50):
         lag.taken_ns(S, index * 40.0)

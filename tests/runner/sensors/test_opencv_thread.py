@@ -1,4 +1,6 @@
-"""The OpenCV reader on real sources: video files, a stream over RTSP that breaks off and comes back, a device that is not there."""
+"""The OpenCV reader on real sources: video files, a stream over RTSP that breaks off and comes
+back, a device that is not there.
+"""
 
 import os
 import threading

@@ -1,4 +1,6 @@
-"""The text of a camera's pipeline, for each platform, and what is refused before anything is opened."""
+"""The text of a camera's pipeline, for each platform, and what is refused before anything is
+opened.
+"""
 
 from typing import Any
 
@@ -21,7 +23,8 @@ def refusal(**params: Any) -> str:
 
 def test_a_raw_camera() -> None:
     assert text(source="v4l2", device="/dev/video2", width=640, height=480, fps=30) == (
-        'v4l2src device="/dev/video2" ! video/x-raw,width=640,height=480,framerate=30/1 ! videoconvert ! appsink name=sink'
+        'v4l2src device="/dev/video2" ! video/x-raw,width=640,height=480,framerate=30/1 !'
+        " videoconvert ! appsink name=sink"
     )
 
 
@@ -35,7 +38,10 @@ H264_FILE = {"source": "file", "path": "/data/run.mp4"}
         (Platform.NVIDIA_DESKTOP, "qtdemux ! h264parse ! nvh264dec ! videoconvert"),
         (
             Platform.TEGRA,
-            "qtdemux ! h264parse ! nvv4l2decoder ! nvvidconv ! video/x-raw,format=BGRx ! videoconvert",
+            (
+                "qtdemux ! h264parse ! nvv4l2decoder ! nvvidconv ! video/x-raw,format=BGRx !"
+                " videoconvert"
+            ),
         ),
     ],
 )
@@ -65,7 +71,9 @@ ALL_SOURCES: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("params", ALL_SOURCES)
 def test_nothing_of_nvidias_closed_sdk_on_a_pc(params: dict[str, Any]) -> None:
-    """The reference's first builder put nvvideoconvert and NVMM there; only DeepStream and Tegra have them."""
+    """The reference's first builder put nvvideoconvert and NVMM there; only DeepStream and Tegra
+    have them.
+    """
     made = text(Platform.NVIDIA_DESKTOP, **params)
     assert "nvvideoconvert" not in made
     assert "nvvidconv" not in made
@@ -86,7 +94,8 @@ def test_the_platform_can_be_chosen() -> None:
 def test_a_stream_loses_pictures_instead_of_falling_behind() -> None:
     made = text(source="rtsp", url="rtsp://user:word@cam/1", transport="udp", latency_ms=40)
     assert made == (
-        'rtspsrc location="rtsp://user:word@cam/1" protocols=udp latency=40 timeout=5000000 tcp-timeout=5000000 ! rtph264depay'
+        'rtspsrc location="rtsp://user:word@cam/1" protocols=udp latency=40 timeout=5000000'
+        " tcp-timeout=5000000 ! rtph264depay"
         " ! avdec_h264 ! queue leaky=downstream max-size-buffers=1 max-size-bytes=0 max-size-time=0"
         " ! videoconvert ! appsink name=sink"
     )

@@ -1,4 +1,6 @@
-"""ROS 2 pictures over DDS on loopback: a publisher and a subscriber in processes of their own, which know nothing of the product."""
+"""ROS 2 pictures over DDS on loopback: a publisher and a subscriber in processes of their own,
+which know nothing of the product.
+"""
 
 import base64
 import json
@@ -118,8 +120,12 @@ def reader_of(topic: str, **params: Any) -> SlotReader:
 
 def image(width: int, height: int, encoding: str = "rgb8", per_pixel: int = 3) -> dict[str, Any]:
     return {
-        "width": width, "height": height, "encoding": encoding, "is_bigendian": 0, "step": width * per_pixel,
-    }  # fmt: skip
+        "width": width,
+        "height": height,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": width * per_pixel,
+    }
 
 
 def picture_now(reader: SlotReader, publisher: Node, data: bytes, **fields: Any) -> SensorFrame:
@@ -242,7 +248,9 @@ def test_a_publisher_that_leaves_takes_its_picture_with_it(
 
 
 def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: str) -> None:
-    """Regression: both came while the camera's thread stood still; the picture was taken up after the word that nobody publishes any more."""
+    """Regression: both came while the camera's thread stood still; the picture was taken up after
+    the word that nobody publishes any more.
+    """
     from cyclonedds.core import DDSStatus, WaitSet
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.sub import DataReader
@@ -341,9 +349,15 @@ def plain(
     stamp_ns: int, encoding: FrameEncoding = FrameEncoding.MONO8, **where: Any
 ) -> SensorFrame:
     return SensorFrame(
-        sensor_id="front", stamp_monotonic_ns=stamp_ns, stamp_wall_ns=stamp_ns, encoding=encoding, width=1, height=1,
-        channels=1, **(where or {"data": b"x"}),
-    )  # fmt: skip
+        sensor_id="front",
+        stamp_monotonic_ns=stamp_ns,
+        stamp_wall_ns=stamp_ns,
+        encoding=encoding,
+        width=1,
+        height=1,
+        channels=1,
+        **(where or {"data": b"x"}),
+    )
 
 
 def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: str) -> None:
@@ -380,9 +394,15 @@ def test_what_is_published_is_read_as_it_was(
     slot, clock = reader.slot, SystemClock()
     for _ in range(300):
         frame = SensorFrame(
-            sensor_id="other", stamp_monotonic_ns=clock.now_ns(), stamp_wall_ns=clock.wall_ns(), encoding=encoding,
-            width=4, height=3, channels=1, data=data,
-        )  # fmt: skip
+            sensor_id="other",
+            stamp_monotonic_ns=clock.now_ns(),
+            stamp_wall_ns=clock.wall_ns(),
+            encoding=encoding,
+            width=4,
+            height=3,
+            channels=1,
+            data=data,
+        )
         publisher.publish(frame)
         with slot._changed:
             if slot._changed.wait_for(lambda: slot._frame is not None, 0.2):
@@ -407,8 +427,10 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
         "from vram_arbiter.runner.control.clock import SystemClock\n"
         "from vram_arbiter.runner.sensors.factory import make_reader\n"
         "from vram_arbiter.schemas.config.robot import SensorReaderConfig\n"
-        f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"
-        "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__, error)\n"
+        f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"(
+            "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__,"
+            " error)\n"
+        )
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False

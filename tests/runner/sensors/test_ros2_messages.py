@@ -1,4 +1,6 @@
-"""ROS picture messages: bytes as Cyclone DDS writes them, meanings as REP 118 and image_transport have them, contradictions refused."""
+"""ROS picture messages: bytes as Cyclone DDS writes them, meanings as REP 118 and image_transport
+have them, contradictions refused.
+"""
 
 import struct
 from typing import Any
@@ -26,9 +28,15 @@ names = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0
 
 def image(**changes: Any) -> RosImage:
     fields: dict[str, Any] = {
-        "stamp_ns": 5, "frame_id": "cam", "height": 2, "width": 3, "encoding": "rgb8", "is_bigendian": False,
-        "step": 9, "data": bytes(range(18)),
-    }  # fmt: skip
+        "stamp_ns": 5,
+        "frame_id": "cam",
+        "height": 2,
+        "width": 3,
+        "encoding": "rgb8",
+        "is_bigendian": False,
+        "step": 9,
+        "data": bytes(range(18)),
+    }
     return RosImage(**{**fields, **changes})
 
 
@@ -83,10 +91,14 @@ def test_any_bytes_are_a_jpeg_or_refused(noise: bytes) -> None:
 @pytest.mark.parametrize(
     ("encoding", "ours", "channels", "per_pixel"),
     [
-        ("bgr8", "bgr8", 3, 3), ("8UC3", "bgr8", 3, 3), ("rgb8", "rgb8", 3, 3), ("mono8", "mono8", 1, 1), ("8UC1", "mono8", 1, 1),
+        ("bgr8", "bgr8", 3, 3),
+        ("8UC3", "bgr8", 3, 3),
+        ("rgb8", "rgb8", 3, 3),
+        ("mono8", "mono8", 1, 1),
+        ("8UC1", "mono8", 1, 1),
         ("16UC1", "depth16", 1, 2),
     ],
-)  # fmt: skip
+)
 def test_encodings(encoding: str, ours: str, channels: int, per_pixel: int) -> None:
     data = bytes(range(6 * per_pixel))
     picture = picture_of(image(encoding=encoding, step=3 * per_pixel, data=data))

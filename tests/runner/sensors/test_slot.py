@@ -1,4 +1,6 @@
-"""The slot that every camera reader is built on: fresh, stale, interrupted, ended, and threads that meet in it."""
+"""The slot that every camera reader is built on: fresh, stale, interrupted, ended, and threads that
+meet in it.
+"""
 
 import math
 import threading
@@ -135,7 +137,9 @@ def test_synced_waits_for_a_picture_taken_after_the_call() -> None:
     asked = threading.Event()
 
     class Told(SystemClock):
-        """Says when the waiting side has begun: its first look at the clock is the time of the call."""
+        """Says when the waiting side has begun: its first look at the clock is the time of the
+        call.
+        """
 
         def now_ns(self) -> int:
             now = super().now_ns()

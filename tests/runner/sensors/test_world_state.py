@@ -1,4 +1,6 @@
-"""The world state: fresh or said to be stale, latched until it is really back, and nothing ever made up."""
+"""The world state: fresh or said to be stale, latched until it is really back, and nothing ever
+made up.
+"""
 
 import pytest
 from hypothesis import given
@@ -150,7 +152,9 @@ def test_jitter_of_the_loop_skips_no_picture(world: WorldStateAggregator) -> Non
 
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(-20, 250), st.booleans()), max_size=40))
 def test_no_history_serves_a_frame_older_than_allowed(story: list[tuple[int, int, bool]]) -> None:
-    """Each step: ms that pass, the age (ms) of the frame that then comes, whether the camera is lost first."""
+    """Each step: ms that pass, the age (ms) of the frame that then comes, whether the camera is
+    lost first.
+    """
     world = WorldStateAggregator({"front": 100.0})
     now = START_NS
     for passed_ms, age_ms, lost in story:

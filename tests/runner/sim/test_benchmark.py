@@ -1,4 +1,6 @@
-"""`vram-runner benchmark`: rates with their interval, one reset a seed, errors that are no verdicts, videos, and a report whatever happens."""
+"""`vram-runner benchmark`: rates with their interval, one reset a seed, errors that are no
+verdicts, videos, and a report whatever happens.
+"""
 
 import argparse
 import asyncio
@@ -33,12 +35,19 @@ SEEK = f"scripted:{HERE}/seek.py"
 Run = Callable[[Any], Any]
 
 
-# -- the interval ---------------------------------------------------------------------------------------------------
+# -- the interval
 @pytest.mark.parametrize(
     ("successes", "of", "low", "high"),
-    # Wilson's score interval without continuity correction, as statsmodels' `proportion_confint(…, method="wilson")` gives it
-    [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (10, 10, 0.7225, 1.0), (1, 1, 0.2065, 1.0), (95, 100, 0.8882, 0.9785)],
-)  # fmt: skip
+    # Wilson's score interval without continuity correction, as statsmodels' `proportion_confint(…,
+    # method="wilson")` gives it
+    [
+        (0, 10, 0.0, 0.2775),
+        (5, 10, 0.2366, 0.7634),
+        (10, 10, 0.7225, 1.0),
+        (1, 1, 0.2065, 1.0),
+        (95, 100, 0.8882, 0.9785),
+    ],
+)
 def test_wilsons_interval(successes: int, of: int, low: float, high: float) -> None:
     assert wilson(successes, of) == pytest.approx((low, high), abs=5e-5)
 
@@ -62,7 +71,7 @@ def test_any_name_can_be_a_file() -> None:
     assert file_name("../x") == "x"
 
 
-# -- one cell ----------------------------------------------------------------------------------------------------------
+# -- one cell
 class Counted:
     """Runs cells on one environment and keeps it, so that its resets can be counted."""
 
@@ -230,7 +239,7 @@ def test_a_contestant_that_never_acts_does_not_play_for_ever(run_async: Run) -> 
     assert [(e.success, e.error) for e in cell.episodes] == [(None, "limit_exceeded")] * 3
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
+# -- the command
 def report(out: Path) -> Any:
     return json.loads((out / "benchmark.json").read_text(encoding="utf-8"))
 
@@ -304,10 +313,13 @@ def test_a_skill_and_the_expert_in_our_own_scene(tmp_path: Path) -> None:
         (["--policy", "random", "--env", "gym:NoSuch-v0"], "NoSuch"),
         (["--policy", "random", "--task", "cook"], "cook"),
         (["--policy", "expert", "--env", "gym:CartPole-v1"], "expert"),
-        (["--policy", "random", "--env", "gym:A-v0", "--env", "gym:B-v0", "--success", "info:x"], "one after another"),
+        (
+            ["--policy", "random", "--env", "gym:A-v0", "--env", "gym:B-v0", "--success", "info:x"],
+            "one after another",
+        ),
         (["--policy", "random", "--env", "gym:CartPole-v1", "--task", "grab"], "--task"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_said_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], said: str
 ) -> None:
@@ -340,7 +352,9 @@ def test_without_videos_a_skill_sees_what_it_saw_with_them() -> None:
 def test_two_cells_of_one_name_do_not_overwrite_each_others_videos(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Regression: scenes of one file name in different folders shared their videos and their row."""
+    """Regression: scenes of one file name in different folders shared their videos and their
+    row.
+    """
     scenes = [tmp_path / folder / "table.yaml" for folder in ("near", "far")]
     for scene in scenes:
         scene.parent.mkdir()

@@ -18,9 +18,22 @@ ROOT = Path(__file__).parents[3]
 def test_each_episode_is_a_trace_with_its_ticks(tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="needs the runner extra")
     argv = [
-        "-m", "vram_arbiter.runner", "sim", "--env", "gym:Pendulum-v1", "--policy", "random", "--episodes", "2", "--max-steps", "4",
-        "--rate", "0", "--no-arbiter", "--no-realtime",
-    ]  # fmt: skip
+        "-m",
+        "vram_arbiter.runner",
+        "sim",
+        "--env",
+        "gym:Pendulum-v1",
+        "--policy",
+        "random",
+        "--episodes",
+        "2",
+        "--max-steps",
+        "4",
+        "--rate",
+        "0",
+        "--no-arbiter",
+        "--no-realtime",
+    ]
     with Collector() as collector:
         environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path)} | collector.environ()
         done = subprocess.run(

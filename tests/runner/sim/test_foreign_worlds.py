@@ -1,4 +1,6 @@
-"""Gymnasium environments that do not keep their word: what they give is refused as what it is, and never becomes somebody's verdict."""
+"""Gymnasium environments that do not keep their word: what they give is refused as what it is, and
+never becomes somebody's verdict.
+"""
 
 import subprocess
 import sys
@@ -27,7 +29,9 @@ SPACE = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
 class Odd(gymnasium.Env[Any, Any]):
-    """`steps` maps the count of a step, over all episodes, to what it returns instead of the ordinary; an error is raised."""
+    """`steps` maps the count of a step, over all episodes, to what it returns instead of the
+    ordinary; an error is raised.
+    """
 
     def __init__(self, steps: Any = None) -> None:
         self.odd: dict[int, Any] = steps or {}
@@ -104,7 +108,9 @@ GOOD = (SEEN, 0.0, True, False, {"success": True})
 
 
 def test_an_episode_whose_last_step_fails_is_not_the_one_before(run_async: Run) -> None:
-    """The policy is done in the tick in which the world raises: there is no episode, and the last one must not count again."""
+    """The policy is done in the tick in which the world raises: there is no episode, and the last
+    one must not count again.
+    """
     env = world({1: GOOD, 3: ZeroDivisionError("the physics blew up")}, hold=[0.0])
     cell = play(run_async, env, 1, 1, 1)
     assert [(e.success, e.error) for e in cell.episodes][:2] == [
@@ -119,7 +125,9 @@ def test_an_episode_whose_last_step_fails_is_not_the_one_before(run_async: Run) 
 
 
 def test_a_world_that_speaks_only_of_successes_does_not_make_them_all(run_async: Run) -> None:
-    """Regression: episodes without a word were left out, which gave 100 % success for one in ten."""
+    """Regression: episodes without a word were left out, which gave 100 % success for one in
+    ten.
+    """
     env = world({2: GOOD})
     cell = play(run_async, env, 1, 1, 1)
     assert [e.success for e in cell.episodes] == [False, True, False]
@@ -142,10 +150,19 @@ def test_a_world_that_speaks_only_of_successes_does_not_make_them_all(run_async:
         ({"v": np.zeros(2), "eye": np.zeros((8, 8, 3))}, 0.0, False, False, {}),
     ],
     ids=[
-        "reward none", "two ends", "success nan", "two successes", "success text", "success part",
-        "vector short", "vector gone", "picture gone", "picture of another size", "picture of floats",
+        "reward none",
+        "two ends",
+        "success nan",
+        "two successes",
+        "success text",
+        "success part",
+        "vector short",
+        "vector gone",
+        "picture gone",
+        "picture of another size",
+        "picture of floats",
     ],
-)  # fmt: skip
+)
 def test_what_was_not_promised_is_the_worlds_failure_and_the_next_episode_is_played(
     run_async: Run, odd: Any
 ) -> None:
@@ -179,7 +196,9 @@ def test_a_number_that_is_none_does_not_pass_however_it_was_built() -> None:
 
 
 def test_a_run_in_which_only_a_success_was_told_is_not_all_successes() -> None:
-    """Regression: episodes without a word were left out, which gave 100 % success for one in ten."""
+    """Regression: episodes without a word were left out, which gave 100 % success for one in
+    ten.
+    """
     env = world({2: GOOD}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: [0.0])
     runner = sim_runner(lambda: env, rate_hz=0, episodes=3, max_steps=1, policy=policy.play)

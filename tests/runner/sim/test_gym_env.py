@@ -1,4 +1,6 @@
-"""Any gymnasium environment as a world: what it says is handed on as it is, what it does not say is missing, what it cannot do is refused."""
+"""Any gymnasium environment as a world: what it says is handed on as it is, what it does not say is
+missing, what it cannot do is refused.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -48,7 +50,7 @@ class Policy:
 ANYBODY = Policy(None)
 
 
-# -- observations ---------------------------------------------------------------------------------------------------
+# -- observations
 def test_joints_are_only_those_that_the_file_names() -> None:
     env = GymEnv(POINT)
     env.reset(3)
@@ -95,7 +97,7 @@ def test_random_actions_are_not_the_worlds_own_random_numbers() -> None:
         assert not env.step(env.sample()).success
 
 
-# -- actions ----------------------------------------------------------------------------------------------------------
+# -- actions
 def test_every_number_of_a_discrete_goes_there_and_back() -> None:
     env = GymEnv("CartPole-v1", render=False)
     for number in (0, 1):
@@ -147,7 +149,7 @@ def test_an_aim_at_the_stop_is_clamped_and_said() -> None:
     assert len(problems) == 1
 
 
-# -- the loop on it -----------------------------------------------------------------------------------------------------
+# -- the loop on it
 def test_one_step_per_tick_and_the_world_waits_without_an_action() -> None:
     env = GymEnv(POINT, NAMED)
     runner = sim_runner(lambda: env, rate_hz=0, seed=4)
@@ -236,7 +238,7 @@ def test_a_configured_action_waits() -> None:
     assert env.observation["agent_pos"][0] == 0.25
 
 
-# -- a real simulator ---------------------------------------------------------------------------------------------------
+# -- a real simulator
 def test_a_mujoco_environment_of_gymnasium_is_driven_and_seen() -> None:
     config = GymConfig(
         control_mode=ControlMode.JOINT_TORQUE,
@@ -279,7 +281,7 @@ def test_gymnasiums_own_environments_of_all_kinds_can_be_played(env_id: str) -> 
     assert all(episode.total_reward is not None for episode in runner.robot.episodes)
 
 
-# -- refusals -------------------------------------------------------------------------------------------------------
+# -- refusals
 @pytest.mark.parametrize(
     ("env_id", "config", "said"),
     [

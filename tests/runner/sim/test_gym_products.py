@@ -1,4 +1,6 @@
-"""Gymnasium environments whose actions and observations have parts: driven, seen, judged and benchmarked like all others."""
+"""Gymnasium environments whose actions and observations have parts: driven, seen, judged and
+benchmarked like all others.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -69,7 +71,7 @@ def given(*row: float, names: tuple[str, ...] | None = None) -> Action:
     return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
 
 
-# -- actions ------------------------------------------------------------------------------------------------------------
+# -- actions
 def test_an_action_of_parts_is_one_row_with_names() -> None:
     env = GymEnv(HAND, render=False)
     env.reset(0)
@@ -189,7 +191,7 @@ def test_a_discretes_copy_that_is_no_choice_does_not_pass() -> None:
         assert gate_of(env).check(copy, NOWHERE)[0] is None
 
 
-# -- observations ---------------------------------------------------------------------------------------------------------
+# -- observations
 def test_joints_may_be_spread_over_the_parts_of_an_observation() -> None:
     observed = spaces.Dict(
         arm=spaces.Box(-9, 9, (2,), np.float64),
@@ -230,9 +232,12 @@ def test_a_part_that_is_shorter_than_promised_does_not_shift_the_others() -> Non
 
 def test_what_is_left_out_of_a_recording_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     observed = spaces.Dict(
-        a=spaces.Box(-1, 1, (2,)), depth=spaces.Box(0, 9, (64, 65)), heat=spaces.Box(0, 255, (4, 4), np.uint8),
-        order=spaces.Text(3), top=PICTURE,
-    )  # fmt: skip
+        a=spaces.Box(-1, 1, (2,)),
+        depth=spaces.Box(0, 9, (64, 65)),
+        heat=spaces.Box(0, 255, (4, 4), np.uint8),
+        order=spaces.Text(3),
+        top=PICTURE,
+    )
     env = plain(spaces.Discrete(2), observed)
     env.reset(0)
     assert [list(env.shown()) for _ in range(2)] == [["a.0", "a.1"]] * 2
@@ -277,9 +282,11 @@ def test_two_parts_that_cannot_be_told_apart_are_refused() -> None:
         plain(spaces.Discrete(2), twice)
 
 
-# -- the loop and the benchmark on them -------------------------------------------------------------------------------------
+# -- the loop and the benchmark on them
 def seeker() -> Policy:
-    """Reads how far the arm is off, as the environment tells it, and closes the gripper with the second step."""
+    """Reads how far the arm is off, as the environment tells it, and closes the gripper with the
+    second step.
+    """
 
     def make(env: Any, seed: int) -> Any:
         aim: list[float] = []

@@ -1,4 +1,6 @@
-"""Spaces as rows of numbers: there and back is the same, whatever is sent is in the space, and what is no row of numbers is refused."""
+"""Spaces as rows of numbers: there and back is the same, whatever is sent is in the space, and what
+is no row of numbers is refused.
+"""
 
 from typing import Any
 

@@ -1,4 +1,6 @@
-"""`so101-put-down` in the simulator, through the gate: what was grasped stands where it stood, and the arm is out of the way."""
+"""`so101-put-down` in the simulator, through the gate: what was grasped stands where it stood, and
+the arm is out of the way.
+"""
 
 import asyncio
 import random
@@ -52,7 +54,8 @@ def test_what_was_grasped_stands_again_where_the_arm_takes_things_from(shape: st
             assert isinstance(outcome, Act)
             allowed, problems = gate.check(outcome.action, seen)
             assert allowed is not None, problems
-            # the gate counts a first step from where a joint is: the grip is back within a tenth of a second
+            # the gate counts a first step from where a joint is: the grip is back within a tenth of
+            # a second
             assert not problems or (
                 tick < 4 and all(one.startswith("gripper") for one in problems)
             ), problems

@@ -1,4 +1,6 @@
-"""The scripted expert grabs every shape, misses show as misses, and the data set writers write what they say."""
+"""The scripted expert grabs every shape, misses show as misses, and the data set writers write what
+they say.
+"""
 
 import json
 import math

@@ -1,4 +1,6 @@
-"""The labels that the progress model learns from are the simulator's truth: they rise with a grab, and only for the thing it grabs."""
+"""The labels that the progress model learns from are the simulator's truth: they rise with a grab,
+and only for the thing it grabs.
+"""
 
 import json
 from pathlib import Path

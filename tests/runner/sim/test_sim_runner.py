@@ -1,4 +1,6 @@
-"""SimRunner: one environment step per tick, as many reset ticks as episodes, one skill at the arm, everything else holds."""
+"""SimRunner: one environment step per tick, as many reset ticks as episodes, one skill at the arm,
+everything else holds.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -87,7 +89,7 @@ def play(
     return [runner.tick() for _ in range(ticks)], ended
 
 
-# -- ticks and episodes ---------------------------------------------------------------------------------------------
+# -- ticks and episodes
 def test_the_first_tick_resets_and_every_other_one_steps(make_runner: Make, env: Any) -> None:
     runner = make_runner(seed=7, rate_hz=0)
     runner.activate()
@@ -282,7 +284,7 @@ def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: A
         runner.tick()
 
 
-# -- the skill at the arm -------------------------------------------------------------------------------------------
+# -- the skill at the arm
 def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(
     make_runner: Make, env: Any
 ) -> None:
@@ -492,7 +494,7 @@ def test_a_skill_without_chunks_says_nothing_of_them(make_runner: Make) -> None:
     assert "prefetch" not in runner.result().metadata
 
 
-# -- pictures -------------------------------------------------------------------------------------------------------
+# -- pictures
 @pytest.mark.heavy
 def test_frames_are_rendered_on_demand_and_reused_while_young(
     make_runner: Make, env: Any, clock: Any
@@ -513,7 +515,9 @@ def test_frames_are_rendered_on_demand_and_reused_while_young(
 def test_a_crowd_of_requests_for_pictures_costs_a_tick_one_picture_a_camera(
     make_runner: Make, env: Any, clock: Any
 ) -> None:
-    """Each request that wanted a picture of this instant rendered one in the tick: sixteen of them made it half a second long."""
+    """Each request that wanted a picture of this instant rendered one in the tick: sixteen of them
+    made it half a second long.
+    """
     runner = make_runner(rate_hz=0, clock=clock, cameras=("front", "wrist"))
     runner.activate()
     runner.tick()
@@ -542,7 +546,7 @@ def test_a_skill_sees_the_cameras_it_wants(make_runner: Make) -> None:
     assert (frames["wrist"].width, frames["wrist"].height) == (32, 24)
 
 
-# -- the real simulator ---------------------------------------------------------------------------------------------
+# -- the real simulator
 @pytest.mark.heavy
 def test_navigating_the_real_simulator_and_filming_it(
     tmp_path: Path, navigate_manifest: Path, run_async: Any
@@ -595,7 +599,10 @@ def test_navigating_the_real_simulator_and_filming_it(
 def test_a_scene_that_takes_long_to_build_misses_no_deadline(
     make_runner: Make, env: Any, clock: Any
 ) -> None:
-    """There is no action that could come too late: `raise` would end every run before its first step."""
+    """There is no action that could come too late:
+
+    `raise` would end every run before its first step.
+    """
     build = env.reset
 
     def slowly(seed: int) -> None:

@@ -1,4 +1,6 @@
-"""`vram-runner sim --env …`: policies that play by themselves, and goals with a served policy, in gymnasium environments and our own scene."""
+"""`vram-runner sim --env …`: policies that play by themselves, and goals with a served policy, in
+gymnasium environments and our own scene.
+"""
 
 import asyncio
 import json
@@ -60,7 +62,7 @@ def sim(tmp_path: Path, capsys: pytest.CaptureFixture[str], *flags: str) -> tupl
     return code, json.loads(out.splitlines()[-1]) if out else None, said
 
 
-# -- policies by themselves -------------------------------------------------------------------------------------------
+# -- policies by themselves
 def test_a_scripted_policy_balances_gymnasiums_pole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -160,7 +162,7 @@ def test_mistakes_are_said(
     assert len(told.splitlines()) == 1
 
 
-# -- goals -----------------------------------------------------------------------------------------------------------
+# -- goals
 class Sidecar:
     """A served policy that always aims at the same place."""
 
@@ -280,7 +282,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
             process.communicate()
 
 
-# -- benchmarks of a served policy ----------------------------------------------------------------------------------------
+# -- benchmarks of a served policy
 def test_a_served_policy_is_started_anew_for_every_seed_and_released(
     tmp_path: Path, run_async: Any
 ) -> None:

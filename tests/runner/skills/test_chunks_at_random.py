@@ -1,6 +1,8 @@
-"""Whatever sizes chunks have, whenever answers come, wherever requests fail: rows play in order, once each, and the play goes on.
+"""Whatever sizes chunks have, whenever answers come, wherever requests fail: rows play in order,
+once each, and the play goes on.
 
-A chunk counts as in time exactly if the robot did not have to stand still before it: told by what was played, not by the player.
+A chunk counts as in time exactly if the robot did not have to stand still before it: told by what
+was played, not by the player.
 """
 
 import concurrent.futures
@@ -17,7 +19,9 @@ ROWS_MAX = 60
 
 
 class Answers:
-    """Answers the n-th request after `delays[n]` further steps (0: before the next one, None: at once); -1 fails it after one step."""
+    """Answers the n-th request after `delays[n]` further steps (0: before the next one, None: at
+    once); -1 fails it after one step.
+    """
 
     def __init__(self, sizes: list[int], delays: list[int | None]) -> None:
         self.sizes, self.delays = sizes, delays

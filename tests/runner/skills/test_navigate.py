@@ -1,4 +1,6 @@
-"""Navigate on a robot without physics: folds, drives, stands; refuses what it does not understand."""
+"""Navigate on a robot without physics: folds, drives, stands; refuses what it does not
+understand.
+"""
 
 import math
 from collections.abc import Callable

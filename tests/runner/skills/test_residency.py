@@ -1,4 +1,6 @@
-"""One GPU-holding skill is resident by (rskill_id, revision); GPU-free ones come and go beside it."""
+"""One GPU-holding skill is resident by (rskill_id, revision); GPU-free ones come and go beside
+it.
+"""
 
 import asyncio
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""The runner's end of a policy sidecar: one use per goal, chunks in order, fails closed. A real socket, a small real server."""
+"""The runner's end of a policy sidecar: one use per goal, chunks in order, fails closed.
+
+A real socket, a small real server.
+"""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -124,8 +127,16 @@ class Sidecar:
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
         elif endpoint == "ping":
             await asyncio.sleep(self.late_s)
-            reply = {"ok": True, "model": "m", "revision": "", "kind": "vla", "rskill": "test/arm-grab", "pid": 1,
-                     "boot_id": "b", "state": self.state}  # fmt: skip
+            reply = {
+                "ok": True,
+                "model": "m",
+                "revision": "",
+                "kind": "vla",
+                "rskill": "test/arm-grab",
+                "pid": 1,
+                "boot_id": "b",
+                "state": self.state,
+            }
             if self.wanted:
                 reply["wanted"] = True
         else:
@@ -177,9 +188,14 @@ class Bench:
 
     def world(self, frames: bool = True, **changes: Any) -> WorldState:
         frame = SensorFrame(
-            sensor_id="front", stamp_monotonic_ns=1, stamp_wall_ns=1, encoding=FrameEncoding.RGB8, width=4, height=2,
+            sensor_id="front",
+            stamp_monotonic_ns=1,
+            stamp_wall_ns=1,
+            encoding=FrameEncoding.RGB8,
+            width=4,
+            height=2,
             data=bytes(range(24)),
-        )  # fmt: skip
+        )
         fields: dict[str, Any] = {
             "stamp_ns": 1,
             "joint_state": JointState(
@@ -446,7 +462,9 @@ def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
 def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
     bench: Callable[..., Bench], run_async: Run
 ) -> None:
-    """Late actions are dropped, others shortened: who counts them as made is soon so far ahead that the gate withholds all the rest."""
+    """Late actions are dropped, others shortened: who counts them as made is soon so far ahead that
+    the gate withholds all the rest.
+    """
     motors = {"a": 0.0, "b": 0.5}
 
     async def play(b: Bench) -> None:
@@ -464,7 +482,9 @@ def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
 def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
     bench: Callable[..., Bench], run_async: Run
 ) -> None:
-    """Regression: a request that reached the event loop after the goal's end carried no token, and to a sidecar that means: load, evict others."""
+    """Regression: a request that reached the event loop after the goal's end carried no token, and
+    to a sidecar that means: load, evict others.
+    """
 
     async def play(b: Bench) -> None:
         b.skill = SidecarPolicy(
@@ -496,8 +516,10 @@ def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
     wanted: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Regressions: the sidecar went on and made others leave the card for a goal that had been canceled; also one that was called back
-    from standby, or left in that moment, and said neither `waiting` nor `loading`."""
+    """Regressions: the sidecar went on and made others leave the card for a goal that had been
+    canceled; also one that was called back from standby, or left in that moment, and said neither
+    `waiting` nor `loading`.
+    """
     monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
 
     async def play(b: Bench) -> None:
@@ -515,7 +537,9 @@ def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
 def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
     bench: Callable[..., Bench], run_async: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Regression: it was asked for a second whether anybody wants the model, and kept it for nobody."""
+    """Regression: it was asked for a second whether anybody wants the model, and kept it for
+    nobody.
+    """
     monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.WITHDRAW_S", 60.0)
 
     async def play(b: Bench) -> None:
@@ -534,7 +558,9 @@ def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
 def test_a_policy_that_does_not_come_in_time_is_not_wanted_any_more(
     bench: Callable[..., Bench], run_async: Run
 ) -> None:
-    """A sidecar that was called back from standby goes on waiting behind the request whose time ended."""
+    """A sidecar that was called back from standby goes on waiting behind the request whose time
+    ended.
+    """
 
     async def play(b: Bench) -> None:
         b.sidecar.state, b.sidecar.wanted = "unloaded", True

@@ -1,4 +1,6 @@
-"""What stands in for FollowJointTrajectory: what is refused before anything moves, and that the targets are those of the points, never faster."""
+"""What stands in for FollowJointTrajectory: what is refused before anything moves, and that the
+targets are those of the points, never faster.
+"""
 
 import asyncio
 import json
@@ -93,7 +95,9 @@ def test_the_way_is_straight_from_point_to_point() -> None:
 
 
 def test_a_gripper_that_holds_something_is_not_let_go_when_a_trajectory_begins() -> None:
-    """Regression: it began where the gripper was, which is not where it had been told to be: what it held fell down."""
+    """Regression: it began where the gripper was, which is not where it had been told to be: what
+    it held fell down.
+    """
     skill = FollowJointTrajectory(
         MOVE, LIMITS, period_s=PERIOD_S, sent=lambda: {"gripper": -0.1, "elbow_flex": 0.0}
     )
@@ -209,7 +213,9 @@ def test_an_arm_that_does_not_arrive_fails_the_goal() -> None:
 
 
 def test_a_second_goal_starts_from_nothing() -> None:
-    """The defect of the field: a wrapped skill that had ended was done at once the next time, without motion."""
+    """The defect of the field: a wrapped skill that had ended was done at once the next time,
+    without motion.
+    """
     skill = started(trajectory((0.5,)))
     assert play(skill)[-1] == pytest.approx(0.5)
     asyncio.run(skill.finish())
@@ -217,7 +223,7 @@ def test_a_second_goal_starts_from_nothing() -> None:
     assert play(skill, start=0.5)[-1] == pytest.approx(-0.5)
 
 
-# -- which skills there is a stand-in for -----------------------------------------------------------------------------
+# -- which skills there is a stand-in for
 def stand_ins(*known: str) -> StandIns:
     drives = {TRAJECTORY: {ControlMode.JOINT_POSITION}, NAVIGATE: {ControlMode.BODY_TWIST}}
     made = {
@@ -241,8 +247,8 @@ def test_a_ros_action_without_a_stand_in_is_refused_with_what_there_is() -> None
     assert both.refuses(MOVE) == both.refuses(DRIVE) == arm.refuses(MOVE) == ""
     said = arm.refuses(DRIVE)
     assert (
-        "has no ROS 2 action client; it stands in for control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose"
-        in said
+        "has no ROS 2 action client; it stands in for control_msgs/FollowJointTrajectory, not for"
+        " nav2_msgs/NavigateToPose" in said
     )
     assert isinstance(arm(MOVE), FollowJointTrajectory)
 

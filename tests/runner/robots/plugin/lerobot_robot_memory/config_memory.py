@@ -9,8 +9,9 @@ from lerobot.robots import RobotConfig
 @RobotConfig.register_subclass("memory_robot")
 @dataclass(kw_only=True)
 class MemoryRobotConfig(RobotConfig):
-    """`values` are the first positions, in the robot's own units; `modes` names lerobot's unit of each motor. `lost_answers`
-    times connecting fails half way, with the port open."""
+    """`values` are the first positions, in the robot's own units; `modes` names lerobot's unit of
+    each motor. `lost_answers` times connecting fails half way, with the port open.
+    """
 
     port: str = "memory"
     values: list[float] = field(default_factory=lambda: [0.0, 0.0, 50.0])
