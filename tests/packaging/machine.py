@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from installed import DEPENDENCIES, PYTHON, TREE, install_into
+from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 
 SYSTEMD = Path("/lib/systemd/systemd")
 TOOLS = ("unshare", "nsenter", "setpriv", "pivot_root", "systemctl", "ldconfig")

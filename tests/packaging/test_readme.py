@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from installed import TREE, install_into
 
+from tests.packaging.installed import TREE, install_into
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.sync import Client
 

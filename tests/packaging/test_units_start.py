@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from machine import PATIENCE_S, Machine, obstacle
+
+from tests.packaging.machine import PATIENCE_S, Machine, obstacle
 
 OBSTACLE = obstacle()
 pytestmark = [

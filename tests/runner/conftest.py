@@ -4,21 +4,17 @@ physics.
 
 import asyncio
 import math
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.runner.manual_clock import ManualClock
 from vram_arbiter.runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.robot import SimRunner, sim_runner
 from vram_arbiter.schemas.world import CameraModel
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helpers beside it
-
-from manual_clock import ManualClock
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 

@@ -9,8 +9,7 @@ import os
 import sys
 from collections.abc import Mapping
 
-from small_robots import Nod
-
+from tests.runner.small_robots import Nod
 from vram_arbiter.runner.__main__ import parse
 from vram_arbiter.runner.cli.deploy import Deploy
 from vram_arbiter.runner.cli.deployment import Parts, read_deployment

@@ -6,13 +6,13 @@ import json
 import sys
 from pathlib import Path
 
-from manual_clock import ManualClock
 from opentelemetry import trace
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
-from small_robots import FedCamera, Nod, Twin
 
+from tests.runner.manual_clock import ManualClock
+from tests.runner.small_robots import FedCamera, Nod, Twin
 from vram_arbiter.runner.protocols import Goal
 from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges

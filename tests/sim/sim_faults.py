@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_clients import Cast, Program
-
+from tests.sim.sim_clients import Cast, Program
 from tests.support.simulation.card import ProbeFaults, SimOutOfMemory
 from tests.support.simulation.wire import QUEUE_MAX, WireFaults
 from tests.support.simulation.world import World

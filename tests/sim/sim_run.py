@@ -19,12 +19,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-if __name__ == "__main__":  # run as a file: the tree is found from here
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
-from sim_clients import Cast, Character, Consumer, Observer, Operator, Runner
-from sim_faults import Nemesis, Slot
-
+from tests.sim.sim_clients import Cast, Character, Consumer, Observer, Operator, Runner
+from tests.sim.sim_faults import Nemesis, Slot
 from tests.support.simulation.clock import TRACE_LINES
 from tests.support.simulation.world import SimFailure, World, state_folder
 

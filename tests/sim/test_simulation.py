@@ -5,9 +5,9 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import pytest
-from sim_clients import SimClient
-from sim_run import run_seed, summary
 
+from tests.sim.sim_clients import SimClient
+from tests.sim.sim_run import run_seed, summary
 from tests.support.simulation.card import Device, SimOutOfMemory
 from tests.support.simulation.clock import Clock, ProcessLoop
 from tests.support.simulation.daemon import Happening

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
 
+from tests.runner.grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_checkpoint
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient

@@ -11,8 +11,8 @@ import signal
 from collections.abc import Iterator
 
 import pytest
-from grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 
+from tests.runner.grab_programs import GOAL_S, GRAB, SKILLS, GrabPrograms, need_checkpoint
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient

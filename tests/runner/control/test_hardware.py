@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
-from small_robots import FedCamera, Nod, Twin
 
+from tests.runner.small_robots import FedCamera, Nod, Twin
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded

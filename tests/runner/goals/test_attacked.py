@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_robots import FedCamera, Nod, Twin
 
+from tests.runner.small_robots import FedCamera, Nod, Twin
 from tests.support.paths import SUPPORT
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_robots import FedCamera, Nod, Twin
 
+from tests.runner.small_robots import FedCamera, Nod, Twin
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.control.clock import SystemClock

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from small_robots import FedCamera, Nod, Twin
 
+from tests.runner.small_robots import FedCamera, Nod, Twin
 from vram_arbiter.runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
 from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges

@@ -9,13 +9,23 @@ import os
 import shutil
 import signal
 import socket
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.runner.recording.ticks import (
+    DONE,
+    FAILED,
+    HEIGHT,
+    TRACE,
+    WIDTH,
+    goal,
+    picture,
+    span_of,
+    tick,
+)
 from tests.support.waiting import until
 from vram_arbiter.runner import __main__ as program
 from vram_arbiter.runner.cli.replay import as_text
@@ -33,10 +43,6 @@ from vram_arbiter.schemas.errors import (
     InternalError,
     VramError,
 )
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
-
-from ticks import DONE, FAILED, HEIGHT, TRACE, WIDTH, goal, picture, span_of, tick
 
 pytestmark = [
     pytest.mark.heavy,

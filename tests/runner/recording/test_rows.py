@@ -3,21 +3,16 @@ row.
 """
 
 import socket
-import sys
 import threading
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
+from tests.runner.recording.ticks import TRACE, goal, picture, span_of, tick
 from vram_arbiter.runner.protocols import GoalTick, Transition
 from vram_arbiter.runner.recording import wire
 from vram_arbiter.runner.recording.rows import NO_CHUNK, NUMBERS_MAX, Incomplete, row_of, trace_of
 from vram_arbiter.schemas.world import FrameEncoding
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helper beside it
-
-from ticks import TRACE, goal, picture, span_of, tick
 
 
 def test_a_row_says_what_was_measured_and_what_was_told() -> None:

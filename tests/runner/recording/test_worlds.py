@@ -18,8 +18,8 @@ pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
 
 HERE = Path(__file__).parents[1]
 ROOT = HERE.parents[1]
-HAND = "gym_worlds:test/Hand-v0"
-POINT = "gym_worlds:test/Point-v0"
+HAND = "tests.runner.gym_worlds:test/Hand-v0"
+POINT = "tests.runner.gym_worlds:test/Point-v0"
 SEED = 5
 DEAF = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"}  # spans are made; nobody takes them
 WAIT_S = 280.0

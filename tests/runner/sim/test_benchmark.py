@@ -28,7 +28,7 @@ from vram_arbiter.schemas.errors import SidecarUnavailable
 
 HERE = Path(__file__).parents[1]
 ROOT = HERE.parents[1]
-POINT_ID = "gym_worlds:test/Point-v0"
+POINT_ID = "tests.runner.gym_worlds:test/Point-v0"
 POINT = f"gym:{POINT_ID}"
 SEEK = f"scripted:{HERE}/seek.py"
 

@@ -22,7 +22,7 @@ from vram_arbiter.schemas.control import ControlMode  # noqa: E402
 from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
 from vram_arbiter.schemas.world import Action, JointState, WorldState  # noqa: E402
 
-POINT = "gym_worlds:test/Point-v0"
+POINT = "tests.runner.gym_worlds:test/Point-v0"
 NAMED = GymConfig(state="agent_pos", joints={"a": 0, "b": 1}, actions=("a", "b"))
 NOWHERE = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
 

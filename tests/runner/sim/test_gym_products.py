@@ -24,7 +24,7 @@ from vram_arbiter.schemas.control import ControlMode  # noqa: E402
 from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed, ModelError  # noqa: E402
 from vram_arbiter.schemas.world import Action, JointState, WorldState  # noqa: E402
 
-HAND = "gym_worlds:test/Hand-v0"
+HAND = "tests.runner.gym_worlds:test/Hand-v0"
 NAMES = ("arm.0", "arm.1", "gripper", "lamps.0", "lamps.1", "walk.0.0", "walk.0.1", "walk.1")
 PICTURE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
 NOWHERE = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
@@ -112,7 +112,7 @@ def test_a_script_gives_what_the_environment_itself_takes() -> None:
     assert env.action_of(taken).rows[0] == pytest.approx((0.5, 0.5, -2 / 3, 0, 1, 0.5, 0.75, -0.5))
     for wrong in ({}, {**taken, "gripper": 2}, {**taken, "walk": [[1, 3]]}, [0.0] * 8, 1):
         with pytest.raises(
-            ModelError, match=r"expected an action of gym_worlds:test/Hand-v0, got "
+            ModelError, match=r"expected an action of tests.runner.gym_worlds:test/Hand-v0, got "
         ):
             env.action_of(wrong)
 

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.heavy
 
 HERE = Path(__file__).parents[1]
 ROOT = HERE.parents[1]
-POINT = "gym:gym_worlds:test/Point-v0"
+POINT = "gym:tests.runner.gym_worlds:test/Point-v0"
 MANIFEST = """
 name: "test/point-seek"
 version: "1.0.0"

@@ -1,6 +1,0 @@
-"""Lets the tests here import their helpers (`sim_*.py`) as the command line does."""
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))
