@@ -12,11 +12,9 @@ from __future__ import annotations
 import base64
 import binascii
 import contextlib
-import fcntl
 import json
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TypedDict
@@ -91,24 +89,20 @@ def locked(root: Path, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
 
     Raises AlreadyRunning when it is still locked after `wait_s`.
     """
+    from filelock import FileLock, Timeout
+
     (root / FOLDER).mkdir(parents=True, exist_ok=True)
-    lock = os.open(root / FOLDER / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    lock = FileLock(root / FOLDER / LOCK, timeout=wait_s, poll_interval=LOCK_POLL_S)
     try:
-        until_s = time.monotonic() + wait_s
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() >= until_s:
-                    raise AlreadyRunning(
-                        f"another process records into {root}",
-                        hint="wait until it has finished, or stop it",
-                    ) from None
-            time.sleep(LOCK_POLL_S)
+        lock.acquire()
+    except Timeout:
+        raise AlreadyRunning(
+            f"another process records into {root}", hint="wait until it has finished, or stop it"
+        ) from None
+    try:
         yield
     finally:
-        os.close(lock)
+        lock.release()
 
 
 def last(root: Path) -> Commit | None:
