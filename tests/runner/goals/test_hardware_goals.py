@@ -336,10 +336,9 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
     code = (
         "import sys; from vram_arbiter.runner.__main__ import main; "
-        "code = main(['estop', '--endpoint', sys.argv[1]]); "(
-            "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim',"
-            " 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
-        )
+        "code = main(['estop', '--endpoint', sys.argv[1]]); "
+        "print(code, sorted({'vram_arbiter.runner.cli.deploy', 'vram_arbiter.runner.cli.sim',"
+        " 'pydantic', 'numpy', 'zmq', 'msgpack'} & set(sys.modules)))"
     )
     argv = [sys.executable, "-c", code, endpoint]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True)

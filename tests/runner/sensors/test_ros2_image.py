@@ -427,10 +427,11 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
         "from vram_arbiter.runner.control.clock import SystemClock\n"
         "from vram_arbiter.runner.sensors.factory import make_reader\n"
         "from vram_arbiter.schemas.config.robot import SensorReaderConfig\n"
-        f"reader = make_reader(SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params={{'topic': {topic!r}}}), SystemClock())\n"(
-            "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__,"
-            " error)\n"
-        )
+        f"params = {{'topic': {topic!r}}}\n"
+        "config = SensorReaderConfig(sensor_id='a', backend='ros2_image', backend_params=params)\n"
+        "reader = make_reader(config, SystemClock())\n"
+        "try:\n    reader.start()\nexcept Exception as error:\n    print(type(error).__name__,"
+        " error)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
