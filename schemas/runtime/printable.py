@@ -1,7 +1,7 @@
-"""Text of other programs, made safe for a terminal or a log that people read.
+"""Text of other programs, made safe for a terminal or a log.
 
-Names, labels and reasons come from any process that may connect. A terminal obeys escape sequences and C1 controls in them, bidirectional
-marks reorder what is read, and a line break forges another line.
+Names, labels and reasons come from any process that may connect. A terminal obeys escape sequences
+and C1 controls in them, bidirectional marks reorder the text, and a line break forges a line.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from functools import wraps
 
 
 def printable(text: object) -> str:
-    """`str(text)` with every control, format and unassigned character escaped as Python writes it (`\\x1b`, `\\u202e`, `\\n`)."""
+    """Return `str(text)` with control, format and unassigned characters escaped (`\\x1b`, `\\n`)."""
     said = str(text)
     if said.isprintable():
         return said
@@ -20,7 +20,7 @@ def printable(text: object) -> str:
 
 
 def printable_lines(text: object) -> str:
-    """The same for text of several lines, such as a traceback: its line breaks stay."""
+    """Return the same for text of several lines, such as a traceback: its line breaks stay."""
     return "\n".join(printable(line) for line in str(text).split("\n"))
 
 

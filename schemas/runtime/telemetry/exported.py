@@ -1,23 +1,24 @@
-"""What goes to a collector, so that it can be read there: one odd text would otherwise cost its whole batch of spans, or every later scrape.
+"""Values for a collector, in a form that can be sent.
 
-Texts come from file names, exceptions and models, and may hold half of a surrogate pair, which UTF-8 has no bytes for, or have no end.
-The SDK's types are imported by what is given them.
+Without it one odd text would cost its whole batch of spans, or every later scrape. Texts come from
+file names, exceptions and models; they may have half of a surrogate pair, which UTF-8 cannot
+encode, or any length. The SDK is imported only where it is used.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 TEXT_MAX_CHARS = 16_384
-"""Of one text of a span: a long stack trace, and no picture."""
+"""Longest text of a span: a long stack trace fits, a picture does not."""
 LABEL_MAX_CHARS = 256
-"""Of a metric's label: each value is a series of its own."""
+"""Longest label of a metric: each value is a series of its own."""
 ITEMS_MAX = 128
-"""Of a list or a mapping; the rest is left out."""
+"""Most items of a list or mapping; the rest is omitted."""
 DEPTH_MAX = 4
 
 
 def text(value: str, most: int = TEXT_MAX_CHARS) -> str:
-    """The same text if it can be sent; else with what cannot be encoded written out (`\\ud800`), and cut with a `…`."""
+    """Return the text if it can be sent; else escaped (`\\ud800`) and cut with a `…`."""
     if len(value) <= most and (value.isascii() or _encodable(value)):
         return value
     legible = value[:most].encode(errors="backslashreplace").decode()
@@ -26,7 +27,10 @@ def text(value: str, most: int = TEXT_MAX_CHARS) -> str:
 
 
 def attribute(value: Any, depth: int = DEPTH_MAX) -> Any:
-    """The same value if it can be sent: text, number, truth, None, or lists and mappings of such. Bytes become text, all else its `str`."""
+    """Return the value if it can be sent: text, number, bool, None, or lists and mappings of these.
+
+    Bytes become text, other types their `str`.
+    """
     match value:
         case None | bool() | float():
             return value
@@ -51,7 +55,7 @@ def attribute(value: Any, depth: int = DEPTH_MAX) -> Any:
 
 
 def attributes(values: Mapping[Any, Any], depth: int = DEPTH_MAX) -> Mapping[Any, Any]:
-    """The same mapping if all of it can be sent."""
+    """Return the mapping if all of it can be sent, else one that can be."""
     sent = {
         text(str(key), LABEL_MAX_CHARS): attribute(value, depth)
         for key, value in list(values.items())[:ITEMS_MAX]
@@ -64,7 +68,7 @@ def attributes(values: Mapping[Any, Any], depth: int = DEPTH_MAX) -> Mapping[Any
 
 
 def labels(values: Mapping[str, str] | None) -> Mapping[str, str] | None:
-    """Of a metric: texts of at most `LABEL_MAX_CHARS`."""
+    """Return a metric's labels: texts of at most `LABEL_MAX_CHARS`."""
     if values is None or all(
         value.isascii() and len(value) <= LABEL_MAX_CHARS for value in values.values()
     ):
@@ -73,7 +77,10 @@ def labels(values: Mapping[str, str] | None) -> Mapping[str, str] | None:
 
 
 class Legible:
-    """An exporter of spans (the SDK's) that gets what can be sent: it would leave out a whole batch for one text that cannot."""
+    """Exporter of spans that passes only values that can be sent to the SDK's exporter.
+
+    That one would omit a whole batch for one bad text.
+    """
 
     def __init__(self, exporter: Any) -> None:
         self._exporter = exporter
@@ -126,5 +133,6 @@ def _encodable(value: str) -> bool:
 def _said(value: object) -> str:
     try:
         return str(value)
-    except Exception:  # noqa: BLE001 - whatever a stranger's type does to be shown; a number of 5,000 digits is refused, too
+    # a foreign type may raise anything; a number of 5,000 digits is refused too
+    except Exception:  # noqa: BLE001
         return f"a {type(value).__name__}"
