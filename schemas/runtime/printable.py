@@ -9,7 +9,7 @@ from functools import wraps
 
 
 def printable(text: object) -> str:
-    """Return `str(text)` with control, format and unassigned characters escaped (`\\x1b`, `\\n`)."""
+    """Return `str(text)` with control, format and unassigned characters escaped (`\\x1b`)."""
     said = str(text)
     if said.isprintable():
         return said
