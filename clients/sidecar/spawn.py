@@ -58,6 +58,8 @@ class Child:
                 start_new_session=True,  # Ctrl-C is for us; we end the child in order
             )
         except OSError as error:
+            if self._temporary:
+                self._log.unlink()
             raise SidecarUnavailable(
                 f"cannot start {spec.argv[0]}: {error.strerror}",
                 hint="check the command of the sidecar",

@@ -1,6 +1,7 @@
 """The async client against a real daemon with a simulated GPU, on asyncio and on trio."""
 
 import contextlib
+import gc
 import json
 import signal
 import sys
@@ -257,6 +258,18 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
                 await runner.begin_use(lease.lease_id, lease.token, "another goal")
         await wanted
         assert unloaded.is_set()
+
+
+async def test_ended_uses_are_forgotten(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
+    """A runner kept an object for each goal that it ever had."""
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
+        lease = await client.acquire(spec("a", 1))
+        await lease.ready()
+        for _ in range(3):
+            async with client.use(lease.lease_id, lease.token, "goal"):
+                assert len(client._session._foreign_uses) == 1
+            gc.collect()
+        assert len(client._session._foreign_uses) == 0
 
 
 async def test_a_use_needs_the_right_token(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:

@@ -161,10 +161,15 @@ async def test_a_boot_that_takes_too_long(endpoint: str, tmp_path: Path) -> None
     assert (tmp_path / "logs" / "s.log").exists()
 
 
-async def test_a_command_that_does_not_exist(endpoint: str) -> None:
+async def test_a_command_that_does_not_exist(
+    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each attempt left an empty log file in the temporary folder."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     async with SidecarClient(endpoint, spawn=SpawnSpec(["/nonexistent/sidecar"])) as client:
         with pytest.raises(SidecarUnavailable, match="cannot start"):
             await client.load()
+    assert list(tmp_path.glob("sidecar-*.log")) == []
 
 
 async def test_two_clients_starting_one_sidecar_end_up_with_one(endpoint: str) -> None:
