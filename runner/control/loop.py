@@ -240,6 +240,7 @@ class ControlLoop[R: Robot]:
         tick.reset = self.robot.reset_due
 
     def _open(self, tick: _Tick) -> None:
+        """Note the tick's trace and slot, and obey a latched stop before anything is sensed."""
         tick.trace_context = self.spans.carrier()
         tick.slot = self._pacing.slot(tick.started_s)
         if tick.reset:
@@ -248,6 +249,7 @@ class ControlLoop[R: Robot]:
             self.mailbox.run_pending()
 
     def _sense(self, tick: _Tick) -> None:
+        """Update the world state; the goal ends if the robot cannot go on."""
         if tick.reset:
             return
         followed = self.slot.follower.sink is not None
@@ -258,6 +260,7 @@ class ControlLoop[R: Robot]:
             self.slot.end(tick.sensed.ended)
 
     def _decide(self, tick: _Tick) -> None:
+        """Ask the skill and pass its action through the gate, unless an input is stale."""
         if tick.reset or self.obey_estop() is not None or not self.slot.busy:
             return
         if tick.sensed.stale is not None:
@@ -266,6 +269,7 @@ class ControlLoop[R: Robot]:
             tick.decision = self.slot.decide(self.world)
 
     def _meet_deadline(self, tick: _Tick) -> None:
+        """Withhold a late action under DROP and RAISE."""
         if self.deadline_policy is DeadlinePolicy.WARN or tick.decision.action is None:
             return
         if self.clock.now_s() > tick.slot.deadline_s:
@@ -274,11 +278,14 @@ class ControlLoop[R: Robot]:
             self.slot.came_too_late()
 
     def _apply(self, tick: _Tick) -> None:
+        """Apply the action, hold, or prepare a scene; the goal ends if the robot says so."""
         tick.apply_s = self.clock.now_s()
         if tick.reset:
             tick.applied = self.robot.reset()
         else:
-            action = tick.decision.action if self.obey_estop() is None else None
+            if self.obey_estop() is not None:
+                tick.decision.action = None
+            action = tick.decision.action
             with nullcontext() if action is None else tracing.span(telemetry.SPAN_SEND):
                 tick.applied = self.robot.apply(action, skill_active=self.slot.busy)
             if action is not None:

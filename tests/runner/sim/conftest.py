@@ -16,7 +16,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 
 @pytest.fixture
-def env() -> "Iterator[SimEnv]":
+def sim_env() -> "Iterator[SimEnv]":
     """The simulated arm on its table."""
     from vram_arbiter.runner.sim.env import SimEnv
 

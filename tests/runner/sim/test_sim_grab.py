@@ -34,48 +34,48 @@ def kinematics() -> ArmKinematics:
 
 @pytest.mark.parametrize("shape", ["cube", "ball", "cylinder"])
 def test_expert_grabs_after_imperfect_navigation(
-    env: SimEnv, kinematics: ArmKinematics, shape: str
+    sim_env: SimEnv, kinematics: ArmKinematics, shape: str
 ) -> None:
     for seed in range(8):
-        env.reset(seed, names=(f"red {shape}", "blue ball", "green cube"))
-        stand_before(env, f"red {shape}", random.Random(seed))
-        assert run_expert(env, GrabExpert(env, kinematics, f"red {shape}"))
-        truth = env.ground_truth()
+        sim_env.reset(seed, names=(f"red {shape}", "blue ball", "green cube"))
+        stand_before(sim_env, f"red {shape}", random.Random(seed))
+        assert run_expert(sim_env, GrabExpert(sim_env, kinematics, f"red {shape}"))
+        truth = sim_env.ground_truth()
         assert truth.held == f"red {shape}"
-        assert env.is_held_above_table(f"red {shape}")
-        assert not env.is_held_above_table("blue ball")
+        assert sim_env.is_held_above_table(f"red {shape}")
+        assert not sim_env.is_held_above_table("blue ball")
         assert truth.objects[f"red {shape}"].lift_m > 0.05
 
 
-def test_a_held_thing_stays_held_while_driving(env: SimEnv, kinematics: ArmKinematics) -> None:
-    env.reset(1)
-    stand_before(env, env.target, random.Random(1))
-    run_expert(env, GrabExpert(env, kinematics, env.target))
+def test_a_held_thing_stays_held_while_driving(sim_env: SimEnv, kinematics: ArmKinematics) -> None:
+    sim_env.reset(1)
+    stand_before(sim_env, sim_env.target, random.Random(1))
+    run_expert(sim_env, GrabExpert(sim_env, kinematics, sim_env.target))
     for _ in range(30):
-        env.step(None, (-0.2, 0.0, 0.2))
-    assert env.held_object() == env.target
+        sim_env.step(None, (-0.2, 0.0, 0.2))
+    assert sim_env.held_object() == sim_env.target
 
 
-def test_a_miss_holds_nothing(env: SimEnv, kinematics: ArmKinematics) -> None:
-    env.reset(2)
-    stand_before(env, env.target, random.Random(2), error_m=0.0)
-    expert = GrabExpert(env, kinematics, env.target, offset_m=(0.0, 0.05), retry=False)
-    assert not run_expert(env, expert)
-    assert env.held_object() is None
+def test_a_miss_holds_nothing(sim_env: SimEnv, kinematics: ArmKinematics) -> None:
+    sim_env.reset(2)
+    stand_before(sim_env, sim_env.target, random.Random(2), error_m=0.0)
+    expert = GrabExpert(sim_env, kinematics, sim_env.target, offset_m=(0.0, 0.05), retry=False)
+    assert not run_expert(sim_env, expert)
+    assert sim_env.held_object() is None
 
 
 def test_opening_the_gripper_lets_go_and_rest_is_reached(
-    env: SimEnv, kinematics: ArmKinematics
+    sim_env: SimEnv, kinematics: ArmKinematics
 ) -> None:
-    env.reset(1)
-    stand_before(env, env.target, random.Random(1))
-    run_expert(env, GrabExpert(env, kinematics, env.target))
-    rest = RestController(env.joint_state())
+    sim_env.reset(1)
+    stand_before(sim_env, sim_env.target, random.Random(1))
+    run_expert(sim_env, GrabExpert(sim_env, kinematics, sim_env.target))
+    rest = RestController(sim_env.joint_state())
     for _ in range(120):
-        env.step(rest.act())
+        sim_env.step(rest.act())
     assert rest.done
-    assert env.held_object() is None
-    assert list(env.joint_state().values()) == pytest.approx(list(REST_POSE), abs=0.02)
+    assert sim_env.held_object() is None
+    assert list(sim_env.joint_state().values()) == pytest.approx(list(REST_POSE), abs=0.02)
 
 
 def test_inverse_kinematics_reaches_the_grasp_zone(kinematics: ArmKinematics) -> None:
@@ -128,7 +128,7 @@ def test_the_shipped_policy_grabs_and_can_drive_a_second_round(tmp_path: Path) -
 
     torch.set_num_threads(1)  # a second thread of so small a network only waits
     policy = LoadedPolicy(CHECKPOINT)
-    with SimEnv() as env:
-        done = [attempt(env, policy, 700 + n, tries=2, error_m=0.015) for n in range(3)]
+    with SimEnv() as sim_env:
+        done = [attempt(sim_env, policy, 700 + n, tries=2, error_m=0.015) for n in range(3)]
     assert sum(one.held == one.name for one in done) >= 2
     assert write_grab(tmp_path, 1, 5, policy)["episodes"] == 1

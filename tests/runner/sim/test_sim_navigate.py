@@ -19,46 +19,50 @@ from vram_arbiter.runner.sim.navigate import (
 pytestmark = pytest.mark.heavy
 
 
-def drive(env: SimEnv, controller: PlanarController, limit: int = 300) -> int:
+def drive(sim_env: SimEnv, controller: PlanarController, limit: int = 300) -> int:
     for step in range(limit):
-        pose = Pose2D(*env.base_pose())
+        pose = Pose2D(*sim_env.base_pose())
         if controller.reached(pose):
             return step
-        env.step(None, controller.command(pose))
-        assert pose.x_m + front_reach_m(env.config, pose.yaw_rad) < env.config.table_edge_x_m
+        sim_env.step(None, controller.command(pose))
+        assert (
+            pose.x_m + front_reach_m(sim_env.config, pose.yaw_rad) < sim_env.config.table_edge_x_m
+        )
     return limit
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_reaches_the_standoff_of_every_object(env: SimEnv, seed: int) -> None:
-    env.reset(seed)
-    for truth in env.ground_truth().objects.values():
-        goal = standoff_pose(truth.position_map[:2], env.config)
-        assert drive(env, PlanarController(goal, env.config)) < 200
+def test_reaches_the_standoff_of_every_object(sim_env: SimEnv, seed: int) -> None:
+    sim_env.reset(seed)
+    for truth in sim_env.ground_truth().objects.values():
+        goal = standoff_pose(truth.position_map[:2], sim_env.config)
+        assert drive(sim_env, PlanarController(goal, sim_env.config)) < 200
         for _ in range(6):
-            env.step(None)
-        x, y, yaw = env.base_pose()
+            sim_env.step(None)
+        x, y, yaw = sim_env.base_pose()
         assert math.dist((x, y), (goal.x_m, goal.y_m)) < 0.01
         assert abs(yaw) < 0.02
-        spot = env.ground_truth().objects[truth.name].position_base
-        assert math.dist(spot[:2], env.config.grasp_spot_in_base_m) < 0.02
+        spot = sim_env.ground_truth().objects[truth.name].position_base
+        assert math.dist(spot[:2], sim_env.config.grasp_spot_in_base_m) < 0.02
 
 
-def test_a_target_deep_on_the_table_stops_before_the_edge(env: SimEnv) -> None:
-    env.reset(0)
-    goal = standoff_pose((5.0, 0.0), env.config)
-    drive(env, PlanarController(goal, env.config))
-    assert env.base_pose()[0] + front_reach_m(env.config, 0.0) < env.config.table_edge_x_m
+def test_a_target_deep_on_the_table_stops_before_the_edge(sim_env: SimEnv) -> None:
+    sim_env.reset(0)
+    goal = standoff_pose((5.0, 0.0), sim_env.config)
+    drive(sim_env, PlanarController(goal, sim_env.config))
+    assert (
+        sim_env.base_pose()[0] + front_reach_m(sim_env.config, 0.0) < sim_env.config.table_edge_x_m
+    )
 
 
-def test_a_goal_inside_the_table_is_never_driven_to(env: SimEnv) -> None:
-    env.reset(0)
-    assert drive(env, PlanarController(Pose2D(1.0, 0.0, 0.0), env.config), limit=150) == 150
+def test_a_goal_inside_the_table_is_never_driven_to(sim_env: SimEnv) -> None:
+    sim_env.reset(0)
+    assert drive(sim_env, PlanarController(Pose2D(1.0, 0.0, 0.0), sim_env.config), limit=150) == 150
 
 
-def test_a_goal_that_turns_is_reached(env: SimEnv) -> None:
-    env.reset(0)
-    assert drive(env, PlanarController(Pose2D(-0.2, 0.3, 1.2), env.config)) < 200
+def test_a_goal_that_turns_is_reached(sim_env: SimEnv) -> None:
+    sim_env.reset(0)
+    assert drive(sim_env, PlanarController(Pose2D(-0.2, 0.3, 1.2), sim_env.config)) < 200
 
 
 def test_to_map_turns_and_shifts() -> None:

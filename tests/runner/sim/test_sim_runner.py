@@ -30,6 +30,7 @@ from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     ConfigError,
     EnvironmentFailed,
+    EstopRequested,
     Evicted,
     InternalError,
     ModelError,
@@ -420,6 +421,27 @@ def test_a_late_action_is_dropped_on_the_way_to_the_simulator(
     runner.begin_skill(Slow(Act(joints(0.1))), GOAL, lambda _: None)
     assert not runner.tick().action_applied
     assert env.steps == [(None, None)]
+
+
+def test_a_stop_that_comes_while_the_skill_decides_acts_in_this_tick(
+    make_runner: Make, env: Any
+) -> None:
+    """The simulator applied that action and obeyed one tick later; hardware never did."""
+
+    class Stopped(Scripted):
+        def step(self, world: WorldState) -> StepOutcome:
+            runner.request_estop("a hand is in the way")
+            return super().step(world)
+
+    runner = make_runner(rate_hz=0)
+    ended: list[SkillEnded] = []
+    runner.activate()
+    runner.tick()
+    runner.begin_skill(Stopped(Act(joints(0.1))), GOAL, ended.append)
+    result = runner.tick()
+    assert env.steps == [(None, None)]
+    assert not result.action_applied
+    assert isinstance(ended[0].error, EstopRequested)
 
 
 def test_one_skill_at_a_time_and_taking_the_arm_back(make_runner: Make, env: Any) -> None:
