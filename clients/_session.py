@@ -16,7 +16,6 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
-from weakref import WeakValueDictionary
 
 import anyio
 from anyio.abc import TaskGroup
@@ -89,7 +88,7 @@ class Session:
         )
         self._waits: dict[str, _Wait] = {}
         self._leases: dict[str, AsyncLease] = {}
-        self._foreign_uses: WeakValueDictionary[str, AsyncForeignUse] = WeakValueDictionary()
+        self._foreign_uses: dict[str, AsyncForeignUse] = {}
         self._subscribers: list[_Subscriber] = []
         self._connect_timeout_s = connect_timeout_s
         self._open = False
@@ -248,6 +247,9 @@ class Session:
         finally:
             if self._replies.pop(request_id, None) is not None and not answer.done:
                 self.protocol.connection.forget(request_id)
+
+    def forget_use(self, use_id: str) -> None:
+        self._foreign_uses.pop(use_id, None)
 
     def pump(self) -> None:
         """Do what the protocol wants: send, tell, move the alarm. Call it after every change."""

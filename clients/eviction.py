@@ -49,6 +49,10 @@ class Driver(Protocol):
         """Send what is queued and wait for the answer to a request. Raises its typed error."""
         ...
 
+    def forget_use(self, use_id: str) -> None:
+        """Drop a use on the lease of another process: it has ended."""
+        ...
+
     def pump(self) -> None:
         """Send what is queued, without waiting for an answer."""
         ...

@@ -436,6 +436,7 @@ class AsyncForeignUse:
             return
         self._ended = True
         use_context.leave(self.use_id)
+        self._driver.forget_use(self.use_id)
         self._driver.protocol.foreign_uses.end(
             self.lease_id, self.token, self.use_id, self._driver.now()
         )
