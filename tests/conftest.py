@@ -94,3 +94,9 @@ def short_folder() -> Iterator[Path]:
     """An empty folder with a short path: the path of a socket holds 107 bytes."""
     with tempfile.TemporaryDirectory(prefix="va") as made:
         yield Path(made)
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The event loop of asynchronous tests, where a test does not name others."""
+    return "asyncio"

@@ -24,7 +24,7 @@ GIB = 1 << 30
 Make = Callable[..., ArbiterProcess]
 
 
-def run(
+def run_daemon(
     arbiter: ArbiterProcess, *arguments: str, **environ: str
 ) -> "subprocess.CompletedProcess[str]":
     """`python -m vram_arbiter.arbiter` with exactly these flags, to its end."""
@@ -39,7 +39,7 @@ def run(
 
 
 def test_help_documents_the_exit_codes(make_arbiter: Make) -> None:
-    done = run(make_arbiter(), "--help")
+    done = run_daemon(make_arbiter(), "--help")
     assert done.returncode == 0
     for code in ("0", "2", "3", "4", "70"):
         assert re.search(rf"^  {code} +\w", done.stdout, re.MULTILINE), (
@@ -49,16 +49,16 @@ def test_help_documents_the_exit_codes(make_arbiter: Make) -> None:
 
 def test_version_and_check_config(make_arbiter: Make) -> None:
     arbiter = make_arbiter()
-    assert run(arbiter, "--version").stdout.startswith("vram-arbiter ")
+    assert run_daemon(arbiter, "--version").stdout.startswith("vram-arbiter ")
     example = Path(__file__).parents[2] / "configs" / "arbiter.yaml"
-    done = run(arbiter, "--check-config", "--config", str(example))
+    done = run_daemon(arbiter, "--check-config", "--config", str(example))
     assert (done.returncode, done.stderr) == (0, "")
     assert f"ok (would serve {arbiter.endpoint}" in done.stdout
 
 
 def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) -> None:
     arbiter = make_arbiter(config="verify:\n  tiemout_s: 3\n")
-    done = run(arbiter, *arbiter.arguments)
+    done = run_daemon(arbiter, *arbiter.arguments)
     assert done.returncode == 2
     assert "arbiter.yaml:2: verify.tiemout_s: unknown key; did you mean timeout_s?" in done.stderr
     assert "Traceback" not in done.stderr
@@ -83,7 +83,7 @@ def test_wrong_flags_end_with_2_and_say_what_to_do(
     make_arbiter: Make, arguments: list[str], words: str
 ) -> None:
     """Regression: `--gpu fake:0` ended with a traceback and exit code 1, which systemd retries."""
-    done = run(make_arbiter(), *arguments)
+    done = run_daemon(make_arbiter(), *arguments)
     assert done.returncode == 2
     assert words in done.stderr
     assert "Traceback" not in done.stderr
@@ -91,7 +91,7 @@ def test_wrong_flags_end_with_2_and_say_what_to_do(
 
 def test_a_cap_on_a_card_that_is_not_there(make_arbiter: Make) -> None:
     arbiter = make_arbiter(config="gpu:\n  capacity_bytes: {'7': 4GiB}\n")
-    done = run(arbiter, *arbiter.arguments, "--gpu", "fake:8GiB")
+    done = run_daemon(arbiter, *arbiter.arguments, "--gpu", "fake:8GiB")
     assert done.returncode == 2
     assert "names no card of this machine: 7" in done.stderr
 
@@ -99,7 +99,7 @@ def test_a_cap_on_a_card_that_is_not_there(make_arbiter: Make) -> None:
 @pytest.mark.skipif(os.path.exists("/dev/nvidiactl"), reason="this machine has an NVIDIA driver")
 def test_without_a_driver_nothing_is_simulated_unasked(make_arbiter: Make) -> None:
     arbiter = make_arbiter()
-    done = run(arbiter, "--state-dir", str(arbiter.state))
+    done = run_daemon(arbiter, "--state-dir", str(arbiter.state))
     assert done.returncode == 4
     assert "--gpu fake:8GiB" in done.stderr
     assert "Traceback" not in done.stderr
@@ -112,7 +112,7 @@ def test_a_second_daemon_on_the_socket_is_refused_and_the_first_serves_on(
 ) -> None:
     client = connect().hello()
     lease = client.granted("holder", GIB)
-    done = run(
+    done = run_daemon(
         arbiter_daemon, "--gpu", "fake:8GiB", "--state-dir", str(arbiter_daemon.runtime / "other")
     )
     assert done.returncode == 3
@@ -123,7 +123,7 @@ def test_a_second_daemon_on_the_socket_is_refused_and_the_first_serves_on(
 
 def test_a_second_daemon_on_the_state_folder_is_refused(arbiter_daemon: ArbiterProcess) -> None:
     endpoint = f"ipc://{arbiter_daemon.runtime}/other.sock"
-    done = run(
+    done = run_daemon(
         arbiter_daemon,
         "--gpu",
         "fake:8GiB",
@@ -141,8 +141,11 @@ def test_the_environment_names_the_endpoint_and_the_flag_wins(make_arbiter: Make
     other = f"ipc://{arbiter.runtime}/by-variable.sock"
     flag = f"ipc://{arbiter.runtime}/by-flag.sock"
     arguments = ["--check-config", "--gpu", "fake:8GiB"]
-    assert other in run(arbiter, *arguments, VRAM_ARBITER_ENDPOINT=other).stdout
-    assert flag in run(arbiter, *arguments, "--endpoint", flag, VRAM_ARBITER_ENDPOINT=other).stdout
+    assert other in run_daemon(arbiter, *arguments, VRAM_ARBITER_ENDPOINT=other).stdout
+    assert (
+        flag
+        in run_daemon(arbiter, *arguments, "--endpoint", flag, VRAM_ARBITER_ENDPOINT=other).stdout
+    )
 
 
 @pytest.mark.parametrize("number", ["TERM", "INT"])

@@ -28,10 +28,10 @@ BEAT = {"WATCHDOG_USEC": "600000"}
 class Tmpfs:
     """The state folder lies on a small file system of its own, which a file of ours can fill."""
 
-    def __init__(self, arbiter: ArbiterProcess) -> None:
-        self._folder = arbiter.state
-        self._ballast = arbiter.state / "ballast"
-        arbiter.state.mkdir(mode=0o700)
+    def __init__(self, on_small_disk: ArbiterProcess) -> None:
+        self._folder = on_small_disk.state
+        self._ballast = on_small_disk.state / "ballast"
+        on_small_disk.state.mkdir(mode=0o700)
         options = ["-t", "tmpfs", "-o", "size=1m,mode=0700", "none"]
         done = subprocess.run(
             ["mount", *options, str(self._folder)], capture_output=True, text=True, timeout=60
@@ -57,8 +57,8 @@ class Tmpfs:
 class SizeLimit:
     """The kernel refuses the daemon to write to any file (RLIMIT_FSIZE): needs no privilege."""
 
-    def __init__(self, arbiter: ArbiterProcess) -> None:
-        self._arbiter = arbiter
+    def __init__(self, on_small_disk: ArbiterProcess) -> None:
+        self._arbiter = on_small_disk
 
     def _limit(self, soft: int) -> None:
         resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE, (soft, resource.RLIM_INFINITY))
@@ -74,38 +74,38 @@ class SizeLimit:
 
 
 @pytest.fixture
-def arbiter() -> Iterator[ArbiterProcess]:
+def on_small_disk() -> Iterator[ArbiterProcess]:
     made = ArbiterProcess(config="record:\n  enabled: false\n")
     yield made
     made.close()
 
 
 @pytest.fixture
-def tmpfs(arbiter: ArbiterProcess) -> Iterator[Tmpfs]:
+def tmpfs(on_small_disk: ArbiterProcess) -> Iterator[Tmpfs]:
     if os.getuid() != 0 or shutil.which("mount") is None:
         pytest.skip("needs root and mount for a small disk")
-    disk = Tmpfs(arbiter)
+    disk = Tmpfs(on_small_disk)
     yield disk
-    if arbiter.process is not None and arbiter.process.poll() is None:
-        arbiter.kill()
+    if on_small_disk.process is not None and on_small_disk.process.poll() is None:
+        on_small_disk.kill()
     disk.close()
 
 
 @pytest.fixture(params=["tmpfs", "limit"])
-def disk(arbiter: ArbiterProcess, request: pytest.FixtureRequest) -> Tmpfs | SizeLimit:
+def disk(on_small_disk: ArbiterProcess, request: pytest.FixtureRequest) -> Tmpfs | SizeLimit:
     if request.param == "tmpfs":
         found: Tmpfs = request.getfixturevalue("tmpfs")
         return found
-    return SizeLimit(arbiter)
+    return SizeLimit(on_small_disk)
 
 
 def consumers(client: WireClient) -> list[str]:
     return [lease["consumer"] for lease in client.ask("status")["leases"]]
 
 
-def kinds_on_disk(arbiter: ArbiterProcess) -> set[str]:
+def kinds_on_disk(on_small_disk: ArbiterProcess) -> set[str]:
     """What a kill would leave of the history; it is written a little after it happened."""
-    with contextlib.closing(sqlite3.connect(arbiter.state / "history.sqlite")) as database:
+    with contextlib.closing(sqlite3.connect(on_small_disk.state / "history.sqlite")) as database:
         return {kind for (kind,) in database.execute("SELECT DISTINCT kind FROM events")}
 
 
@@ -119,10 +119,10 @@ def wait_until(client: WireClient, good: Callable[[], bool]) -> None:
 
 
 def test_a_full_disk_blocks_grants_and_nothing_else(
-    arbiter: ArbiterProcess, disk: Tmpfs | SizeLimit
+    on_small_disk: ArbiterProcess, disk: Tmpfs | SizeLimit
 ) -> None:
-    arbiter.start(BEAT)
-    with WireClient(arbiter.endpoint) as client:
+    on_small_disk.start(BEAT)
+    with WireClient(on_small_disk.endpoint) as client:
         client.hello().ask("subscribe")
         held = [client.granted(name, 200 << 20, ttl_s=600.0) for name in ("stays",)]
         on = {"lease_id": held[0]["lease_id"], "token": held[0]["token"]}
@@ -139,10 +139,10 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
         assert any(
             "journal cannot be written" in problem for problem in client.ask("status")["problems"]
         )
-        arbiter.wait_for("journal cannot be written", PATIENCE_S)
+        on_small_disk.wait_for("journal cannot be written", PATIENCE_S)
         doctor = subprocess.run(
             [sys.executable, "-m", "vram_arbiter.clients", "doctor"],
-            env=arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+            env=on_small_disk.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
         )  # fmt: skip
         assert doctor.returncode == 1, "a daemon that can grant nothing is not healthy"
         assert "BAD  files" in doctor.stdout
@@ -160,10 +160,10 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
         client.granted("later", 200 << 20, ttl_s=600.0)
         kinds = {event["kind"] for event in client.ask("history", limit=1000)["events"]}
         assert {"journal_failed", "released", "granted"} <= kinds, sorted(kinds)
-        wait_until(client, lambda: "journal_failed" in kinds_on_disk(arbiter))
-    arbiter.kill()
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
+        wait_until(client, lambda: "journal_failed" in kinds_on_disk(on_small_disk))
+    on_small_disk.kill()
+    on_small_disk.start()
+    with WireClient(on_small_disk.endpoint) as client:
         client.hello()
         assert sorted(consumers(client)) == ["later", "stays"], (
             "what was released does not come back as a lease"
@@ -175,61 +175,63 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
 
 
 def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
-    arbiter: ArbiterProcess, tmpfs: Tmpfs
+    on_small_disk: ArbiterProcess, tmpfs: Tmpfs
 ) -> None:
     """Regression: it ended with a traceback, or with an exit code for wrong configuration, which
     systemd does not retry."""
     tmpfs.fill()
     with pytest.raises(RuntimeError, match="ended with 5"):
-        arbiter.start()
-    assert "on a disk that is full, failing or read-only" in arbiter.log
-    assert "Traceback" not in arbiter.log
+        on_small_disk.start()
+    assert "on a disk that is full, failing or read-only" in on_small_disk.log
+    assert "Traceback" not in on_small_disk.log
     tmpfs.free()
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
+    on_small_disk.start()
+    with WireClient(on_small_disk.endpoint) as client:
         assert client.hello().acquire("later", GIB)["ok"]
 
 
 def test_a_start_on_a_read_only_disk_is_worth_another_try_and_loses_no_lease(
-    arbiter: ArbiterProcess, tmpfs: Tmpfs
+    on_small_disk: ArbiterProcess, tmpfs: Tmpfs
 ) -> None:
     """Regression: it ended with 2, the code that systemd takes for a person's mistake, and stayed down for ever."""
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
+    on_small_disk.start()
+    with WireClient(on_small_disk.endpoint) as client:
         client.hello().granted("holder", GIB, ttl_s=600.0)
         client.ask("ping")
-    arbiter.kill()
+    on_small_disk.kill()
     tmpfs.remount("ro")
     for _ in range(2):
         with pytest.raises(RuntimeError, match="ended with 5"):
-            arbiter.start()
-    assert "full, failing or read-only" in arbiter.log
-    assert "Traceback" not in arbiter.log
+            on_small_disk.start()
+    assert "full, failing or read-only" in on_small_disk.log
+    assert "Traceback" not in on_small_disk.log
     tmpfs.remount("rw")
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
+    on_small_disk.start()
+    with WireClient(on_small_disk.endpoint) as client:
         assert consumers(client.hello()) == ["holder"]
         assert not client.ask("status")["problems"], "and nothing was taken for damage"
 
 
-def test_a_restart_on_a_full_disk_loses_no_lease(arbiter: ArbiterProcess, tmpfs: Tmpfs) -> None:
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
+def test_a_restart_on_a_full_disk_loses_no_lease(
+    on_small_disk: ArbiterProcess, tmpfs: Tmpfs
+) -> None:
+    on_small_disk.start()
+    with WireClient(on_small_disk.endpoint) as client:
         held = client.hello().granted("stays", 200 << 20, ttl_s=600.0)
-    arbiter.kill()
+    on_small_disk.kill()
     tmpfs.fill()
     with pytest.raises(RuntimeError, match="ended with 5"):
-        arbiter.start()
+        on_small_disk.start()
     tmpfs.free()
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
+    on_small_disk.start()
+    with WireClient(on_small_disk.endpoint) as client:
         (lease,) = client.hello().ask("status")["leases"]
         assert (lease["lease_id"], lease["token"]) == (held["lease_id"], held["token"])
 
 
-def test_the_state_folder_is_the_small_disk(arbiter: ArbiterProcess, tmpfs: Tmpfs) -> None:
+def test_the_state_folder_is_the_small_disk(on_small_disk: ArbiterProcess, tmpfs: Tmpfs) -> None:
     """What the tests above rest on."""
-    assert os.stat(arbiter.state).st_dev != os.stat(arbiter.runtime).st_dev
+    assert os.stat(on_small_disk.state).st_dev != os.stat(on_small_disk.runtime).st_dev
     tmpfs.fill()
     with pytest.raises(OSError, match="No space left"):
-        Path(arbiter.state / "more").write_bytes(b"x" * 8192)
+        Path(on_small_disk.state / "more").write_bytes(b"x" * 8192)

@@ -134,7 +134,7 @@ def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
                 assert sidecar.push("granted")["lease"]["lease_id"] == waiting["lease"]["lease_id"]
 
 
-def leases(client: WireClient) -> list[tuple[str, str, list[int] | None]]:
+def leases_of(client: WireClient) -> list[tuple[str, str, list[int] | None]]:
     return [
         (lease["consumer"], lease["state"], lease["token"])
         for lease in client.ask("status")["leases"]
@@ -152,7 +152,7 @@ def test_leases_survive_kill_9_of_the_daemon(make_arbiter: Make) -> None:
         status = client.ask("status")
         assert status["phase"] == "recovering"
         assert status["epoch"] > on["token"][0]
-        assert leases(client) == [("holder", "held", on["token"])]
+        assert leases_of(client) == [("holder", "held", on["token"])]
         waiting = client.acquire("waiter", 5 * GIB)
         assert waiting["state"] == "queued", "nothing is granted before the holder is accounted for"
         assert reattach(client, on, "holder", 5 * GIB)["kept"]
@@ -223,7 +223,7 @@ def test_a_corrupt_journal_is_reported_and_the_holder_is_believed(
             "somebody may hold what nobody remembers"
         )
         assert reattach(client, on, "holder", 5 * GIB)["kept"]
-        assert ("holder", "held", on["token"]) in leases(client)
+        assert ("holder", "held", on["token"]) in leases_of(client)
 
 
 def test_a_grant_that_cannot_be_written_is_refused_and_not_charged(make_arbiter: Make) -> None:

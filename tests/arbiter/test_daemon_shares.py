@@ -46,7 +46,7 @@ with WireClient(endpoint) as client:
 )
 
 
-def start(arbiter: ArbiterProcess, script: str, uid: int, gid: int) -> "subprocess.Popen[str]":
+def start_user(arbiter: ArbiterProcess, script: str, uid: int, gid: int) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-c", script, arbiter.endpoint, str(uid), str(gid)],
         env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -67,11 +67,11 @@ def test_the_processes_of_one_user_leave_room_for_another(
     codes: list[str] = []
     with ExitStack() as ended:
         for _ in range(PROCESSES):
-            greedy = start(arbiter, TAKE_ALL, GREEDY, group.gr_gid)
+            greedy = start_user(arbiter, TAKE_ALL, GREEDY, group.gr_gid)
             ended.callback(greedy.communicate)
             assert greedy.stdout is not None
             codes += json.loads(greedy.stdout.readline())
         assert codes.count("ok") == SESSIONS_MAX / 2
         assert set(codes) == {"ok", "process_share", "user_share"}
-        out, _ = start(arbiter, ASK, OTHER, group.gr_gid).communicate(timeout=60)
+        out, _ = start_user(arbiter, ASK, OTHER, group.gr_gid).communicate(timeout=60)
         assert json.loads(out) == SESSIONS_MAX / 2 + 1

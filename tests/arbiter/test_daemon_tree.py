@@ -29,7 +29,7 @@ sys.stdin.readline()
 
 
 @pytest.fixture
-def arbiter(
+def quick_reader(
     make_arbiter: Callable[..., ArbiterProcess], request: pytest.FixtureRequest
 ) -> ArbiterProcess:
     """Reads its card ten times a second, and waits for bytes for a minute, or as long as `indirect` parametrization says."""
@@ -40,21 +40,21 @@ def arbiter(
 
 
 @pytest.fixture
-def observer(arbiter: ArbiterProcess) -> Iterator[WireClient]:
+def observer(quick_reader: ArbiterProcess) -> Iterator[WireClient]:
     """A connected client: the card is read in the background while there is one."""
-    with WireClient(arbiter.endpoint) as client:
+    with WireClient(quick_reader.endpoint) as client:
         yield client.hello("watcher", role="observer")
 
 
 @contextlib.contextmanager
 def job(
-    arbiter: ArbiterProcess, size: int, *extra: str
+    quick_reader: ArbiterProcess, size: int, *extra: str
 ) -> Iterator[tuple["subprocess.Popen[str]", int]]:
     """`vramctl run` of a child that holds `size` until its stdin closes: (vramctl, the child's pid)."""
     process = subprocess.Popen(
         [sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "5GiB", "--name", "job", "--",
-         *extra, sys.executable, "-c", CHILD, str(arbiter.card), str(size)],
-        env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+         *extra, sys.executable, "-c", CHILD, str(quick_reader.card), str(size)],
+        env=quick_reader.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdin is not None
     assert process.stdout is not None
@@ -95,10 +95,10 @@ def wait_told(
     "through", [[], ["sh", "-c", '"$@"; exit $?', "sh"]], ids=["child", "grandchild"]
 )
 def test_the_bytes_of_a_child_are_those_of_the_lease(
-    arbiter: ArbiterProcess, observer: WireClient, through: list[str]
+    quick_reader: ArbiterProcess, observer: WireClient, through: list[str]
 ) -> None:
     assert observer.ask("subscribe")["ok"]
-    with job(arbiter, 4 * GIB, *through) as (vramctl, child):
+    with job(quick_reader, 4 * GIB, *through) as (vramctl, child):
         gpu = seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
         (process,) = gpu["processes"]
         assert child != vramctl.pid
@@ -121,12 +121,12 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
     assert vramctl.returncode == 0
 
 
-@pytest.mark.parametrize("arbiter", [2], indirect=True)
+@pytest.mark.parametrize("quick_reader", [2], indirect=True)
 def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
-    arbiter: ArbiterProcess, observer: WireClient
+    quick_reader: ArbiterProcess, observer: WireClient
 ) -> None:
     assert observer.ask("subscribe")["ok"]
-    with job(arbiter, 4 * GIB) as (vramctl, child):
+    with job(quick_reader, 4 * GIB) as (vramctl, child):
         seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
         vramctl.send_signal(signal.SIGKILL)
         stowaway = wait_told(observer, "stowaway", lambda event: event["pid"] == child)
@@ -142,12 +142,12 @@ def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
 
 
 def test_what_the_child_of_an_observer_holds_is_not_hidden(
-    arbiter: ArbiterProcess, observer: WireClient
+    quick_reader: ArbiterProcess, observer: WireClient
 ) -> None:
     """This very process is connected and the child's parent."""
     with subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(arbiter.card), str(GIB)],
-        env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-c", CHILD, str(quick_reader.card), str(GIB)],
+        env=quick_reader.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     ) as child:  # fmt: skip
         assert child.stdout is not None
         assert int(child.stdout.readline()) == child.pid

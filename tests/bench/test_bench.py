@@ -24,7 +24,7 @@ KEYS = {
 }
 
 
-def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
+def run_bench(out: Path, *subjects: str) -> list[dict[str, object]]:
     """A short run over a few subjects: the rows that it wrote to `out`, all of them in the table that it printed."""
     flags = [word for subject in subjects for word in ("--only", subject)]
     command = [
@@ -51,7 +51,7 @@ def bench(out: Path, *subjects: str) -> list[dict[str, object]]:
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, object]]:
     """What one short run over a few subjects writes."""
-    return bench(
+    return run_bench(
         tmp_path_factory.mktemp("bench") / "deep" / "arbiter.json", "grants", "eviction", "death"
     )
 
@@ -86,7 +86,7 @@ def test_a_comparison_names_its_floor(rows: list[dict[str, object]]) -> None:
 def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> None:
     if not (HERE.parents[1] / "configs/models/so101-grab/model.safetensors").exists():
         pytest.skip("the checkpoints are not in this tree")
-    rows = bench(tmp_path / "runner.json", "runner")
+    rows = run_bench(tmp_path / "runner.json", "runner")
     for row in rows:
         assert set(row) == {"name", "p50_us", "p99_us", "idle_p99_us", "ratio", "target", "ok"}
         assert isinstance(row["p50_us"], float)

@@ -20,12 +20,6 @@ meanwhile."""
 
 
 @pytest.fixture
-def anyio_backend() -> str:
-    """The clients are asyncio programs."""
-    return "asyncio"
-
-
-@pytest.fixture
 async def beside() -> AsyncIterator[Start]:
     """`beside(work())` runs a coroutine beside the test; what still runs at its end is canceled."""
     async with anyio.create_task_group() as tasks:

@@ -161,8 +161,8 @@ class Programs:
 class Stage:
     """One test's clients, and the history from its beginning on. It opens with the detector on the card and nobody else."""
 
-    def __init__(self, programs: Programs) -> None:
-        self.programs = programs
+    def __init__(self, episode_programs: Programs) -> None:
+        self.programs = episode_programs
         self.events: list[dict[str, Any]] = []
         self._more = asyncio.Event()
         self.arbiter: AsyncClient
@@ -170,12 +170,12 @@ class Stage:
         self.detector: DetectorClient
 
     @classmethod
-    async def open(cls, programs: Programs, stack: AsyncExitStack) -> "Stage":
-        stage, where = cls(programs), f"ipc://{programs.runtime}"
+    async def open(cls, episode_programs: Programs, stack: AsyncExitStack) -> "Stage":
+        stage, where = cls(episode_programs), f"ipc://{episode_programs.runtime}"
         stage.arbiter = await stack.enter_async_context(
             AsyncClient(
                 "witness",
-                endpoint=programs.arbiter.endpoint,
+                endpoint=episode_programs.arbiter.endpoint,
                 role="operator",
                 connect_timeout_s=WAIT_S,
             )
@@ -287,7 +287,7 @@ class Stage:
 
 
 @pytest.fixture(scope="module")
-def programs() -> Iterator[Programs]:
+def episode_programs() -> Iterator[Programs]:
     started = Programs()
     yield started
     started.close()
@@ -459,17 +459,19 @@ async def runner_killed(stage: Stage) -> None:
     ids=lambda end: end.__name__,
 )  # fmt: skip
 def test_after_a_goal_the_detector_is_back_by_itself(
-    programs: Programs, end: Callable[[Stage], Coroutine[Any, Any, None]]
+    episode_programs: Programs, end: Callable[[Stage], Coroutine[Any, Any, None]]
 ) -> None:
-    programs.play(end)
+    episode_programs.play(end)
 
 
 async def called_back(stage: Stage) -> None:
     """Of a policy that is on standby itself: its lease waits to come back, behind a look, when its goal is over."""
-    programs, manifest = stage.programs, parse_manifest(MANIFESTS["policy"])
-    programs.sidecar("policy", POLICY_BYTES, "--standby", "--min-residency-s", "0", name="spare")
+    episode_programs, manifest = stage.programs, parse_manifest(MANIFESTS["policy"])
+    episode_programs.sidecar(
+        "policy", POLICY_BYTES, "--standby", "--min-residency-s", "0", name="spare"
+    )
     joints = tuple(JOINTS.strip("[]").split(", "))
-    where = f"ipc://{programs.runtime}/spare.sock"
+    where = f"ipc://{episode_programs.runtime}/spare.sock"
     async with PolicyClient(where, connect_timeout_s=BOOT_S) as sidecar:
         skill = SidecarPolicy(
             manifest, wire_up(manifest, joints, None), sidecar, stage.arbiter, period_s=0.1
@@ -497,13 +499,13 @@ async def called_back(stage: Stage) -> None:
 
 
 def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
-    programs: Programs,
+    episode_programs: Programs,
 ) -> None:
     """Regression: the detector left the card for a goal that had been canceled, and stayed away."""
     try:
-        programs.play(called_back)
+        episode_programs.play(called_back)
     finally:
-        programs.kill("spare")
+        episode_programs.kill("spare")
 
 
 # -- while it runs -------------------------------------------------------------------------------------------------------
@@ -520,9 +522,11 @@ async def wanted_meanwhile(stage: Stage) -> None:
     assert await stage.leases() == {"detector": "held"}
 
 
-def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(programs: Programs) -> None:
+def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(
+    episode_programs: Programs,
+) -> None:
     """Nobody is made to leave in the middle of a step; the look that was wanted comes with the goal's end."""
-    programs.play(wanted_meanwhile)
+    episode_programs.play(wanted_meanwhile)
 
 
 async def one_after_the_other(stage: Stage) -> None:
@@ -552,9 +556,9 @@ async def one_after_the_other(stage: Stage) -> None:
 
 
 def test_the_next_goal_with_other_words_loads_nothing_and_lets_nothing_back_in_between(
-    programs: Programs,
+    episode_programs: Programs,
 ) -> None:
-    programs.play(one_after_the_other)
+    episode_programs.play(one_after_the_other)
 
 
 async def without_a_gpu(stage: Stage) -> None:
@@ -567,8 +571,8 @@ async def without_a_gpu(stage: Stage) -> None:
     assert (await stage.detector.ping(timeout_s=WAIT_S))["token"] == before["token"]
 
 
-def test_a_goal_without_a_gpu_sends_nobody_away(programs: Programs) -> None:
-    programs.play(without_a_gpu)
+def test_a_goal_without_a_gpu_sends_nobody_away(episode_programs: Programs) -> None:
+    episode_programs.play(without_a_gpu)
 
 
 async def slow_start(stage: Stage) -> None:
@@ -594,8 +598,8 @@ async def slow_start(stage: Stage) -> None:
     await stage.detector_is_back()
 
 
-def test_no_goal_runs_before_its_policy_is_ready(programs: Programs) -> None:
-    programs.play(slow_start)
+def test_no_goal_runs_before_its_policy_is_ready(episode_programs: Programs) -> None:
+    episode_programs.play(slow_start)
 
 
 class Script:

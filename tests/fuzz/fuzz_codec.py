@@ -29,7 +29,7 @@ ANSWER_MAX_BYTES = 16_384
 SEEDS_PER_OP = 4
 
 
-def one(frame: bytes) -> None:
+def try_codec(frame: bytes) -> None:
     """One execution: the frame as it is, and the mutant that its bytes choose."""
     for tried in (frame, Forger(random.Random(frame)).frame()):
         try:
@@ -55,7 +55,7 @@ def main() -> None:
         folder = Path(tempfile.mkdtemp(prefix="corpus"))
         write_corpus(folder)
         arguments.append(str(folder))
-    atheris.Setup(arguments, one)
+    atheris.Setup(arguments, try_codec)
     atheris.Fuzz()
 
 

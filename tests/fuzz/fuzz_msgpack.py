@@ -29,7 +29,7 @@ def values_in(value: object) -> int:
     return 1 + sum(map(values_in, value)) if isinstance(value, list) else 1
 
 
-def one(frame: bytes) -> None:
+def try_msgpack(frame: bytes) -> None:
     """What is built is never more than was counted and allowed; fewer where a key stands twice."""
     try:
         built = values_in(unpack_map(frame, LIMITS))
@@ -69,7 +69,7 @@ def main() -> None:
         if all(argument.startswith("-") for argument in arguments[1:]):
             write_corpus(Path(folder))
             arguments.append(folder)
-        atheris.Setup(arguments, one)
+        atheris.Setup(arguments, try_msgpack)
         atheris.Fuzz()
 
 

@@ -358,7 +358,7 @@ def run(mutants: list[Mutant], jobs: int) -> None:
 
 
 # -- what it says ----------------------------------------------------------------------------------------------------
-def summary(existing: int, tried: list[Mutant], known: list[dict[str, str]]) -> dict[str, Any]:
+def summary_of(existing: int, tried: list[Mutant], known: list[dict[str, str]]) -> dict[str, Any]:
     """The report. A survivor counts as equivalent while it is the very change that was judged."""
     judged = {(entry["where"], entry["diff"]) for entry in known}
     for mutant in tried:
@@ -401,7 +401,7 @@ def main() -> int:
     print(f"{existing} mutants, {len(mutants)} of them are tried", flush=True)
     known = json.loads(KNOWN.read_text())
     run(mutants, options.jobs)
-    report = summary(existing, sorted(mutants, key=lambda mutant: mutant.name), known)
+    report = summary_of(existing, sorted(mutants, key=lambda mutant: mutant.name), known)
     report |= {"seed": options.seed, "wall_s": round(time.perf_counter() - began, 1)}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n")

@@ -23,7 +23,7 @@ def fits(gate: Gate, size: int) -> bool:
 '''
 
 
-def load(path: Path) -> Any:
+def load_runner(path: Path) -> Any:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
@@ -34,50 +34,52 @@ def load(path: Path) -> Any:
 
 
 @pytest.fixture
-def run() -> Any:
-    return load(Path(__file__).with_name("mutation_run.py"))
+def mutants_run() -> Any:
+    return load_runner(Path(__file__).with_name("mutation_run.py"))
 
 
 @pytest.fixture
 def gates(tmp_path: Path) -> ModuleType:
     path = tmp_path / "gates.py"
     path.write_text(SOURCE)
-    return load(path)
+    return load_runner(path)
 
 
-def test_whoever_imported_the_function_has_the_mutant(run: Any, gates: Any) -> None:
+def test_whoever_imported_the_function_has_the_mutant(mutants_run: Any, gates: Any) -> None:
     fits, gate = gates.fits, gates.Gate(4)
-    assert run.swap(gates, SOURCE.replace("<=", "<")) == 1
+    assert mutants_run.swap(gates, SOURCE.replace("<=", "<")) == 1
     assert not fits(gate, 4)
-    assert run.swap(gates, SOURCE.replace("> 3", "> 4")) == 2, "and the other one is as it was"
+    assert mutants_run.swap(gates, SOURCE.replace("> 3", "> 4")) == 2, (
+        "and the other one is as it was"
+    )
     assert fits(gate, 4)
     assert not gate.wide
 
 
-def test_a_change_that_changes_no_bytecode_has_no_effect(run: Any, gates: Any) -> None:
-    assert run.swap(gates, "\n" + SOURCE) == 0
+def test_a_change_that_changes_no_bytecode_has_no_effect(mutants_run: Any, gates: Any) -> None:
+    assert mutants_run.swap(gates, "\n" + SOURCE) == 0
 
 
-def test_mutants_have_names_lines_and_diffs(run: Any, tmp_path: Path) -> None:
+def test_mutants_have_names_lines_and_diffs(mutants_run: Any, tmp_path: Path) -> None:
     pytest.importorskip("mutmut", reason="make mutation installs it")
     (tmp_path / "gates.py").write_text(SOURCE)
-    existing, mutants = run.choose(0, 0, {}, tmp_path)
+    existing, mutants = mutants_run.choose(0, 0, {}, tmp_path)
     assert existing == len(mutants) == 2, "decorated functions stay as they are"
     found = next(mutant for mutant in mutants if "size < gate.width" in mutant.diff)
     assert found.where == "gates.fits"
     assert 12 in found.lines
     assert not any("XX" in mutant.diff for mutant in mutants)
-    _, again = run.choose(0, 0, {"gates.fits:99": found.diff, "gates.gone:1": ""}, tmp_path)
+    _, again = mutants_run.choose(0, 0, {"gates.fits:99": found.diff, "gates.gone:1": ""}, tmp_path)
     assert [mutant.diff for mutant in again] == [found.diff]
-    assert run.choose(2, 5, {}, tmp_path)[1] == run.choose(2, 5, {}, tmp_path)[1]
+    assert mutants_run.choose(2, 5, {}, tmp_path)[1] == mutants_run.choose(2, 5, {}, tmp_path)[1]
 
 
-def test_only_the_very_change_that_was_judged_counts_as_equivalent(run: Any) -> None:
+def test_only_the_very_change_that_was_judged_counts_as_equivalent(mutants_run: Any) -> None:
     def tried(diff: str, outcome: str) -> Any:
-        return run.Mutant("gates.fits:1", "gates", [12], diff, "", outcome)
+        return mutants_run.Mutant("gates.fits:1", "gates", [12], diff, "", outcome)
 
     known = [{"where": "gates.fits", "diff": "-a\n+b", "why": "they are the same"}]
-    report = run.summary(
+    report = mutants_run.summary(
         9, [tried("-a\n+b", "survived"), tried("-a\n+c", "survived"), tried("-a", "killed")], known
     )
     assert (report["killed"], report["survived"], report["equivalent"]) == (1, 1, 1)

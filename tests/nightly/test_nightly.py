@@ -28,7 +28,7 @@ Sound.TestCase.settings = Broken.TestCase.settings = walk(5)
 
 
 @pytest.fixture
-def run() -> Any:
+def night_run() -> Any:
     path = Path(__file__).with_name("nightly_run.py")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
@@ -39,8 +39,8 @@ def run() -> Any:
     return module
 
 
-def test_the_histories_are_split_evenly_under_seeds_of_their_own(run: Any) -> None:
-    todo = run.portions(["a", "b"], 5000, 70)
+def test_the_histories_are_split_evenly_under_seeds_of_their_own(night_run: Any) -> None:
+    todo = night_run.portions(["a", "b"], 5000, 70)
     assert sum(portion.wanted for portion in todo) == 5000
     assert {machine: sum(p.wanted for p in todo if p.machine == machine) for machine in "ab"} == {
         "a": 2500,
@@ -49,23 +49,23 @@ def test_the_histories_are_split_evenly_under_seeds_of_their_own(run: Any) -> No
     assert [portion.seed for portion in todo] == list(range(70, 70 + len(todo)))
 
 
-def test_every_machine_is_there(run: Any) -> None:
-    for machine in run.MACHINES:
-        assert issubclass(run.load(machine), RuleBasedStateMachine)
+def test_every_machine_is_there(night_run: Any) -> None:
+    for machine in night_run.MACHINES:
+        assert issubclass(night_run.load(machine), RuleBasedStateMachine)
 
 
-def test_a_sound_machine_is_counted(run: Any) -> None:
-    done = run.walk(run.Portion("sound", 1, 20), Sound)
+def test_a_sound_machine_is_counted(night_run: Any) -> None:
+    done = night_run.walk(night_run.Portion("sound", 1, 20), Sound)
     assert not done.failure
     assert done.histories >= 20
-    report = run.summary([done], 1.0)
+    report = night_run.summary([done], 1.0)
     assert report["histories"] == done.histories
     assert not report["failures"]
 
 
-def test_a_failure_is_told_shrunk_and_found_again(run: Any) -> None:
-    done = run.walk(run.Portion("broken", 3, 20), Broken)
+def test_a_failure_is_told_shrunk_and_found_again(night_run: Any) -> None:
+    done = night_run.walk(night_run.Portion("broken", 3, 20), Broken)
     assert "state.step(n=50)" in done.failure
-    (failure,) = run.summary([done], 1.0)["failures"]
+    (failure,) = night_run.summary([done], 1.0)["failures"]
     assert failure["again"].endswith("--machine broken --seed 3 --histories 20")
-    assert run.walk(run.Portion("broken", 3, 20), Broken).failure == done.failure
+    assert night_run.walk(night_run.Portion("broken", 3, 20), Broken).failure == done.failure

@@ -69,7 +69,7 @@ def answer_of[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
     return answer
 
 
-def leases(
+def leases_inside(
     machine: Machine, endpoint: str = ENDPOINT, user: str | None = None
 ) -> dict[str, dict[str, Any]] | None:
     """The granted leases by their consumer; None while nothing is granted again after a restart."""
@@ -89,13 +89,15 @@ def leases(
 
 
 @contextmanager
-def held(
+def held_inside(
     machine: Machine, name: str, *options: str, user: str | None = None
 ) -> Iterator[dict[str, Any]]:
     """A program that runs under a lease."""
     command = ["vramctl", "run", "--endpoint", ENDPOINT, "--name", name, "--vram", "1GiB", *options]
     process = subprocess.Popen(machine.inside(*command, "--", "sleep", "1000", user=user))
-    lease = answer_of(lambda: (leases(machine) or {}).get(name), lambda: machine.log(ARBITER))
+    lease = answer_of(
+        lambda: (leases_inside(machine) or {}).get(name), lambda: machine.log(ARBITER)
+    )
     yield lease
     assert process.poll() is None, "the holder ended with the arbiter"
     machine.run("kill", str(lease["pid"]))
@@ -117,7 +119,7 @@ def hit(machine: Machine, name: str) -> None:
 def test_each_group_may_do_its_part(machine: Machine) -> None:
     (text,) = machine.show(ARBITER, "StatusText")
     assert text.startswith("serving Simulated GPU")
-    with held(machine, "of-the-group", user="vram-robot"):
+    with held_inside(machine, "of-the-group", user="vram-robot"):
         assert "of-the-group" in machine.run("bash", "-lc", "vramctl status", user="vram-robot")
     drain = ("vramctl", "drain", "--reason", "a test", "--endpoint", ENDPOINT)
     machine.run(*drain, user="vram-robot", code=1)
@@ -130,20 +132,20 @@ def test_each_group_may_do_its_part(machine: Machine) -> None:
 
 
 def test_a_killed_arbiter_comes_back_with_its_leases(machine: Machine) -> None:
-    with held(machine, "survivor") as before:
+    with held_inside(machine, "survivor") as before:
         hit(machine, "KILL")
         after = answer_of(
-            lambda: (leases(machine) or {}).get("survivor"), lambda: machine.log(ARBITER)
+            lambda: (leases_inside(machine) or {}).get("survivor"), lambda: machine.log(ARBITER)
         )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
 
 
 def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
-    with held(machine, "patient") as before:
+    with held_inside(machine, "patient") as before:
         hit(machine, "STOP")
         assert "Fatal Python error: Aborted" in machine.log(ARBITER), "where it hung, is said"
         after = answer_of(
-            lambda: (leases(machine) or {}).get("patient"), lambda: machine.log(ARBITER)
+            lambda: (leases_inside(machine) or {}).get("patient"), lambda: machine.log(ARBITER)
         )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
 
@@ -184,7 +186,10 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     machine.start("manager.service")
     as_user = ["env", f"XDG_RUNTIME_DIR={runtime}", "systemctl", "--user"]
     machine.run(*as_user, "start", "vram-arbiter", user="vram-robot")
-    assert leases(machine, f"ipc://{runtime}/vram-arbiter/arbiter.sock", user="vram-robot") == {}
+    assert (
+        leases_inside(machine, f"ipc://{runtime}/vram-arbiter/arbiter.sock", user="vram-robot")
+        == {}
+    )
     machine.run("systemctl", "stop", "manager.service")
 
 
@@ -220,7 +225,7 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
         machine.run(*load, user="vram-robot")
     except AssertionError as error:
         raise AssertionError(machine.log(f"{sidecar}.service")) from error
-    assert set(leases(machine) or {}) == {"reward"}
+    assert set(leases_inside(machine) or {}) == {"reward"}
 
     answer_of(
         lambda: True if "runner.sock" in machine.run("ls", "/run/vram-arbiter").split() else None,

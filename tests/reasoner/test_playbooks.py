@@ -18,7 +18,7 @@ PALETTE = Palette(
 )
 
 
-def written(
+def playbook_file(
     folder: Path, *, body: str = "./PLAYBOOK.md", tools: str = "[locate_in_view, execute_rskill]"
 ) -> Path:
     file = folder / "rskill.yaml"
@@ -34,7 +34,7 @@ def written(
 
 
 def test_a_playbook_tells_how_and_narrows_what(tmp_path: Path) -> None:
-    playbook = load_playbook(written(tmp_path))
+    playbook = load_playbook(playbook_file(tmp_path))
     assert "Turn left first." in playbook.procedure
     assert "It is done when: it is in view. You have 4 steps." in playbook.procedure
     assert playbook.max_steps == 4
@@ -58,16 +58,16 @@ def test_a_playbook_is_refused_as_a_skill_with_the_way_to_use_it() -> None:
 
 def test_what_is_wrong_with_a_playbook_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="query_scene, which is not provided"):
-        load_playbook(written(tmp_path, tools="[query_scene]")).narrow(
+        load_playbook(playbook_file(tmp_path, tools="[query_scene]")).narrow(
             Palette(PALETTE.skills, can_query=False)
         )
     with pytest.raises(ManifestInvalid, match="unknown tool format_disk"):
-        load_playbook(written(tmp_path, tools="[format_disk]"))
+        load_playbook(playbook_file(tmp_path, tools="[format_disk]"))
     with pytest.raises(ConfigError, match="outside of the playbook's folder"):
-        load_playbook(written(tmp_path, body="../../etc/passwd"))
+        load_playbook(playbook_file(tmp_path, body="../../etc/passwd"))
     with pytest.raises(ConfigError, match="cannot be read"):
-        load_playbook(written(tmp_path, body="./NOTES.md"))
-    file = written(tmp_path)
+        load_playbook(playbook_file(tmp_path, body="./NOTES.md"))
+    file = playbook_file(tmp_path)
     (tmp_path / "PLAYBOOK.md").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match="not UTF-8"):
         load_playbook(file)

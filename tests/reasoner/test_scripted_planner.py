@@ -23,7 +23,7 @@ YES = Outcome("answered", "Yes, the gripper holds the red cube.")
 NO = Outcome("answered", "No, the gripper is empty.")
 
 
-def play(
+def run_script(
     world: Callable[[ToolCall, int], Outcome], palette: Palette = PALETTE
 ) -> tuple[Result, list[ToolCall]]:
     """Run the script against a world that answers (call, how many calls of this tool came
@@ -50,7 +50,7 @@ def test_finds_drives_corrects_grabs_and_asks() -> None:
             case _:
                 return DONE
 
-    result, calls = play(world)
+    result, calls = run_script(world)
     assert [call.tool for call in calls] == [
         "query_scene",
         "locate_in_view",
@@ -79,7 +79,7 @@ def test_retries_at_most_three_times() -> None:
             else DONE
         )
 
-    result, calls = play(world)
+    result, calls = run_script(world)
     assert result["status"] == "failure"
     assert result["attempts"] == 3
     assert not result["vlm_confirmed"]
@@ -97,7 +97,7 @@ def test_looks_around_when_not_seen_and_gives_up_without_grabbing() -> None:
             else DONE
         )
 
-    result, calls = play(world)
+    result, calls = run_script(world)
     turns = [call.goal_params["turn_rad"] for call in calls if isinstance(call, ExecuteRskill)]
     assert turns == [0.35, -0.70, 0.35]
     assert result["attempts"] == 0
@@ -118,7 +118,7 @@ def test_evicted_is_not_absent() -> None:
             case _:
                 return DONE
 
-    result, calls = play(world)
+    result, calls = run_script(world)
     assert [call.tool for call in calls][1:4] == [
         "locate_in_view",
         "locate_in_view",
@@ -134,7 +134,7 @@ def test_a_detector_that_cannot_look_makes_nobody_turn_away() -> None:
             Outcome("error", "CUDA out of memory", "oom") if isinstance(call, LocateInView) else YES
         )
 
-    result, calls = play(world)
+    result, calls = run_script(world)
     assert not any(isinstance(call, ExecuteRskill) for call in calls)
     assert result["reason"] == "could not look for the red cube: CUDA out of memory"
 
@@ -151,7 +151,7 @@ def test_a_failed_drive_or_grab_is_a_retry_with_its_reason() -> None:
             case _:
                 return DONE
 
-    result, _ = play(world)
+    result, _ = run_script(world)
     assert result["status"] == "failure"
     assert result["attempts"] == 3
     assert "out of memory" in result["reason"]
@@ -167,7 +167,7 @@ def test_an_unclear_answer_is_not_a_yes() -> None:
             else DONE
         )
 
-    assert play(world)[0]["status"] == "failure"
+    assert run_script(world)[0]["status"] == "failure"
 
 
 def test_a_yes_that_names_something_else_is_asked_after() -> None:
@@ -185,9 +185,9 @@ def test_a_yes_that_names_something_else_is_asked_after() -> None:
 
         return answer
 
-    refuted, _ = play(world("The gripper holds the red ball."))
+    refuted, _ = run_script(world("The gripper holds the red ball."))
     assert (refuted["status"], refuted["attempts"]) == ("failure", 3)
-    confirmed, _ = play(world("A red cube."))
+    confirmed, _ = run_script(world("A red cube."))
     assert (confirmed["status"], confirmed["attempts"]) == ("success", 1)
     assert confirmed["vlm_confirmed"]
 
@@ -272,7 +272,7 @@ def test_a_look_from_near_at_another_thing_is_no_correction() -> None:
     """
     far = sees([0.0, 0.0, 0.0], (0.7, -0.3, 0.62))
     near = sees([0.375, -0.3, 0.0], (0.285, 0.23, 0.63), (0.33, 0.01, 0.60))
-    result, calls = play(looks_of(far, near))
+    result, calls = run_script(looks_of(far, near))
     assert drives(calls) == [(0.7, -0.3), (0.33, 0.01)]
     assert (result["status"], result["attempts"]) == ("success", 1)
 
@@ -281,18 +281,18 @@ def test_two_looks_that_speak_for_another_place_make_it_that_ones_turn() -> None
     far = sees([0.0, 0.0, 0.0], (0.7, -0.3, 0.5), (0.7, 0.0, 0.45))
     near = sees([0.375, -0.3, 0.0], (0.325, 0.3, 0.8))
     there = sees([0.375, 0.0, 0.0], (0.32, 0.0, 0.9))
-    _, calls = play(looks_of(far, near, there))
+    _, calls = run_script(looks_of(far, near, there))
     assert drives(calls) == [(0.7, -0.3), (0.325, 0.3), (0.32, 0.0)]
 
 
 def test_without_odometry_the_newest_look_counts() -> None:
-    _, calls = play(looks_of(sees(None, (0.7, -0.3, 0.9)), sees(None, (0.3, 0.1, 0.5))))
+    _, calls = run_script(looks_of(sees(None, (0.7, -0.3, 0.9)), sees(None, (0.3, 0.1, 0.5))))
     assert drives(calls) == [(0.7, -0.3), (0.3, 0.1)]
 
 
 def test_places_that_outdo_each_other_do_not_make_it_drive_for_ever() -> None:
     looks = [sees([0.0, 0.0, 0.0], (0.5 + 0.2 * n, 0.0, 0.5 + 0.1 * n)) for n in range(9)]
-    result, calls = play(looks_of(*looks))
+    result, calls = run_script(looks_of(*looks))
     assert len(drives(calls)) == PLACES_MAX
     assert result["attempts"] == 1
 
@@ -312,7 +312,7 @@ def grabs_and_places(answer: Outcome) -> list[str]:
             else DONE
         )
 
-    _, calls = play(world, Palette((NAVIGATE, GRAB, PLACE, DETECTOR)))
+    _, calls = run_script(world, Palette((NAVIGATE, GRAB, PLACE, DETECTOR)))
     return [
         call.rskill_id
         for call in calls

@@ -124,7 +124,7 @@ def test_a_camera_that_shows_nothing_leaves_a_gap_and_is_looked_at_again() -> No
 PALETTE = Palette((Skill("lab/grab", "vla", "", ("grasp",)),), can_judge=True)
 
 
-def ask(
+def ask_tool(
     a_runner: Any,
     a_sidecar: Any,
     prepare: Callable[[Any, Any], None],
@@ -156,7 +156,7 @@ def ask(
 
 
 def test_an_opinion_is_said_with_what_it_is_worth(a_runner: Any, a_sidecar: Any) -> None:
-    outcome, asked = ask(a_runner, a_sidecar, lambda runner, sidecar: None)
+    outcome, asked = ask_tool(a_runner, a_sidecar, lambda runner, sidecar: None)
     assert outcome.status == "answered"
     assert "progress 0.70, 0.20" in outcome.text
     assert "it looks done (0.90, done from 0.50 on). An opinion about" in outcome.text
@@ -170,7 +170,7 @@ def test_pictures_that_waited_for_the_card_are_taken_anew(a_runner: Any, a_sidec
         sidecar.late = 1
         sidecar.judgement |= {"progress": [0.5], "success": []}
 
-    outcome, asked = ask(a_runner, a_sidecar, late)
+    outcome, asked = ask_tool(a_runner, a_sidecar, late)
     assert (outcome.status, len(asked)) == ("answered", 2)
     assert all(0.0 < message["fresh_s"] < LOOKED_AT_MAX_S for message in asked)
 
@@ -179,7 +179,9 @@ def test_what_the_model_does_not_say_is_not_said(a_runner: Any, a_sidecar: Any) 
     def says_less(runner: Any, sidecar: Any) -> None:
         sidecar.judgement = {"progress": [0.4], "success": [], "success_threshold": 0.5}
 
-    outcome, asked = ask(a_runner, a_sidecar, says_less, QueryTaskProgress(task="open the drawer"))
+    outcome, asked = ask_tool(
+        a_runner, a_sidecar, says_less, QueryTaskProgress(task="open the drawer")
+    )
     assert asked[0]["task"] == "open the drawer"
     assert outcome.text.startswith("'open the drawer': progress 0.40. An opinion")
 
@@ -198,7 +200,7 @@ def test_no_answer_is_never_no_progress(
     def fails(runner: Any, sidecar: Any) -> None:
         sidecar.error = error
 
-    outcome, _ = ask(a_runner, a_sidecar, fails)
+    outcome, _ = ask_tool(a_runner, a_sidecar, fails)
     assert (outcome.status, outcome.code) == (status, code)
     assert "progress" not in outcome.data
 
@@ -225,7 +227,7 @@ def test_a_strange_answer_is_an_error(
     def strange(runner: Any, sidecar: Any) -> None:
         sidecar.judgement = judgement
 
-    outcome, _ = ask(a_runner, a_sidecar, strange)
+    outcome, _ = ask_tool(a_runner, a_sidecar, strange)
     assert (outcome.status, outcome.code) == ("error", "model_error")
 
 
@@ -233,12 +235,12 @@ def test_without_a_fresh_picture_nothing_is_judged(a_runner: Any, a_sidecar: Any
     def dark(runner: Any, sidecar: Any) -> None:
         runner.frame_error = FrameStale("the camera is dark")
 
-    outcome, asked = ask(a_runner, a_sidecar, dark)
+    outcome, asked = ask_tool(a_runner, a_sidecar, dark)
     assert (outcome.status, outcome.code, asked) == ("no_frame", "frame_stale", [])
 
 
 def test_a_barred_model_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
-    outcome, asked = ask(
+    outcome, asked = ask_tool(
         a_runner, a_sidecar, lambda runner, sidecar: None, barred="it is made for go2"
     )
     assert (outcome.status, asked) == ("refused", [])

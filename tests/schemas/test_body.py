@@ -20,22 +20,24 @@ ARM = Body(
 )  # fmt: skip
 
 
-def skill(tags: list[str], **needs: Any) -> RSkillManifest:
+def skill_for(tags: list[str], **needs: Any) -> RSkillManifest:
     return RSkillManifest.model_validate(
         {**BASE, "embodiment_tags": tags, "capabilities_required": needs}
     )
 
 
 def test_tags() -> None:
-    assert ARM.misfit(skill(["so101_follower"])) == ""
-    assert ARM.misfit(skill(["franka_panda", "so101_follower"])) == ""
-    assert ARM.misfit(skill(["any"])) == UNKNOWN_BODY.misfit(skill(["any"])) == ""
+    assert ARM.misfit(skill_for(["so101_follower"])) == ""
+    assert ARM.misfit(skill_for(["franka_panda", "so101_follower"])) == ""
+    assert ARM.misfit(skill_for(["any"])) == UNKNOWN_BODY.misfit(skill_for(["any"])) == ""
     assert (
-        ARM.misfit(skill(["franka_panda", "ur5e"]))
+        ARM.misfit(skill_for(["franka_panda", "ur5e"]))
         == "it is made for franka_panda or ur5e; this robot is so101_follower"
     )
-    assert "does not say what it is" in UNKNOWN_BODY.misfit(skill(["so101_follower"]))
-    assert ARM.misfit(skill(["multi"])), "several robots, and nobody says that this is one of them"
+    assert "does not say what it is" in UNKNOWN_BODY.misfit(skill_for(["so101_follower"]))
+    assert ARM.misfit(skill_for(["multi"])), (
+        "several robots, and nobody says that this is one of them"
+    )
 
 
 @pytest.mark.parametrize("vague", ["any", "multi"])
@@ -70,11 +72,11 @@ def test_a_robot_is_one_robot(vague: str) -> None:
 )
 def test_capabilities_count_by_value(needs: dict[str, Any], said: str) -> None:
     """The defect of the field: only their names were looked at, so that `can_lift_kg: 50` fitted every arm that can lift."""
-    assert ARM.misfit(skill(["so101_follower"], **needs)) == said
+    assert ARM.misfit(skill_for(["so101_follower"], **needs)) == said
 
 
 def test_every_finding_is_named() -> None:
-    fields = [field for field, _ in ARM.misfits(skill(["ur5e"], has_legs=True, can_lift_kg=3))]
+    fields = [field for field, _ in ARM.misfits(skill_for(["ur5e"], has_legs=True, can_lift_kg=3))]
     assert fields == [
         "embodiment_tags",
         "capabilities_required.has_legs",
@@ -87,7 +89,7 @@ VALUES = st.booleans() | st.integers(-3, 3) | st.floats(allow_infinity=True) | s
 
 @given(wanted=VALUES, have=st.none() | VALUES)
 def test_a_robot_that_says_less_never_fits_more(wanted: Any, have: Any) -> None:
-    manifest = skill(["any"], thing=wanted)
+    manifest = skill_for(["any"], thing=wanted)
     fits = not Body(capabilities={} if have is None else {"thing": have}).misfits(manifest)
     if not UNKNOWN_BODY.misfits(manifest):
         assert wanted is False, "only what must not be there is fitted by silence"

@@ -28,13 +28,13 @@ STAMPS = {"stamp_monotonic_ns": 1_000_000_000, "stamp_wall_ns": 2}
 SIZE = {"width": 2, "height": 1}
 
 
-def frame(**fields: Any) -> SensorFrame:
+def sensor_frame(**fields: Any) -> SensorFrame:
     return SensorFrame(**({"sensor_id": "front", "encoding": "rgb8", **STAMPS, **SIZE} | fields))
 
 
 @given(st.binary(min_size=6, max_size=6))
 def test_frame_bytes_survive_json_and_python(data: bytes) -> None:
-    original = frame(data=data)
+    original = sensor_frame(data=data)
     assert SensorFrame.model_validate_json(original.model_dump_json()) == original
     assert SensorFrame.model_validate(json.loads(original.model_dump_json())) == original
     assert SensorFrame.model_validate(original.model_dump()) == original
@@ -45,7 +45,7 @@ def test_frame_bytes_survive_json_and_python(data: bytes) -> None:
     "fields", [{"topic": "/front"}, {"handle": 7}, {"handle": "cuda:1", "data": b"", "topic": ""}]
 )
 def test_frame_may_point_elsewhere(fields: dict[str, Any]) -> None:
-    assert frame(**fields).data is None
+    assert sensor_frame(**fields).data is None
 
 
 @pytest.mark.parametrize(
@@ -63,15 +63,15 @@ def test_frame_may_point_elsewhere(fields: dict[str, Any]) -> None:
 )
 def test_wrong_frame_is_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        frame(**fields)
+        sensor_frame(**fields)
 
 
 def test_compressed_frames_have_any_length() -> None:
-    assert frame(data=b"\xff\xd8", encoding=FrameEncoding.JPEG).data == b"\xff\xd8"
+    assert sensor_frame(data=b"\xff\xd8", encoding=FrameEncoding.JPEG).data == b"\xff\xd8"
 
 
 def test_age_of_a_frame() -> None:
-    assert frame(topic="/x").age_s(1_250_000_000) == pytest.approx(0.25)
+    assert sensor_frame(topic="/x").age_s(1_250_000_000) == pytest.approx(0.25)
 
 
 def test_joint_state_lengths_agree() -> None:
@@ -93,7 +93,7 @@ def test_world_state_round_trip_and_stale_components() -> None:
         joint_state=JointState(name=("a",), position=(0.5,), stamp_ns=4),
         base_pose=Pose(xyz=(1, 2, 0), frame_id="odom"),
         base_twist=(0.1, 0, 0, 0, 0, 0.2),
-        image_frames={"front": frame(data=b"123456")},
+        image_frames={"front": sensor_frame(data=b"123456")},
         detected_objects=(DetectedObject(label="cube", confidence=0.9, box=(0, 0, 5, 5)),),
         diagnostics={"joints": "ok", "front": "stale", "base": "error"},
     )

@@ -34,11 +34,6 @@ detector: {labels: [cube]}
 """
 
 
-@pytest.fixture
-def anyio_backend():
-    return "asyncio"
-
-
 class Model:
     """Counts its loads; one lasts until it `may_load`."""
 

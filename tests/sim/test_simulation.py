@@ -42,7 +42,7 @@ def test_sums_over_runs_name_the_seeds_that_failed() -> None:
 
 
 # -- the checks can fail ---------------------------------------------------------------------------------------------
-def world(tmp_path: Path) -> World:
+def world_with_daemon(tmp_path: Path) -> World:
     made = World(7, tmp_path)
     made.start_daemon()
     made.run(0.1)
@@ -55,7 +55,7 @@ def granted(*leases: tuple[ProcessKey, int, bool]) -> Iterator[Entitlement]:
 
 
 def test_more_granted_than_the_card_has_is_a_breach_that_names_the_seed(tmp_path: Path) -> None:
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     made.entitlements = lambda: granted((A, 5 * GIB, False), (B, 4 * GIB, False))
     made.clock.after(0.0, made.touch)
     with pytest.raises(
@@ -66,7 +66,7 @@ def test_more_granted_than_the_card_has_is_a_breach_that_names_the_seed(tmp_path
 
 
 def test_freed_memory_that_is_not_back_yet_counts(tmp_path: Path) -> None:
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     card = made.cards[GPU]
     card.lag_s = 10.0
     card.allocate(A, "L0-1", 5 * GIB)
@@ -79,7 +79,7 @@ def test_freed_memory_that_is_not_back_yet_counts(tmp_path: Path) -> None:
 
 
 def test_company_of_an_exclusive_lease_is_a_breach(tmp_path: Path) -> None:
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     made.entitlements = lambda: granted((A, GIB, True), (B, GIB, False))
     made.clock.after(0.0, made.touch)
     with pytest.raises(SimFailure, match="beside the exclusive"):
@@ -88,7 +88,7 @@ def test_company_of_an_exclusive_lease_is_a_breach(tmp_path: Path) -> None:
 
 
 def test_a_token_that_does_not_grow_is_a_breach(tmp_path: Path) -> None:
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     for lease, serial in (("L1-1", 5), ("L1-2", 4)):
         made.machine.tokens[lease] = (1, serial)
         made.machine.history.append(Happening(made.clock.now, 1, "granted", {"lease_id": lease}))
@@ -174,7 +174,7 @@ def run_client(
 
 def test_a_lease_that_is_given_up_while_it_parks_ends(tmp_path: Path) -> None:
     """Regression: `give_up` waited for ever for an end, and the lease slept."""
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     parked: list[str] = []
 
     async def life(client: SimClient) -> None:
@@ -190,7 +190,7 @@ def test_a_lease_that_is_given_up_while_it_parks_ends(tmp_path: Path) -> None:
 
 def test_a_wait_to_come_back_outlives_the_daemon(tmp_path: Path) -> None:
     """Regression: after a restart the arbiter knew that the lease was parked, but not that it was wanted."""
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     parked: list[str] = []
 
     async def life(client: SimClient) -> None:
@@ -214,7 +214,7 @@ def test_a_wait_to_come_back_outlives_the_daemon(tmp_path: Path) -> None:
 
 def test_a_lease_that_finds_no_host_ram_to_park_is_released_all_the_same(tmp_path: Path) -> None:
     """Regression: a release that was refused ended the task that leaves, and the lease stayed `unloading` for ever."""
-    made = world(tmp_path)
+    made = world_with_daemon(tmp_path)
     parked: list[str] = []
 
     async def life(client: SimClient) -> None:

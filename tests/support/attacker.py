@@ -19,7 +19,7 @@ EMPTY_FRAMES = 3_000_000
 SECONDS_MAX = 120.0
 
 
-def connect(path: str) -> socket.socket:
+def greeted(path: str) -> socket.socket:
     peer = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     peer.connect(path)
     peer.sendall(GREETING + READY)
@@ -36,14 +36,14 @@ def push(peer: socket.socket, data: bytes) -> None:
             left = left[peer.send(left[: 1 << 18]) :]
 
 
-def frame(payload: bytes, flags: int = 0) -> bytes:
+def zmtp_frame(payload: bytes, flags: int = 0) -> bytes:
     return bytes((flags | 2,)) + len(payload).to_bytes(8) + payload
 
 
 def empties(path: str) -> None:
     """Three million messages of one empty frame."""
     under_way()
-    push(connect(path), b"\x00\x00" * EMPTY_FRAMES)
+    push(greeted(path), b"\x00\x00" * EMPTY_FRAMES)
 
 
 def maps(path: str) -> None:
@@ -52,11 +52,13 @@ def maps(path: str) -> None:
     """
     under_way()
     ends = time.monotonic() + SECONDS_MAX
-    allowed = frame(b"\x81\xa1x\xdc\x0f\xa0" + b"\x80" * 4000)
-    bombs = [frame(b"\xdd" + n.to_bytes(4) + b"\x80" * n) for n in ((1 << 20) - 5, (16 << 20) - 5)]
+    allowed = zmtp_frame(b"\x81\xa1x\xdc\x0f\xa0" + b"\x80" * 4000)
+    bombs = [
+        zmtp_frame(b"\xdd" + n.to_bytes(4) + b"\x80" * n) for n in ((1 << 20) - 5, (16 << 20) - 5)
+    ]
     while time.monotonic() < ends:
         for bomb in (*bombs, *[allowed] * 100):
-            push(connect(path), bomb)
+            push(greeted(path), bomb)
 
 
 def more(path: str) -> None:
@@ -64,7 +66,7 @@ def more(path: str) -> None:
     under_way()
     ends = time.monotonic() + SECONDS_MAX
     while time.monotonic() < ends:
-        push(connect(path), frame(bytes(1 << 16), 1) * 64)
+        push(greeted(path), zmtp_frame(bytes(1 << 16), 1) * 64)
 
 
 def connects(path: str) -> None:

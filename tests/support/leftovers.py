@@ -6,14 +6,16 @@ A pytest plugin. Whatever the tests and their programs leave in TMPDIR fails the
 import os
 import shutil
 import tempfile
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
 
 _KEY = pytest.StashKey[Path]()
 _FAILED = pytest.StashKey[bool]()
-KEPT = ("pytest-of-", "torchinductor_")
-"""Folders of `tmp_path`, and of torch's compiler, which makes its own in every process."""
+KEPT = ("pytest-of-*", "torchinductor_*", "tmp*.json", "sidecar-*.log")
+"""What may lie there at the end, beside `tmp_path`: files that torch's compiler and lerobot's loader of
+configurations never remove, and the log that a client keeps of a sidecar it started."""
 
 
 def _is_worker() -> bool:
@@ -53,4 +55,5 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 def leftovers(folder: Path) -> list[str]:
     """Return the names of what lies there, but for what KEPT names."""
-    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(KEPT))
+    names = (path.name for path in folder.iterdir())
+    return sorted(name for name in names if not any(fnmatch(name, kept) for kept in KEPT))

@@ -11,7 +11,7 @@ from vram_arbiter.schemas import defaults as d
 GIB = d.GIB
 
 
-def refused(effects: list[Effect]) -> list[Refuse]:
+def refusals_in(effects: list[Effect]) -> list[Refuse]:
     return [effect for effect in effects if isinstance(effect, Refuse)]
 
 
@@ -70,7 +70,7 @@ def test_17_a_load_that_succeeds_or_time_forgets_it() -> None:
             driver.advance(FORGOTTEN_S + 1.0)
         crash(driver, gib=1)
         held(driver, "working", 5)
-        assert not refused(driver.consumer("policy").try_acquire(5 * GIB))
+        assert not refusals_in(driver.consumer("policy").try_acquire(5 * GIB))
 
 
 def test_17_others_and_what_an_exclusive_one_or_a_queue_would_cost() -> None:
@@ -81,7 +81,7 @@ def test_17_others_and_what_an_exclusive_one_or_a_queue_would_cost() -> None:
     assert (
         refusal(driver.consumer("policy").try_acquire(1 * GIB, **exclusive)).code == "load_failing"
     )
-    assert not refused(driver.consumer("other").try_acquire(7 * GIB)), (
+    assert not refusals_in(driver.consumer("other").try_acquire(7 * GIB)), (
         "another consumer is not meant"
     )
     assert refusal(driver.consumer("policy").try_acquire(1 * GIB)).code == "load_failing", (
@@ -98,7 +98,7 @@ def test_17_dying_while_resident_is_no_failed_load_and_the_table_is_bounded() ->
         person.die()
         driver.advance(1.0)
     held(driver, "working", 5)
-    assert not refused(driver.consumer("policy").try_acquire(5 * GIB))
+    assert not refusals_in(driver.consumer("policy").try_acquire(5 * GIB))
     driver = CoreDriver(8 * GIB)
     for n in range(NAMES_MAX + 3):
         crash(driver, f"p{n}", 1)

@@ -63,7 +63,7 @@ class Scene:
         assert await asyncio.to_thread(self.sink.entered.wait, PATIENCE_S)
 
 
-def run(test: Callable[[Scene], Awaitable[None]]) -> Scene:
+def run_scene(test: Callable[[Scene], Awaitable[None]]) -> Scene:
     async def scene() -> Scene:
         made = Scene()
         try:
@@ -82,7 +82,7 @@ def test_close_writes_the_rest_in_order() -> None:
         for number in range(5):
             scene.writer.put(number)
 
-    scene = run(test)
+    scene = run_scene(test)
     assert scene.sink.batches == [[0, 1, 2, 3, 4]]
     assert scene.sink.closed
     assert scene.told == []
@@ -94,7 +94,7 @@ def test_a_batch_is_written_without_being_asked_for() -> None:
         scene.writer.put(1)
         assert await scene.hear() is None
 
-    assert run(test).sink.batches == [[1]]
+    assert run_scene(test).sink.batches == [[1]]
 
 
 def test_each_failure_is_told_and_then_that_it_works_again() -> None:
@@ -113,7 +113,7 @@ def test_each_failure_is_told_and_then_that_it_works_again() -> None:
             scene.writer.flush()
         assert await scene.hear() is None
 
-    scene = run(test)
+    scene = run_scene(test)
     assert scene.told[2:] == [None], "once"
     assert scene.sink.batches == [[3], [4]]
 
@@ -135,7 +135,7 @@ def test_a_disk_that_hangs_holds_a_bounded_number_and_the_oldest_are_dropped() -
         assert await scene.hear() is None
 
     newest = list(range(103, 100 + ITEMS_MAX + 3))
-    written = [number for batch in run(test).sink.batches for number in batch]
+    written = [number for batch in run_scene(test).sink.batches for number in batch]
     assert written == [*range(ITEMS_MAX + 1), *newest]
 
 
@@ -146,7 +146,7 @@ def test_an_answer_comes_after_what_was_put_before_it() -> None:
         scene.writer.ask(lambda: list(scene.sink.batches), answer.set_result)
         assert await answer == [[7]]
 
-    run(test)
+    run_scene(test)
 
 
 def test_a_question_that_fails_is_answered_with_its_failure() -> None:
@@ -160,7 +160,7 @@ def test_a_question_that_fails_is_answered_with_its_failure() -> None:
         assert isinstance(failure, DiskFailed)
         assert str(failure) == "damaged"
 
-    assert run(test).told == []
+    assert run_scene(test).told == []
 
 
 def test_questions_to_a_disk_that_hangs_are_bounded() -> None:
@@ -171,4 +171,4 @@ def test_questions_to_a_disk_that_hangs_are_bounded() -> None:
         with pytest.raises(DiskBehind):
             scene.writer.ask(int, print)
 
-    run(test)
+    run_scene(test)

@@ -35,7 +35,7 @@ STARTED_S = 1000.0
 
 
 @cache
-def written() -> tuple[tuple[Settings, Records], ...]:
+def records_written() -> tuple[tuple[Settings, Records], ...]:
     """Return what three engines wrote, the last of each key.
 
     A bit of everything, a lease in use by another process, a lease on standby.
@@ -52,7 +52,7 @@ def written() -> tuple[tuple[Settings, Records], ...]:
     return tuple(found)
 
 
-def start(settings: Settings, texts: dict[str, str]) -> Opened:
+def start_with(settings: Settings, texts: dict[str, str]) -> Opened:
     """As the daemon does it, with an hour of work afterwards. Raises nothing, whatever the records say."""
     with tempfile.TemporaryDirectory(prefix="va", dir="/dev/shm") as root:
         Journal.open(Path(root), "boot").close()
@@ -107,11 +107,11 @@ def deep(levels: int) -> Any:
 
 @pytest.mark.parametrize("index", [0, 1, 2])
 def test_what_the_core_writes_is_taken(index: int) -> None:
-    settings, records = written()[index]
+    settings, records = records_written()[index]
     for key, record in records.items():
         if key.startswith("lease:"):
             assert set(record) <= set(LeaseRecord.model_fields), "a field that no model checks"
-    opened = start(settings, texts_of(records))
+    opened = start_with(settings, texts_of(records))
     assert set(opened.records) == {*records, DOUBT_KEY}, (
         "planted behind the seal's back, so in doubt"
     )
@@ -128,7 +128,7 @@ NASTY = st.sampled_from(
 def test_a_record_with_a_value_that_cannot_be_is_put_aside_or_harmless(
     index: int, data: st.DataObject
 ) -> None:
-    settings, records = written()[index]
+    settings, records = records_written()[index]
     records = copy.deepcopy(records)
     changed = set()
     for key in data.draw(
@@ -143,7 +143,7 @@ def test_a_record_with_a_value_that_cannot_be_is_put_aside_or_harmless(
         else:
             place[last] = data.draw(NASTY)
         changed.add(key)
-    opened = start(settings, texts_of(records))
+    opened = start_with(settings, texts_of(records))
     if opened.put_aside is None or "journal.records" in opened.put_aside.name:
         assert set(records) - set(opened.records) <= changed, "its neighbors are kept"
 
@@ -168,8 +168,8 @@ def test_a_record_with_a_value_that_cannot_be_is_put_aside_or_harmless(
     ],
 )
 def test_a_text_that_is_no_record_is_put_aside(key: str, text: str) -> None:
-    settings, records = written()[2]
-    opened = start(settings, {**texts_of(records), key: text})
+    settings, records = records_written()[2]
+    opened = start_with(settings, {**texts_of(records), key: text})
     assert opened.put_aside is not None
     assert any("could not be used" in problem for problem in opened.problems)
     assert set(records) - {key} <= set(opened.records)

@@ -20,7 +20,7 @@ def shipped(name: str) -> Scenario:
     return load_scenario(text, name).model_copy(update={"seconds": 120.0})
 
 
-def scenario(
+def scenario_of(
     consumers: str, *, seconds: float = 120, lag_s: float = 0.5, card: str = "8GiB", more: str = ""
 ) -> Scenario:
     text = f"about: test\nseconds: {seconds}\ncards: [{{capacity: {card}, release_lag_s: {lag_s}}}]\n{more}\nconsumers:\n"
@@ -57,7 +57,7 @@ def test_the_same_scenario_gives_the_same_outcome() -> None:
 
 
 def test_a_switch_waits_for_the_safe_point_and_for_the_memory() -> None:
-    outcome = under(scenario(TWO, seconds=20))
+    outcome = under(scenario_of(TWO, seconds=20))
     assert story(outcome, "granted", "revoke_asked", "verified")[:4] == [
         ("granted", "left"),
         ("revoke_asked", "left"),
@@ -73,7 +73,9 @@ def test_a_switch_waits_for_the_safe_point_and_for_the_memory() -> None:
 
 def test_a_resident_model_makes_nobody_wait() -> None:
     outcome = under(
-        scenario("  a: {load_peak: 1GiB, load_s: 2, use_s: 1, arrivals: {every_s: 10}}", seconds=35)
+        scenario_of(
+            "  a: {load_peak: 1GiB, load_s: 2, use_s: 1, arrivals: {every_s: 10}}", seconds=35
+        )
     )
     tally = outcome.of("a")
     assert (tally.jobs, tally.loads, tally.waits_s[1:]) == (4, 1, [0.0, 0.0, 0.0])
@@ -85,7 +87,7 @@ def test_jobs_that_follow_each_other_make_a_circle() -> None:
   a: {load_peak: 1GiB, load_s: 0, use_s: 1, arrivals: {after: b, think_s: 1, start_s: 0}}
   b: {load_peak: 1GiB, load_s: 0, use_s: 1, arrivals: {after: a, think_s: 1, count: 3}}
 """
-    outcome = under(scenario(circle, seconds=60))
+    outcome = under(scenario_of(circle, seconds=60))
     assert [who for _, who in story(outcome, "use_began")] == ["a", "b"] * 3 + ["a"]
 
 
@@ -94,7 +96,7 @@ def test_who_waits_too_long_is_denied_and_the_rest_goes_on() -> None:
   long: {load_peak: 6GiB, load_s: 1, use_s: 50, arrivals: {at_s: [0]}}
   hasty: {load_peak: 6GiB, load_s: 1, use_s: 1, wait_timeout_s: 5, arrivals: {at_s: [2, 60]}}
 """
-    outcome = under(scenario(text))
+    outcome = under(scenario_of(text))
     tally = outcome.of("hasty")
     assert (tally.denied, tally.loads, tally.unserved) == (1, 1, 0)
     assert tally.waits_s[0] == pytest.approx(5.0)
@@ -103,7 +105,7 @@ def test_who_waits_too_long_is_denied_and_the_rest_goes_on() -> None:
 def test_a_request_that_never_fits_is_denied_at_once() -> None:
     text = "  huge: {load_peak: 20GiB, use_s: 1, arrivals: {at_s: [1, 2]}}"
     for policy in ("default", "ollama_rules"):
-        tally = under(scenario(text), policy).of("huge")
+        tally = under(scenario_of(text), policy).of("huge")
         assert (tally.denied, tally.loads) == (2, 0)
 
 
@@ -113,7 +115,7 @@ def test_whoever_still_waits_at_the_end_is_counted() -> None:
   other: {load_peak: 1.5GiB, load_s: 1, use_s: 200, arrivals: {at_s: [2]}}
   late: {load_peak: 1.5GiB, use_s: 1, arrivals: {at_s: [20]}}
 """
-    tally = under(scenario(text)).of("late")
+    tally = under(scenario_of(text)).of("late")
     assert (tally.unserved, tally.waits_s) == (1, [100.0])
 
 
@@ -123,7 +125,7 @@ def test_idle_release_and_standby() -> None:
   back: {load_peak: 5GiB, load_s: 1, use_s: 1, standby: true, arrivals: {at_s: [10]}}
   guest: {load_peak: 5GiB, load_s: 1, use_s: 1, idle_release_s: 1, arrivals: {at_s: [20]}}
 """
-    outcome = under(scenario(text))
+    outcome = under(scenario_of(text))
     assert ("revoke_asked", "polite") not in story(outcome, "revoke_asked")
     assert [who for _, who in story(outcome, "granted")] == ["polite", "back", "guest", "back"]
 
@@ -131,40 +133,40 @@ def test_idle_release_and_standby() -> None:
 def test_stowaways_are_charged_and_come_and_go() -> None:
     text = "  a: {load_peak: 6GiB, load_s: 1, use_s: 1, arrivals: {at_s: [10]}}"
     more = "stowaways: [{name: game, bytes: 3GiB, from_s: 1, to_s: 30}]"
-    outcome = under(scenario(text, more=more))
+    outcome = under(scenario_of(text, more=more))
     assert outcome.total.ooms == 0
     assert 20.0 < outcome.of("a").waits_s[0] < 24.0
 
 
 # -- other programs' rules -----------------------------------------------------------------------------------------
 def test_without_anybody_to_decide_the_second_never_gets_in() -> None:
-    outcome = under(scenario(TWO), "unmanaged")
+    outcome = under(scenario_of(TWO), "unmanaged")
     assert outcome.of("right").ooms > 50
     assert outcome.of("right").unserved == 3
     assert outcome.of("left").ooms == 0
 
 
 def test_llama_swap_starts_the_next_before_the_memory_is_back() -> None:
-    assert under(scenario(TWO, lag_s=0.5), "llama_swap_rules").total.ooms > 0
-    calm = under(scenario(TWO, lag_s=0.0), "llama_swap_rules")
+    assert under(scenario_of(TWO, lag_s=0.5), "llama_swap_rules").total.ooms > 0
+    calm = under(scenario_of(TWO, lag_s=0.0), "llama_swap_rules")
     assert (calm.total.ooms, calm.total.unserved, calm.switches) == (0, 0, 5)
 
 
 def test_llama_swap_holds_one_model_even_where_two_fit() -> None:
-    outcome = under(scenario(TWO, card="24GiB", lag_s=0.0), "llama_swap_rules")
+    outcome = under(scenario_of(TWO, card="24GiB", lag_s=0.0), "llama_swap_rules")
     assert outcome.switches == 5
-    assert under(scenario(TWO, card="24GiB")).switches == 0
+    assert under(scenario_of(TWO, card="24GiB")).switches == 0
 
 
 def test_ollama_waits_for_the_memory_and_loads_beside_what_fits() -> None:
-    outcome = under(scenario(TWO, lag_s=1.0), "ollama_rules")
+    outcome = under(scenario_of(TWO, lag_s=1.0), "ollama_rules")
     assert (outcome.total.ooms, outcome.total.unserved, outcome.switches) == (0, 0, 5)
-    assert under(scenario(TWO, card="24GiB"), "ollama_rules").switches == 0
+    assert under(scenario_of(TWO, card="24GiB"), "ollama_rules").switches == 0
 
 
 def test_ollama_goes_on_after_five_seconds_anyway() -> None:
-    assert under(scenario(TWO, lag_s=8.0), "ollama_rules").total.ooms > 0
-    assert under(scenario(TWO, lag_s=8.0)).total.ooms == 0
+    assert under(scenario_of(TWO, lag_s=8.0), "ollama_rules").total.ooms > 0
+    assert under(scenario_of(TWO, lag_s=8.0)).total.ooms == 0
 
 
 def test_a_small_model_waits_behind_a_large_one_with_ollama_and_not_here() -> None:
@@ -173,8 +175,8 @@ def test_a_small_model_waits_behind_a_large_one_with_ollama_and_not_here() -> No
   large: {load_peak: 6GiB, load_s: 1, use_s: 1, arrivals: {at_s: [5]}}
   small: {load_peak: 1GiB, load_s: 1, use_s: 1, arrivals: {at_s: [10]}}
 """
-    assert under(scenario(text), "ollama_rules").of("small").wait_s(1.0) > 40
-    assert under(scenario(text)).of("small").wait_s(1.0) < 2
+    assert under(scenario_of(text), "ollama_rules").of("small").wait_s(1.0) > 40
+    assert under(scenario_of(text)).of("small").wait_s(1.0) < 2
 
 
 def test_the_ports_know_one_card_and_names_are_checked() -> None:

@@ -236,7 +236,7 @@ class Plant:
         }
 
 
-def attack(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
+def attack_table(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
     """Hellos, valid requests, mutants, bombs and noise over a few connections of two processes. Counts answers per frame."""
     counts: Counter[int] = Counter()
     connections = [(b"c%d" % number, ATTACKERS[number % 2]) for number in range(6)]
@@ -275,7 +275,7 @@ def learn(forger: Forger, answer: Mapping[str, Any]) -> None:
 def test_nothing_raises_and_nothing_is_left(seed: int) -> None:
     draw = random.Random(seed)
     plant = Plant(real=False)
-    counts = attack(plant, draw, Forger(draw), 60)
+    counts = attack_table(plant, draw, Forger(draw), 60)
     assert max(counts) <= 1, "nothing is answered twice"
     plant.everybody_dies()
     assert not plant.leftovers()
@@ -297,7 +297,7 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
     forger = Forger(draw)
     forger.lease_ids += [lease["lease_id"], "victim"]
     forger.tokens.append(lease["token"])  # stolen
-    counts = attack(plant, draw, forger, 60)
+    counts = attack_table(plant, draw, forger, 60)
     assert set(counts) <= {1}, f"every frame is answered exactly once: {counts}"
     core.advance(draw.choice([0.0, 1.0, 40.0]))
     (mine,) = (view for view in core.status()["leases"] if view["consumer"] == "victim")

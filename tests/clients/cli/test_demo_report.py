@@ -34,7 +34,7 @@ def line(pid: int, t: float, op: str, process: int, used: int) -> str:
     )
 
 
-def summary(**changes: Any) -> dict[str, Any]:
+def demo_summary(**changes: Any) -> dict[str, Any]:
     story = CardStory((), 5 * GIB, ())
     given: dict[str, Any] = {
         "seed": 3, "arbiter": True, "task": "grab the red cube", "story": story, "capacity_bytes": 8 * GIB, "events": [LOAD, SWITCH],
@@ -68,22 +68,22 @@ def test_samples_of_a_real_card_give_the_same_story() -> None:
 
 
 def test_completed_needs_all_three_witnesses() -> None:
-    assert summary()["completed"]
-    assert not summary(truth={"held_above_table": {"red cube": False}})["completed"]
-    assert not summary(target="blue ball")["completed"]
-    assert not summary(reasoner=SUCCESS | {"vlm_confirmed": False})["completed"]
-    assert not summary(reasoner=SUCCESS | {"status": "failure"})["completed"]
-    assert not summary(reasoner={})["completed"]
+    assert demo_summary()["completed"]
+    assert not demo_summary(truth={"held_above_table": {"red cube": False}})["completed"]
+    assert not demo_summary(target="blue ball")["completed"]
+    assert not demo_summary(reasoner=SUCCESS | {"vlm_confirmed": False})["completed"]
+    assert not demo_summary(reasoner=SUCCESS | {"status": "failure"})["completed"]
+    assert not demo_summary(reasoner={})["completed"]
 
 
 def test_switches_are_counted_apart_from_loads_beside_others() -> None:
-    told = summary()
+    told = demo_summary()
     assert (told["switches"], told["switches_verified"]) == (1, 1)
     assert told["loads"][1] == {
         "consumer": "grab", "evicted": ["detector"], "verdicts": ["verified"],
         "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0, "total_ms": 15.0,
     }  # fmt: skip
-    assert summary(events=[SWITCH | {"verified": False}])["switches_verified"] == 0
+    assert demo_summary(events=[SWITCH | {"verified": False}])["switches_verified"] == 0
 
 
 def test_events_read_as_sentences() -> None:

@@ -33,11 +33,6 @@ VIEW = protocol_wire.view(token=[1, 2])
 PROGRAM = "import os, signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print(os.getpid(), flush=True); signal.pause()"
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
 class GrantsAtOnce:
     """Grants every lease, and leaves `ready` to the test; anything else is fine with it."""
 

@@ -76,7 +76,7 @@ class Answering:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., str]]:
+def serve_answer() -> Iterator[Callable[..., str]]:
     """`serve(before, after)`: the endpoint of a server that calls these with its peer before and after it answers."""
     with tempfile.TemporaryDirectory(prefix="va") as folder:
         made: list[Answering] = []
@@ -93,7 +93,7 @@ def serve() -> Iterator[Callable[..., str]]:
             server.close()
 
 
-async def connect(endpoint: str) -> None:
+async def connect_once(endpoint: str) -> None:
     async with AsyncClient("t", endpoint=endpoint, connect_timeout_s=LIMIT_S):
         pass
 
@@ -112,9 +112,9 @@ async def ask_reasoner(endpoint: str) -> None:
     await reasoner.send(endpoint, {"op": "state"}, timeout_s=LIMIT_S)
 
 
-@pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
+@pytest.mark.parametrize("ask", [connect_once, ping_runner, ping_sidecar, ask_reasoner])
 def test_an_answer_that_came_while_the_loop_stood_still_counts(
-    serve: Callable[..., str], ask: Any
+    serve_answer: Callable[..., str], ask: Any
 ) -> None:
     """Regression: a program that imported something for longer than its time limit said that nobody had answered."""
     asked, standing, said = threading.Event(), threading.Event(), threading.Event()
@@ -123,7 +123,7 @@ def test_an_answer_that_came_while_the_loop_stood_still_counts(
         asked.set()
         standing.wait(PATIENCE_S)
 
-    endpoint = serve(before, lambda _: said.set())
+    endpoint = serve_answer(before, lambda _: said.set())
 
     def stand_still() -> None:
         if not asked.is_set():  # the client connects first, which takes a few turns of its loop
@@ -142,12 +142,12 @@ def test_an_answer_that_came_while_the_loop_stood_still_counts(
     assert said.is_set()
 
 
-@pytest.mark.parametrize("ask", [connect, ping_runner, ping_sidecar, ask_reasoner])
+@pytest.mark.parametrize("ask", [connect_once, ping_runner, ping_sidecar, ask_reasoner])
 def test_a_loop_that_stood_still_before_it_could_ask_still_asks(
-    serve: Callable[..., str], ask: Any
+    serve_answer: Callable[..., str], ask: Any
 ) -> None:
     """A client says nothing before it knows whose server it is: its connection is noticed on its loop."""
-    endpoint = serve()
+    endpoint = serve_answer()
 
     async def run() -> None:
         asking = asyncio.create_task(ask(endpoint))
@@ -158,7 +158,7 @@ def test_a_loop_that_stood_still_before_it_could_ask_still_asks(
 
 
 def test_an_answer_that_came_while_the_process_was_stopped_counts(
-    serve: Callable[..., str],
+    serve_answer: Callable[..., str],
 ) -> None:
     """Regression: answer and time-out were found together after a stop, and the time-out won."""
     stopped: list[int] = []
@@ -174,7 +174,7 @@ def test_an_answer_that_came_while_the_process_was_stopped_counts(
         assert peer.pid is not None
         os.kill(peer.pid, signal.SIGCONT)
 
-    endpoint = serve(stop, go_on)
+    endpoint = serve_answer(stop, go_on)
     child = subprocess.Popen(
         [sys.executable, "-c", CLIENT, endpoint],
         env={**os.environ, "PYTHONPATH": f"{ROOT}/src"},

@@ -93,7 +93,7 @@ class Client:
         self._context.destroy(0)
 
 
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
+def with_server(scenario: Callable[[], Awaitable[None]]) -> None:
     async def bounded() -> None:
         async with asyncio.timeout(WAIT_S):
             await scenario()
@@ -117,7 +117,7 @@ def test_the_first_message_may_be_the_largest_picture(tmp_path: Path, kind: int)
             assert {(peer.pid, peer.uid) for peer in server.peers} == {(os.getpid(), os.getuid())}
             assert len({peer.identity for peer in server.peers}) == 1
 
-    run(scenario)
+    with_server(scenario)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_a_message_that_costs_too_much_is_refused_and_its_sender_served_on(
             assert (await client.ask({"op": "ping", "id": 1}))["ok"]
             client.close()
 
-    run(scenario)
+    with_server(scenario)
 
 
 def test_a_server_without_pictures_takes_a_mebibyte(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_server_without_pictures_takes_a_mebibyte(tmp_path: Path) -> None:
             assert answer["code"] == "message_too_large"
             client.close()
 
-    run(scenario)
+    with_server(scenario)
 
 
 def test_a_goal_may_be_a_trajectory_of_eight_hundred_points(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_goal_may_be_a_trajectory_of_eight_hundred_points(tmp_path: Path) -> N
             assert (await client.ask(goal))["ok"]
             client.close()
 
-    run(scenario)
+    with_server(scenario)
 
 
 def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path:
             assert f"{WAITING_MAX} requests" in (await client.answer())["message"]
             client.close()
 
-    run(scenario)
+    with_server(scenario)
 
 
 def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(
@@ -236,7 +236,7 @@ def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(
             greedy.close()
             client.close()
 
-    run(scenario)
+    with_server(scenario)
 
 
 def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
             assert stat.S_IMODE(path.stat().st_mode) == 0o660
         assert not path.exists()
 
-    run(scenario)
+    with_server(scenario)
 
 
 @pytest.mark.parametrize(

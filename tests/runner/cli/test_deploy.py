@@ -92,7 +92,7 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
         process.communicate()
 
 
-def play(tmp_path: Path, body: Callable[[RunnerClient], Any]) -> None:
+def with_client(tmp_path: Path, body: Callable[[RunnerClient], Any]) -> None:
     async def bounded() -> None:
         async with (
             asyncio.timeout(120),
@@ -149,7 +149,7 @@ def test_a_signal_cancels_the_goal_and_ends_in_order(
         process.send_signal(how)
         assert (await goal.result(60))["status"] == "canceled"
 
-    play(tmp_path, body)
+    with_client(tmp_path, body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "so101 is disconnected" in err
@@ -201,7 +201,7 @@ def test_a_camera_file_that_ends_withholds_and_fails_the_goal(start: Start, tmp_
         assert result["data"]["withheld"] > 0
         assert (await client.state())["world"]["diagnostics"]["front"] == "stale"
 
-    play(tmp_path, body)
+    with_client(tmp_path, body)
 
 
 def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> N
             await client.send_goal(RSKILL)
         process.send_signal(signal.SIGTERM)
 
-    play(tmp_path, body)
+    with_client(tmp_path, body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "emergency stop: test" in json.loads(out)["metadata"]["estop"]
@@ -258,7 +258,7 @@ def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_con
         assert "emergency stop: test" in state["estop"]
         process.send_signal(signal.SIGTERM)
 
-    play(tmp_path, body)
+    with_client(tmp_path, body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 2, err  # systemd's RestartPreventExitStatus
     assert json.loads(out)["success"] is False
@@ -274,7 +274,7 @@ def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_r
     async def stop(client: RunnerClient) -> None:
         await stopped(client, "a hand is in the way")
 
-    play(tmp_path, stop)
+    with_client(tmp_path, stop)
     assert "a hand is in the way" in mark.read_text()
     first.kill()  # as the kernel does when memory is short; systemd starts it again
     first.communicate(timeout=60)
@@ -290,7 +290,7 @@ def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_r
         await stopped(client, "again")
         third.send_signal(signal.SIGTERM)
 
-    play(tmp_path, stop_and_end)
+    with_client(tmp_path, stop_and_end)
     third.communicate(timeout=60)
     assert not mark.exists()  # a person ended it
 
@@ -332,7 +332,7 @@ def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
         assert second.returncode == 1
         assert f"(pid {first.pid}) already uses robot bench" in err
 
-    play(tmp_path, body)
+    with_client(tmp_path, body)
 
 
 def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_path: Path) -> None:
@@ -358,4 +358,4 @@ def test_what_the_robot_does_not_offer_is_refused(start: Start, tmp_path: Path) 
         with pytest.raises(UnknownSkill, match="so101-navigate"):
             await client.send_goal("no/such")
 
-    play(tmp_path, body)
+    with_client(tmp_path, body)

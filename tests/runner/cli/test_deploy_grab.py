@@ -70,7 +70,7 @@ def uses(status: StatusReply) -> list[int]:
     return [lease.uses for lease in status.leases if lease.consumer == "grab"]
 
 
-async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
+async def interrupted_grab(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
         AsyncClient("watcher", endpoint=arbiter.endpoint) as watcher,
@@ -97,4 +97,4 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
 def test_the_policy_moves_the_arm_and_a_signal_ends_its_use(
     arbiter_daemon: ArbiterProcess, programs: GrabPrograms
 ) -> None:
-    programs.play(scenario(arbiter_daemon, programs))
+    programs.play(interrupted_grab(arbiter_daemon, programs))

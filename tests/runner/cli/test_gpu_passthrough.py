@@ -22,7 +22,7 @@ SKILL = "vram-arbiter/gpu-passthrough"
 
 
 @pytest.fixture
-def programs(
+def passthrough_programs(
     arbiter_daemon: ArbiterProcess, tmp_path: Path
 ) -> Iterator[list["subprocess.Popen[bytes]"]]:
     environ = arbiter_daemon.environ | {"OMP_NUM_THREADS": "1"}
@@ -55,7 +55,7 @@ def programs(
     print(log.read_text(errors="replace")[-3000:])
 
 
-async def scenario(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -> None:
+async def one_goal(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -> None:
     async with (
         RunnerClient(f"ipc://{daemon.runtime}/runner.sock", connect_timeout_s=120.0) as runner,
         AsyncClient("watcher", endpoint=daemon.endpoint, role="observer") as watcher,
@@ -79,6 +79,6 @@ async def scenario(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -
 
 
 def test_frames_pass_the_card_under_a_lease_and_nothing_moves(
-    arbiter_daemon: ArbiterProcess, programs: list["subprocess.Popen[bytes]"]
+    arbiter_daemon: ArbiterProcess, passthrough_programs: list["subprocess.Popen[bytes]"]
 ) -> None:
-    asyncio.run(asyncio.wait_for(scenario(arbiter_daemon, programs[0]), 280))
+    asyncio.run(asyncio.wait_for(one_goal(arbiter_daemon, passthrough_programs[0]), 280))

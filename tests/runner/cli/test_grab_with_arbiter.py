@@ -37,7 +37,7 @@ def leases(status: StatusReply, consumer: str) -> list[tuple[str, int]]:
     return [(lease.state, lease.uses) for lease in status.leases if lease.consumer == consumer]
 
 
-async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
+async def grab_beside_rival(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
     async with (
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
         AsyncClient("rival", endpoint=arbiter.endpoint) as rival,
@@ -95,4 +95,4 @@ async def scenario(arbiter: ArbiterProcess, programs: GrabPrograms) -> None:
 def test_a_goal_is_one_use_and_a_dead_policy_fails_closed(
     arbiter_daemon: ArbiterProcess, programs: GrabPrograms
 ) -> None:
-    programs.play(scenario(arbiter_daemon, programs))
+    programs.play(grab_beside_rival(arbiter_daemon, programs))

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+def start_runner(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
     started: list[subprocess.Popen[bytes]] = []
 
     def begin(*flags: str) -> subprocess.Popen[bytes]:
@@ -52,7 +52,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 @pytest.mark.e2e
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_in_order_and_the_video_is_whole(
-    start: Callable[..., subprocess.Popen[bytes]],
+    start_runner: Callable[..., subprocess.Popen[bytes]],
     tmp_path: Path,
     run_async: Run,
     how: signal.Signals,
@@ -60,7 +60,7 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
     import imageio_ffmpeg
 
     video = tmp_path / "episode.mp4"
-    process = start("--no-arbiter", "--seed", "2", "--video", str(video), "--rate", "30")
+    process = start_runner("--no-arbiter", "--seed", "2", "--video", str(video), "--rate", "30")
 
     async def use() -> None:
         async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client:
@@ -99,9 +99,9 @@ def run_async_long(coroutine: Callable[[], Any]) -> None:
 @pytest.mark.heavy
 @pytest.mark.e2e
 def test_without_an_arbiter_it_says_so_and_does_not_start(
-    start: Callable[..., subprocess.Popen[bytes]],
+    start_runner: Callable[..., subprocess.Popen[bytes]],
 ) -> None:
-    process = start()
+    process = start_runner()
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert b"--no-arbiter" in errors

@@ -56,7 +56,7 @@ def front(clock: Any) -> FedCamera:
 
 
 @pytest.fixture
-def make(clock: Any, twin: Twin) -> MakeRunner:
+def make_runner(clock: Any, twin: Twin) -> MakeRunner:
     def build(cameras: Sequence[FedCamera] = (), **options: Any) -> HardwareRunner:
         readers = [(camera, 100.0) for camera in cameras]
         return hardware_runner(
@@ -90,10 +90,10 @@ def begin(runner: HardwareRunner, skill: Nod, **goal: Any) -> list[SkillEnded]:
 
 
 def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
-    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
     seen: list[WorldState] = []
-    runner = make([front])
+    runner = make_runner([front])
     runner.activate()
     ended = begin(runner, nod(cameras=("front",), steps=3, on_step=seen.append))
     result = tick(runner, clock)
@@ -112,9 +112,9 @@ def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
 
 @pytest.mark.parametrize("cause", ["hangs", "ends", "is not there"])
 def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
-    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any, cause: str
+    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any, cause: str
 ) -> None:
-    runner = make([front])
+    runner = make_runner([front])
     runner.activate()
     skill = nod(cameras=("rear",) if cause == "is not there" else ("front",))
     ended = begin(runner, skill)
@@ -140,9 +140,9 @@ def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
 
 
 def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
-    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
-    runner = make([front])
+    runner = make_runner([front])
     runner.activate()
     ended = begin(runner, nod(cameras=("front",)))
     front.always = False
@@ -156,9 +156,9 @@ def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
 
 
 def test_a_camera_that_no_skill_looks_at_stops_nobody(
-    make: MakeRunner, front: FedCamera, nod: Any, clock: Any
+    make_runner: MakeRunner, front: FedCamera, nod: Any, clock: Any
 ) -> None:
-    runner = make([front])
+    runner = make_runner([front])
     runner.activate()
     begin(runner, nod())
     front.stop()
@@ -169,9 +169,9 @@ def test_a_camera_that_no_skill_looks_at_stops_nobody(
 
 
 def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make()
+    runner = make_runner()
     runner.activate()
     ended = begin(runner, nod())
     tick(runner, clock)
@@ -191,9 +191,9 @@ def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
 
 
 def test_what_cannot_be_sent_fails_the_goal(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make()
+    runner = make_runner()
     runner.activate()
     ended = begin(runner, nod())
     twin.deaf = True
@@ -203,7 +203,7 @@ def test_what_cannot_be_sent_fails_the_goal(
 
 
 def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     asked: list[Skill] = []
 
@@ -211,7 +211,7 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
         asked.append(skill)
         return JointRanges({"wrist_flex": (-0.1, 0.1)})
 
-    runner = make(make_gate=narrow)
+    runner = make_runner(make_gate=narrow)
     runner.activate()
     skill = nod()
     begin(runner, skill)
@@ -222,11 +222,11 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
     assert not twin.sent
 
 
-def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make: MakeRunner, nod: Any) -> None:
+def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make_runner: MakeRunner, nod: Any) -> None:
     def broken(skill: Skill) -> SafetyGate:
         raise LimitExceeded("the envelope is empty")
 
-    runner = make(make_gate=broken)
+    runner = make_runner(make_gate=broken)
     runner.activate()
     with pytest.raises(LimitExceeded):
         begin(runner, nod())
@@ -235,10 +235,10 @@ def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make: MakeRunner, nod: 
 
 
 def test_the_emergency_stop_comes_before_anything_else(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     told: list[str] = []
-    runner = make(on_estop=told.append)
+    runner = make_runner(on_estop=told.append)
     runner.activate()
     skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
     ended = begin(runner, skill)
@@ -260,10 +260,10 @@ def test_the_emergency_stop_comes_before_anything_else(
 
 
 def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     told: list[str] = []
-    runner = make(on_estop=told.append)
+    runner = make_runner(on_estop=told.append)
     runner.activate()
     ended = begin(runner, nod())
     with pytest.raises(EstopRequested):
@@ -277,9 +277,9 @@ def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
 
 
 def test_a_late_action_is_withheld_under_drop(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make(deadline_policy=DeadlinePolicy.DROP)
+    runner = make_runner(deadline_policy=DeadlinePolicy.DROP)
     runner.activate()
     begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S)))
     result = tick(runner, clock)
@@ -288,10 +288,10 @@ def test_a_late_action_is_withheld_under_drop(
 
 
 def test_a_goal_whose_actions_all_come_too_late_fails(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     """Regression: under `drop` such a goal succeeded without one command to a motor."""
-    runner = make(deadline_policy=DeadlinePolicy.DROP)
+    runner = make_runner(deadline_policy=DeadlinePolicy.DROP)
     runner.activate()
     ended = begin(runner, nod(steps=100, on_step=lambda world: clock.advance(2 * PERIOD_S)))
     tick(runner, clock, 30)
@@ -302,11 +302,11 @@ def test_a_goal_whose_actions_all_come_too_late_fails(
 
 
 def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
-    make: MakeRunner, twin: Twin, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     """Regression: the gate judged the state's age by its stamp and not by the clock."""
     own = RobotGate(twin.description, rate_hz=30.0, now_ns=clock.now_ns)
-    runner = make(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
+    runner = make_runner(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
     runner.activate()
     begin(runner, nod(on_step=lambda world: clock.advance(0.5)))
     result = tick(runner, clock)
@@ -316,9 +316,9 @@ def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
 
 
 def test_a_tick_says_where_its_time_went(
-    make: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
-    runner = make([front])
+    runner = make_runner([front])
     runner.activate()
     begin(runner, nod(on_step=lambda world: clock.advance(0.004)))
     result = runner.tick()
@@ -333,9 +333,9 @@ def test_a_tick_says_where_its_time_went(
 
 
 def test_a_goal_ends_after_as_many_ticks_as_it_may_take(
-    make: MakeRunner, nod: Any, clock: Any
+    make_runner: MakeRunner, nod: Any, clock: Any
 ) -> None:
-    runner = make()
+    runner = make_runner()
     runner.activate()
     ended = begin(runner, nod(), max_ticks=5)
     tick(runner, clock, 8)
@@ -345,9 +345,9 @@ def test_a_goal_ends_after_as_many_ticks_as_it_may_take(
 
 @pytest.mark.heavy
 def test_pictures_for_others_come_in_their_colours_and_never_too_old(
-    make: MakeRunner, front: FedCamera, clock: Any
+    make_runner: MakeRunner, front: FedCamera, clock: Any
 ) -> None:
-    runner = make([front])
+    runner = make_runner([front])
     runner.activate()
     assert runner.snapshot("front", 0.1).rgb.tolist() == [[[0, 0, 255], [255, 0, 0]]]
     front.always = False
@@ -360,11 +360,11 @@ def test_pictures_for_others_come_in_their_colours_and_never_too_old(
 
 
 def test_it_does_not_start_on_a_camera_that_shows_nothing(
-    make: MakeRunner, twin: Twin, front: FedCamera, clock: Any
+    make_runner: MakeRunner, twin: Twin, front: FedCamera, clock: Any
 ) -> None:
     front.always = False
     front._run_begins = lambda feed: feed.end("there is no /dev/video7")  # type: ignore[method-assign]
-    runner = make([front])
+    runner = make_runner([front])
     with pytest.raises(FrameStale, match="video7"):
         runner.activate()
     runner.deactivate()
@@ -372,13 +372,13 @@ def test_it_does_not_start_on_a_camera_that_shows_nothing(
 
 
 def test_everything_is_stopped_whatever_one_of_them_raises(
-    make: MakeRunner, twin: Twin, front: FedCamera, clock: Any
+    make_runner: MakeRunner, twin: Twin, front: FedCamera, clock: Any
 ) -> None:
     class Stubborn(FedCamera):
         def _run_ends(self) -> None:
             raise OSError("the driver hangs")
 
-    runner = make([front, Stubborn("wrist", clock)])
+    runner = make_runner([front, Stubborn("wrist", clock)])
     runner.activate()
     with pytest.raises(OSError, match="hangs"):
         runner.deactivate()
@@ -418,9 +418,11 @@ def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
     runner.deactivate()
 
 
-def test_it_does_not_start_on_a_robot_that_says_nothing(make: MakeRunner, twin: Twin) -> None:
+def test_it_does_not_start_on_a_robot_that_says_nothing(
+    make_runner: MakeRunner, twin: Twin
+) -> None:
     twin.silent = True
-    runner = make()
+    runner = make_runner()
     with pytest.raises(StateStale, match="motor 3"):
         runner.activate()
     runner.deactivate()
@@ -428,10 +430,10 @@ def test_it_does_not_start_on_a_robot_that_says_nothing(make: MakeRunner, twin: 
 
 
 def test_a_robot_whose_first_answer_is_lost_starts(
-    make: MakeRunner, twin: Twin, clock: Any
+    make_runner: MakeRunner, twin: Twin, clock: Any
 ) -> None:
     twin.answers_lost = FIRST_STATE_TRIES - 1
-    runner = make()
+    runner = make_runner()
     runner.activate()
     assert runner.world is not None
     assert runner.world.stale == ()
@@ -439,10 +441,10 @@ def test_a_robot_whose_first_answer_is_lost_starts(
 
 
 def test_waiting_for_a_camera_ends_when_the_runner_is_to_stop(
-    make: MakeRunner, twin: Twin, front: FedCamera
+    make_runner: MakeRunner, twin: Twin, front: FedCamera
 ) -> None:
     front.always = False
-    runner = make([front])
+    runner = make_runner([front])
     runner.request_stop()
     with pytest.raises(Cancelled):
         runner.activate()

@@ -45,7 +45,7 @@ REASON = {
 }
 
 
-def manifest(kind: Kind, tag: str = "any") -> RSkillManifest:
+def manifest_of(kind: Kind, tag: str = "any") -> RSkillManifest:
     return RSkillManifest.model_validate(
         {
             "name": f"lab/{kind}",
@@ -62,17 +62,20 @@ def manifest(kind: Kind, tag: str = "any") -> RSkillManifest:
     )
 
 
-def make(manifest: RSkillManifest) -> Skill:
-    raise AssertionError(f"{manifest.name} must not be made here")
+def make_skill(manifest_of: RSkillManifest) -> Skill:
+    raise AssertionError(f"{manifest_of.name} must not be made here")
 
 
-EVERY_MAKER: dict[Kind, Maker] = dict.fromkeys(Kind, make)
+EVERY_MAKER: dict[Kind, Maker] = dict.fromkeys(Kind, make_skill)
 
 
 @pytest.mark.parametrize("kind", list(Kind))
 def test_every_kind_runs_or_is_refused_with_the_way_to_use_it(kind: Kind) -> None:
     """A maker for a kind that moves nothing changes nothing: the kind decides, whoever asks."""
-    with_makers, without = Catalogue([manifest(kind)], EVERY_MAKER), Catalogue([manifest(kind)], {})
+    with_makers, without = (
+        Catalogue([manifest_of(kind)], EVERY_MAKER),
+        Catalogue([manifest_of(kind)], {}),
+    )
     if kind in EXECUTABLE:
         assert with_makers.find(f"lab/{kind}")[2].kind is kind
     else:
@@ -91,7 +94,7 @@ def test_every_kind_runs_or_is_refused_with_the_way_to_use_it(kind: Kind) -> Non
 
 def test_a_goal_for_another_robot_is_refused_whoever_asks() -> None:
     found = Catalogue(
-        [manifest(Kind.VLA, "go2"), manifest(Kind.ROS_ACTION, "mobile_base")],
+        [manifest_of(Kind.VLA, "go2"), manifest_of(Kind.ROS_ACTION, "mobile_base")],
         EVERY_MAKER,
         body=SIMULATED,
     )

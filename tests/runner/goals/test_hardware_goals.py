@@ -114,7 +114,7 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
     return serving
 
 
-def play(
+def on_bench(
     run_async: Run,
     bench: Callable[..., Any],
     body: Callable[[Bench, RunnerClient], Any],
@@ -173,7 +173,7 @@ def test_the_stop_fails_the_goal_and_refuses_new_ones(
         assert "a hand is in the way" in again.message
         assert len(b.twin.sent) == sent
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
@@ -191,7 +191,7 @@ def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
             await asyncio.sleep(0.01)
         assert b.twin.sent == []  # what the step came back with was not sent
 
-    play(run_async, bench, body, estop_s=0.5)
+    on_bench(run_async, bench, body, estop_s=0.5)
 
 
 def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run) -> None:
@@ -204,7 +204,7 @@ def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run
         b.skill.go_on.set()
         await diagnosed(client, "ok")
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 @pytest.mark.usefixtures("patient")
@@ -217,7 +217,7 @@ def test_the_command_line_stops_the_robot(
         assert b.runner.estop is not None
         assert b.twin.story == ["connect", "halt"]
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
     assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
 
 
@@ -248,7 +248,7 @@ def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
         assert "emergency stop: smoke; all joints stand still" in said
         assert b.twin.story.count("halt") == 1
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
@@ -270,7 +270,7 @@ def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read
         assert any(isinstance(answer, LimitExceeded) for answer in answers)
         assert b.twin.sent == []
 
-    play(run_async, bench, body, estop_s=0.5)
+    on_bench(run_async, bench, body, estop_s=0.5)
 
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
@@ -282,7 +282,7 @@ def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, reason:
         assert b.runner.estop is not None
         assert b.twin.story == ["connect", "halt"]
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 def test_whoever_names_no_endpoint_stops_the_system_service_too(
@@ -313,7 +313,7 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
         assert said.out.count("bench: emergency stop: smoke") == 2
         assert "cut its power" in said.err
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
@@ -330,7 +330,7 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
         assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
         assert b.twin.story == ["connect", "halt"]
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
@@ -365,7 +365,7 @@ def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(bench: Any, run_async:
         assert len(b.twin.sent) == sent
         assert (await client.state())["estop"] is None
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
@@ -378,7 +378,7 @@ def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
         )  # more where the machine stood still, and the skill was not asked
         assert b.skill.taken <= 4
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)
 
 
 @pytest.mark.heavy
@@ -396,4 +396,4 @@ def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
         with pytest.raises(FrameStale, match="stopped"):
             await client.frame("front", max_age_ms=60_000)
 
-    play(run_async, bench, body)
+    on_bench(run_async, bench, body)

@@ -144,7 +144,7 @@ def bench(
     return serving
 
 
-def play(
+def on_bench(
     run_async: Run,
     bench: Callable[..., Any],
     endpoint: str,
@@ -171,7 +171,7 @@ def test_a_goal_feeds_back_and_ends_with_one_result(
         again = await client.call("result", {"goal_id": goal.goal_id})
         assert again["status"] == "succeeded"
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_the_next_goal_of_the_same_skill_reuses_it(
@@ -183,7 +183,7 @@ def test_the_next_goal_of_the_same_skill_reuses_it(
         assert len(b.made) == 1
         assert b.made[0].story == ["start end", "finish"] * 3
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_second_goal_is_refused_and_the_first_goes_on(
@@ -198,7 +198,7 @@ def test_a_second_goal_is_refused_and_the_first_goes_on(
         assert (await first.result(60))["status"] == "canceled"
         assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 @pytest.mark.parametrize("by", ["cancel", "estop"])
@@ -221,7 +221,7 @@ def test_a_cancel_or_stop_while_a_goal_finishes_does_not_cost_its_result(
             again = await client.send_goal(RSKILL, prompt="end")
             assert (await again.result(60))["success"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 @pytest.mark.parametrize("what", ["set", "large number"])
@@ -238,7 +238,7 @@ def test_a_result_that_no_wire_carries_still_reaches_the_client(
         assert "seen" in result["data"]["unsendable"]
         assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "succeeded"
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_no_goal_is_accepted_once_the_control_loop_has_ended(
@@ -256,7 +256,7 @@ def test_no_goal_is_accepted_once_the_control_loop_has_ended(
             await client.send_goal(RSKILL, prompt="end")
         b.made[0].finished.set()
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_skill_that_could_not_undo_a_failed_start_can_be_started_again(
@@ -269,7 +269,7 @@ def test_a_skill_that_could_not_undo_a_failed_start_can_be_started_again(
         assert (await goal.result(60))["status"] == "failed"
         assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_skill_that_breaks_while_it_finishes_still_gives_a_result(
@@ -283,7 +283,7 @@ def test_a_skill_that_breaks_while_it_finishes_still_gives_a_result(
         assert (await goal.result(60))["success"]
         assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 @pytest.mark.parametrize("prompt", ["forever", "hang"])
@@ -306,7 +306,7 @@ def test_cancel_takes_the_arm_back(bench: Any, endpoint: str, run_async: Run, pr
         await client.state()
         assert b.made[0].steps == steps
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_cancel_right_behind_the_goal_still_gives_a_result(
@@ -330,7 +330,7 @@ def test_cancel_right_behind_the_goal_still_gives_a_result(
         finally:
             socket.close(0)
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 @pytest.mark.parametrize("prompt", ["forever", "hang"])
@@ -341,7 +341,7 @@ def test_a_deadline_is_no_success(bench: Any, endpoint: str, run_async: Run, pro
         assert (result["status"], result["success"]) == ("deadline", False)
         assert b.made[0].story[-1] == "finish"
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 @pytest.mark.parametrize(
@@ -357,7 +357,7 @@ def test_failures_are_typed(
         assert result["message"]
         assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_client_that_vanished_finds_its_result(bench: Any, endpoint: str, run_async: Run) -> None:
@@ -374,7 +374,7 @@ def test_a_client_that_vanished_finds_its_result(bench: Any, endpoint: str, run_
         with pytest.raises(GoalRejected, match="has ended"):
             await client.send_goal(RSKILL, prompt="end", goal_id="mine")
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_the_same_goal_sent_again_is_the_same_goal(
@@ -389,7 +389,7 @@ def test_the_same_goal_sent_again_is_the_same_goal(
         assert (await goal.result(60))["status"] == "canceled"
         assert b.made[0].story == ["start forever", "finish"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
@@ -407,7 +407,7 @@ def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
             assert (await again.result(60))["status"] == "canceled"
         assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "canceled"
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_reads(bench: Any, endpoint: str, run_async: Run) -> None:
@@ -424,7 +424,7 @@ def test_reads(bench: Any, endpoint: str, run_async: Run) -> None:
         with pytest.raises(BadRequest, match="no camera 'rear'"):
             await client.call("frame", {"camera": "rear"})
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 @pytest.mark.parametrize(
@@ -466,7 +466,7 @@ def test_bad_input_gets_an_answer_and_harms_nothing(
             socket.close(0)
         assert (await client.ping(timeout_s=60))["ok"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_shutdown_answers_cancels_and_ends(bench: Any, endpoint: str, run_async: Run) -> None:
@@ -476,7 +476,7 @@ def test_shutdown_answers_cancels_and_ends(bench: Any, endpoint: str, run_async:
         assert (await goal.result(60))["status"] == "canceled"
         assert b.made[0].story == ["start forever", "finish", "release"]
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_second_runner_on_the_same_socket_is_refused(
@@ -536,7 +536,7 @@ def test_the_emergency_stop_of_a_simulator_ends_its_goal_too(
         with pytest.raises(EstopRequested, match="smoke"):
             await client.send_goal(RSKILL, prompt="end")
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_a_goal_runs_when_it_has_the_arm_and_not_before(
@@ -572,7 +572,7 @@ def test_a_goal_runs_when_it_has_the_arm_and_not_before(
         await second.cancel()
         assert (await second.result(60))["status"] == "canceled"
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)
 
 
 def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(
@@ -586,4 +586,4 @@ def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(
         assert len(str(unknown.value)) < 1000
         assert len(str(wrong.value)) < 1000
 
-    play(run_async, bench, endpoint, body)
+    on_bench(run_async, bench, endpoint, body)

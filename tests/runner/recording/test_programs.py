@@ -30,7 +30,7 @@ Start = Callable[..., subprocess.Popen[str]]
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def start_recording(tmp_path: Path) -> Iterator[Start]:
     started: list[subprocess.Popen[str]] = []
 
     def begin(*argv: str, **environ: str) -> subprocess.Popen[str]:
@@ -57,10 +57,10 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
-    start: Start, tmp_path: Path
+    start_recording: Start, tmp_path: Path
 ) -> None:
     root = tmp_path / "set"
-    process = start(
+    process = start_recording(
         "-m", "vram_arbiter.runner", "sim", "--record", str(root), "--rate", "0", **DEAF
     )
 
@@ -105,7 +105,7 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
     assert commit.repair(root) == []
 
 
-def test_a_deployment_records_into_its_save_dir(start: Start, tmp_path: Path) -> None:
+def test_a_deployment_records_into_its_save_dir(start_recording: Start, tmp_path: Path) -> None:
     root = tmp_path / "set"
     config = tmp_path / "robot.yaml"
     config.write_text(
@@ -113,7 +113,7 @@ def test_a_deployment_records_into_its_save_dir(start: Start, tmp_path: Path) ->
         " so101_kinematic}\n"
         f"task: {{id: nod, instruction: nod twice, max_steps: 400}}\nvla: {{id: {RSKILL}}}\nsave_dir: {root}\n"
     )
-    process = start(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")
+    process = start_recording(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")
     out, _ = process.communicate(timeout=WAIT_S)
     assert process.returncode == 0
     result = json.loads(out.splitlines()[-1])

@@ -58,7 +58,7 @@ def recorder(root: Path, **options: Any) -> DatasetRecorder:
     return DatasetRecorder(root, **given | options)
 
 
-def play(made: DatasetRecorder, of: Any, ended: Any, ticks: int, **options: Any) -> None:
+def record_goal(made: DatasetRecorder, of: Any, ended: Any, ticks: int, **options: Any) -> None:
     for index in range(ticks):
         made.tick(tick(index, of=of, **options))
     made.goal_ended(of, ended)
@@ -93,8 +93,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     first = recorder(root)
     first.start()
     first.tick(tick(0, of=FIRST, targets={"pan": 0.0}))  # nobody has told the gripper anything yet
-    play(first, FIRST, DONE, 6)
-    play(first, SECOND, FAILED, 4)
+    record_goal(first, FIRST, DONE, 6)
+    record_goal(first, SECOND, FAILED, 4)
     until(lambda: first.episodes == 2)
     for index in range(QUEUE_TICKS):
         first.tick(tick(index, of=goal("lost")))
@@ -116,15 +116,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
             pass
         in_the_way = root / "data/chunk-000/file-002.parquet"
         in_the_way.mkdir()
-        play(second, goal("blocked"), DONE, 2)
+        record_goal(second, goal("blocked"), DONE, 2)
         until(lambda: second.error is not None)
         blocked = second.error
         in_the_way.rmdir()
-        play(second, goal("small"), DONE, 3, frames=small)
-        play(second, goal("g3"), None, 3)
-        play(second, goal("short"), DONE, 1)
+        record_goal(second, goal("small"), DONE, 3, frames=small)
+        record_goal(second, goal("g3"), None, 3)
+        record_goal(second, goal("short"), DONE, 1)
         second.tick(tick(0, of=goal("torn"), frames=torn))
-        play(second, goal("torn"), DONE, 2)
+        record_goal(second, goal("torn"), DONE, 2)
     finally:
         second.close()
         logging.getLogger("vram_arbiter.runner.recording").removeHandler(handler)

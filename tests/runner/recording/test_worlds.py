@@ -58,7 +58,7 @@ def record(
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def recorded_world(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """Three episodes of random actions in a world whose actions and observations have parts of all
     kinds; and the run's result.
     """
@@ -84,9 +84,9 @@ def played(seed: int) -> list[tuple[dict[str, float], dict[str, float], float]]:
 
 
 def test_lerobot_reads_what_the_world_showed_and_was_sent(
-    recorded: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    recorded_world: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    root, result = recorded
+    root, result = recorded_world
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     import datasets
     from lerobot.datasets import LeRobotDataset
@@ -143,9 +143,9 @@ def test_lerobot_reads_what_the_world_showed_and_was_sent(
 
 
 def test_a_frame_of_a_world_leads_back_to_its_tick(
-    recorded: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+    recorded_world: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, _ = recorded
+    root, _ = recorded_world
     shown, sent, _ = played(SEED + 1)[1]
     argv = ["replay", "--dataset", str(root), "--episode", "1", "--frame", "1"]
     assert program.main([*argv, "--json"]) == 0

@@ -43,7 +43,7 @@ def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def make(tmp_path: Path, clock: Any) -> Make:
+def make_robot(tmp_path: Path, clock: Any) -> Make:
     def made(params: dict[str, Any] | None = None, **transport: Any) -> LerobotHal:
         config = HalConfig(
             adapter="lerobot:memory_robot",
@@ -61,8 +61,8 @@ def robot_of(hal: LerobotHal) -> Any:
     return hal._robot
 
 
-def test_it_reads_in_rad_what_lerobot_says_in_its_units(make: Make, clock: Any) -> None:
-    hal = make(values=[90.0, -50.0, 25.0])
+def test_it_reads_in_rad_what_lerobot_says_in_its_units(make_robot: Make, clock: Any) -> None:
+    hal = make_robot(values=[90.0, -50.0, 25.0])
     hal.connect()
     state = hal.read_state()
     assert state.name == hal.description.joint_names == ("motor_1", "motor_2", "motor_3")
@@ -74,8 +74,8 @@ def test_it_reads_in_rad_what_lerobot_says_in_its_units(make: Make, clock: Any) 
     assert state.stamp_ns == clock.now_ns()
 
 
-def test_it_sends_in_lerobots_units_what_is_said_in_rad(make: Make) -> None:
-    hal = make()
+def test_it_sends_in_lerobots_units_what_is_said_in_rad(make_robot: Make) -> None:
+    hal = make_robot()
     hal.connect()
     hal.send_action(to(motor_1=-math.pi / 4, motor_2=1.0, motor_3=1.0))
     assert robot_of(hal).sent[-1] == pytest.approx(
@@ -84,8 +84,8 @@ def test_it_sends_in_lerobots_units_what_is_said_in_rad(make: Make) -> None:
     assert hal.read_state().position == pytest.approx((-math.pi / 4, 1.0, 1.0))
 
 
-def test_joints_that_are_left_out_stay_where_they_were_sent(make: Make) -> None:
-    hal = make(values=[10.0, 20.0, 30.0])
+def test_joints_that_are_left_out_stay_where_they_were_sent(make_robot: Make) -> None:
+    hal = make_robot(values=[10.0, 20.0, 30.0])
     hal.connect()
     hal.send_action(to(motor_1=0.1))
     assert robot_of(hal).sent[-1] == pytest.approx(
@@ -95,8 +95,8 @@ def test_joints_that_are_left_out_stay_where_they_were_sent(make: Make) -> None:
     assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(math.degrees(0.1))
 
 
-def test_a_shortened_step_is_remembered_as_it_was_made(make: Make) -> None:
-    hal = make(max_relative_target=5.0)
+def test_a_shortened_step_is_remembered_as_it_was_made(make_robot: Make) -> None:
+    hal = make_robot(max_relative_target=5.0)
     hal.connect()
     hal.send_action(to(motor_1=1.0))
     assert hal.sent()["motor_1"] == pytest.approx(math.radians(5.0))
@@ -104,12 +104,12 @@ def test_a_shortened_step_is_remembered_as_it_was_made(make: Make) -> None:
     assert hal.read_state().position[0] == pytest.approx(math.radians(5.0))
 
 
-def test_the_files_word_goes_before_lerobots(make: Make) -> None:
+def test_the_files_word_goes_before_lerobots(make_robot: Make) -> None:
     joints = {
         **JOINTS,
         "motor_1": {**JOINTS["motor_1"], "unit": "rad", "sign": -1, "offset_rad": 0.5},
     }
-    hal = make({"joints": joints}, values=[0.25, 0.0, 0.0])
+    hal = make_robot({"joints": joints}, values=[0.25, 0.0, 0.0])
     hal.connect()
     assert hal.read_state().position[0] == pytest.approx(0.25)
     hal.send_action(to(motor_1=0.5))
@@ -144,10 +144,10 @@ def test_the_files_word_goes_before_lerobots(make: Make) -> None:
     ],
 )
 def test_each_mistake_names_its_field(
-    make: Make, transport: Any, params: Any, field: str, said: str
+    make_robot: Make, transport: Any, params: Any, field: str, said: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
-        make(params, **transport)
+        make_robot(params, **transport)
     found = caught.value.details["fields"][0]
     assert found["field"] == field
     assert said in found["problem"]
@@ -158,19 +158,19 @@ def test_an_unknown_robot_is_told_with_what_lerobot_knows() -> None:
         make_hal(HalConfig(adapter="lerobot:so101_folower"))
 
 
-def test_a_connection_that_fails_half_way_is_taken_back_and_tried_again(make: Make) -> None:
-    hal = make(lost_answers=2)
+def test_a_connection_that_fails_half_way_is_taken_back_and_tried_again(make_robot: Make) -> None:
+    hal = make_robot(lost_answers=2)
     hal.connect()
     assert robot_of(hal).is_connected
     assert hal.read_state().position[0] == 0.0
-    lost = make(lost_answers=100)
+    lost = make_robot(lost_answers=100)
     with pytest.raises(RobotFault, match="motor 3 is missing"):
         lost.connect()
     assert not robot_of(lost).is_connected
 
 
-def test_an_uncalibrated_robot_asks_nobody_on_the_terminal(make: Make) -> None:
-    hal = make(calibrated=False)
+def test_an_uncalibrated_robot_asks_nobody_on_the_terminal(make_robot: Make) -> None:
+    hal = make_robot(calibrated=False)
     with pytest.raises(RobotFault, match="lerobot-calibrate"):
         hal.connect()
     assert not robot_of(hal).is_connected
@@ -180,8 +180,8 @@ def test_an_uncalibrated_robot_asks_nobody_on_the_terminal(make: Make) -> None:
     "fault",
     [ConnectionError("no status packet"), RuntimeError("motor 3 is missing"), OSError(5, "I/O")],
 )
-def test_faults_of_the_bus_are_typed(make: Make, fault: Exception) -> None:
-    hal = make()
+def test_faults_of_the_bus_are_typed(make_robot: Make, fault: Exception) -> None:
+    hal = make_robot()
     robot_of(hal).fault = fault
     with pytest.raises(RobotFault, match="does not connect"):
         hal.connect()
@@ -197,16 +197,16 @@ def test_faults_of_the_bus_are_typed(make: Make, fault: Exception) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "twelve"])
-def test_a_position_that_is_no_number_is_never_acted_upon(make: Make, value: Any) -> None:
-    hal = make()
+def test_a_position_that_is_no_number_is_never_acted_upon(make_robot: Make, value: Any) -> None:
+    hal = make_robot()
     hal.connect()
     robot_of(hal).values["motor_2"] = value
     with pytest.raises(RobotFault, match="motor_2"):
         hal.read_state()
 
 
-def test_a_joint_that_is_not_reported_is_not_zero(make: Make) -> None:
-    hal = make()
+def test_a_joint_that_is_not_reported_is_not_zero(make_robot: Make) -> None:
+    hal = make_robot()
     hal.connect()
     del robot_of(hal).values["motor_2"]
     with pytest.raises(RobotFault, match="does not report motor_2"):
@@ -215,9 +215,9 @@ def test_a_joint_that_is_not_reported_is_not_zero(make: Make) -> None:
 
 @pytest.mark.parametrize(("how", "torque"), [("hold", True), ("torque_off", False)])
 def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
-    make: Make, how: str, torque: bool
+    make_robot: Make, how: str, torque: bool
 ) -> None:
-    hal = make({"joints": JOINTS, "estop": how}, values=[10.0, 0.0, 50.0])
+    hal = make_robot({"joints": JOINTS, "estop": how}, values=[10.0, 0.0, 50.0])
     hal.connect()
     hal.send_action(to(motor_1=1.0))
     robot_of(hal).values["motor_1"] = 40.0  # it is still on its way
@@ -232,8 +232,8 @@ def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
         hal.send_action(to(motor_1=0.0))
 
 
-def test_a_stop_that_cannot_hold_switches_off(make: Make) -> None:
-    hal = make()
+def test_a_stop_that_cannot_hold_switches_off(make_robot: Make) -> None:
+    hal = make_robot()
     hal.connect()
     robot_of(hal).values["motor_1"] = float("nan")
     with pytest.raises(EstopRequested, match="the motors are off"):
@@ -241,9 +241,9 @@ def test_a_stop_that_cannot_hold_switches_off(make: Make) -> None:
     assert robot_of(hal).bus.torque is False
 
 
-def test_a_stop_that_does_not_reach_the_motors_says_so(make: Make) -> None:
+def test_a_stop_that_does_not_reach_the_motors_says_so(make_robot: Make) -> None:
     bare = {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()}
-    hal = make({"joints": bare}, bus=False)
+    hal = make_robot({"joints": bare}, bus=False)
     hal.connect()
     robot_of(hal).fault = ConnectionError("cable")
     with pytest.raises(EstopRequested, match="the motors may still be on") as caught:
@@ -251,9 +251,11 @@ def test_a_stop_that_does_not_reach_the_motors_says_so(make: Make) -> None:
     assert "cable" in caught.value.details["halted"]
 
 
-def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(make: Make) -> None:
+def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(
+    make_robot: Make,
+) -> None:
     """Regression: `termios.error` is not an OSError, so the runner neither worked nor ended."""
-    hal = make()
+    hal = make_robot()
     hal.connect()
     robot_of(hal).fault = termios.error(
         5, "Input/output error"

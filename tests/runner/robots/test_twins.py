@@ -22,7 +22,7 @@ BOTH = pytest.mark.parametrize(
 MakeHal = Callable[..., HalBase]
 
 
-def to(**targets: float) -> Action:
+def to_targets(**targets: float) -> Action:
     return Action(
         control_mode=ControlMode.JOINT_POSITION,
         joint_targets=(tuple(targets.values()),),
@@ -36,7 +36,7 @@ def positions(hal: HalBase) -> dict[str, float]:
 
 
 @pytest.fixture
-def make(clock: Any) -> MakeHal:
+def make_twin(clock: Any) -> MakeHal:
     def made(adapter: str, **params: Any) -> HalBase:
         hal = make_hal(HalConfig(adapter=adapter, params=params), clock=clock)
         hal.connect()
@@ -51,7 +51,7 @@ def test_nothing_is_read_or_sent_without_a_connection(adapter: str, clock: Any) 
     with pytest.raises(BadState, match="not connected"):
         hal.read_state()
     with pytest.raises(BadState, match="not connected"):
-        hal.send_action(to(gripper=0.0))
+        hal.send_action(to_targets(gripper=0.0))
     hal.disconnect()  # harmless
     hal.connect()
     hal.connect()
@@ -62,9 +62,9 @@ def test_nothing_is_read_or_sent_without_a_connection(adapter: str, clock: Any) 
 
 @BOTH
 def test_it_starts_in_the_rest_pose_and_stays_there(
-    adapter: str, make: MakeHal, clock: Any
+    adapter: str, make_twin: MakeHal, clock: Any
 ) -> None:
-    hal = make(adapter)
+    hal = make_twin(adapter)
     clock.advance(0.4)
     rest = hal.description.rest_pose_rad
     assert positions(hal) == pytest.approx(dict(rest), abs=0.02)
@@ -74,11 +74,13 @@ def test_it_starts_in_the_rest_pose_and_stays_there(
 
 
 @BOTH
-def test_a_named_joint_moves_and_the_others_stay(adapter: str, make: MakeHal, clock: Any) -> None:
-    hal = make(adapter)
+def test_a_named_joint_moves_and_the_others_stay(
+    adapter: str, make_twin: MakeHal, clock: Any
+) -> None:
+    hal = make_twin(adapter)
     before = positions(hal)
     for _ in range(90):
-        hal.send_action(to(shoulder_pan=0.8))
+        hal.send_action(to_targets(shoulder_pan=0.8))
         clock.advance(1 / 30)
     after = positions(hal)
     assert after["shoulder_pan"] == pytest.approx(0.8, abs=0.02)
@@ -89,13 +91,13 @@ def test_a_named_joint_moves_and_the_others_stay(adapter: str, make: MakeHal, cl
 
 
 @BOTH
-def test_what_was_sent_is_known(adapter: str, make: MakeHal) -> None:
-    hal = make(adapter)
+def test_what_was_sent_is_known(adapter: str, make_twin: MakeHal) -> None:
+    hal = make_twin(adapter)
     assert hal.sent() == {}
-    hal.send_action(to(shoulder_pan=0.4))
-    hal.send_action(to(gripper=0.2))
+    hal.send_action(to_targets(shoulder_pan=0.4))
+    hal.send_action(to_targets(gripper=0.2))
     with pytest.raises(InternalError):
-        hal.send_action(to(gripper=0.9, tail=0.0))
+        hal.send_action(to_targets(gripper=0.9, tail=0.0))
     assert hal.sent() == {"shoulder_pan": 0.4, "gripper": 0.2}
     hal.disconnect()
     hal.connect()
@@ -103,9 +105,9 @@ def test_what_was_sent_is_known(adapter: str, make: MakeHal) -> None:
 
 
 @BOTH
-def test_it_moves_on_between_the_calls(adapter: str, make: MakeHal, clock: Any) -> None:
-    hal = make(adapter)
-    hal.send_action(to(shoulder_pan=1.5))
+def test_it_moves_on_between_the_calls(adapter: str, make_twin: MakeHal, clock: Any) -> None:
+    hal = make_twin(adapter)
+    hal.send_action(to_targets(shoulder_pan=1.5))
     clock.advance(0.1)
     first = hal.read_state()
     clock.advance(0.1)
@@ -114,9 +116,9 @@ def test_it_moves_on_between_the_calls(adapter: str, make: MakeHal, clock: Any) 
     assert second.velocity[0] > 0.5
 
 
-def test_a_kinematic_joint_keeps_its_greatest_speed(make: MakeHal, clock: Any) -> None:
-    hal = make("so101_kinematic", start_pose_rad={"shoulder_pan": 1.0})
-    hal.send_action(to(shoulder_pan=-1.0, gripper=0.6))
+def test_a_kinematic_joint_keeps_its_greatest_speed(make_twin: MakeHal, clock: Any) -> None:
+    hal = make_twin("so101_kinematic", start_pose_rad={"shoulder_pan": 1.0})
+    hal.send_action(to_targets(shoulder_pan=-1.0, gripper=0.6))
     clock.advance(0.1)
     state = hal.read_state()
     assert state.position[0] == pytest.approx(1.0 - 0.47)
@@ -125,16 +127,16 @@ def test_a_kinematic_joint_keeps_its_greatest_speed(make: MakeHal, clock: Any) -
 
 
 @BOTH
-def test_an_emergency_stop_latches(adapter: str, make: MakeHal, clock: Any) -> None:
-    hal = make(adapter)
-    hal.send_action(to(shoulder_pan=1.5))
+def test_an_emergency_stop_latches(adapter: str, make_twin: MakeHal, clock: Any) -> None:
+    hal = make_twin(adapter)
+    hal.send_action(to_targets(shoulder_pan=1.5))
     clock.advance(0.1)
     with pytest.raises(EstopRequested, match="emergency stop: hand in the way"):
         hal.estop("hand in the way")
     clock.advance(0.3)  # the physical arm has to brake first
     still = positions(hal)["shoulder_pan"]
     with pytest.raises(EstopRequested, match="hand in the way"):
-        hal.send_action(to(shoulder_pan=1.5))
+        hal.send_action(to_targets(shoulder_pan=1.5))
     with pytest.raises(EstopRequested, match="hand in the way"):
         hal.estop("another reason")
     clock.advance(1.0)
@@ -156,14 +158,14 @@ def test_an_emergency_stop_latches(adapter: str, make: MakeHal, clock: Any) -> N
             joint_names=("gripper",),
         ),
         Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.1, 0.0, 0.0, 0.0, 0.0, 0.0),)),
-        to(sixth_finger=1.0),
+        to_targets(sixth_finger=1.0),
         Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0, 1.0),)),
     ],
 )
 def test_what_no_gate_lets_through_is_not_sent(
-    adapter: str, action: Action, make: MakeHal, clock: Any
+    adapter: str, action: Action, make_twin: MakeHal, clock: Any
 ) -> None:
-    hal = make(adapter)
+    hal = make_twin(adapter)
     with pytest.raises(InternalError):
         hal.send_action(action)
     clock.advance(0.2)
@@ -188,10 +190,10 @@ def test_the_description_is_that_of_the_published_model() -> None:
 
 
 @HEAVY
-def test_physics_tells_efforts_and_a_table_stops_the_arm(make: MakeHal, clock: Any) -> None:
-    hal = make("so101_mujoco")
+def test_physics_tells_efforts_and_a_table_stops_the_arm(make_twin: MakeHal, clock: Any) -> None:
+    hal = make_twin("so101_mujoco")
     for _ in range(60):  # down through the table top
-        hal.send_action(to(shoulder_lift=1.2, elbow_flex=0.2, wrist_flex=1.0))
+        hal.send_action(to_targets(shoulder_lift=1.2, elbow_flex=0.2, wrist_flex=1.0))
         clock.advance(1 / 30)
     state = hal.read_state()
     lift = state.name.index("shoulder_lift")
@@ -201,9 +203,9 @@ def test_physics_tells_efforts_and_a_table_stops_the_arm(make: MakeHal, clock: A
 
 
 @HEAVY
-def test_a_long_pause_is_not_simulated_second_by_second(make: MakeHal, clock: Any) -> None:
-    hal = make("so101_mujoco")
-    hal.send_action(to(shoulder_pan=0.5))
+def test_a_long_pause_is_not_simulated_second_by_second(make_twin: MakeHal, clock: Any) -> None:
+    hal = make_twin("so101_mujoco")
+    hal.send_action(to_targets(shoulder_pan=0.5))
     clock.advance(3600.0)
     assert positions(hal)["shoulder_pan"] == pytest.approx(0.5, abs=0.1)
     assert hal.read_state().stamp_ns == clock.now_ns()

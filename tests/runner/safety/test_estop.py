@@ -88,7 +88,7 @@ def robot() -> Iterator[Robot]:
 
 
 @pytest.fixture
-def serve(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
+def serve_estop(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
     def make(obey_s: float = WAIT_S, silent_s: float = SILENT_S) -> EstopServer:
         return EstopServer(
             endpoint,
@@ -103,7 +103,7 @@ def serve(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
     return make
 
 
-def connect(endpoint: str) -> socket.socket:
+def connect_to(endpoint: str) -> socket.socket:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     limit = struct.pack(
         "ll", int(WAIT_S), 0
@@ -115,14 +115,14 @@ def connect(endpoint: str) -> socket.socket:
 
 
 def test_a_stop_is_answered_while_the_event_loop_stands_still(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     """Regression: the stop came in on the goal socket; three million empty frames there delayed it
     by 20.9 s.
     """
 
     async def scenario() -> str:
-        with serve():
+        with serve_estop():
             return stop(
                 endpoint, "smoke", timeout_s=WAIT_S
             ).message  # nothing else runs on this loop until it returns
@@ -131,9 +131,9 @@ def test_a_stop_is_answered_while_the_event_loop_stands_still(
 
 
 def test_the_first_reason_and_its_time_stay(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
-    with serve():
+    with serve_estop():
         before_ns = time.monotonic_ns()
         first = stop(endpoint, "a hand in the way", timeout_s=WAIT_S)
         again = stop(endpoint, "once more", timeout_s=WAIT_S)
@@ -144,10 +144,10 @@ def test_the_first_reason_and_its_time_stay(
 
 
 def test_a_loop_that_hangs_is_said_after_the_stop_is_latched(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     robot.hangs.set()
-    with serve(obey_s=0.05):
+    with serve_estop(obey_s=0.05):
         with pytest.raises(InternalError, match="has not obeyed"):
             stop(endpoint, "smoke", timeout_s=WAIT_S)
         assert robot.estop is not None
@@ -156,22 +156,22 @@ def test_a_loop_that_hangs_is_said_after_the_stop_is_latched(
 
 
 def test_an_ended_control_thread_is_said(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     robot.mailbox.close()
-    with serve(), pytest.raises(InternalError, match="control thread"):
+    with serve_estop(), pytest.raises(InternalError, match="control thread"):
         stop(endpoint, "smoke", timeout_s=WAIT_S)
     assert robot.estop is not None
 
 
 def test_silent_connections_of_the_same_user_keep_no_stop_out(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     """A peer that may connect could hold all places; the oldest silent connection is closed for a
     new one.
     """
-    with serve():
-        silent = [connect(endpoint) for _ in range(10 * CONNECTIONS_PER_UID)]
+    with serve_estop():
+        silent = [connect_to(endpoint) for _ in range(10 * CONNECTIONS_PER_UID)]
         assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
         assert silent[0].recv(1) == b""  # hung up on
         for one in silent:
@@ -179,7 +179,7 @@ def test_silent_connections_of_the_same_user_keep_no_stop_out(
 
 
 def test_a_process_with_one_connection_keeps_it_beside_one_with_many(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     """A client that was held up between its connect and its request lost its place to a flood of
     the same user.
@@ -193,20 +193,20 @@ def test_a_process_with_one_connection_keeps_it_beside_one_with_many(
     )
     argv = [sys.executable, "-c", crowd, path_of(endpoint), str(4 * CONNECTIONS_PER_UID)]
     with (
-        serve(silent_s=WAIT_S),
-        connect(endpoint) as honest,
+        serve_estop(silent_s=WAIT_S),
+        connect_to(endpoint) as honest,
         subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as flood,
     ):
         assert flood.stdout is not None
         assert flood.stdout.readline()
-        connect(endpoint).close()  # accepted behind all of them
+        connect_to(endpoint).close()  # accepted behind all of them
         honest.send(request("smoke"))
         assert reply_in(honest.recv(4096)).answer is Answer.LATCHED
         flood.communicate()
 
 
 def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     ended, under_way = threading.Event(), threading.Barrier(5)
 
@@ -216,7 +216,7 @@ def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
             for count in range(20_000):
                 if ended.is_set():
                     return
-                opened.append(connect(endpoint))
+                opened.append(connect_to(endpoint))
                 if count == 10:
                     under_way.wait(WAIT_S)
                 if len(opened) > 50:
@@ -225,7 +225,7 @@ def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
             for one in opened:
                 one.close()
 
-    with serve():
+    with serve_estop():
         floods = [threading.Thread(target=flood) for _ in range(4)]
         for one in floods:
             one.start()
@@ -237,13 +237,13 @@ def test_a_flood_of_connections_from_other_threads_keeps_no_stop_out(
 
 
 def test_a_stop_is_read_by_a_process_that_has_no_descriptor_left(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     """Bare connects to the goal socket could use all descriptors up; the server keeps one for a
     stop.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with serve(), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+    with serve_estop(), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
         client.settimeout(WAIT_S)
         taken: list[int] = []
         resource.setrlimit(
@@ -265,23 +265,25 @@ def test_a_stop_is_read_by_a_process_that_has_no_descriptor_left(
 
 @pytest.mark.parametrize("packet", [b"stop", b"\x00" * 4096, b"VRAM-ESTO"])
 def test_what_is_no_request_stops_nothing_and_is_hung_up_on(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str, packet: bytes
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str, packet: bytes
 ) -> None:
-    with serve():
-        with connect(endpoint) as client:
+    with serve_estop():
+        with connect_to(endpoint) as client:
             client.send(packet)
             assert client.recv(4096) == b""
         assert robot.estop is None
-        with connect(endpoint) as client:  # any version stops, and a reason that is too long is cut
+        with connect_to(
+            endpoint
+        ) as client:  # any version stops, and a reason that is too long is cut
             client.send(b"VRAM-ESTOP/7 " + b"x" * 100_000)
             assert reply_in(client.recv(4096)).answer is Answer.LATCHED
 
 
 def test_a_deleted_socket_file_is_made_again(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str
 ) -> None:
     path = Path(path_of(endpoint))
-    with serve():
+    with serve_estop():
         assert stat.S_IMODE(path.stat().st_mode) == 0o660
         path.unlink()
         deadline = time.monotonic() + WAIT_S
@@ -297,16 +299,16 @@ def test_a_deleted_socket_file_is_made_again(
 
 
 def test_the_socket_of_a_killed_runner_is_taken_over_and_nothing_else(
-    serve: Callable[..., EstopServer], robot: Robot, endpoint: str, tmp_path: Path
+    serve_estop: Callable[..., EstopServer], robot: Robot, endpoint: str, tmp_path: Path
 ) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left_over:
         left_over.bind(path_of(endpoint))
     with pytest.raises(RunnerUnreachable, match="was killed"):
         stop(endpoint, "smoke", timeout_s=WAIT_S)
-    with serve():
+    with serve_estop():
         assert stop(endpoint, "smoke", timeout_s=WAIT_S).first
     Path(path_of(endpoint)).write_text("a file")
-    with pytest.raises(AlreadyRunning, match="not a socket"), serve():
+    with pytest.raises(AlreadyRunning, match="not a socket"), serve_estop():
         pass
     with pytest.raises(ConfigError, match="the socket path has"):
         path_of(

@@ -70,7 +70,7 @@ def at(*position: float, ms: float = 1000.0, age_ms: float = 0.0, **more: Any) -
     return WorldState(stamp_ns=stamp_ns, joint_state=joints, **more)
 
 
-def to(*row: float, **more: Any) -> Action:
+def to_row(*row: float, **more: Any) -> Action:
     more.setdefault("joint_names", NAMES)
     return Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), **more)
 
@@ -87,15 +87,15 @@ HERE = (0.0, 1.0, 0.5)
 # -- what passes and what does not
 @pytest.mark.parametrize("names", [NAMES, None])
 def test_what_is_inside_passes_unchanged(names: tuple[str, ...] | None) -> None:
-    action = to(0.05, 1.05, 0.6, joint_names=names)
+    action = to_row(0.05, 1.05, 0.6, joint_names=names)
     assert gate().check(action, at(*HERE)) == (action, ())
 
 
 def test_ranges_are_still_checked() -> None:
-    assert row_of(gate().check(to(1.95 + 0.1, joint_names=("reach",)), at(0.0, 1.95, 0.5))) == (
+    assert row_of(gate().check(to_row(1.95 + 0.1, joint_names=("reach",)), at(0.0, 1.95, 0.5))) == (
         2.0,
     )
-    assert gate().check(to(2.5, joint_names=("reach",)), at(0.0, 1.95, 0.5))[0] is None
+    assert gate().check(to_row(2.5, joint_names=("reach",)), at(0.0, 1.95, 0.5))[0] is None
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,8 @@ def test_ranges_are_still_checked() -> None:
             Action(control_mode=ControlMode.JOINT_POSITION, horizon=2, joint_targets=(HERE, HERE)),
             "2 steps at once",
         ),
-        (to(0.0, 0.1, joint_names=("turn", "turn")), "commanded twice"),
-        (to(0.0, joint_names=("tail",)), "unknown joint tail"),
+        (to_row(0.0, 0.1, joint_names=("turn", "turn")), "commanded twice"),
+        (to_row(0.0, joint_names=("tail",)), "unknown joint tail"),
     ],
 )
 def test_forms_that_are_not_one_step_of_joints_are_withheld(action: Action, said: str) -> None:
@@ -120,7 +120,7 @@ def test_forms_that_are_not_one_step_of_joints_are_withheld(action: Action, said
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_state_or_target_that_is_no_number_cannot_be_built(value: float) -> None:
     with pytest.raises(ValueError, match="finite"):
-        to(value, 0.0, 0.0)
+        to_row(value, 0.0, 0.0)
     with pytest.raises(ValueError, match="finite"):
         at(value, 0.0, 0.0)
 
@@ -131,7 +131,7 @@ def test_a_target_that_is_no_number_is_withheld_however_it_was_built(
     value: float, kinematic: bool
 ) -> None:
     """Regression: copies of an action are not validated, and every comparison with NaN is false."""
-    action = to(0.0, 1.0, 0.5).model_copy(
+    action = to_row(0.0, 1.0, 0.5).model_copy(
         update={"joint_targets": ((value, 1.0, 0.5),)}
     )  # not validated
     allowed, problems = gate(kinematic=kinematic).check(action, at(*HERE))
@@ -155,14 +155,14 @@ def test_a_stale_world_stops(
     state: Any, component: str, needs: frozenset[str] | None, stops: bool
 ) -> None:
     world = at(*HERE, diagnostics={component: state})
-    allowed, problems = gate(needs).check(to(*HERE), world)
+    allowed, problems = gate(needs).check(to_row(*HERE), world)
     assert (allowed is None) is stops
     assert not stops or component in problems[0]
 
 
 def test_an_old_joint_state_stops_even_when_nobody_says_so() -> None:
-    assert gate().check(to(*HERE), at(*HERE, age_ms=150))[0] is not None
-    allowed, problems = gate().check(to(*HERE), at(*HERE, age_ms=250))
+    assert gate().check(to_row(*HERE), at(*HERE, age_ms=150))[0] is not None
+    allowed, problems = gate().check(to_row(*HERE), at(*HERE, age_ms=250))
     assert allowed is None
     assert "0.25 s old" in problems[0]
 
@@ -171,14 +171,14 @@ def test_a_joint_that_is_not_measured_stops() -> None:
     partial = WorldState(
         stamp_ns=1, joint_state=JointState(name=NAMES[:2], position=(0.0, 1.0), stamp_ns=1)
     )
-    allowed, problems = gate().check(to(0.0, joint_names=("turn",)), partial)
+    allowed, problems = gate().check(to_row(0.0, joint_names=("turn",)), partial)
     assert allowed is None
     assert "grip" in problems[0]
 
 
 # -- speed
 def test_a_step_a_little_too_long_is_shortened_and_said() -> None:
-    verdict = gate().check(to(STEP + 0.9 * CLAMP_TOLERANCE_RAD, 1.0, 0.5), at(*HERE))
+    verdict = gate().check(to_row(STEP + 0.9 * CLAMP_TOLERANCE_RAD, 1.0, 0.5), at(*HERE))
     assert row_of(verdict) == pytest.approx((STEP, 1.0, 0.5))
     assert "turn: 7.05 rad/s is beyond 3.00 rad/s" in verdict[1][0]
 
@@ -186,29 +186,33 @@ def test_a_step_a_little_too_long_is_shortened_and_said() -> None:
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_step_far_too_long_is_withheld(direction: int) -> None:
     allowed, problems = gate().check(
-        to(direction * (STEP + 1.1 * CLAMP_TOLERANCE_RAD), 1.0, 0.5), at(*HERE)
+        to_row(direction * (STEP + 1.1 * CLAMP_TOLERANCE_RAD), 1.0, 0.5), at(*HERE)
     )
     assert allowed is None
     assert "turn" in problems[0]
 
 
 def test_a_gripper_that_jumps_closes_at_its_own_speed() -> None:
-    assert row_of(gate().check(to(0.0, 1.0, 0.0), at(0.0, 1.0, 0.9))) == pytest.approx(
+    assert row_of(gate().check(to_row(0.0, 1.0, 0.0), at(0.0, 1.0, 0.9))) == pytest.approx(
         (0.0, 1.0, 0.7)
     )
 
 
 def test_steps_are_measured_from_the_last_target_while_it_is_young() -> None:
     checked = gate()
-    row_of(checked.check(to(0.1, 1.0, 0.5), at(*HERE, ms=1000)))
+    row_of(checked.check(to_row(0.1, 1.0, 0.5), at(*HERE, ms=1000)))
     # the servo lags at 0.02; the next target is a step from the last one, not from there
-    assert row_of(checked.check(to(0.2, 1.0, 0.5), at(0.02, 1.0, 0.5, ms=1033))) == (0.2, 1.0, 0.5)
-    # after a late tick the way may be half as long again, and no more however late it is
-    assert row_of(checked.check(to(0.4, 1.0, 0.5), at(0.1, 1.0, 0.5, ms=1150)))[0] == pytest.approx(
-        0.35
+    assert row_of(checked.check(to_row(0.2, 1.0, 0.5), at(0.02, 1.0, 0.5, ms=1033))) == (
+        0.2,
+        1.0,
+        0.5,
     )
+    # after a late tick the way may be half as long again, and no more however late it is
+    assert row_of(checked.check(to_row(0.4, 1.0, 0.5), at(0.1, 1.0, 0.5, ms=1150)))[
+        0
+    ] == pytest.approx(0.35)
     # much later only where it is counts
-    allowed = row_of(checked.check(to(0.4, 1.0, 0.5), at(0.2, 1.0, 0.5, ms=5000)))
+    allowed = row_of(checked.check(to_row(0.4, 1.0, 0.5), at(0.2, 1.0, 0.5, ms=5000)))
     assert allowed == pytest.approx((0.3, 1.0, 0.5))
 
 
@@ -225,7 +229,7 @@ def test_ticks_that_come_late_and_then_early_make_no_joint_faster(early: float) 
         ms += share * 1000 / 30
         wanted = motors["turn"] + min(max(share, 1.0), LATE_MAX) * STEP
         allowed, _ = checked.check(
-            to(wanted, joint_names=("turn",)), at(motors["turn"], 1.0, 0.5, ms=ms)
+            to_row(wanted, joint_names=("turn",)), at(motors["turn"], 1.0, 0.5, ms=ms)
         )
         motors["turn"] = row_of((allowed, ()))[0]
         if motors["turn"] > 2.5:  # the way back
@@ -238,7 +242,7 @@ def test_ticks_that_come_late_and_then_early_make_no_joint_faster(early: float) 
 def test_a_withheld_step_is_no_reference_for_the_next_one() -> None:
     checked = gate()
     for tick in range(20):  # a lost policy does not get to its far target by repeating it
-        assert checked.check(to(2.0, 1.0, 0.5), at(*HERE, ms=1000 + 33 * tick))[0] is None
+        assert checked.check(to_row(2.0, 1.0, 0.5), at(*HERE, ms=1000 + 33 * tick))[0] is None
 
 
 def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
@@ -251,13 +255,13 @@ def test_steps_that_were_dropped_for_being_late_do_not_add_up() -> None:
     for tick in range(10):
         wanted += STEP
         seen = at(*HERE, ms=1000 + 100 * tick / 3)
-        allowed, _ = checked.check(to(wanted, joint_names=("turn",)), seen)
+        allowed, _ = checked.check(to_row(wanted, joint_names=("turn",)), seen)
         assert allowed is None or abs(allowed.rows[0][0]) <= LATE_MAX * STEP
     motors["turn"] = 0.05
     later = RobotGate(ROBOT, rate_hz=30.0, sent=lambda: motors)
-    row_of(later.check(to(0.1, joint_names=("turn",)), at(*HERE, ms=1000)))
+    row_of(later.check(to_row(0.1, joint_names=("turn",)), at(*HERE, ms=1000)))
     shortened = later.tightened("skill", None).check(
-        to(0.2, joint_names=("turn",)), at(*HERE, ms=1033)
+        to_row(0.2, joint_names=("turn",)), at(*HERE, ms=1033)
     )
     assert row_of(shortened) == pytest.approx((0.15,))
 
@@ -273,7 +277,7 @@ def test_a_joint_that_does_not_follow_is_let_go_and_not_pushed_again() -> None:
     for tick in range(60):  # measured never changes
         turn = min(turn + STEP, 1.5)
         allowed, problems = checked.check(
-            to(turn, joint_names=("turn",)), at(*HERE, ms=1000 + 100 * tick / 3)
+            to_row(turn, joint_names=("turn",)), at(*HERE, ms=1000 + 100 * tick / 3)
         )
         if allowed is None:
             withheld += 1
@@ -289,18 +293,18 @@ def test_a_joint_that_does_not_follow_is_let_go_and_not_pushed_again() -> None:
 
 
 def test_a_measured_speed_beyond_all_limits_stops() -> None:
-    assert gate().check(to(*HERE), at(*HERE, velocity=(4.0, 0.0, 0.0)))[0] is not None
-    allowed, problems = gate().check(to(*HERE), at(*HERE, velocity=(-4.6, 0.0, 0.0)))
+    assert gate().check(to_row(*HERE), at(*HERE, velocity=(4.0, 0.0, 0.0)))[0] is not None
+    allowed, problems = gate().check(to_row(*HERE), at(*HERE, velocity=(-4.6, 0.0, 0.0)))
     assert allowed is None
     assert "turn moves at -4.60 rad/s" in problems[0]
 
 
 def test_the_tool_keeps_its_speed() -> None:
     slow = gate(max_ee_speed_m_s=1.5)  # 50 mm a tick; turning 0.08 rad at 1 m would be 80 mm
-    verdict = slow.check(to(0.08, 1.0, 0.5), at(*HERE))
+    verdict = slow.check(to_row(0.08, 1.0, 0.5), at(*HERE))
     assert row_of(verdict)[0] == pytest.approx(0.05, abs=0.002)
     assert "80 mm" in verdict[1][0]
-    allowed, _ = gate(max_cartesian_step_m=0.02).check(to(0.08, 1.0, 0.5), at(*HERE))
+    allowed, _ = gate(max_cartesian_step_m=0.02).check(to_row(0.08, 1.0, 0.5), at(*HERE))
     assert allowed is None  # a quarter of what was asked is not what was asked
 
 
@@ -309,25 +313,25 @@ BOX = {"workspace_box_min_xyz": (0.2, -0.5, -0.1), "workspace_box_max_xyz": (1.0
 
 
 def test_the_tool_stays_in_the_workspace() -> None:
-    assert gate(**BOX).check(to(0.0, 1.04, 0.5), at(*HERE))[0] is not None
-    allowed, problems = gate(**BOX).check(to(0.0, 1.07, 0.5), at(*HERE))
+    assert gate(**BOX).check(to_row(0.0, 1.04, 0.5), at(*HERE))[0] is not None
+    allowed, problems = gate(**BOX).check(to_row(0.0, 1.07, 0.5), at(*HERE))
     assert allowed is None
     assert "20 mm outside the workspace" in problems[0]
 
 
 def test_a_tool_that_is_outside_may_only_come_back() -> None:
     outside = at(0.0, 1.2, 0.5)
-    verdict = gate(**BOX).check(to(0.0, 1.12, 0.5), outside)
+    verdict = gate(**BOX).check(to_row(0.0, 1.12, 0.5), outside)
     assert row_of(verdict) == (0.0, 1.12, 0.5)
     assert "on its way back" in verdict[1][0]
     for reach in (1.2, 1.25):
-        assert gate(**BOX).check(to(0.0, reach, 0.5), outside)[0] is None
+        assert gate(**BOX).check(to_row(0.0, reach, 0.5), outside)[0] is None
 
 
 def test_an_open_side_of_the_workspace_is_open() -> None:
     half = {"workspace_box_max_xyz": (1.05, 9.0, 9.0)}
-    assert gate(**half).check(to(0.0, 0.95, 0.5), at(*HERE))[0] is not None
-    assert gate(**half).check(to(0.0, 1.07, 0.5), at(*HERE))[0] is None
+    assert gate(**half).check(to_row(0.0, 0.95, 0.5), at(*HERE))[0] is not None
+    assert gate(**half).check(to_row(0.0, 1.07, 0.5), at(*HERE))[0] is None
 
 
 @pytest.mark.parametrize(
@@ -339,15 +343,15 @@ def test_an_open_side_of_the_workspace_is_open() -> None:
     ],
 )
 def test_no_point_of_the_arm_enters_a_zone(zone: dict[str, Any]) -> None:
-    allowed, problems = gate(no_go_zones=(zone,)).check(to(0.0, 1.07, 0.5), at(*HERE))
+    allowed, problems = gate(no_go_zones=(zone,)).check(to_row(0.0, 1.07, 0.5), at(*HERE))
     assert allowed is None
     assert "no-go zone bin" in problems[0]
-    assert gate(no_go_zones=(zone,)).check(to(0.0, 0.95, 0.5), at(*HERE))[0] is not None
+    assert gate(no_go_zones=(zone,)).check(to_row(0.0, 0.95, 0.5), at(*HERE))[0] is not None
 
 
 def test_a_thin_zone_is_not_stepped_over() -> None:
     wall = {"min_xyz": (1.04, -1.0, -1.0), "max_xyz": (1.06, 1.0, 1.0)}
-    assert gate(no_go_zones=(wall,)).check(to(0.0, 1.1, 0.5), at(*HERE))[0] is None
+    assert gate(no_go_zones=(wall,)).check(to_row(0.0, 1.1, 0.5), at(*HERE))[0] is None
 
 
 # -- effort
@@ -361,7 +365,7 @@ def test_a_grip_eases_to_its_limit_and_keeps_it() -> None:
         effort = 10.0 * (target - 0.5)
         efforts.append(abs(effort))
         world = at(0.0, 1.0, 0.5, ms=1000 + 100 * tick / 3, effort=(0.0, 0.0, effort))
-        target = row_of(checked.check(to(0.0, 1.0, 0.0), world))[2]
+        target = row_of(checked.check(to_row(0.0, 1.0, 0.0), world))[2]
     assert max(efforts[:5]) > 1.0  # it was seen only after it happened
     assert efforts[-10:] == pytest.approx([1.0] * 10, abs=0.01)
 
@@ -369,22 +373,22 @@ def test_a_grip_eases_to_its_limit_and_keeps_it() -> None:
 def test_an_easing_joint_is_said_and_opening_is_free() -> None:
     checked = gate(max_force_n=10.0)
     pressed = at(0.0, 1.0, 0.5, effort=(0.0, 0.0, -2.0))
-    verdict = checked.check(to(0.0, 1.0, 0.2), pressed)
+    verdict = checked.check(to_row(0.0, 1.0, 0.2), pressed)
     assert row_of(verdict)[2] == 0.5
     assert "grip pushes with 2.00 N·m, the limit is 1.00: it yields" in verdict[1]
-    assert row_of(checked.check(to(0.0, 1.0, 0.6), pressed))[2] == 0.6
+    assert row_of(checked.check(to_row(0.0, 1.0, 0.6), pressed))[2] == 0.6
 
 
 def test_an_arm_joint_keeps_its_torque() -> None:
     checked = gate(max_torque_nm=2.0)
-    verdict = checked.check(to(0.05, 1.0, 0.5), at(*HERE, effort=(3.0, 0.0, 0.0)))
+    verdict = checked.check(to_row(0.05, 1.0, 0.5), at(*HERE, effort=(3.0, 0.0, 0.0)))
     assert row_of(verdict)[0] == 0.0
 
 
 def test_a_collision_stops() -> None:
     hit = at(*HERE, contact_forces={"wrist": (0.0, 30.0, 40.0)})
-    assert gate().check(to(*HERE), hit)[0] is not None  # nobody set a limit
-    allowed, problems = gate(contact_force_threshold_n=40.0).check(to(*HERE), hit)
+    assert gate().check(to_row(*HERE), hit)[0] is not None  # nobody set a limit
+    allowed, problems = gate(contact_force_threshold_n=40.0).check(to_row(*HERE), hit)
     assert allowed is None
     assert "wrist: 50.0 N" in problems[0]
 
@@ -506,7 +510,7 @@ def test_an_action_cannot_switch_a_check_off() -> None:
         "workspace_box_max_xyz": (9, 9, 9),
         "disable": True,
     }
-    allowed, _ = gate(**BOX).check(to(0.0, 1.07, 0.5, safety_overrides=overrides), at(*HERE))
+    allowed, _ = gate(**BOX).check(to_row(0.0, 1.07, 0.5, safety_overrides=overrides), at(*HERE))
     assert allowed is None
 
 
@@ -516,7 +520,7 @@ def test_a_latched_stop_holds_for_every_gate_of_the_robot() -> None:
     goal.trip("hand in the way")
     goal.trip("second reason")
     for checked in (base, goal, base.tightened("next", None)):
-        allowed, problems = checked.check(to(*HERE), at(*HERE))
+        allowed, problems = checked.check(to_row(*HERE), at(*HERE))
         assert allowed is None
         assert "hand in the way" in problems[0]
 
@@ -546,7 +550,7 @@ def test_whatever_is_asked_for_what_passes_is_inside(
     arm = Planar()
     here = start
     for tick, target in enumerate(targets):
-        allowed, problems = checked.check(to(*target), at(*here, ms=1000 + 100 * tick / 3))
+        allowed, problems = checked.check(to_row(*target), at(*here, ms=1000 + 100 * tick / 3))
         if allowed is None:
             assert problems
             continue

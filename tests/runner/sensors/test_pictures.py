@@ -14,15 +14,15 @@ pytestmark = pytest.mark.heavy
 RED_BLUE = [[[255, 0, 0], [0, 0, 255]]]
 
 
-def frame(encoding: FrameEncoding, data: bytes | None = None, **more: Any) -> SensorFrame:
+def frame_of(encoding: FrameEncoding, data: bytes | None = None, **more: Any) -> SensorFrame:
     fields = {"width": 2, "height": 1, "stamp_monotonic_ns": 1, "stamp_wall_ns": 1, **more}
     return SensorFrame(sensor_id="front", encoding=encoding, data=data, **fields)
 
 
 def test_raw_frames() -> None:
-    assert as_rgb(frame(FrameEncoding.RGB8, bytes([255, 0, 0, 0, 0, 255]))).tolist() == RED_BLUE
-    assert as_rgb(frame(FrameEncoding.BGR8, bytes([0, 0, 255, 255, 0, 0]))).tolist() == RED_BLUE
-    assert as_rgb(frame(FrameEncoding.MONO8, bytes([7, 9]))).tolist() == [[[7, 7, 7], [9, 9, 9]]]
+    assert as_rgb(frame_of(FrameEncoding.RGB8, bytes([255, 0, 0, 0, 0, 255]))).tolist() == RED_BLUE
+    assert as_rgb(frame_of(FrameEncoding.BGR8, bytes([0, 0, 255, 255, 0, 0]))).tolist() == RED_BLUE
+    assert as_rgb(frame_of(FrameEncoding.MONO8, bytes([7, 9]))).tolist() == [[[7, 7, 7], [9, 9, 9]]]
 
 
 def test_compressed_frames() -> None:
@@ -31,11 +31,11 @@ def test_compressed_frames() -> None:
 
     bgr = np.array(RED_BLUE, dtype=np.uint8)[:, :, ::-1]
     png = bytes(cv2.imencode(".png", bgr)[1])
-    assert as_rgb(frame(FrameEncoding.PNG, png)).tolist() == RED_BLUE
+    assert as_rgb(frame_of(FrameEncoding.PNG, png)).tolist() == RED_BLUE
     with pytest.raises(FrameStale, match="broken"):
-        as_rgb(frame(FrameEncoding.PNG, png, width=3))
+        as_rgb(frame_of(FrameEncoding.PNG, png, width=3))
     with pytest.raises(FrameStale, match="broken"):
-        as_rgb(frame(FrameEncoding.JPEG, b"no picture at all"))
+        as_rgb(frame_of(FrameEncoding.JPEG, b"no picture at all"))
 
 
 @pytest.mark.parametrize(
@@ -63,19 +63,19 @@ def test_a_header_that_asks_for_gigabytes_is_refused_before_it_is_decoded(
 
     monkeypatch.setattr(cv2, "imdecode", decode)
     with pytest.raises(FrameStale, match=r"broken: 60000 × 60000 pixels in a frame of 2 × 1"):
-        as_rgb(frame(encoding, start + bytes(40)))
+        as_rgb(frame_of(encoding, start + bytes(40)))
     with pytest.raises(FrameStale, match=r"broken: 60000 × 60000 pixels, 16777216 are accepted"):
-        as_rgb(frame(encoding, start + bytes(40), width=60_000, height=60_000))
+        as_rgb(frame_of(encoding, start + bytes(40), width=60_000, height=60_000))
 
 
 def test_a_frame_of_too_many_bytes_is_refused() -> None:
     """Decoding time grows with the bytes, and the control loop waits for it."""
     with pytest.raises(FrameStale, match="16777217 bytes, 16777216 are accepted"):
-        as_rgb(frame(FrameEncoding.JPEG, b"\xff\xd8" + bytes(COMPRESSED_MAX_BYTES - 1)))
+        as_rgb(frame_of(FrameEncoding.JPEG, b"\xff\xd8" + bytes(COMPRESSED_MAX_BYTES - 1)))
 
 
 def test_what_has_no_colours_is_refused() -> None:
     with pytest.raises(ModelError, match="depth16"):
-        as_rgb(frame(FrameEncoding.DEPTH16, bytes(4)))
+        as_rgb(frame_of(FrameEncoding.DEPTH16, bytes(4)))
     with pytest.raises(ModelError, match="does not carry"):
-        as_rgb(frame(FrameEncoding.RGB8, topic="/front"))
+        as_rgb(frame_of(FrameEncoding.RGB8, topic="/front"))

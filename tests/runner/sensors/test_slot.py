@@ -15,7 +15,7 @@ from vram_arbiter.schemas.errors import FrameStale
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 
-def frame(stamp_ns: int, value: int = 0, sensor_id: str = "front") -> SensorFrame:
+def frame_at(stamp_ns: int, value: int = 0, sensor_id: str = "front") -> SensorFrame:
     return SensorFrame(
         sensor_id=sensor_id,
         stamp_monotonic_ns=stamp_ns,
@@ -53,8 +53,8 @@ class Shelf:
         self.frames: list[SensorFrame] = []
         self.closed = 0
 
-    def publish(self, frame: SensorFrame) -> None:
-        self.frames.append(frame)
+    def publish(self, frame_at: SensorFrame) -> None:
+        self.frames.append(frame_at)
 
     def close(self) -> None:
         self.closed += 1
@@ -71,7 +71,7 @@ def test_nothing_is_served_before_the_first_picture(clock: Any) -> None:
 
 def test_a_frame_is_served_until_it_is_too_old(clock: Any) -> None:
     slot = LatestSlot("front", 100.0, clock)
-    slot.open().put(frame(clock.now_ns(), 7))
+    slot.open().put(frame_at(clock.now_ns(), 7))
     clock.advance(0.1)
     assert slot.latest().data == b"\x07"
     clock.advance(0.05)
@@ -85,7 +85,7 @@ def test_a_frame_is_served_until_it_is_too_old(clock: Any) -> None:
 
 def test_a_stamp_of_the_future_is_not_fresh(clock: Any) -> None:
     slot = LatestSlot("front", 100.0, clock)
-    slot.open().put(frame(clock.now_ns() + 5_000_000))
+    slot.open().put(frame_at(clock.now_ns() + 5_000_000))
     with pytest.raises(FrameStale, match="5 ms in the future"):
         slot.latest()
 
@@ -93,29 +93,29 @@ def test_a_stamp_of_the_future_is_not_fresh(clock: Any) -> None:
 def test_an_older_frame_never_replaces_a_newer_one(clock: Any) -> None:
     slot = LatestSlot("front", 100.0, clock)
     feed = slot.open()
-    assert feed.put(frame(clock.now_ns(), 2))
-    assert not feed.put(frame(clock.now_ns() - 1, 1))
+    assert feed.put(frame_at(clock.now_ns(), 2))
+    assert not feed.put(frame_at(clock.now_ns() - 1, 1))
     assert slot.latest().data == b"\x02"
 
 
 def test_a_frame_of_another_camera_is_refused(clock: Any) -> None:
     with pytest.raises(ValueError, match="wrist"):
-        LatestSlot("front", 100.0, clock).open().put(frame(1, sensor_id="wrist"))
+        LatestSlot("front", 100.0, clock).open().put(frame_at(1, sensor_id="wrist"))
 
 
 def test_the_last_frame_of_a_broken_source_is_served_no_more_though_it_is_young(clock: Any) -> None:
     slot = LatestSlot("front", 100.0, clock)
     feed = slot.open()
-    feed.put(frame(clock.now_ns(), 1))
+    feed.put(frame_at(clock.now_ns(), 1))
     assert feed.interrupt("the cable is out")
     with pytest.raises(FrameStale, match="the cable is out") as stale:
         slot.latest()
     assert stale.value.details["ended"] is False
-    feed.put(frame(clock.now_ns(), 2))
+    feed.put(frame_at(clock.now_ns(), 2))
     assert slot.latest().data == b"\x02"
     assert slot.ended is None
     feed.end("the file is over")
-    assert not feed.put(frame(clock.now_ns(), 3))
+    assert not feed.put(frame_at(clock.now_ns(), 3))
     assert not feed.end("another reason")
     assert slot.ended == "the file is over"
     with pytest.raises(FrameStale, match="the file is over"):
@@ -126,9 +126,9 @@ def test_a_replaced_feed_is_deaf(clock: Any) -> None:
     slot = LatestSlot("front", 100.0, clock)
     old = slot.open()
     new = slot.open()
-    assert not old.put(frame(clock.now_ns(), 1))
+    assert not old.put(frame_at(clock.now_ns(), 1))
     assert not old.end("late")
-    assert new.put(frame(clock.now_ns(), 2))
+    assert new.put(frame_at(clock.now_ns(), 2))
     assert slot.latest().data == b"\x02"
 
 
@@ -148,11 +148,11 @@ def test_synced_waits_for_a_picture_taken_after_the_call() -> None:
 
     slot = LatestSlot("front", 100.0, Told())
     feed = slot.open()
-    feed.put(frame(clock.now_ns(), 1))
+    feed.put(frame_at(clock.now_ns(), 1))
 
     def take() -> None:
         asked.wait(60)
-        feed.put(frame(clock.now_ns(), 2))
+        feed.put(frame_at(clock.now_ns(), 2))
 
     thread = threading.Thread(target=take)
     thread.start()
@@ -167,7 +167,7 @@ def test_synced_gives_up_at_its_deadline_and_says_so() -> None:
     feed = slot.open()
     with pytest.raises(FrameStale, match="first picture has not come"):
         slot.synced(clock.now_ns())
-    feed.put(frame(clock.now_ns(), 1))
+    feed.put(frame_at(clock.now_ns(), 1))
     with pytest.raises(FrameStale, match="no new picture within"):
         slot.synced(clock.now_ns() + 1_000_000)
 
@@ -199,7 +199,7 @@ def test_a_reader_conforms_starts_again_and_tells_its_tee(clock: Any) -> None:
     as_protocol.start()
     as_protocol.start()
     assert len(reader.feeds) == 1
-    reader.deliver(reader.feeds[0], frame(clock.now_ns(), 1))
+    reader.deliver(reader.feeds[0], frame_at(clock.now_ns(), 1))
     assert as_protocol.read_latest().data == b"\x01"
     as_protocol.stop()
     as_protocol.stop()
@@ -207,10 +207,12 @@ def test_a_reader_conforms_starts_again_and_tells_its_tee(clock: Any) -> None:
     with pytest.raises(FrameStale, match="stopped"):
         as_protocol.read_latest()
     as_protocol.start()
-    reader.deliver(reader.feeds[0], frame(clock.now_ns(), 2))  # the thread of the first run, late
+    reader.deliver(
+        reader.feeds[0], frame_at(clock.now_ns(), 2)
+    )  # the thread of the first run, late
     with pytest.raises(FrameStale):
         as_protocol.read_latest()
-    reader.deliver(reader.feeds[1], frame(clock.now_ns(), 3))
+    reader.deliver(reader.feeds[1], frame_at(clock.now_ns(), 3))
     assert [kept.data for kept in shelf.frames] == [b"\x01", b"\x03"]
 
 
@@ -225,5 +227,5 @@ def test_a_source_that_cannot_be_opened_leaves_a_reader_that_can_be_started_agai
         reader.read_latest()
     reader.broken = None
     reader.start()
-    reader.deliver(reader.feeds[0], frame(clock.now_ns(), 1))
+    reader.deliver(reader.feeds[0], frame_at(clock.now_ns(), 1))
     assert reader.read_latest().data == b"\x01"

@@ -64,7 +64,7 @@ if ID not in gymnasium.registry:
 JOINTS = {"state": "v", "joints": ["a", "b"], "hold": [0.0]}
 
 
-def world(steps: dict[int, Any], **config: Any) -> GymEnv:
+def gym_world(steps: dict[int, Any], **config: Any) -> GymEnv:
     return GymEnv(
         ID, GymConfig.model_validate({"kwargs": {"steps": steps}, **config}), render=False
     )
@@ -97,7 +97,7 @@ class Plays(PolicyContestant):
         return Looks("test", env, act)
 
 
-def play(run_async: Run, env: GymEnv, *actions: int, max_steps: int = 50) -> Cell:
+def play_world(run_async: Run, env: GymEnv, *actions: int, max_steps: int = 50) -> Cell:
     runner = sim_runner(lambda: env, rate_hz=0, ends_with_skill=True, max_steps=max_steps)
     bench = Benchmark(runner, world="odd", episode_s=60)
     cell: Cell = run_async(bench.run(Plays(*actions), range(len(actions))))
@@ -111,8 +111,8 @@ def test_an_episode_whose_last_step_fails_is_not_the_one_before(run_async: Run) 
     """The policy is done in the tick in which the world raises: there is no episode, and the last
     one must not count again.
     """
-    env = world({1: GOOD, 3: ZeroDivisionError("the physics blew up")}, hold=[0.0])
-    cell = play(run_async, env, 1, 1, 1)
+    env = gym_world({1: GOOD, 3: ZeroDivisionError("the physics blew up")}, hold=[0.0])
+    cell = play_world(run_async, env, 1, 1, 1)
     assert [(e.success, e.error) for e in cell.episodes][:2] == [
         (True, ""),
         (None, "environment_failed"),
@@ -128,8 +128,8 @@ def test_a_world_that_speaks_only_of_successes_does_not_make_them_all(run_async:
     """Regression: episodes without a word were left out, which gave 100 % success for one in
     ten.
     """
-    env = world({2: GOOD})
-    cell = play(run_async, env, 1, 1, 1)
+    env = gym_world({2: GOOD})
+    cell = play_world(run_async, env, 1, 1, 1)
     assert [e.success for e in cell.episodes] == [False, True, False]
     assert (cell.judged, cell.success_rate) == (3, 1 / 3)
 
@@ -168,7 +168,7 @@ def test_what_was_not_promised_is_the_worlds_failure_and_the_next_episode_is_pla
 ) -> None:
     """Regression: `"False"` counted as success, and a short vector ended the whole benchmark with a
     traceback."""
-    cell = play(run_async, world({2: odd, 6: GOOD}, **JOINTS), 3, 3, 3)
+    cell = play_world(run_async, gym_world({2: odd, 6: GOOD}, **JOINTS), 3, 3, 3)
     assert (cell.episodes[0].success, cell.episodes[0].error) == (None, "environment_failed")
     assert any(e.success for e in cell.episodes[1:])
     assert cell.successes == 1
@@ -179,14 +179,14 @@ def test_what_was_not_promised_is_the_worlds_failure_and_the_next_episode_is_pla
     "said", [True, np.True_, 1, 1.0, np.float32(1), np.array(1), np.array([True])]
 )
 def test_every_plain_yes_is_one(said: Any) -> None:
-    env = world({1: (SEEN, 0.0, True, False, {"success": said})})
+    env = gym_world({1: (SEEN, 0.0, True, False, {"success": said})})
     env.reset(0)
     assert env.step(env.action_of([0.0])).success is True
 
 
 def test_a_number_that_is_none_does_not_pass_however_it_was_built() -> None:
     """Regression: copies of an action are not validated, and every comparison with NaN is false."""
-    env = world({})
+    env = gym_world({})
     env.reset(0)
     broken = env.action_of([0.0]).model_copy(update={"joint_targets": ((float("nan"),),)})
     gate = env.gate(PolicyPlayer("test", env, lambda seen: None))
@@ -199,7 +199,7 @@ def test_a_run_in_which_only_a_success_was_told_is_not_all_successes() -> None:
     """Regression: episodes without a word were left out, which gave 100 % success for one in
     ten.
     """
-    env = world({2: GOOD}, hold=[0.0])
+    env = gym_world({2: GOOD}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: [0.0])
     runner = sim_runner(lambda: env, rate_hz=0, episodes=3, max_steps=1, policy=policy.play)
     runner.activate()
@@ -209,7 +209,7 @@ def test_a_run_in_which_only_a_success_was_told_is_not_all_successes() -> None:
 def test_a_policy_that_is_done_as_its_world_fails_does_not_play_for_ever() -> None:
     """Regression: both in one tick left no listener for the failure, and the episode was repeated
     for ever."""
-    env = world({n: ZeroDivisionError("again") for n in range(1, 9)}, hold=[0.0])
+    env = gym_world({n: ZeroDivisionError("again") for n in range(1, 9)}, hold=[0.0])
     policy = Policy("test", lambda env, seed: lambda seen: None)
     runner = sim_runner(lambda: env, rate_hz=0, episodes=1, policy=policy.play)
     runner.activate()

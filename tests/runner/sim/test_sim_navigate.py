@@ -19,7 +19,7 @@ from vram_arbiter.runner.sim.navigate import (
 pytestmark = pytest.mark.heavy
 
 
-def drive(sim_env: SimEnv, controller: PlanarController, limit: int = 300) -> int:
+def drive_to(sim_env: SimEnv, controller: PlanarController, limit: int = 300) -> int:
     for step in range(limit):
         pose = Pose2D(*sim_env.base_pose())
         if controller.reached(pose):
@@ -36,7 +36,7 @@ def test_reaches_the_standoff_of_every_object(sim_env: SimEnv, seed: int) -> Non
     sim_env.reset(seed)
     for truth in sim_env.ground_truth().objects.values():
         goal = standoff_pose(truth.position_map[:2], sim_env.config)
-        assert drive(sim_env, PlanarController(goal, sim_env.config)) < 200
+        assert drive_to(sim_env, PlanarController(goal, sim_env.config)) < 200
         for _ in range(6):
             sim_env.step(None)
         x, y, yaw = sim_env.base_pose()
@@ -49,7 +49,7 @@ def test_reaches_the_standoff_of_every_object(sim_env: SimEnv, seed: int) -> Non
 def test_a_target_deep_on_the_table_stops_before_the_edge(sim_env: SimEnv) -> None:
     sim_env.reset(0)
     goal = standoff_pose((5.0, 0.0), sim_env.config)
-    drive(sim_env, PlanarController(goal, sim_env.config))
+    drive_to(sim_env, PlanarController(goal, sim_env.config))
     assert (
         sim_env.base_pose()[0] + front_reach_m(sim_env.config, 0.0) < sim_env.config.table_edge_x_m
     )
@@ -57,12 +57,14 @@ def test_a_target_deep_on_the_table_stops_before_the_edge(sim_env: SimEnv) -> No
 
 def test_a_goal_inside_the_table_is_never_driven_to(sim_env: SimEnv) -> None:
     sim_env.reset(0)
-    assert drive(sim_env, PlanarController(Pose2D(1.0, 0.0, 0.0), sim_env.config), limit=150) == 150
+    assert (
+        drive_to(sim_env, PlanarController(Pose2D(1.0, 0.0, 0.0), sim_env.config), limit=150) == 150
+    )
 
 
 def test_a_goal_that_turns_is_reached(sim_env: SimEnv) -> None:
     sim_env.reset(0)
-    assert drive(sim_env, PlanarController(Pose2D(-0.2, 0.3, 1.2), sim_env.config)) < 200
+    assert drive_to(sim_env, PlanarController(Pose2D(-0.2, 0.3, 1.2), sim_env.config)) < 200
 
 
 def test_to_map_turns_and_shifts() -> None:

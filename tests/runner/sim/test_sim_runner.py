@@ -79,7 +79,7 @@ class Scripted:
     async def release(self) -> None: ...
 
 
-def play(
+def play_script(
     runner: Any, script: Sequence[StepOutcome | Exception], ticks: int
 ) -> tuple[list[Any], list[SkillEnded]]:
     """A reset tick, then the script; the results of the ticks after it and how the skill ended."""
@@ -236,7 +236,7 @@ def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(
 
 def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0, max_steps=3, judge=lambda e: len(e.steps) == 5)
-    ticks, ended = play(runner, [Act(joints(0.1))] * 9, 3)
+    ticks, ended = play_script(runner, [Act(joints(0.1))] * 9, 3)
     assert [tick.truncated for tick in ticks] == [False, False, True]
     assert (ended[0].error.code, ended[0].error.details) == ("limit_exceeded", {"limit": "episode"})
     assert ended[0].data["steps"] == 3
@@ -249,14 +249,14 @@ def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -
 
 
 def test_an_episode_that_nobody_judges_is_no_success(make_runner: Make) -> None:
-    _, ended = play(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
+    _, ended = play_script(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
     assert isinstance(ended[0].error, ModelError)
     assert "does not say" in ended[0].error.message
 
 
 def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0, ends_with_skill=True, judge=lambda e: len(e.steps) > 99)
-    ticks, ended = play(runner, [Act(joints(0.1))], 2)
+    ticks, ended = play_script(runner, [Act(joints(0.1))], 2)
     assert ended[0].error is None
     assert [tick.truncated for tick in ticks] == [False, True]
     assert [(e.steps, e.success, e.truncated) for e in runner.robot.episodes] == [(2, False, True)]
@@ -269,7 +269,7 @@ def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
 def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0, seed=5)
     bad = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
-    _, ended = play(runner, [Act(joints(0.1))], 1)
+    _, ended = play_script(runner, [Act(joints(0.1))], 1)
     env.fails = True
     runner.end_skill()
     runner.begin_skill(Scripted(Act(bad)), GOAL, ended.append)
@@ -293,7 +293,7 @@ def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(
         control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),)
     )
     script = [Act(joints(0.1), chunk_index=4), Hold("thinking"), Act(twist)]
-    ticks, ended = play(make_runner(rate_hz=0), script, 5)
+    ticks, ended = play_script(make_runner(rate_hz=0), script, 5)
     first = dict(zip(env.joints, (0.1, -1.20, 1.05, 1.35, 0.0, 0.60), strict=True))
     assert env.steps == [
         (first, None),
@@ -311,7 +311,7 @@ def test_joints_that_an_action_leaves_out_keep_their_last_target(
     make_runner: Make, env: Any
 ) -> None:
     closed = joints(0.0, -1.0, 1.0, 1.0, 0.0, -0.1)
-    play(make_runner(rate_hz=0), [Act(closed), Hold("gripped"), Act(joints(0.3, -1.1))], 4)
+    play_script(make_runner(rate_hz=0), [Act(closed), Hold("gripped"), Act(joints(0.3, -1.1))], 4)
     assert list(env.steps[2][0].values()) == [0.3, -1.1, 1.0, 1.0, 0.0, -0.1]
 
 
@@ -320,7 +320,7 @@ def test_a_typed_error_fails_the_goal_and_the_arm_holds(
     make_runner: Make, env: Any, error: Exception
 ) -> None:
     runner = make_runner(rate_hz=0)
-    ticks, ended = play(runner, [Act(joints(0.1)), error], 4)
+    ticks, ended = play_script(runner, [Act(joints(0.1)), error], 4)
     assert [e.error for e in ended] == [error]
     assert env.steps[1:] == [(None, None)] * 3
     assert ticks[1].safety_violations
@@ -328,7 +328,7 @@ def test_a_typed_error_fails_the_goal_and_the_arm_holds(
 
 
 def test_a_defect_of_a_skill_does_not_take_the_loop_with_it(make_runner: Make, env: Any) -> None:
-    _, ended = play(make_runner(rate_hz=0), [ZeroDivisionError("oops")], 3)
+    _, ended = play_script(make_runner(rate_hz=0), [ZeroDivisionError("oops")], 3)
     assert isinstance(ended[0].error, InternalError)
     assert len(env.steps) == 3
 
@@ -337,7 +337,7 @@ def test_an_action_outside_the_envelope_is_withheld_and_recorded(
     make_runner: Make, env: Any
 ) -> None:
     runner = make_runner(rate_hz=0)
-    ticks, ended = play(runner, [Act(joints(3.0)), Act(joints(0.6))], 3)
+    ticks, ended = play_script(runner, [Act(joints(3.0)), Act(joints(0.6))], 3)
     assert env.steps[0] == (None, None)
     assert env.steps[1][0]["shoulder_pan"] == 0.5
     assert [t.action_applied for t in ticks[:2]] == [False, True]
@@ -353,7 +353,7 @@ def test_the_gate_is_a_robots_and_each_skill_tightens_it(make_runner: Make, env:
         )
 
     runner = make_runner(rate_hz=0)
-    play(runner, [Act(joints(0.2))], 2)
+    play_script(runner, [Act(joints(0.2))], 2)
     assert env.joints["shoulder_pan"] == 0.2  # 6 rad/s; the arm makes 30
     ended: list[SkillEnded] = []
     runner.begin_skill(Careful(Act(joints(0.4)), Act(joints(-0.3))), GOAL, ended.append)
@@ -402,7 +402,7 @@ def test_speeds_are_judged_by_simulated_time(make_runner: Make, env: Any, clock:
 
 
 def test_a_policy_that_is_lost_fails_its_goal(make_runner: Make) -> None:
-    _, ended = play(make_runner(rate_hz=0), [Act(joints(9.0))] * 40, 30)
+    _, ended = play_script(make_runner(rate_hz=0), [Act(joints(9.0))] * 40, 30)
     assert isinstance(ended[0].error, ModelError)
     assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
 
@@ -446,7 +446,7 @@ def test_a_stop_that_comes_while_the_skill_decides_acts_in_this_tick(
 
 def test_one_skill_at_a_time_and_taking_the_arm_back(make_runner: Make, env: Any) -> None:
     runner, ended = make_runner(rate_hz=0), []
-    play(runner, [Act(joints(0.1))] * 10, 2)
+    play_script(runner, [Act(joints(0.1))] * 10, 2)
     with pytest.raises(InternalError, match="another skill"):
         runner.begin_skill(Scripted(), GOAL, ended.append)
     runner.end_skill()
@@ -469,7 +469,7 @@ def test_a_state_that_is_not_finite_fails_closed(make_runner: Make, env: Any) ->
 
 def test_stopping_ends_the_skill_with_an_error(make_runner: Make) -> None:
     runner = make_runner(rate_hz=0)
-    _, ended = play(runner, [Act(joints(0.1))] * 10, 1)
+    _, ended = play_script(runner, [Act(joints(0.1))] * 10, 1)
     runner.deactivate()
     assert isinstance(ended[0].error, InternalError)
 
@@ -496,7 +496,7 @@ def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make)
         Act(joints(0.1), chunk_index=3, prefetched=True),
         Evicted("gone"),
     ]
-    _, ended = play(runner, script, 6)
+    _, ended = play_script(runner, script, 6)
     counts = {"withheld": 1, "clamped": 1, "prefetch": {"hits": 2, "misses": 1, "hit_rate": 2 / 3}}
     assert ended[0].data == {"ticks": 5, **counts}
     metadata = runner.result().metadata
@@ -511,7 +511,7 @@ def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make)
 
 def test_a_skill_without_chunks_says_nothing_of_them(make_runner: Make) -> None:
     runner = make_runner(rate_hz=0)
-    _, ended = play(runner, [Act(joints(0.1))], 2)
+    _, ended = play_script(runner, [Act(joints(0.1))], 2)
     assert "prefetch" not in ended[0].data
     assert "prefetch" not in runner.result().metadata
 

@@ -225,21 +225,21 @@ class Bench:
 
 
 @pytest.fixture
-def bench(manifest: RSkillManifest, tmp_path: Path) -> Callable[..., Bench]:
+def policy_bench(manifest: RSkillManifest, tmp_path: Path) -> Callable[..., Bench]:
     def make(arbiter: Arbiter | None = None, **options: Any) -> Bench:
         return Bench(manifest, f"ipc://{tmp_path}/grab.sock", arbiter, **options)
 
     return make
 
 
-def scenario(run_async: Run, bench: Bench, play: Callable[[Bench], Any]) -> None:
+def scenario(run_async: Run, policy_bench: Bench, play: Callable[[Bench], Any]) -> None:
     async def body() -> None:
-        async with bench.sidecar.served(bench.client.endpoint):
+        async with policy_bench.sidecar.served(policy_bench.client.endpoint):
             try:
-                await play(bench)
+                await play(policy_bench)
             finally:
-                await bench.skill.finish()
-                await bench.client.close()
+                await policy_bench.skill.finish()
+                await policy_bench.client.close()
 
     run_async(body())
 
@@ -248,7 +248,7 @@ GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=20.0)
 
 
 def test_a_goal_is_one_use_and_its_chunks_play_in_order(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
@@ -269,11 +269,11 @@ def test_a_goal_is_one_use_and_its_chunks_play_in_order(
         assert b.sidecar.observations[0]["observation.state"].tolist() == pytest.approx([0.0, 0.5])
         assert b.sidecar.observations[0]["observation.images.front"].shape == (2, 4, 3)
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_the_arm_goes_to_its_start_pose_before_the_policy_sees_anything(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     async def play(b: Bench) -> None:
         b.position = {"a": 0.8, "b": -0.5}
@@ -285,11 +285,11 @@ def test_the_arm_goes_to_its_start_pose_before_the_policy_sees_anything(
             await b.step()
         assert b.sidecar.observations[0]["observation.state"].tolist() == pytest.approx([0.0, 0.5])
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_a_lease_that_goes_between_load_and_use_is_loaded_again(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     async def play(b: Bench) -> None:
         b.sidecar.load_error = Evicted("just now")
@@ -298,10 +298,10 @@ def test_a_lease_that_goes_between_load_and_use_is_loaded_again(
         assert b.arbiter is not None
         assert len(b.arbiter.asked) == 2
 
-    scenario(run_async, bench(Arbiter(LeaseRevoking("asked to leave"))), play)
+    scenario(run_async, policy_bench(Arbiter(LeaseRevoking("asked to leave"))), play)
 
 
-def test_a_lost_use_fails_the_goal(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_a_lost_use_fails_the_goal(policy_bench: Callable[..., Bench], run_async: Run) -> None:
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
         await b.step()
@@ -310,10 +310,12 @@ def test_a_lost_use_fails_the_goal(bench: Callable[..., Bench], run_async: Run) 
         with pytest.raises(LeaseLost):
             await b.step()
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
-def test_eviction_in_the_middle_fails_the_goal(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_eviction_in_the_middle_fails_the_goal(
+    policy_bench: Callable[..., Bench], run_async: Run
+) -> None:
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
         b.sidecar.error = Evicted("another model is there")
@@ -321,10 +323,12 @@ def test_eviction_in_the_middle_fails_the_goal(bench: Callable[..., Bench], run_
         with pytest.raises(Evicted):
             await b.step()
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
-def test_without_an_arbiter_no_use_is_marked(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_without_an_arbiter_no_use_is_marked(
+    policy_bench: Callable[..., Bench], run_async: Run
+) -> None:
     async def play(b: Bench) -> None:
         b.sidecar.arbitrated = False
         await b.skill.start(GOAL)
@@ -332,7 +336,7 @@ def test_without_an_arbiter_no_use_is_marked(bench: Callable[..., Bench], run_as
         assert done.data["steps"] == 7
         assert set(map(str, b.sidecar.tokens)) == {"None"}
 
-    scenario(run_async, bench(None), play)
+    scenario(run_async, policy_bench(None), play)
 
 
 @pytest.mark.parametrize(
@@ -340,7 +344,7 @@ def test_without_an_arbiter_no_use_is_marked(bench: Callable[..., Bench], run_as
     [[[float("nan"), 0.0]], [[0.0, float("inf")]], [[0.0, 0.0, 0.0]], [0.0, 0.0], [], "left"],
 )
 def test_actions_that_are_none_never_reach_the_arm(
-    bench: Callable[..., Bench], run_async: Run, action: Any
+    policy_bench: Callable[..., Bench], run_async: Run, action: Any
 ) -> None:
     import numpy as np
 
@@ -351,10 +355,10 @@ def test_actions_that_are_none_never_reach_the_arm(
         with pytest.raises(ModelError):
             await b.step()
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
-def test_no_frame_no_motion(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_no_frame_no_motion(policy_bench: Callable[..., Bench], run_async: Run) -> None:
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
         assert isinstance(await b.step(), Hold)
@@ -365,20 +369,24 @@ def test_no_frame_no_motion(bench: Callable[..., Bench], run_async: Run) -> None
         with pytest.raises(ModelError, match="lacks b"):
             await b.step(joint_state=JointState(name=("a",), position=(0.0,), stamp_ns=1))
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
-def test_a_goal_without_words_is_refused(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_a_goal_without_words_is_refused(
+    policy_bench: Callable[..., Bench], run_async: Run
+) -> None:
     async def play(b: Bench) -> None:
         with pytest.raises(ModelError, match="prompt"):
             await b.skill.start(Goal("g", "test/arm-grab"))
         with pytest.raises(BadState):
             await b.step()
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
-def test_losing_residency_unloads_the_sidecar(bench: Callable[..., Bench], run_async: Run) -> None:
+def test_losing_residency_unloads_the_sidecar(
+    policy_bench: Callable[..., Bench], run_async: Run
+) -> None:
     async def play(b: Bench) -> None:
         await b.skill.start(GOAL)
         await b.skill.release()
@@ -386,7 +394,7 @@ def test_losing_residency_unloads_the_sidecar(bench: Callable[..., Bench], run_a
         assert b.arbiter.uses[0].ended == 1
         assert b.sidecar.calls[-1] == "unload"
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_a_policy_that_stands_still_has_ended(
@@ -443,7 +451,7 @@ def test_views_are_cropped_and_averaged_as_trained(
 
 
 def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     async def play(b: Bench) -> None:
         import numpy as np
@@ -456,11 +464,11 @@ def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
             for n in range(1, 8)
         ]
 
-    scenario(run_async, bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
+    scenario(run_async, policy_bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
 
 
 def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     """Late actions are dropped, others shortened: who counts them as made is soon so far ahead that
     the gate withholds all the rest.
@@ -475,12 +483,12 @@ def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
         rows, _ = await b.play()  # nothing of it reaches the motors
         assert rows == [pytest.approx((3.0 * STEP_SHARE / 30, 0.5 - 1.5 * STEP_SHARE / 30))] * 7
 
-    made = bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}, sent=lambda: motors)
+    made = policy_bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}, sent=lambda: motors)
     scenario(run_async, made, play)
 
 
 def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     """Regression: a request that reached the event loop after the goal's end carried no token, and
     to a sidecar that means: load, evict others.
@@ -504,13 +512,13 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
         tokens = dict(zip(b.sidecar.calls, b.sidecar.tokens, strict=True))
         assert tokens["get_action"] == [1, 1]
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 @pytest.mark.parametrize("wanted", [True, False])
 @pytest.mark.parametrize("state", ["unloaded", "waiting", "resident"])
 def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
-    bench: Callable[..., Bench],
+    policy_bench: Callable[..., Bench],
     run_async: Run,
     state: str,
     wanted: bool,
@@ -531,11 +539,11 @@ def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
             await starting
         assert ("unload" in b.sidecar.calls) == wanted
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
-    bench: Callable[..., Bench], run_async: Run, monkeypatch: pytest.MonkeyPatch
+    policy_bench: Callable[..., Bench], run_async: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: it was asked for a second whether anybody wants the model, and kept it for
     nobody.
@@ -552,11 +560,11 @@ def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
             await starting
         assert b.sidecar.calls == ["load", "unload"]
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_a_policy_that_does_not_come_in_time_is_not_wanted_any_more(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     """A sidecar that was called back from standby goes on waiting behind the request whose time
     ended.
@@ -569,11 +577,11 @@ def test_a_policy_that_does_not_come_in_time_is_not_wanted_any_more(
             await b.skill.start(GOAL)
         assert b.sidecar.calls == ["load", "unload"]
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_the_next_goal_of_the_same_skill_begins_anew(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     """Nothing of the goal before is played: reset, its own use, its own chunks, its own words."""
 
@@ -598,11 +606,11 @@ def test_the_next_goal_of_the_same_skill_begins_anew(
         assert b.arbiter is not None
         assert [use.ended for use in b.arbiter.uses] == [1, 0]
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)
 
 
 def test_a_skill_that_never_loaded_is_released_without_a_word(
-    bench: Callable[..., Bench], run_async: Run
+    policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
     async def play(b: Bench) -> None:
         b.sidecar.load_error = ModelError("no")
@@ -611,4 +619,4 @@ def test_a_skill_that_never_loaded_is_released_without_a_word(
         await b.skill.release()
         assert b.sidecar.calls == ["load"]
 
-    scenario(run_async, bench(Arbiter()), play)
+    scenario(run_async, policy_bench(Arbiter()), play)

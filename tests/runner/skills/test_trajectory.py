@@ -74,7 +74,7 @@ def started(
     return skill
 
 
-def play(skill: FollowJointTrajectory, start: float = 0.0) -> list[float]:
+def targets_of(skill: FollowJointTrajectory, start: float = 0.0) -> list[float]:
     """Targets of the elbow for an arm that goes where it is told, until the skill is done."""
     targets, here = [], start
     while not isinstance(outcome := skill.step(world(elbow_flex=here)), Done):
@@ -86,7 +86,7 @@ def play(skill: FollowJointTrajectory, start: float = 0.0) -> list[float]:
 
 
 def test_the_way_is_straight_from_point_to_point() -> None:
-    targets = play(started(trajectory((0.6,), (0.3,))), start=-0.3)
+    targets = targets_of(started(trajectory((0.6,), (0.3,))), start=-0.3)
     assert targets[14] == pytest.approx(0.15, abs=1e-9), "half a second: half way"
     assert targets[29] == pytest.approx(0.6, abs=1e-9)
     assert targets[44] == pytest.approx(0.45, abs=1e-9)
@@ -125,7 +125,7 @@ def test_it_is_refused_or_played_within_the_limits(
     most = LIMITS.speeds_rad_s["elbow_flex"]
     fast = any(abs(b - a) / every_s > most * 1.01 for a, b in pairwise([start, *points]))
     try:
-        targets = play(started(trajectory(*((p,) for p in points), every_s=every_s)), start)
+        targets = targets_of(started(trajectory(*((p,) for p in points), every_s=every_s)), start)
     except BadRequest:
         assert any(abs(b - a) / every_s > most * 0.99 for a, b in pairwise([start, *points]))
         return
@@ -217,10 +217,10 @@ def test_a_second_goal_starts_from_nothing() -> None:
     without motion.
     """
     skill = started(trajectory((0.5,)))
-    assert play(skill)[-1] == pytest.approx(0.5)
+    assert targets_of(skill)[-1] == pytest.approx(0.5)
     asyncio.run(skill.finish())
     asyncio.run(skill.start(Goal("h", MOVE.name, params=trajectory((-0.5,)))))
-    assert play(skill, start=0.5)[-1] == pytest.approx(-0.5)
+    assert targets_of(skill, start=0.5)[-1] == pytest.approx(-0.5)
 
 
 # -- which skills there is a stand-in for

@@ -73,20 +73,20 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(inner, (*at, key))
 
 
-def written(value: Any, place: tuple[Any, ...], raw: str, at: tuple[Any, ...] = ()) -> str:
+def yaml_text(value: Any, place: tuple[Any, ...], raw: str, at: tuple[Any, ...] = ()) -> str:
     """The value as YAML in one line, with `raw` at one place."""
     if at == place:
         return raw
     if isinstance(value, dict):
         pairs = (
-            f"{json.dumps(str(key))}: {written(inner, place, raw, (*at, key))}"
+            f"{json.dumps(str(key))}: {yaml_text(inner, place, raw, (*at, key))}"
             for key, inner in value.items()
         )
         return "{" + ", ".join(pairs) + "}"
     if isinstance(value, list):
         return (
             "["
-            + ", ".join(written(inner, place, raw, (*at, i)) for i, inner in enumerate(value))
+            + ", ".join(yaml_text(inner, place, raw, (*at, i)) for i, inner in enumerate(value))
             + "]"
         )
     return json.dumps(value)
@@ -108,7 +108,7 @@ def test_any_value_at_any_key_is_read_or_found_fault_with(
     """Regression: `model_family: []` ended in a TypeError."""
     name, document, place = case
     try:
-        READERS[name][0](written(document, place, raw))
+        READERS[name][0](yaml_text(document, place, raw))
     except (ConfigError, ManifestError):
         pass
 
@@ -119,7 +119,7 @@ def test_a_family_of_a_wrong_type_is_a_finding(raw: str) -> None:
     text = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
     document = yaml.safe_load(text)
     with pytest.raises(ManifestError) as caught:
-        parse_manifest(written(document, ("model_family",), raw))
+        parse_manifest(yaml_text(document, ("model_family",), raw))
     (problem,) = caught.value.problems
     assert problem.field == "model_family" or "cannot be read as timestamp" in problem.message
     assert problem.line
@@ -133,12 +133,12 @@ def test_one_wrong_entry_is_one_finding(place: tuple[Any, ...]) -> None:
     )
     document[place[0]] = document[place[0]][:1]
     with pytest.raises(ManifestError) as caught:
-        parse_manifest(written(document, place, "[]"))
+        parse_manifest(yaml_text(document, place, "[]"))
     assert len(caught.value.problems) == 1
     document[place[0]] = []
     if place[0] != "sensors_required":
         with pytest.raises(ManifestError, match="must have at least 1 entry"):
-            parse_manifest(written(document, ("nowhere",), ""))
+            parse_manifest(yaml_text(document, ("nowhere",), ""))
 
 
 def test_one_wrong_range_is_one_finding() -> None:

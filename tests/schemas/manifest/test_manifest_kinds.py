@@ -48,7 +48,7 @@ def problems(data: dict[str, Any]) -> set[str]:
     return set()
 
 
-def sample(kind: Kind) -> dict[str, Any]:
+def sample_of(kind: Kind) -> dict[str, Any]:
     return copy.deepcopy(SAMPLES[kind])
 
 
@@ -60,13 +60,13 @@ def test_every_field_of_the_table_is_a_field_of_the_manifest() -> None:
 @given(st.sampled_from(FORBIDDEN))
 def test_forbidden_field_is_refused(cell: tuple[Kind, str]) -> None:
     kind, field = cell
-    assert problems(sample(kind) | {field: VALUES[field]}) == {field}
+    assert problems(sample_of(kind) | {field: VALUES[field]}) == {field}
 
 
 @given(st.sampled_from(REQUIRED), st.sampled_from(["absent", "null", "empty"]))
 def test_missing_required_field_is_refused(cell: tuple[Kind, str], how: str) -> None:
     kind, field = cell
-    data = sample(kind)
+    data = sample_of(kind)
     del data[field]
     if how == "empty":
         data |= {field: [] if isinstance(VALUES[field], list) else None}
@@ -78,13 +78,13 @@ def test_missing_required_field_is_refused(cell: tuple[Kind, str], how: str) -> 
 @given(st.sampled_from(FREE))
 def test_free_field_is_accepted_and_may_be_left_out(cell: tuple[Kind, str]) -> None:
     kind, field = cell
-    assert problems(sample(kind) | {field: VALUES[field]}) == set()
+    assert problems(sample_of(kind) | {field: VALUES[field]}) == set()
     if field not in (
         "chunk_size",
         "actions",
         "processors",
     ):  # required of every kind, or by the family
-        data = sample(kind)
+        data = sample_of(kind)
         data.pop(field, None)
         assert problems(data) == set()
 
@@ -94,12 +94,12 @@ def test_chunks_of_one_where_rows_are_checked_one_by_one(kind: Kind, chunk_size:
     expected = (
         {"chunk_size"} if kind in (Kind.ROS_ACTION, Kind.ROS_SERVICE, Kind.PLAYBOOK) else set()
     )
-    assert problems(sample(kind) | {"chunk_size": chunk_size}) == expected
+    assert problems(sample_of(kind) | {"chunk_size": chunk_size}) == expected
 
 
 @given(st.sampled_from(KINDS), st.sampled_from(["s0", "s1", None]))
 def test_only_playbooks_are_bound_to_a_role(kind: Kind, role: str | None) -> None:
-    data = sample(kind) | {"role": role}
+    data = sample_of(kind) | {"role": role}
     if role is None:  # the default, s1
         del data["role"]
     assert problems(data) == ({"role"} if kind is Kind.PLAYBOOK else set())
@@ -110,13 +110,13 @@ def test_only_playbooks_are_bound_to_a_role(kind: Kind, role: str | None) -> Non
     st.sets(st.sampled_from(sorted(set(VALUES) - {"chunk_size", "role", "actions"}))),
 )
 def test_any_set_of_extra_fields_is_judged_field_by_field(kind: Kind, extra: set[str]) -> None:
-    data = sample(kind) | {field: VALUES[field] for field in extra}
+    data = sample_of(kind) | {field: VALUES[field] for field in extra}
     assert problems(data) == {field for field in extra if RULES[field][kind] == "F"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_raw_and_validated_values_are_judged_alike(kind: Kind) -> None:
-    assert check_kind(kind, sample(kind)) == []
+    assert check_kind(kind, sample_of(kind)) == []
     assert {problem.field for problem in check_kind(kind, {})} >= {
         field for field, row in RULES.items() if row[kind] == "R"
     }

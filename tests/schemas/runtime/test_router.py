@@ -72,7 +72,9 @@ def path() -> Iterator[Path]:
 
 
 @asynccontextmanager
-async def serving(path: Path, handler: Echo, limits: Limits = LIMITS) -> AsyncIterator[Router]:
+async def serving_router(
+    path: Path, handler: Echo, limits: Limits = LIMITS
+) -> AsyncIterator[Router]:
     router = Router(path, handler, limits)
     router.bind()
     router.start(asyncio.get_running_loop())
@@ -84,7 +86,7 @@ async def serving(path: Path, handler: Echo, limits: Limits = LIMITS) -> AsyncIt
     assert len(router) == 0
 
 
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
+def with_router(scenario: Callable[[], Awaitable[None]]) -> None:
     async def limited() -> None:
         async with asyncio.timeout(WAIT_S):
             await scenario()
@@ -132,7 +134,7 @@ class Raw:
         self.writer.transport.abort()
 
 
-def ask(path: Path, kind: int, *payloads: bytes) -> list[bytes]:
+def ask_with_libzmq(path: Path, kind: int, *payloads: bytes) -> list[bytes]:
     """What an unmodified libzmq client is answered. Blocks: for a thread."""
     with zmq.Context() as context, context.socket(kind) as peer:
         peer.setsockopt(zmq.LINGER, 0)
@@ -151,11 +153,11 @@ def test_an_unmodified_peer_is_answered(path: Path, kind: int) -> None:
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
-            assert await asyncio.to_thread(ask, path, kind, *payloads) == list(payloads)
+        async with serving_router(path, handler):
+            assert await asyncio.to_thread(ask_with_libzmq, path, kind, *payloads) == list(payloads)
             await comes_true(lambda: len(handler.ended) == 1)
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
@@ -168,18 +170,20 @@ def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             raws = [
                 await (await Raw.connect(path, GREETING_AND_READY[:64] + ready)).ready()
                 for _ in range(3)
             ]
             assert [await raw.echo(b"%d" % n) for n, raw in enumerate(raws)] == [b"0", b"1", b"2"]
-            assert await asyncio.to_thread(ask, path, zmq.DEALER, b"honest") == [b"honest"]
+            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [
+                b"honest"
+            ]
             assert len(handler.open) >= 3
             for raw in raws:
                 raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +203,7 @@ def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler) as router:
+        async with serving_router(path, handler) as router:
             raw = await (await Raw.connect(path)).ready()
             raw.writer.write(attack)
             await raw.ended()
@@ -207,24 +211,28 @@ def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
             assert "protocol error" in handler.ended[0]
             assert router._users == {}
             assert router._processes == {}
-            assert await asyncio.to_thread(ask, path, zmq.DEALER, b"honest") == [b"honest"]
+            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [
+                b"honest"
+            ]
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_message_over_the_limit_is_answered_and_the_connection_lives(path: Path) -> None:
     async def scenario() -> None:
-        async with serving(path, Echo()):
-            answers = await asyncio.to_thread(ask, path, zmq.REQ, bytes((1 << 20) + 1), b"next")
+        async with serving_router(path, Echo()):
+            answers = await asyncio.to_thread(
+                ask_with_libzmq, path, zmq.REQ, bytes((1 << 20) + 1), b"next"
+            )
             assert answers == [b"oversize %d" % ((1 << 20) + 1), b"next"]
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_stranger_may_send_little_until_it_is_admitted(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo(admits=False)
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             raw = await (await Raw.connect(path)).ready()
             assert await raw.echo(b"hello") == b"hello"
             raw.writer.write(encode(bytes(1 << 17), False))
@@ -234,7 +242,7 @@ def test_a_stranger_may_send_little_until_it_is_admitted(path: Path) -> None:
             assert len(await raw.reader.readexactly(9 + (1 << 17))) == 9 + (1 << 17)
             raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(path: Path) -> None:
@@ -242,13 +250,15 @@ def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(pa
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler) as router:
+        async with serving_router(path, handler) as router:
             slow = await (await Raw.connect(path)).ready()
             slow.writer.write(encode(bytes(1 << 19), False) * 64)
             await comes_true(lambda: any(user.out_bytes for user in router._users.values()))
             connection = next(iter(handler.open.values()))
             handled = len(handler.received_from)
-            assert await asyncio.to_thread(ask, path, zmq.DEALER, b"honest") == [b"honest"]
+            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [
+                b"honest"
+            ]
             assert len(handler.received_from) - handled <= 2
             # pushes have a bound, too
             while connection.send(bytes(1 << 16)):
@@ -259,13 +269,13 @@ def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(pa
             assert router._users == {}
         assert handler.dropped == 0
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_small_messages_to_a_peer_that_does_not_read_are_counted(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             raw = await (await Raw.connect(path)).ready()
             await comes_true(lambda: bool(handler.open))
             connection = next(iter(handler.open.values()))
@@ -276,7 +286,7 @@ def test_small_messages_to_a_peer_that_does_not_read_are_counted(path: Path) -> 
             assert sent <= OUT_MESSAGES_MAX
             raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_silent_connections_are_cut(path: Path) -> None:
@@ -285,7 +295,7 @@ def test_silent_connections_are_cut(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo(admits=False)
         limits = Limits(handshake_s=0.0, hello_s=0.01, process_share=1.0, user_share=1.0)
-        async with serving(path, handler, limits) as router:
+        async with serving_router(path, handler, limits) as router:
             bare = [await Raw.connect(path, b"") for _ in range(50)]
             shaken = await Raw.connect(path)
             for raw in (*bare, shaken):
@@ -293,7 +303,7 @@ def test_silent_connections_are_cut(path: Path) -> None:
             await comes_true(lambda: len(router) == 0)
             assert router._processes == {}
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
@@ -304,7 +314,7 @@ def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
         limits = Limits(
             connections_max=8, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
         )
-        async with serving(path, handler, limits) as router:
+        async with serving_router(path, handler, limits) as router:
             bare = [await Raw.connect(path, b"") for _ in range(20)]
             honest = await (await Raw.connect(path)).ready()
             assert await honest.echo(b"here") == b"here"
@@ -312,7 +322,7 @@ def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
             for raw in (*bare, honest):
                 raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 _HONEST = """
@@ -330,7 +340,7 @@ def test_a_process_has_a_share_of_the_connections(path: Path) -> None:
         limits = Limits(
             connections_max=8, process_share=0.5, user_share=1.0, handshake_s=30, hello_s=30
         )
-        async with serving(path, handler, limits):
+        async with serving_router(path, handler, limits):
             greedy = [await (await Raw.connect(path)).ready() for _ in range(4)]
             refused = await Raw.connect(path)
             await refused.ended()
@@ -341,13 +351,13 @@ def test_a_process_has_a_share_of_the_connections(path: Path) -> None:
             for raw in greedy:
                 raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             flood = await (await Raw.connect(path)).ready()
             honest = await (await Raw.connect(path)).ready()
             await comes_true(lambda: len(handler.open) == 2)
@@ -363,19 +373,19 @@ def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) 
                 raw.close()
             await reading
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_connection_over_its_rate_rests_and_loses_nothing(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo(within_rate=False)
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             raw = await (await Raw.connect(path)).ready()
             raw.writer.write(encode(b"abc", False) * 20)
             assert await raw.reader.readexactly(20 * 5) == encode(b"abc", False) * 20
             raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 _ORPHAN = """
@@ -396,7 +406,7 @@ def test_a_child_does_not_speak_on_its_dead_parents_connection(path: Path) -> No
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-c", _ORPHAN, path, GREETING_AND_READY.hex()
             )
@@ -404,30 +414,30 @@ def test_a_child_does_not_speak_on_its_dead_parents_connection(path: Path) -> No
             await comes_true(lambda: bool(handler.ended))
             assert handler.ended == ["its process has ended"]
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_defect_of_the_handler_costs_one_answer(path: Path) -> None:
     async def scenario() -> None:
-        async with serving(path, Echo()):
+        async with serving_router(path, Echo()):
             raw = await (await Raw.connect(path)).ready()
             raw.writer.write(encode(b"fail", False))
             assert await raw.echo(b"next") == b"next"
             raw.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_what_was_sent_before_closing_arrives(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             raw = await (await Raw.connect(path)).ready()
             assert await raw.echo(b"close") == b"closing"
             await raw.ended()
             assert handler.ended == ["as asked"]
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) -> None:
@@ -436,7 +446,7 @@ def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) ->
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler) as router:
+        async with serving_router(path, handler) as router:
             raw = await (await Raw.connect(path)).ready()
             raw.writer.write(encode(bytes(1 << 19), False))
             await comes_true(lambda: bool(handler.received_from))
@@ -446,7 +456,7 @@ def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) ->
             raw.close()
             await ending
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_a_deleted_socket_file_is_bound_again(path: Path) -> None:
@@ -454,15 +464,15 @@ def test_a_deleted_socket_file_is_bound_again(path: Path) -> None:
 
     async def scenario() -> None:
         handler = Echo()
-        async with serving(path, handler):
+        async with serving_router(path, handler):
             before = await (await Raw.connect(path)).ready()
             path.unlink()
             await comes_true(path.exists)
-            assert await asyncio.to_thread(ask, path, zmq.REQ, b"again") == [b"again"]
+            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.REQ, b"again") == [b"again"]
             assert await before.echo(b"still here") == b"still here"
             before.close()
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_another_file_in_the_place_of_the_socket_is_left_alone(path: Path) -> None:
@@ -476,7 +486,7 @@ def test_another_file_in_the_place_of_the_socket_is_left_alone(path: Path) -> No
         await router.aclose()
         assert path.read_text() == "mine"
 
-    run(scenario)
+    with_router(scenario)
 
 
 def test_the_socket_is_for_user_and_group_from_the_first_instant(path: Path) -> None:

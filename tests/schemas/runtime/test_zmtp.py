@@ -46,13 +46,13 @@ def greeted(ready: bytes = DEALER_READY) -> ServerConnection:
     return connection
 
 
-def command(name: bytes, rest: bytes = b"") -> bytes:
+def command_frame(name: bytes, rest: bytes = b"") -> bytes:
     body = bytes((len(name),)) + name + rest
     return bytes((4, len(body))) + body
 
 
 def ready(*properties: tuple[bytes, bytes]) -> bytes:
-    return command(
+    return command_frame(
         b"READY",
         b"".join(
             bytes((len(name),)) + name + len(value).to_bytes(4) + value
@@ -97,23 +97,26 @@ def test_the_greeting_goes_out_first_and_ready_only_to_a_zmtp_peer() -> None:
         (PEER_GREETING[:12] + b"CURVE".ljust(20, b"\x00") + bytes(32), "security mechanism"),
         (PEER_GREETING + DEALER_HELLO, "a message before READY"),
         (PEER_GREETING + PING, "a command before READY"),
-        (PEER_GREETING + command(b"ERROR", b"\x00"), "refused the handshake"),
+        (PEER_GREETING + command_frame(b"ERROR", b"\x00"), "refused the handshake"),
         (PEER_GREETING + ready(), "neither a DEALER nor a REQ"),
         (PEER_GREETING + ready((b"Socket-Type", b"PUB")), "neither a DEALER nor a REQ"),
-        (PEER_GREETING + command(b"READY", b"\x00"), "malformed property"),
+        (PEER_GREETING + command_frame(b"READY", b"\x00"), "malformed property"),
         (
-            PEER_GREETING + command(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"),
+            PEER_GREETING + command_frame(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"),
             "malformed property",
         ),
-        (PEER_GREETING + command(b"READY", b"\x0bSocket"), "malformed property"),
+        (PEER_GREETING + command_frame(b"READY", b"\x0bSocket"), "malformed property"),
         (PEER_GREETING + b"\x04\x00", "without a name"),
         (PEER_GREETING + b"\x04\x01\x05", "without a name"),
         (PEER_GREETING + b"\x06" + (COMMAND_MAX_BYTES + 1).to_bytes(8), "a command of"),
         (PEER_GREETING + DEALER_READY + DEALER_READY, "unexpected command 'READY'"),
-        (PEER_GREETING + DEALER_READY + command(b"SUBSCRIBE"), "unexpected command 'SUBSCRIBE'"),
-        (PEER_GREETING + DEALER_READY + command(b"\x1b[2J"), r"'\\x1b\[2J'"),
-        (PEER_GREETING + DEALER_READY + command(b"PING"), "a PING of 0 bytes"),
-        (PEER_GREETING + DEALER_READY + command(b"PING", bytes(19)), "a PING of 19 bytes"),
+        (
+            PEER_GREETING + DEALER_READY + command_frame(b"SUBSCRIBE"),
+            "unexpected command 'SUBSCRIBE'",
+        ),
+        (PEER_GREETING + DEALER_READY + command_frame(b"\x1b[2J"), r"'\\x1b\[2J'"),
+        (PEER_GREETING + DEALER_READY + command_frame(b"PING"), "a PING of 0 bytes"),
+        (PEER_GREETING + DEALER_READY + command_frame(b"PING", bytes(19)), "a PING of 19 bytes"),
         (PEER_GREETING + DEALER_READY + b"\x08\x00", "flags 0x08"),
         (PEER_GREETING + DEALER_READY + b"\x05\x00", "flags 0x05"),
         (PEER_GREETING + DEALER_READY + b"\x01\x00" * (FRAMES_MAX + 1), "more than 8 frames"),
@@ -184,7 +187,9 @@ def test_an_envelope_of_another_form_arrives_as_an_empty_payload() -> None:
 
 def test_a_ping_is_answered_with_its_context_and_a_pong_is_not() -> None:
     connection = greeted()
-    assert events(connection, command(b"PING", b"\x00\x64context") + command(b"PONG")) == [
+    assert events(
+        connection, command_frame(b"PING", b"\x00\x64context") + command_frame(b"PONG")
+    ) == [
         Heartbeat(),
         Heartbeat(),
     ]

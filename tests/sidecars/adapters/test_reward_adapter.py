@@ -26,7 +26,7 @@ TASK = "grab the red cube"
 
 
 @pytest.fixture(scope="module")
-def shipped() -> RewardAdapter:
+def shipped_adapter() -> RewardAdapter:
     manifest = load_manifest(SKILL)
     adapter = make_adapter(manifest, resolve(str(manifest.weights_uri), CONFIGS))
     assert isinstance(adapter, RewardAdapter)
@@ -47,7 +47,9 @@ def score(adapter: RewardAdapter, *images: bytes, task: str = TASK) -> dict[str,
     return adapter.run(ScoreOp(op="score", task=task, images=list(images)))
 
 
-def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(shipped: RewardAdapter) -> None:
+def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(
+    shipped_adapter: RewardAdapter,
+) -> None:
     """A scene that the training never saw; the pictures are what the runner would serve."""
     import random
 
@@ -62,15 +64,15 @@ def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(shipped: RewardAd
         before = as_png(env.render("wrist"))
         assert run_expert(env, GrabExpert(env, ArmKinematics(env.config), "red cube"))
         after = as_png(env.render("wrist"))
-    right = score(shipped, before, after)
+    right = score(shipped_adapter, before, after)
     assert right["success"][0] < 0.5 < right["success"][1]
     assert right["progress"][1] > right["progress"][0] + 0.3
-    wrong = score(shipped, before, after, task="pick up the blue ball, please")
+    wrong = score(shipped_adapter, before, after, task="pick up the blue ball, please")
     assert wrong["success"][1] < 0.5, "what is held is not what was asked for"
     assert wrong["progress"][1] < right["progress"][1] - 0.3
 
 
-def test_both_ways_to_send_pictures_are_judged_alike(shipped: RewardAdapter) -> None:
+def test_both_ways_to_send_pictures_are_judged_alike(shipped_adapter: RewardAdapter) -> None:
     """The field's raw BGR pictures, and PNGs."""
     import numpy as np
 
@@ -84,32 +86,38 @@ def test_both_ways_to_send_pictures_are_judged_alike(shipped: RewardAdapter) -> 
         height=72,
         num_bins=10,
     )
-    assert shipped.run(raw) == score(shipped, *map(as_png, rgb))
-    shipped.unload()
-    shipped.load("cpu")
-    assert shipped.run(raw) == score(shipped, *map(as_png, rgb)), "the same after a reload"
+    assert shipped_adapter.run(raw) == score(shipped_adapter, *map(as_png, rgb))
+    shipped_adapter.unload()
+    shipped_adapter.load("cpu")
+    assert shipped_adapter.run(raw) == score(shipped_adapter, *map(as_png, rgb)), (
+        "the same after a reload"
+    )
 
 
 @pytest.mark.parametrize(
     "task", ["", "  ", "tidy the room", "grab the cube", "put the red cube on the blue ball"]
 )
 def test_a_task_that_it_cannot_read_is_refused_and_not_guessed(
-    shipped: RewardAdapter, png: Any, task: str
+    shipped_adapter: RewardAdapter, png: Any, task: str
 ) -> None:
     with pytest.raises(BadRequest, match="task"):
-        score(shipped, png(96, 72), task=task)
+        score(shipped_adapter, png(96, 72), task=task)
 
 
-def test_pictures_that_do_not_go_together_are_refused(shipped: RewardAdapter, png: Any) -> None:
+def test_pictures_that_do_not_go_together_are_refused(
+    shipped_adapter: RewardAdapter, png: Any
+) -> None:
     """Regression: 32 small files made the sidecar decode 1.6 GB before it added up their sizes."""
     with pytest.raises(BadRequest, match="different sizes: 80 x 60, 96 x 72"):
-        score(shipped, png(96, 72), png(80, 60))
+        score(shipped_adapter, png(96, 72), png(80, 60))
     with pytest.raises(BadRequest, match="cannot be decoded"):
-        score(shipped, b"no picture at all")
+        score(shipped_adapter, b"no picture at all")
     with pytest.raises(BadRequest, match="pixels"):
-        score(shipped, *[png(4000, 4000)] * 2)
+        score(shipped_adapter, *[png(4000, 4000)] * 2)
     with pytest.raises(BadRequest, match="pixels"):
-        score(shipped, *[png(4000, 4000)[:100]] * 2)  # looked at no further than their headers
+        score(
+            shipped_adapter, *[png(4000, 4000)[:100]] * 2
+        )  # looked at no further than their headers
 
 
 # -- a reward model that somebody else registers

@@ -125,7 +125,7 @@ def save_smolvla(folder: Path) -> None:
     SmolVLAPolicy(config).save_pretrained(folder)
 
 
-def shipped(name: str) -> Callable[[Path], None]:
+def shipped_copy(name: str) -> Callable[[Path], None]:
     def copy(folder: Path) -> None:
         shutil.copytree(CONFIGS / "models" / name, folder, dirs_exist_ok=True)
 
@@ -171,10 +171,10 @@ OTHERS: dict[str, Callable[[Path], None]] = {
     "grounding_dino": save_grounding_dino,
     "vqbet": save_vqbet,
     "smolvla": save_smolvla,
-    "compact_act": shipped("so101-grab"),
-    "compact_progress": shipped("so101-progress"),
-    "shipped detector": shipped("so101-detector"),
-    "shipped vlm": shipped("so101-scene-vlm"),
+    "compact_act": shipped_copy("so101-grab"),
+    "compact_progress": shipped_copy("so101-progress"),
+    "shipped detector": shipped_copy("so101-detector"),
+    "shipped vlm": shipped_copy("so101-scene-vlm"),
 }
 MODELS: dict[str, tuple[Callable[[Weights, str], Any],
 str]] = {  # how it is loaded, and a part that it does not work without
@@ -209,7 +209,7 @@ def saved(weights: Any, tmp_path_factory: Any) -> Callable[[str], Path]:
     return saved
 
 
-def refused(load: Callable[[Weights, str], Any], folder: Path, device: str) -> ModelError:
+def refusal_of(load: Callable[[Weights, str], Any], folder: Path, device: str) -> ModelError:
     with pytest.raises(ModelError) as caught:
         load(Weights(str(folder), local=True), device)
     return caught.value
@@ -235,7 +235,7 @@ def test_only_a_whole_checkpoint_is_loaded(
 
     def damaged(content: dict[str, Any]) -> ModelError:
         save_file(content, folder / WHOLE, metadata={"format": "pt"})
-        return refused(load, folder, device)
+        return refusal_of(load, folder, device)
 
     without = {key: tensor for key, tensor in tensors.items() if part not in key}
     assert without.keys() < tensors.keys(), f"no {part} in {sorted(tensors)}"
@@ -254,9 +254,9 @@ def test_only_a_whole_checkpoint_is_loaded(
 
     content = (whole / WHOLE).read_bytes()
     (folder / WHOLE).write_bytes(content[: len(content) // 2])
-    refused(load, folder, device)
+    refusal_of(load, folder, device)
     (folder / WHOLE).unlink()
-    refused(load, folder, device)
+    refusal_of(load, folder, device)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -270,7 +270,7 @@ def test_a_checkpoint_in_parts_needs_all_of_them(tmp_path: Path, device: str) ->
     assert len(parts) > 2
     load_detector(Weights(str(tmp_path / "parts"), local=True), device)
     parts[1].unlink()
-    refused(load_detector, tmp_path / "parts", device)
+    refusal_of(load_detector, tmp_path / "parts", device)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -297,7 +297,7 @@ def test_a_quantized_checkpoint_is_compared_with_its_statistics(
     ):
         kept = {key: tensor for key, tensor in tensors.items() if key not in dropped}
         save_file(kept, tmp_path / WHOLE, metadata={"format": "pt"})
-        refused(load_detector, tmp_path, device)
+        refusal_of(load_detector, tmp_path, device)
 
 
 def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Path) -> None:
@@ -308,9 +308,9 @@ def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Pa
     from safetensors.torch import save_file
 
     PI05Config(**features())._save_pretrained(tmp_path)
-    assert "read no weights" in refused(load_policy, tmp_path, "meta").message
+    assert "read no weights" in refusal_of(load_policy, tmp_path, "meta").message
     save_file({"another.models.weight": torch.zeros(3)}, tmp_path / WHOLE)
-    error = refused(load_policy, tmp_path, "meta")
+    error = refusal_of(load_policy, tmp_path, "meta")
     assert error.details["foreign"] == 1
     assert error.details["missing"] > 100
 
@@ -327,7 +327,7 @@ def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, d
     from vram_arbiter.schemas.manifest import load_manifest
     from vram_arbiter.sidecars.adapters.choose import make_adapter
 
-    shipped("so101-grab")(tmp_path)
+    shipped_copy("so101-grab")(tmp_path)
     file = tmp_path / f"policy_{part}_processor.safetensors"
     kept = "observation.state." if "post" in part else "action."
     numbers = {key: tensor for key, tensor in load_file(file).items() if key.startswith(kept)}

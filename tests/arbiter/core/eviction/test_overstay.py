@@ -12,7 +12,7 @@ from vram_arbiter.schemas.ids import LeaseId
 GIB = d.GIB
 
 
-def asked(driver: CoreDriver, **spec: Any) -> tuple[Consumer, LeaseId, LeaseId]:
+def idle_and_revoked(driver: CoreDriver, **spec: Any) -> tuple[Consumer, LeaseId, LeaseId]:
     """An idle holder that was just asked to leave and will not, and the waiter."""
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, **spec)
@@ -29,7 +29,7 @@ def signals(driver: CoreDriver) -> list[Signal]:
 
 def test_by_default_nothing_is_ever_done() -> None:
     driver = CoreDriver(8 * GIB)
-    _, lease, waiter = asked(driver)
+    _, lease, waiter = idle_and_revoked(driver)
     driver.advance(3000.0)
     assert not signals(driver)
     assert (driver.state(lease), driver.state(waiter)) == ("revoking", "queued")
@@ -37,7 +37,7 @@ def test_by_default_nothing_is_ever_done() -> None:
 
 def test_terminate_is_said_once_and_then_it_is_waited() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, waiter = asked(driver, on_overstay="terminate")
+    det, lease, waiter = idle_and_revoked(driver, on_overstay="terminate")
     driver.advance(29.9)
     assert not signals(driver)
     driver.advance(0.2)
@@ -54,7 +54,7 @@ def test_terminate_is_said_once_and_then_it_is_waited() -> None:
 
 def test_kill_comes_after_terminate_and_its_grace() -> None:
     driver = CoreDriver(8 * GIB)
-    det, _, waiter = asked(driver, on_overstay="kill")
+    det, _, waiter = idle_and_revoked(driver, on_overstay="kill")
     driver.advance(30.1)
     assert [signal.kind for signal in signals(driver)] == ["term"]
     driver.advance(4.8)
@@ -69,7 +69,7 @@ def test_kill_comes_after_terminate_and_its_grace() -> None:
 
 def test_a_holder_that_leaves_in_its_grace_is_left_alone() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, waiter = asked(driver, on_overstay="kill")
+    det, lease, waiter = idle_and_revoked(driver, on_overstay="kill")
     driver.advance(31.0)
     det.unload(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
@@ -97,7 +97,7 @@ def test_a_lease_in_use_is_never_signalled_and_has_its_whole_time_after_it() -> 
 def test_a_process_that_uses_anything_is_not_signalled() -> None:
     """Its idle lease outstays, but the same process drives the arm with another one, or with somebody else's."""
     driver = CoreDriver(8 * GIB)
-    det, _, _ = asked(driver, on_overstay="kill")
+    det, _, _ = idle_and_revoked(driver, on_overstay="kill")
     policy = driver.consumer("policy")
     arm = policy.acquire(1 * GIB)
     driver.until(lambda: driver.state(arm) == "loading", limit_s=1.0)
@@ -113,7 +113,7 @@ def test_a_process_that_uses_anything_is_not_signalled() -> None:
 
 def test_a_use_of_others_on_another_lease_of_it_counts_too() -> None:
     driver = CoreDriver(8 * GIB)
-    det, _, _ = asked(driver, on_overstay="terminate")
+    det, _, _ = idle_and_revoked(driver, on_overstay="terminate")
     second = det.acquire(1 * GIB, key="second")
     driver.until(lambda: driver.state(second) == "loading", limit_s=1.0)
     det.ready(second)
@@ -129,7 +129,7 @@ def test_a_use_of_others_on_another_lease_of_it_counts_too() -> None:
 
 def test_an_unload_that_hangs_outstays_too() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, _ = asked(driver, on_overstay="terminate")
+    det, lease, _ = idle_and_revoked(driver, on_overstay="terminate")
     driver.advance(20.0)
     det.unloading(lease)
     driver.advance(29.0)
@@ -141,7 +141,7 @@ def test_an_unload_that_hangs_outstays_too() -> None:
 @pytest.mark.parametrize("standby", [False, True])
 def test_a_lease_that_left_is_not_pursued(standby: bool) -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, waiter = asked(driver, on_overstay="kill", standby=standby)
+    det, lease, waiter = idle_and_revoked(driver, on_overstay="kill", standby=standby)
     det.unload(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
     driver.advance(100.0)
@@ -151,7 +151,7 @@ def test_a_lease_that_left_is_not_pursued(standby: bool) -> None:
 def test_a_slow_verdict_is_no_overstay() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 50.0
-    det, lease, _ = asked(driver, on_overstay="kill")
+    det, lease, _ = idle_and_revoked(driver, on_overstay="kill")
     driver.advance(25.0)
     det.unload(lease)
     driver.advance(40.0)

@@ -24,7 +24,7 @@ def driver_with(budget_gib: float = 16, **more: Any) -> CoreDriver:
     return CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": int(budget_gib * GIB)}, **more)
 
 
-def asked(
+def revoked_vlm(
     driver: CoreDriver, park_gib: float = 5, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
     """A VLM that was asked to leave, and who asked for its room."""
@@ -38,7 +38,7 @@ def asked(
 
 
 def parked(driver: CoreDriver, **spec: Any) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
-    vlm, lease, policy, wanted = asked(driver, **spec)
+    vlm, lease, policy, wanted = revoked_vlm(driver, **spec)
     vlm.unload(lease, parked=True)
     driver.until(lambda: driver.state(wanted) == "loading")
     policy.load(wanted)
@@ -74,7 +74,7 @@ def test_the_budget_by_itself() -> None:
 
 def test_room_is_kept_from_the_revoke_until_it_lets_go() -> None:
     driver = driver_with(8)
-    vlm, lease, _, _ = asked(driver)
+    vlm, lease, _, _ = revoked_vlm(driver)
     assert driver.pushes("revoke", lease)[-1]["park"] is True
     assert ram(driver) == 5 * GIB
     other, second = held(driver, "other", 1, park_bytes=4 * GIB)
@@ -96,7 +96,7 @@ def test_room_is_kept_from_the_revoke_until_it_lets_go() -> None:
 
 def test_without_room_the_revoke_says_so() -> None:
     driver = driver_with(4)
-    vlm, lease, _, _ = asked(driver)
+    vlm, lease, _, _ = revoked_vlm(driver)
     assert driver.pushes("revoke", lease)[-1]["park"] is False
     assert ram(driver) == 0
     assert refusal(vlm.release(lease, parked=True)).code == "host_ram_insufficient"
@@ -105,7 +105,7 @@ def test_without_room_the_revoke_says_so() -> None:
 
 def test_no_budget_no_parking() -> None:
     driver = CoreDriver(8 * GIB)
-    _, lease, _, _ = asked(driver)
+    _, lease, _, _ = revoked_vlm(driver)
     assert driver.pushes("revoke", lease)[-1]["park"] is False
 
 
@@ -184,7 +184,7 @@ def test_a_load_from_ram_that_fails_may_stay_parked_or_end() -> None:
 
 def test_reacquire_on_the_way_to_ram() -> None:
     driver = driver_with()
-    vlm, lease, _, wanted = asked(driver)
+    vlm, lease, _, wanted = revoked_vlm(driver)
     vlm.unload(lease, parked=True)
     assert answer(vlm.reacquire(lease))["state"] == "queued"
     driver.until(lambda: driver.state(wanted) == "loading")
@@ -194,7 +194,7 @@ def test_reacquire_on_the_way_to_ram() -> None:
 def test_giving_up_frees_the_ram() -> None:
     for end in ("cancel", "bye", "death", "timeout", "bye while measured", "death while measured"):
         driver = driver_with()
-        vlm, lease, policy, wanted = asked(driver)
+        vlm, lease, policy, wanted = revoked_vlm(driver)
         vlm.unload(lease, parked=True)
         if "measured" not in end:
             driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023  # reason: run at once
@@ -218,7 +218,7 @@ def test_giving_up_frees_the_ram() -> None:
 
 def test_a_lease_that_expires_while_asked_frees_its_booking() -> None:
     driver = driver_with()
-    _, lease, _, _ = asked(driver, ttl_s=10.0)
+    _, lease, _, _ = revoked_vlm(driver, ttl_s=10.0)
     driver.advance(11.0)
     assert driver.state(lease) == "over"
     assert ram(driver) == 0
@@ -275,7 +275,7 @@ def test_a_smaller_budget_after_a_restart_is_no_violation_and_admits_nobody() ->
 def test_a_release_that_was_lost_is_made_up_for() -> None:
     driver = driver_with()
     other, resident = held(driver, "other", 1)
-    vlm, lease, _, _ = asked(driver)
+    vlm, lease, _, _ = revoked_vlm(driver)
     token, other_token = vlm.token(lease), other.token(resident)
     vlm.hold(RESIDUE)
     driver.restart()
@@ -289,7 +289,7 @@ def test_a_release_that_was_lost_is_made_up_for() -> None:
 
 def test_after_a_restart_its_holder_says_that_it_parked_and_not_an_empty_card() -> None:
     driver = driver_with()
-    vlm, lease, _, _ = asked(driver)
+    vlm, lease, _, _ = revoked_vlm(driver)
     token = vlm.token(lease)
     vlm.hold(0)
     driver.restart()

@@ -177,7 +177,7 @@ class Crowd:
         )
 
 
-def live(seed: int, steps: int) -> tuple[Crowd, collections.Counter[str]]:
+def live_at_random(seed: int, steps: int) -> tuple[Crowd, collections.Counter[str]]:
     crowd = Crowd(seed)
     for _ in range(steps):
         crowd.disturb()
@@ -213,7 +213,7 @@ def live(seed: int, steps: int) -> tuple[Crowd, collections.Counter[str]]:
 def test_nothing_is_lost_or_granted_twice(block: int) -> None:
     seen: collections.Counter[str] = collections.Counter()
     for seed in range(block * 3, block * 3 + 3):
-        seen += live(seed, 120)[1]
+        seen += live_at_random(seed, 120)[1]
     assert all(
         seen[kind] for kind in ("standby", "parked", "resized", "granted", "revoke_asked")
     ), seen

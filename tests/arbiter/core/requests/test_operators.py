@@ -19,12 +19,12 @@ def ops(driver: CoreDriver) -> Consumer:
     return driver.consumer("ops")
 
 
-def ask(ops: Consumer, action: Any, target: str = "", reason: str = "test") -> list[Effect]:
+def order_of(ops: Consumer, action: Any, target: str = "", reason: str = "test") -> list[Effect]:
     event = OperatorAsked(ops.client, ops.driver.next_request(), action, target, BY, reason)
     return ops.driver.post(event)
 
 
-def held(driver: CoreDriver, name: str, count: int, **spec: Any) -> tuple[Consumer, LeaseId]:
+def held_bytes(driver: CoreDriver, name: str, count: int, **spec: Any) -> tuple[Consumer, LeaseId]:
     consumer = driver.consumer(name)
     lease = consumer.acquire(count, **spec)
     driver.until(lambda: driver.state(lease) == "loading")
@@ -39,9 +39,9 @@ def noted(effects: list[Effect]) -> dict[str, Any]:
 
 # -- evict -------------------------------------------------------------------------------------------------------------
 def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5 * GIB)
+    det, lease = held_bytes(driver, "det", 5 * GIB)
     det.use_begin(lease)
-    effects = ask(ops, "evict", "det", "maintenance")
+    effects = order_of(ops, "evict", "det", "maintenance")
     assert answer(effects)["state"] == "revoking"
     assert noted(effects) | {
         "action": "evict",
@@ -71,9 +71,9 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
 
 
 def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = held(driver, "det", 5 * GIB)
-    ask(ops, "evict", lease)
-    effects = ask(ops, "evict", lease)
+    _, lease = held_bytes(driver, "det", 5 * GIB)
+    order_of(ops, "evict", lease)
+    effects = order_of(ops, "evict", lease)
     assert noted(effects)["repeated"] is True
     assert len(driver.notes("revoke_asked")) == 1
 
@@ -82,12 +82,12 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
     driver: CoreDriver, ops: Consumer
 ) -> None:
     """`vramctl run` lets a waiter of its own priority wait, and ends its program for an operator."""
-    det, lease = held(driver, "det", 5 * GIB)
+    det, lease = held_bytes(driver, "det", 5 * GIB)
     det.use_begin(lease)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.until(lambda: bool(driver.pushes("revoke", lease)))
     det.ack(lease, None)
-    ask(ops, "evict", lease, "maintenance")
+    order_of(ops, "evict", lease, "maintenance")
     first, *_, last = driver.pushes("revoke", lease)
     assert (first["priority"], first["reason"]) == (d.PRIORITY, "vlm needs the room")
     assert "priority" not in last
@@ -98,42 +98,42 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
 def test_a_pinned_holder_is_not_evicted_even_by_an_operator(
     driver: CoreDriver, ops: Consumer, spec: dict[str, Any]
 ) -> None:
-    _, lease = held(driver, "det", 5 * GIB, **spec)
+    _, lease = held_bytes(driver, "det", 5 * GIB, **spec)
     if not spec:
-        ask(ops, "pin", lease)
-    assert refusal(ask(ops, "evict", lease)).code == "bad_state"
+        order_of(ops, "pin", lease)
+    assert refusal(order_of(ops, "evict", lease)).code == "bad_state"
     assert driver.state(lease) == "held"
 
 
 def test_only_what_is_resident_can_be_evicted(driver: CoreDriver, ops: Consumer) -> None:
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB)
-    assert refusal(ask(ops, "evict", lease)).details["state"] == "loading"
+    assert refusal(order_of(ops, "evict", lease)).details["state"] == "loading"
 
 
 # -- who is meant --------------------------------------------------------------------------------------------------------
 def test_a_consumer_with_several_leases_has_to_be_named_by_lease(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    det, first = held(driver, "det", 1 * GIB)
+    det, first = held_bytes(driver, "det", 1 * GIB)
     second = det.acquire(1 * GIB)
-    refused = refusal(ask(ops, "evict", "det"))
+    refused = refusal(order_of(ops, "evict", "det"))
     assert (refused.code, refused.details["leases"]) == ("bad_request", [first, second])
 
 
 def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    det, first = held(driver, "det", 5 * GIB, min_residency_s=100.0)
+    det, first = held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
     det.acquire(5 * GIB)
-    assert answer(ask(ops, "pin", "det"))["lease"]["lease_id"] == first
+    assert answer(order_of(ops, "pin", "det"))["lease"]["lease_id"] == first
 
 
 def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5 * GIB)
+    det, lease = held_bytes(driver, "det", 5 * GIB)
     det.die()
-    assert refusal(ask(ops, "evict", "nobody")).code == "unknown_lease"
-    over = refusal(ask(ops, "evict", lease))
+    assert refusal(order_of(ops, "evict", "nobody")).code == "unknown_lease"
+    over = refusal(order_of(ops, "evict", lease))
     assert (over.code, "died" in over.message) == ("lease_lost", True)
     assert over.hint == "it is over; its story is in `vramctl history`", (
         "what a program would be told is no help here"
@@ -142,35 +142,35 @@ def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -
 
 @pytest.mark.parametrize("evictable", [True, False])
 def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evictable: bool) -> None:
-    _, lease = held(driver, "det", 5 * GIB, evictable=evictable)
+    _, lease = held_bytes(driver, "det", 5 * GIB, evictable=evictable)
     waiter = driver.consumer("w").acquire(5 * GIB) if evictable else lease
-    alive = refusal(ask(ops, "release_dead", lease))
+    alive = refusal(order_of(ops, "release_dead", lease))
     assert alive.hint == ("evict it instead" if evictable else "end its program: it is pinned")
     for action, target in (
         ("unpin", lease), ("evict", waiter), ("release_dead", waiter), ("pin", "nobody"), ("unpin", "L9-9"),
     ):  # fmt: skip
-        refused = [effect for effect in ask(ops, action, target) if isinstance(effect, Refuse)]
+        refused = [effect for effect in order_of(ops, action, target) if isinstance(effect, Refuse)]
         assert all(effect.message and effect.hint for effect in refused), action
         assert len(refused) == 1, action
 
 
 # -- pins --------------------------------------------------------------------------------------------------------------
 def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = held(driver, "det", 5 * GIB)
+    _, lease = held_bytes(driver, "det", 5 * GIB)
     vlm = driver.consumer("vlm")
     waiting = vlm.acquire(3 * GIB)
     assert driver.state(lease) == "revoking"
-    assert refusal(ask(ops, "pin", lease)).code == "bad_state", (
+    assert refusal(order_of(ops, "pin", lease)).code == "bad_state", (
         "it was asked to leave before the pin"
     )
     vlm.cancel(waiting)
 
     other = CoreDriver(8 * GIB)
     operator = other.consumer("ops")
-    _, lease = held(other, "det", 5 * GIB, min_residency_s=1.0)
+    _, lease = held_bytes(other, "det", 5 * GIB, min_residency_s=1.0)
     policy = other.consumer("policy")
     waiting = policy.acquire(4 * GIB)
-    ask(operator, "pin", lease, "demo for the press")
+    order_of(operator, "pin", lease, "demo for the press")
     other.advance(5.0)
     assert other.state(lease) == "held"
     assert other.state(waiting) == "queued"
@@ -179,7 +179,7 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     view = other.view(lease)
     assert view is not None
     assert (view["evictable"], view["pinned"]) == (False, f"{BY}: demo for the press")
-    ask(operator, "unpin", lease, "")
+    order_of(operator, "unpin", lease, "")
     assert other.state(lease) == "revoking"
     assert other.notes("operator")[-1]["action"] == "unpin"
 
@@ -187,19 +187,19 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
 def test_a_request_that_a_pin_is_in_the_way_of_waits_for_the_unpin(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    _, lease = held(driver, "det", 5 * GIB)
-    ask(ops, "pin", lease)
+    _, lease = held_bytes(driver, "det", 5 * GIB)
+    order_of(ops, "pin", lease)
     waiter = driver.consumer("policy").acquire(4 * GIB)
     driver.advance(10.0)
     assert (driver.state(waiter), driver.state(lease)) == ("queued", "held")
-    ask(ops, "unpin", lease, "")
+    order_of(ops, "unpin", lease, "")
     assert driver.state(lease) == "revoking"
 
 
 def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consumer) -> None:
-    det, _ = held(driver, "det", 5 * GIB, min_residency_s=100.0)
+    det, _ = held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
     waiting = driver.consumer("policy").acquire(4 * GIB)
-    ask(ops, "pin", waiting)
+    order_of(ops, "pin", waiting)
     view = driver.view(waiting)
     assert view is not None
     assert view["pinned"].startswith(BY)
@@ -207,15 +207,15 @@ def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consu
 
 
 def test_only_an_operators_pin_is_undone(driver: CoreDriver, ops: Consumer) -> None:
-    _, mine = held(driver, "det", 1 * GIB, evictable=False)
-    _, free = held(driver, "vlm", 1 * GIB)
-    assert "own to change" in refusal(ask(ops, "unpin", mine)).hint
-    assert refusal(ask(ops, "unpin", free)).hint == "nothing to undo"
+    _, mine = held_bytes(driver, "det", 1 * GIB, evictable=False)
+    _, free = held_bytes(driver, "vlm", 1 * GIB)
+    assert "own to change" in refusal(order_of(ops, "unpin", mine)).hint
+    assert refusal(order_of(ops, "unpin", free)).hint == "nothing to undo"
 
 
 def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5 * GIB)
-    ask(ops, "pin", lease, "why not")
+    det, lease = held_bytes(driver, "det", 5 * GIB)
+    order_of(ops, "pin", lease, "why not")
     token = det.token(lease)
     driver.restart()
     det.connect()
@@ -229,24 +229,24 @@ def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
 def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    _, lease = held(driver, "det", 3 * GIB)
-    assert answer(ask(ops, "drain", reason="new driver"))["drained"] == f"{BY}: new driver"
+    _, lease = held_bytes(driver, "det", 3 * GIB)
+    assert answer(order_of(ops, "drain", reason="new driver"))["drained"] == f"{BY}: new driver"
     waiting = driver.consumer("vlm").acquire(1 * GIB)
     driver.advance(20.0)
     assert (driver.state(lease), driver.state(waiting)) == ("held", "queued")
     assert driver.arbiter.status(driver.now)["drained"] == f"{BY}: new driver"
     assert "drained by" in driver.arbiter.why("vlm", driver.now)["leases"][0]["next"]
-    assert answer(ask(ops, "resume", reason=""))["drained"] == ""
+    assert answer(order_of(ops, "resume", reason=""))["drained"] == ""
     driver.until(lambda: driver.state(waiting) == "loading")
-    assert answer(ask(ops, "resume"))["drained"] == "", "resuming what is not drained is fine"
+    assert answer(order_of(ops, "resume"))["drained"] == "", "resuming what is not drained is fine"
 
 
 @pytest.mark.parametrize("with_lease", [True, False])
 def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lease: bool) -> None:
     if with_lease:
-        det, lease = held(driver, "det", 3 * GIB)
+        det, lease = held_bytes(driver, "det", 3 * GIB)
         token = det.token(lease)
-    ask(ops, "drain", reason="new driver")
+    order_of(ops, "drain", reason="new driver")
     driver.restart()
     assert driver.arbiter.status(driver.now)["drained"] == f"{BY}: new driver"
     if with_lease:
@@ -256,7 +256,7 @@ def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lea
     waiting = driver.consumer("vlm").acquire(1 * GIB)
     driver.advance(20.0)
     assert driver.state(waiting) == "queued"
-    ask(ops, "resume")
+    order_of(ops, "resume")
     assert "drain" not in driver.journal
     driver.until(lambda: driver.state(waiting) == "loading")
 
@@ -265,11 +265,11 @@ def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lea
 def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
-    refused = refusal(ask(ops, "release_dead", lease))
+    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=600.0)
+    refused = refusal(order_of(ops, "release_dead", lease))
     assert "not dead" in refused.message
     driver.advance(450.0)
-    assert answer(ask(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
+    assert answer(order_of(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
     (lost,) = driver.pushes("lost", lease)
     assert lost["error"]["code"] == "lease_expired"
     assert "hangs since noon" in lost["error"]["message"]
@@ -281,16 +281,16 @@ def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
 
 
 def test_a_lease_in_use_is_never_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
+    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=600.0)
     det.use_begin(lease)
     driver.advance(450.0)
-    assert "in use" in refusal(ask(ops, "release_dead", lease)).message
+    assert "in use" in refusal(order_of(ops, "release_dead", lease)).message
 
 
 def test_a_waiter_has_nothing_to_be_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    held(driver, "det", 5 * GIB, min_residency_s=100.0)
+    held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
     waiting = driver.consumer("policy").acquire(4 * GIB)
-    assert refusal(ask(ops, "release_dead", waiting)).code == "bad_state"
+    assert refusal(order_of(ops, "release_dead", waiting)).code == "bad_state"
 
 
 def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
@@ -298,10 +298,10 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 ) -> None:
     """Regression: recovery ended with the verdict on a declared-dead holder and not with its lease,
     so all requests waited."""
-    det, lease = held(driver, "det", 5 * GIB, ttl_s=600.0)
+    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=600.0)
     driver.restart()
     ops.connect()
-    ask(ops, "release_dead", lease, "it was a crash")
+    order_of(ops, "release_dead", lease, "it was a crash")
     assert driver.arbiter.status(driver.now)["phase"] == "serving", (
         "its bytes are a debt: others wait for nothing"
     )
@@ -318,10 +318,10 @@ def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itsel
     """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps until then is no mere residue."""
     driver = CoreDriver(8 * GIB)
     ops = driver.consumer("ops")
-    det, lease = held(driver, "det", 5 * GIB, ttl_s=30.0)
+    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=30.0)
     driver.restart()
     ops.connect()
-    ask(ops, "release_dead", lease, "frozen")
+    order_of(ops, "release_dead", lease, "frozen")
     if restarts == 2:
         driver.restart(epoch=3)
     waiter = driver.consumer("policy").acquire(1 * GIB, exclusive=True)
@@ -346,10 +346,10 @@ def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fenc
     driver: CoreDriver, ops: Consumer
 ) -> None:
     """What it holds beyond its context is less than a reading can be off: its bytes are "gone" while all of them are there."""
-    det, lease = held(driver, "det", 500 * MIB, residue_bytes=450 * MIB, ttl_s=10.0)
+    det, lease = held_bytes(driver, "det", 500 * MIB, residue_bytes=450 * MIB, ttl_s=10.0)
     driver.restart()
     ops.connect()
-    ask(ops, "release_dead", lease, "frozen")
+    order_of(ops, "release_dead", lease, "frozen")
     waiter = driver.consumer("policy").acquire(1 * GIB, exclusive=True)
     took = driver.until(lambda: driver.state(waiter) == "loading")
     assert 14.9 <= took <= 15.1, "its ttl, and the grace"
@@ -365,7 +365,7 @@ def test_who_is_given_up_while_it_loads_may_load_on_until_it_fences_itself(
     lease = det.acquire(5 * GIB, ttl_s=60.0)
     driver.until(lambda: driver.state(lease) == "loading")
     driver.advance(45.0)
-    ask(ops, "release_dead", lease, "frozen")
+    order_of(ops, "release_dead", lease, "frozen")
     given_up = driver.now
     driver.until(lambda: driver.gpu()["charged_bytes"] == 0)
     assert 20.0 <= driver.now - given_up <= 20.2, "15 s of its time, 5 s of grace"

@@ -17,7 +17,9 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
 GIB, MIB = d.GIB, d.MIB
 
 
-def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId, Token]:
+def held_with_token(
+    driver: CoreDriver, name: str, gib: float, **spec: Any
+) -> tuple[Consumer, LeaseId, Token]:
     person = driver.consumer(name)
     lease = person.acquire(int(gib * GIB), **spec)
     driver.until(lambda: driver.state(lease) == "loading")
@@ -29,7 +31,7 @@ def held(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consum
 
 def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
+    det, lease, token = held_with_token(driver, "det", 5)
     driver.restart()
     assert driver.arbiter.status(driver.now)["phase"] == "recovering"
     assert driver.gpu()["charged_bytes"] == 5 * GIB
@@ -54,7 +56,7 @@ def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
 
 def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
+    det, lease, token = held_with_token(driver, "det", 5)
     det.use_begin(lease, "over")
     det.use_begin(lease, "runs")
     det.client = ClientId(
@@ -76,7 +78,7 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
 def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> None:
     """Regression: after a restart the users may be back before the holder, whose list knows only its own uses."""
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
+    det, lease, token = held_with_token(driver, "det", 5)
     runner = driver.consumer("runner")
     driver.restart()
     second = ClientId("second")  # another connection of the holder's process
@@ -100,7 +102,7 @@ def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> N
 
 def test_wrong_tokens_and_wrong_processes_are_not_kept() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
+    det, lease, token = held_with_token(driver, "det", 5)
     thief = driver.consumer("thief")
     spec = det.specs[lease]
     assert (
@@ -128,7 +130,7 @@ def test_a_ready_that_was_lost_with_the_daemon_is_made_up_for() -> None:
 
 def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
     driver = CoreDriver(8 * GIB)
-    _, lease, _ = held(driver, "det", 5, ttl_s=10.0)
+    _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
     driver.restart()
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(14.9)
@@ -143,7 +145,7 @@ def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
 def test_whoever_has_not_come_back_is_named() -> None:
     driver = CoreDriver(8 * GIB)
     for n in range(5):
-        held(driver, f"m{n}", 1)
+        held_with_token(driver, f"m{n}", 1)
     driver.restart()
     told = str(driver.gpu()["blocked"])
     assert told.startswith("recovering after a restart: m0 (pid ")
@@ -158,7 +160,7 @@ def test_whoever_has_not_come_back_is_named() -> None:
 
 def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, _ = held(driver, "det", 5)
+    det, lease, _ = held_with_token(driver, "det", 5)
     driver.restart()
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.card.lag_s = 0.5
@@ -173,7 +175,7 @@ def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> No
 def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
     """A reading that says that the card is empty may lie, and a model may sleep in host RAM. Nobody has to be waited for there, that is all."""
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5, ttl_s=10.0)
+    det, lease, token = held_with_token(driver, "det", 5, ttl_s=10.0)
     loader = driver.consumer("loader")
     loading = loader.acquire(1 * GIB)
     driver.until(lambda: driver.state(loading) == "loading")
@@ -198,7 +200,7 @@ def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
 
 def test_who_does_not_come_back_to_an_empty_card_is_given_up_in_time() -> None:
     driver = CoreDriver(8 * GIB)
-    _, lease, _ = held(driver, "det", 5, ttl_s=10.0)
+    _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
     driver.card.held.clear()
     driver.restart()
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -212,8 +214,8 @@ def test_who_does_not_come_back_to_an_empty_card_is_given_up_in_time() -> None:
 
 def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
-    vlm, other, _ = held(driver, "vlm", 2)
+    det, lease, token = held_with_token(driver, "det", 5)
+    vlm, other, _ = held_with_token(driver, "vlm", 2)
     driver.restart()
     det.connect()
     det.reattach(lease, token)
@@ -229,8 +231,8 @@ def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer
 def test_verifications_and_debts_go_on_after_the_restart() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 3.0
-    det, lease, token = held(driver, "det", 4, residue_bytes=450 * MIB)
-    vlm, other, _ = held(driver, "vlm", 2)
+    det, lease, token = held_with_token(driver, "det", 4, residue_bytes=450 * MIB)
+    vlm, other, _ = held_with_token(driver, "vlm", 2)
     driver.card.set(driver.consumer("x").process, 200 * MIB, driver.now)
     det.unload(lease)
     vlm.die()
@@ -265,7 +267,7 @@ def test_a_debt_keeps_its_fence_grace_over_a_restart() -> None:
 
 def test_a_lost_journal_believes_holders_for_a_while() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
+    det, lease, token = held_with_token(driver, "det", 5)
     loader = driver.consumer("loader")
     loading = loader.acquire(2 * GIB)
     driver.until(lambda: driver.state(loading) == "loading")
@@ -298,7 +300,7 @@ def test_a_lost_journal_believes_holders_for_a_while() -> None:
 
 def test_adopting_more_than_the_card_has_is_pressure_not_a_crash() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, token = held(driver, "det", 5)
+    det, lease, token = held_with_token(driver, "det", 5)
     driver.restart(keep_journal=False)
     liar = driver.consumer("liar")
     det.connect()
@@ -314,7 +316,7 @@ def test_a_lease_that_shrank_just_before_the_restart_is_not_taken_for_gone() -> 
     had gone."""
     driver = CoreDriver(8 * GIB)
     driver.card.lists_processes = False
-    det, lease, token = held(driver, "det", 1)
+    det, lease, token = held_with_token(driver, "det", 1)
     small = 330 * MIB  # as much as an empty card may show
     det.hold(small)
     det.resize(lease, small)
@@ -351,7 +353,7 @@ def test_records_of_a_card_that_is_gone_are_dropped() -> None:
 
 def test_a_reading_from_before_the_restart_voids_nothing() -> None:
     driver = CoreDriver(8 * GIB)
-    _, lease, _ = held(driver, "det", 5)
+    _, lease, _ = held_with_token(driver, "det", 5)
     records = dict(driver.journal)
     driver = CoreDriver(8 * GIB, start=False)
     driver.post(Recovered(records))
@@ -362,7 +364,7 @@ def test_a_reading_from_before_the_restart_voids_nothing() -> None:
 
 def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease, _ = held(driver, "det", 5)
+    det, lease, _ = held_with_token(driver, "det", 5)
     other = driver.consumer("other")
     driver.card.set(other.process, 1 * GIB, driver.now)
     driver.advance(1.5)
@@ -383,7 +385,7 @@ def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> Non
 def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
     """They used to break the invariant on bytes at the start, and the whole journal was put aside for it."""
     driver = CoreDriver(8 * GIB)
-    _, lease, _ = held(driver, "det", 5)
+    _, lease, _ = held_with_token(driver, "det", 5)
     records = dict(driver.journal)
     other = driver.consumer("other")
     stale = {"gpu": "GPU-0", "pid": other.process.pid, "start_ticks": other.process.start_ticks}
@@ -409,8 +411,8 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
 def test_records_of_sub_leases_come_back_as_plain_leases() -> None:
     """Version 0.1 carved leases out of others. Each is charged its own bytes until it reattaches, or is measured gone."""
     driver = CoreDriver(8 * GIB)
-    runner, root, _ = held(driver, "runner", 1, exclusive=False)
-    policy, leaf, token = held(driver, "policy", 4)
+    runner, root, _ = held_with_token(driver, "runner", 1, exclusive=False)
+    policy, leaf, token = held_with_token(driver, "policy", 4)
     parent, child = f"lease:{root}", f"lease:{leaf}"
     estate = {
         "booked_bytes": 5 * GIB,

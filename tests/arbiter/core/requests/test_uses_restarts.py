@@ -36,7 +36,7 @@ def restarted(
     sidecar.reattach(lease, token)
 
 
-def live(
+def live_on(
     driver: CoreDriver, sidecar: Consumer, lease: LeaseId, token: Token, seconds: float
 ) -> None:
     """Time passes, and the holder renews its lease."""
@@ -63,14 +63,14 @@ def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder() -> None:
     )
     assert shown(driver, lease)["uses"] == 1
     vlm = driver.consumer("vlm").acquire(5 * GIB, priority=90)
-    live(driver, sidecar, lease, token, PATIENCE_S - 1.0)
+    live_on(driver, sidecar, lease, token, PATIENCE_S - 1.0)
     assert driver.state(vlm) == "queued"
     assert refusal(sidecar.unloading(lease)).details["uses"] == 1, "not at a safe point"
     runner.connect()
     assert answer(runner.use_begin(lease, "goal", token))["uses"] == 1, "it is the same use"
     told = driver.notes("use_began")[-1]
     assert (told["label"], told["resumed"], told["uses"]) == ("grab", True, 1)
-    live(driver, sidecar, lease, token, 2 * PATIENCE_S)
+    live_on(driver, sidecar, lease, token, 2 * PATIENCE_S)
     assert shown(driver, lease)["uses"] == 1, "it was said again: its bound is that of any use"
     before = len(driver.notes("use_began"))
     runner.use_begin(lease, "goal", token)
@@ -109,7 +109,7 @@ def test_a_user_that_does_not_come_back_is_waited_for_as_long_as_a_silent_holder
     began = driver.now - 0.01
     sidecar.connect()
     sidecar.reattach(lease, token)
-    live(driver, sidecar, lease, token, began + patience_s - 0.001 - driver.now)
+    live_on(driver, sidecar, lease, token, began + patience_s - 0.001 - driver.now)
     assert shown(driver, lease)["uses"] == 1
     driver.advance(0.001)
     assert shown(driver, lease)["uses"] == 0
@@ -129,7 +129,7 @@ def test_only_the_user_that_did_not_come_back_is_given_up() -> None:
     runner.connect()
     runner.use_begin(lease, "goal", token)
     sidecar.use_begin(lease, "own", token)
-    live(driver, sidecar, lease, token, PATIENCE_S)
+    live_on(driver, sidecar, lease, token, PATIENCE_S)
     assert [note["use_id"] for note in driver.notes("use_ended")] == ["watch"]
     assert shown(driver, lease)["uses"] == 2
     assert writes(driver.effects)[-1] == ["goal"]
@@ -139,9 +139,9 @@ def test_a_suspend_after_the_restart_gives_the_user_its_whole_time_anew() -> Non
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, _ = used(driver)
     restarted(driver, sidecar, lease, token)
-    live(driver, sidecar, lease, token, PATIENCE_S - 1.0)
+    live_on(driver, sidecar, lease, token, PATIENCE_S - 1.0)
     driver.post(Resumed(3600.0))
-    live(driver, sidecar, lease, token, PATIENCE_S - 0.001)
+    live_on(driver, sidecar, lease, token, PATIENCE_S - 0.001)
     assert shown(driver, lease)["uses"] == 1
     driver.advance(0.001)
     assert shown(driver, lease)["uses"] == 0
@@ -165,7 +165,7 @@ def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
     restarted(driver, sidecar, lease, token, epoch=3)
     assert shown(driver, lease)["uses"] == 2
     driver.post(ProcessDied(runner.process))
-    live(driver, sidecar, lease, token, PATIENCE_S)
+    live_on(driver, sidecar, lease, token, PATIENCE_S)
     assert answer(sidecar.unload(lease))["next"] == "standby"
 
 

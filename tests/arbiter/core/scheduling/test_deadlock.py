@@ -41,7 +41,7 @@ def links(refused: Refuse) -> list[tuple[str, list[str], list[str]]]:
     ]
 
 
-def asked(effects: list[Effect]) -> list[Any]:
+def revokes_in(effects: list[Effect]) -> list[Any]:
     return [e for e in effects if getattr(e, "body", {}).get("push") == "revoke"]
 
 
@@ -57,7 +57,7 @@ def test_who_uses_what_is_in_his_way_is_told_at_once(driver: CoreDriver) -> None
         in refused.message
     )
     assert "`yield`" in refused.hint
-    assert not asked(effects), "nobody is asked to leave in vain"
+    assert not revokes_in(effects), "nobody is asked to leave in vain"
     assert driver.state(lease) == "held"
     assert [n["code"] for n in driver.notes("denied")] == ["would_deadlock"]
 

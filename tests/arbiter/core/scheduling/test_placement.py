@@ -37,12 +37,12 @@ def test_a_card_whose_pin_ended_is_a_place_for_who_waits(two_gpus: CoreDriver, e
         keeper.unload(pinned)
         two_gpus.until(lambda: two_gpus.state(pinned) == "over")
         keeper, pinned = held(two_gpus, "another", 6, gpu="1")
-        order(two_gpus, "pin", pinned)
+        order_lease(two_gpus, "pin", pinned)
     waiter = two_gpus.consumer("w").acquire(5 * GIB)
     two_gpus.advance(1.0)
     assert two_gpus.state(waiter) == "queued"
     if end == "unpin":
-        order(two_gpus, "unpin", pinned)
+        order_lease(two_gpus, "unpin", pinned)
         two_gpus.until(lambda: two_gpus.state(pinned) == "revoking", limit_s=1.0)
     if end == "death":
         keeper.die()
@@ -54,7 +54,7 @@ def test_a_card_whose_pin_ended_is_a_place_for_who_waits(two_gpus: CoreDriver, e
     assert late is None or two_gpus.state(late) == "queued", "who came first is first there too"
 
 
-def order(two_gpus: CoreDriver, action: str, lease: LeaseId) -> None:
+def order_lease(two_gpus: CoreDriver, action: str, lease: LeaseId) -> None:
     ops = two_gpus.consumer("ops")
     two_gpus.post(OperatorAsked(ops.client, two_gpus.next_request(), action, lease, "ops", "test"))
 

@@ -17,7 +17,7 @@ def waiter(arrival: int, at: float, priority: int = 50, need: int = 10) -> Lease
     )
 
 
-def order(queue: WaitQueue) -> list[int]:
+def arrivals(queue: WaitQueue) -> list[int]:
     return [lease.request.arrival for lease in queue]
 
 
@@ -30,7 +30,7 @@ def test_priority_then_arrival() -> None:
         waiter(4, 0.2, priority=40),
     ):
         queue.add(lease)
-    assert order(queue) == [3, 1, 2, 4]
+    assert arrivals(queue) == [3, 1, 2, 4]
     assert [lease.request.arrival for lease in queue.behind_head()] == [1, 2, 4]
 
 
@@ -38,9 +38,9 @@ def test_ageing_bounds_the_wait_behind_higher_priorities() -> None:
     queue = WaitQueue(5.0)
     queue.add(old := waiter(1, 0.0, priority=50))
     queue.add(waiter(2, 40.0, priority=60))
-    assert order(queue) == [2, 1], "ten points are worth 50 s"
+    assert arrivals(queue) == [2, 1], "ten points are worth 50 s"
     queue.add(waiter(3, 60.0, priority=60))
-    assert order(queue) == [2, 1, 3]
+    assert arrivals(queue) == [2, 1, 3]
     assert queue.position(old) == 2
     assert queue.ahead_of(old) == "L1-2"
     head = queue.head()

@@ -13,7 +13,7 @@ GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 
 
-def held(
+def held_after_peak(
     driver: CoreDriver, name: str, gib: float, *, peak_gib: float = 0, **spec: Any
 ) -> tuple[Consumer, LeaseId]:
     person = driver.consumer(name)
@@ -46,7 +46,7 @@ def stuck(gib: float = 5, by: float = 4, *, lists: bool = True) -> tuple[CoreDri
 def test_small_ones_pass_a_head_that_waits_for_a_stowaway(lists: bool) -> None:
     """Regression: everybody behind it waited until the stowaway had gone, beside 3.6 GiB that were free."""
     driver, head = stuck(lists=lists)
-    small, lease = held(driver, "small", 2)
+    small, lease = held_after_peak(driver, "small", 2)
     small.use_begin(lease)
     assert driver.state(head) == "queued"
     stowaway(driver, 0)
@@ -57,7 +57,7 @@ def test_small_ones_pass_a_head_that_waits_for_a_stowaway(lists: bool) -> None:
 def test_what_the_head_will_need_is_kept_for_it() -> None:
     """5 + 2.5 fit the 7.6 GiB, a second one of 2 GiB would not, though there are free bytes for it now."""
     driver, head = stuck(by=3)
-    held(driver, "small", 2.5)
+    held_after_peak(driver, "small", 2.5)
     late = driver.consumer("late").acquire(2 * GIB)
     driver.advance(5.0)
     assert driver.state(late) == "queued"
@@ -68,7 +68,7 @@ def test_what_the_head_will_need_is_kept_for_it() -> None:
 def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room() -> None:
     """It fits beside the stowaway once the holder has gone: what comes back of the stowaway is not counted on."""
     driver = CoreDriver(8 * GIB)
-    busy, lease = held(driver, "busy", 4, priority=90)
+    busy, lease = held_after_peak(driver, "busy", 4, priority=90)
     busy.use_begin(lease)
     stowaway(driver, 2)
     head = driver.consumer("head").acquire(5 * GIB)
@@ -85,7 +85,7 @@ def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
     """The stowaway may give back a part: enough for the head alone, and then nobody could make room for it."""
     driver, head = stuck()
     pinned = driver.consumer("pinned").acquire(2 * GIB, evictable=False)
-    _, other = held(driver, "other", 1)
+    _, other = held_after_peak(driver, "other", 1)
     driver.advance(2.0)
     assert (driver.state(pinned), driver.state(head)) == ("queued", "queued")
     assert driver.state(other) == "held", "those behind it pass both"
@@ -93,8 +93,8 @@ def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
 
 def test_a_growth_passes_if_its_lease_may_be_asked() -> None:
     driver = CoreDriver(8 * GIB)
-    first, lease = held(driver, "first", 1)
-    second, pinned = held(driver, "second", 1, evictable=False)
+    first, lease = held_after_peak(driver, "first", 1)
+    second, pinned = held_after_peak(driver, "second", 1, evictable=False)
     stowaway(driver, 3)
     head = driver.consumer("head").acquire(5 * GIB)
     driver.advance(0.1)
@@ -127,7 +127,7 @@ def test_with_no_backfill_nobody_passes() -> None:
 def test_of_a_stowaway_that_gives_back_a_part_the_head_gets_it_all() -> None:
     """It fits beside what is left of the stowaway, not beside who passed it: that one is asked."""
     driver, head = stuck()
-    small, lease = held(driver, "small", 2)
+    small, lease = held_after_peak(driver, "small", 2)
     stowaway(driver, 2)
     driver.until(lambda: driver.state(lease) == "revoking", limit_s=1.0)
     later = driver.consumer("later").acquire(GIB)
@@ -162,7 +162,7 @@ def test_the_ageing_bound_holds_against_those_who_passed() -> None:
 def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -> None:
     draw = random.Random(seed)
     driver = CoreDriver(8 * GIB)
-    keeper, kept = held(driver, "keeper", 1, residue_bytes=draw.choice([0, 300 * MIB]))
+    keeper, kept = held_after_peak(driver, "keeper", 1, residue_bytes=draw.choice([0, 300 * MIB]))
     if draw.random() < 0.5:
         keeper.unload(kept)
         driver.until(lambda: driver.state(kept) == "over")
@@ -200,12 +200,12 @@ def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -
 def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
     """7.4 GiB do not fit beside the context of a process that lives on; when it ends, both do."""
     driver = CoreDriver(8 * GIB)
-    old, lease = held(driver, "old", 2, residue_bytes=500 * MIB)
+    old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
     head = driver.consumer("head").acquire(int(7.4 * GIB))
     too_big = driver.consumer("big").acquire(GIB)
-    held(driver, "small", 0.2)
+    held_after_peak(driver, "small", 0.2)
     assert (driver.state(head), driver.state(too_big)) == ("queued", "queued")
     old.die()
     driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
@@ -214,7 +214,7 @@ def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
 def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 1.0
-    old, lease = held(driver, "old", 2, residue_bytes=500 * MIB)
+    old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
     head = driver.consumer("head").acquire(int(7.4 * GIB))
@@ -235,7 +235,7 @@ def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
     driver.advance(0.1)
     assert driver.state(head) == "queued"
     too_big = driver.consumer("big").acquire(2 * GIB)
-    _, small = held(driver, "small", 1.5)
+    _, small = held_after_peak(driver, "small", 1.5)
     driver.advance(1.0)
     assert (driver.state(too_big), driver.state(small)) == ("queued", "held")
     stowaway(driver, 0)
@@ -245,8 +245,8 @@ def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
 def test_a_growing_lease_does_not_free_itself() -> None:
     """Regression: what a waiter behind a growth may take was counted as if the lease that grows left for it."""
     driver = CoreDriver(8 * GIB)
-    a, grows = held(driver, "a", 3)
-    b, busy = held(driver, "b", 2, priority=90)
+    a, grows = held_after_peak(driver, "a", 3)
+    b, busy = held_after_peak(driver, "b", 2, priority=90)
     a.use_begin(grows)
     b.use_begin(busy)
     a.resize(grows, 6 * GIB)
@@ -262,8 +262,8 @@ def test_a_growing_lease_does_not_free_itself() -> None:
 def away() -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
     """Three are on standby, the one that loads with 5 GiB left first, and a stowaway of 4 GiB came as the one went that they left for."""
     driver = CoreDriver(8 * GIB)
-    people = [held(driver, "large", 4.5, peak_gib=5, standby=True)]
-    people += [held(driver, name, 1.5, standby=True) for name in ("small", "late")]
+    people = [held_after_peak(driver, "large", 4.5, peak_gib=5, standby=True)]
+    people += [held_after_peak(driver, name, 1.5, standby=True) for name in ("small", "late")]
     policy = driver.consumer("policy")
     wanted = policy.acquire(int(7.5 * GIB))
     for person, lease in people:
@@ -296,7 +296,7 @@ def test_standby_returns_beside_one_that_waits_for_a_stowaway() -> None:
 def unplanned() -> tuple[CoreDriver, Consumer, LeaseId, LeaseId]:
     """A head of 5 GiB that may not ask the only holder, of 3: in use, of a higher priority."""
     driver = CoreDriver(8 * GIB)
-    busy, lease = held(driver, "busy", 3, priority=90)
+    busy, lease = held_after_peak(driver, "busy", 3, priority=90)
     busy.use_begin(lease)
     head = driver.consumer("head").acquire(5 * GIB)
     return driver, busy, lease, head
@@ -305,7 +305,7 @@ def unplanned() -> tuple[CoreDriver, Consumer, LeaseId, LeaseId]:
 def test_those_who_passed_are_no_room_for_the_next_to_pass() -> None:
     """Regression: each fitted beside the head, both together did not, and the head had to ask them."""
     driver, busy, lease, head = unplanned()
-    held(driver, "first", 2)
+    held_after_peak(driver, "first", 2)
     second = driver.consumer("second").acquire(2 * GIB)
     driver.advance(3.0)
     assert driver.state(second) == "queued", "5 + 2 + 2 do not fit"
@@ -317,10 +317,10 @@ def test_those_who_passed_are_no_room_for_the_next_to_pass() -> None:
 
 def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
     driver = CoreDriver(8 * GIB)
-    _, low = held(driver, "low", 2, priority=10, min_residency_s=10.0)
+    _, low = held_after_peak(driver, "low", 2, priority=10, min_residency_s=10.0)
     driver.advance(0.1)
     head = driver.consumer("head").acquire(6 * GIB)
-    _, small = held(driver, "small", 1.5)
+    _, small = held_after_peak(driver, "small", 1.5)
     assert (driver.state(low), driver.state(head), driver.state(small)) == (
         "held",
         "queued",

@@ -40,7 +40,7 @@ def granted(client: WireClient, name: str, size: int, **spec: Any) -> dict[str, 
     return {"lease_id": lease["lease_id"], "token": lease["token"]}
 
 
-def held(client: WireClient, nvml: NvmlStub, size: int) -> dict[str, Any]:
+def held_here(client: WireClient, nvml: NvmlStub, size: int) -> dict[str, Any]:
     """This very process holds a lease and its bytes."""
     on = granted(client, "holder", size)
     nvml.card(size)
@@ -86,7 +86,7 @@ def test_a_cycle_with_release_lag(
     assert (card["gpu"], card["name"]) == ("GPU-stub-0", "NVIDIA Stub")
     assert card["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
     assert client.ask("subscribe")["ok"]
-    on = held(client, nvml, 5 * GIB)
+    on = held_here(client, nvml, 5 * GIB)
     let_go(
         client, nvml, on, 5 * GIB, f"process 0 compute {ME} {5 * GIB}"
     )  # the driver takes its time
@@ -110,7 +110,7 @@ def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
     client: WireClient, nvml: NvmlStub
 ) -> None:
     assert client.ask("subscribe")["ok"]
-    on = held(client, nvml, 5 * GIB)
+    on = held_here(client, nvml, 5 * GIB)
     let_go(client, nvml, on, 0, "hang memory")
     assert "no answer within 0.4 s" in event(client, "probe_failed")["reason"]
     assert event(client, "verified")["verdict"] == "stale"
@@ -144,7 +144,7 @@ def test_bytes_that_stay_are_charged_to_the_process_that_holds_them(
     client: WireClient, nvml: NvmlStub
 ) -> None:
     assert client.ask("subscribe")["ok"]
-    on = held(client, nvml, 5 * GIB)
+    on = held_here(client, nvml, 5 * GIB)
     let_go(client, nvml, on, 2 * GIB, f"process 0 compute {ME} {2 * GIB}")
     verdict = event(client, "verified")
     assert (verdict["verdict"], verdict["culprits"][0]["pid"]) == ("residue", ME)

@@ -49,7 +49,7 @@ LOST = """
 """
 
 
-def ask(stub: NvmlStub, code: str, text: str = "") -> Any:
+def answer_of_child(stub: NvmlStub, code: str, text: str = "") -> Any:
     """What a child process prints as JSON that runs `code` with the stub's library."""
     done = subprocess.run(
         [sys.executable, "-c", "import json, os, sys\n" + textwrap.dedent(code)],
@@ -70,7 +70,7 @@ def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
         f"card GPU-stub-a {24 * GIB} {512 * MIB} 0",
     ]
     nvml.write()
-    said = ask(nvml, READ)
+    said = answer_of_child(nvml, READ)
     assert said["cards"] == [
         ["GPU-stub-b", 0, "NVIDIA Stub", 8 * GIB - 256 * MIB, 256 * MIB],
         ["GPU-stub-a", 1, "NVIDIA Stub", 24 * GIB - 512 * MIB, 512 * MIB],
@@ -82,7 +82,7 @@ def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
 def test_a_driver_without_memory_v2_counts_its_reserve_as_used(nvml: NvmlStub, code: int) -> None:
     nvml.card(GIB)
     nvml.write(f"error memory_v2 {code}")
-    said = ask(nvml, READ)
+    said = answer_of_child(nvml, READ)
     assert (said["used"], said["total"]) == (GIB + 256 * MIB, 8 * GIB)
 
 
@@ -95,7 +95,7 @@ def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml:
         "process 0 compute 4194301 na",
         "process 0 graphics 4194302 7",
     )
-    mine, unknown, other = ask(nvml, READ)["processes"]
+    mine, unknown, other = answer_of_child(nvml, READ)["processes"]
     assert (mine[0], mine[2]) == (me, 2 * GIB)
     assert mine[1] > 0, "seen from here: with its start time"
     assert unknown == [4194301, 0, None], "all ones is N/A, not 16 EiB"
@@ -105,7 +105,7 @@ def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml:
 def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> None:
     nvml.card(GIB)
     nvml.write("error compute 3")
-    said = ask(nvml, READ)
+    said = answer_of_child(nvml, READ)
     assert (said["used"], said["processes"]) == (GIB, None)
 
 
@@ -124,7 +124,7 @@ def test_what_cannot_be_served_is_a_typed_error(
 ) -> None:
     nvml.card(0, more=more)
     nvml.write(*lines)
-    name, message, hint = ask(nvml, REFUSED)
+    name, message, hint = answer_of_child(nvml, REFUSED)
     assert (name, words in message) == (error, True), message
     assert hint
 
@@ -132,13 +132,13 @@ def test_what_cannot_be_served_is_a_typed_error(
 def test_no_card_at_all(nvml: NvmlStub) -> None:
     nvml.cards = []
     nvml.write()
-    assert ask(nvml, REFUSED)[0] == "NoGpu"
+    assert answer_of_child(nvml, REFUSED)[0] == "NoGpu"
 
 
 def test_a_card_that_was_lost_is_read_again_after_the_driver_came_back(nvml: NvmlStub) -> None:
     """Every card failed, so everything is opened anew; a driver that is away meanwhile is one more failed reading."""
     card = f"card GPU-stub-0 {8 * GIB} 0"
-    said = ask(
+    said = answer_of_child(
         nvml,
         LOST,
         f"{card} 1\n{card} 2;error memory 15\n{card} 3;error init 9\ncard GPU-other {GIB} 0 4\n{card} 5\n{card} 6\n",

@@ -14,7 +14,7 @@ from vram_arbiter.schemas.runtime.telemetry.exported import (
     text,
 )
 
-from .test_setup import needs_sdk, run
+from .test_setup import needs_sdk, run_program
 
 HALF = "half a pair: \ud800"
 
@@ -88,7 +88,7 @@ def test_half_a_surrogate_pair_costs_no_other_span_and_no_metric() -> None:
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
             "OTEL_RESOURCE_ATTRIBUTES": "site=l\udcfcbeck",
         }
-        result = run(PROGRAM, environ)
+        result = run_program(PROGRAM, environ)
         assert (result.returncode, result.stderr) == (0, "")
         sent = "half a pair: \\ud800"
         assert [span.name for span in collector.spans()] == ["good", sent, "failed"]

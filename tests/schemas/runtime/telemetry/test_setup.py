@@ -24,7 +24,7 @@ needs_sdk = pytest.mark.skipif(
 BASE = "http://collector:4318"
 
 
-def run(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+def run_program(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
     """In a process of its own: an SDK is installed once per process."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OTEL_")}
     return subprocess.run(
@@ -109,7 +109,7 @@ def test_the_prometheus_endpoint_stays_on_loopback(environ: Mapping[str, str], w
     ],
 )
 def test_an_exporter_that_cannot_be_made_is_named(environ: dict[str, str], words: str) -> None:
-    said = run(
+    said = run_program(
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.errors import ConfigError\n"
         "try: o.set_up('robot')\n"
@@ -121,7 +121,7 @@ def test_an_exporter_that_cannot_be_made_is_named(environ: dict[str, str], words
 
 # -- off ----------------------------------------------------------------------------------------------------------------
 def test_off_imports_nothing_of_opentelemetry_and_starts_nothing() -> None:
-    result = run(
+    result = run_program(
         "import sys, threading, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
         "t()\n"
@@ -151,7 +151,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
         "OTEL_EXPORTER_PROMETHEUS_PORT": "0",
     }
     for package in ("opentelemetry.sdk", "opentelemetry.exporter.otlp", "prometheus_client"):
-        said = run(hidden.format(package), environ).stdout
+        said = run_program(hidden.format(package), environ).stdout
         assert "ConfigError" in said, said
         assert "pip install 'vram-arbiter[telemetry]'" in said
         assert said.strip().endswith(" 1"), "no thread was left"
@@ -182,7 +182,9 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
             "OTEL_RESOURCE_ATTRIBUTES": "robot.model=so101-b",
         }
-        result = run(PROGRAM, environ)  # nothing is due before the end: it is the end that sends
+        result = run_program(
+            PROGRAM, environ
+        )  # nothing is due before the end: it is the end that sends
         assert (result.returncode, result.stderr) == (0, "")
         tick, goal = collector.spans()
         assert [tick.name, goal.name] == ["rskill.tick", "rskill.goal"]
@@ -209,7 +211,7 @@ def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, ke
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
             "OTEL_TRACES_SAMPLER_ARG": "0",
         }
-        result = run(f"import sys; sys.argv[1:] = [{parent!r}]\n{PROGRAM}", environ)
+        result = run_program(f"import sys; sys.argv[1:] = [{parent!r}]\n{PROGRAM}", environ)
         assert (result.returncode, result.stderr) == (0, "")
         assert len(collector.spans()) == kept
         assert {span.trace_id for span in collector.spans()} <= {"a" * 32}
@@ -221,7 +223,7 @@ def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, ke
 
 @needs_sdk
 def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
-    result = run(
+    result = run_program(
         "import http.client, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.runtime.telemetry import names as n\n"
         "t = o.set_up('vram-arbiter', prometheus_port=0)\n"
@@ -262,7 +264,7 @@ def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() ->
     with socket.socket() as deaf:  # takes connections and never answers
         deaf.bind(("127.0.0.1", 0))
         deaf.listen()
-        result = run(
+        result = run_program(
             "import logging; logging.basicConfig(format='%(message)s')\n"
             "import time, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
             "from vram_arbiter.schemas.runtime.telemetry import spans as tracing\n"
@@ -312,7 +314,7 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
 ) -> None:
     """Regression: a bad number in an `OTEL_` variable ended programs with a traceback and left half
     a set-up."""
-    result = run(
+    result = run_program(
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.errors import ConfigError\n"
         "try:\n    o.set_up('robot', prometheus_port=0)\n"
@@ -330,7 +332,7 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
 @needs_sdk
 def test_an_operators_time_limits_win_over_ours() -> None:
     """Regression: a limit for one signal was overridden by our 3 s."""
-    result = run(
+    result = run_program(
         "import gc\n"
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
@@ -346,7 +348,7 @@ def test_an_operators_time_limits_win_over_ours() -> None:
 def test_no_secret_stands_in_a_message() -> None:
     """Regression: the SDK writes an unreadable header into its warning, and our message named the
     address as given."""
-    result = run(
+    result = run_program(
         "import logging; logging.basicConfig()\n"
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.config.arbiter import ArbiterConfig\n"
@@ -367,7 +369,7 @@ def test_no_secret_stands_in_a_message() -> None:
 @needs_sdk
 def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> None:
     """Regression: only the exporters were quietened: "Queue full" was logged every 20 s."""
-    result = run(
+    result = run_program(
         "import logging; logging.basicConfig(format='%(message)s')\n"
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "o.set_up('robot')\n"
