@@ -163,11 +163,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:
             chosen = config.telemetry
-            otel.plan(
-                os.environ,
-                endpoint=chosen.endpoint,
-                prometheus_port=chosen.prometheus_port,
-                sample_ratio=chosen.sample_ratio,
+            otel.check(
+                otel.plan(
+                    os.environ,
+                    endpoint=chosen.endpoint,
+                    prometheus_port=chosen.prometheus_port,
+                    sample_ratio=chosen.sample_ratio,
+                )
             )
             print(
                 f"{flags.config or 'built-in configuration'}: ok (would serve {places.endpoint}, gpu {config.gpu.source})"

@@ -7,13 +7,13 @@ keys with the same defaults, and a test holds both together. No key is required:
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Annotated, Literal, Self
-from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
+from vram_arbiter.schemas.urls import collector_url
 from vram_arbiter.schemas.yamltext import Path, parse_yaml, validated
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
@@ -245,7 +245,7 @@ class TelemetryConfig(_Section):
     @field_validator("endpoint")
     @classmethod
     def _a_collector(cls, value: str | None) -> str | None:
-        return None if value is None else _collector_url(value)
+        return None if value is None else collector_url(value)
 
 
 class ArbiterConfig(_Section):
@@ -292,18 +292,3 @@ def load_config(text: str, name: str) -> ArbiterConfig:
             for key, value in data.items()
         }
     return validated(ArbiterConfig, replace(source, data=data), known_keys())
-
-
-def _collector_url(text: str) -> str:
-    """Return `text`. Raises ValueError unless it is http://HOST... or https://HOST...."""
-    try:
-        parts = urlsplit(text)
-        good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        good = False
-    if not good:
-        shown = text.rpartition("@")[2].partition("?")[0]  # without password and token
-        raise ValueError(
-            f"expected the URL of a collector, got {shown!r}; write http://localhost:4318"
-        )
-    return text

@@ -186,11 +186,11 @@ def test_off_imports_nothing_and_passes_the_trace_on(make_arbiter: Make) -> None
     [
         (
             {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"},
-            "OTEL_EXPORTER_OTLP_ENDPOINT: 'collector' is no URL",
+            "OTEL_EXPORTER_OTLP_ENDPOINT: expected the URL of a collector",
         ),
         (
             {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://x", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"},
-            "http/protobuf",
+            "no exporter 'otlp_proto_grpc' is installed",
         ),
     ],
 )

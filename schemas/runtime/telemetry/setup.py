@@ -18,11 +18,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.telemetry import exported
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.urls import collector_url
 
 log = logging.getLogger(__name__)
 
@@ -167,11 +169,22 @@ def _exporters(environ: Mapping[str, str], signal: Signal, endpoint: str | None)
     """Return the exporters' names. An OTLP endpoint alone asks for `otlp`."""
     given = environ.get(f"OTEL_{signal.upper()}_EXPORTER", "").lower().split(",")
     names = tuple(name.strip() for name in given if name.strip())
-    if names:
-        return tuple(name for name in names if name != "none")
-    own = environ.get(f"OTEL_EXPORTER_OTLP_{signal.upper()}_ENDPOINT", "").strip()
-    common = environ.get("OTEL_EXPORTER_OTLP_ENDPOINT", "").strip()
-    return ("otlp",) if endpoint or own or common else ()
+    urls = [
+        variable
+        for variable in (
+            f"OTEL_EXPORTER_OTLP_{signal.upper()}_ENDPOINT",
+            "OTEL_EXPORTER_OTLP_ENDPOINT",
+        )
+        if environ.get(variable, "").strip()
+    ]
+    if not names and (urls or endpoint is not None):
+        names = ("otlp",)
+    for variable in urls if "otlp" in names else ():
+        try:
+            collector_url(environ[variable].strip())
+        except ValueError as error:
+            raise ConfigError(f"{variable}: {error}", hint="or unset it") from None
+    return tuple(name for name in names if name != "none")
 
 
 def _prometheus(environ: Mapping[str, str], port: int | None) -> tuple[str, int]:
@@ -201,6 +214,42 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+def check(planned: Plan) -> None:
+    """Raise ConfigError for an exporter that `set_up` could not make; import no SDK."""
+    try:
+        for name in planned.traces:
+            _entry_point("traces", name)
+        for name in planned.metrics:
+            _entry_point("metrics", name)
+        if planned.prometheus is not None and find_spec("prometheus_client") is None:
+            raise ImportError("No module named 'prometheus_client'")
+    except ImportError as error:
+        raise _not_installed(error) from error
+
+
+def _not_installed(error: ImportError) -> ConfigError:
+    return ConfigError(
+        f"telemetry is asked for, but its packages are not installed: {error}",
+        hint=f"pip install '{EXTRA}', or unset the OTEL_ variables and the telemetry section",
+    )
+
+
+def _entry_point(signal: Signal, name: str) -> Any:
+    """Return an installed exporter's entry point by its name in the specification."""
+    from importlib.metadata import entry_points
+
+    entry = f"otlp_proto_{_protocol(signal)}" if name == "otlp" else name
+    found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))
+    if found:
+        return found[0]
+    if name == "otlp":
+        raise ImportError(f"no exporter {entry!r} is installed")
+    raise ConfigError(
+        f"OTEL_{signal.upper()}_EXPORTER: no exporter {name!r} is installed",
+        hint="write otlp, prometheus (metrics only) or none, or install its package",
+    )
+
+
 # -- the SDK: nothing above this line imports it ---------------------------------------------------
 def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Telemetry:
     """Install all of `planned`, or nothing."""
@@ -211,10 +260,7 @@ def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Tele
         for end in ends:
             end()
         if isinstance(error, ImportError):
-            raise ConfigError(
-                f"telemetry is asked for, but its packages are not installed: {error}",
-                hint=f"pip install '{EXTRA}', or unset the OTEL_ variables and the telemetry section",
-            ) from error
+            raise _not_installed(error) from error
         if isinstance(error, ValueError):
             raise ConfigError(
                 f"OpenTelemetry refuses its settings: {error}",
@@ -276,26 +322,14 @@ def _resource(service: str, attributes: Mapping[str, str]) -> Any:
 
 def _exporter(signal: Signal, name: str, planned: Plan) -> Any:
     """Return an exporter by its name in the specification, from the installed entry points."""
-    from importlib.metadata import entry_points
-
     options: dict[str, object] = {}
-    entry = name
     if name == "otlp":
-        entry = f"otlp_proto_{_protocol(signal)}"
         limits = ("OTEL_EXPORTER_OTLP_TIMEOUT", f"OTEL_EXPORTER_OTLP_{signal.upper()}_TIMEOUT")
         if not any(os.environ.get(limit, "").strip() for limit in limits):
             options["timeout"] = EXPORT_S
         if planned.endpoint is not None:
             options["endpoint"] = f"{planned.endpoint.rstrip('/')}/v1/{signal}"
-    found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))
-    if not found:
-        if name == "otlp":
-            raise ImportError(f"no exporter {entry!r} is installed")
-        raise ConfigError(
-            f"OTEL_{signal.upper()}_EXPORTER: no exporter {name!r} is installed",
-            hint="write otlp, prometheus (metrics only) or none, or install its package",
-        )
-    return found[0].load()(**options)
+    return _entry_point(signal, name).load()(**options)
 
 
 def _protocol(signal: Signal) -> str:
