@@ -40,6 +40,7 @@ from vram_arbiter.arbiter.host.records import check_record
 from vram_arbiter.arbiter.host.suspend import SuspendWatch
 from vram_arbiter.arbiter.host.systemd import Notifier
 from vram_arbiter.arbiter.inbox import Inbox
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.peer import group_id
 from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig, GpuConfig
@@ -302,6 +303,7 @@ class Daemon:
             inbox.post,
             telemetry.log_event if traced is None else traced.log_event,
             watch.signal,
+            words,
             None if traced is None else traced.leases,
         )
 

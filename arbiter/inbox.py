@@ -16,8 +16,11 @@ from typing import Any, Protocol
 
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event, Resumed, Tick
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import STATUS_PAGE
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import StatusReply
 
 log = logging.getLogger(__name__)
 
@@ -50,9 +53,9 @@ class Core(Protocol):
         reader: ProcessKey | None = None,
         after: tuple[int, float, int] | None = None,
         limit: int | None = None,
-    ) -> dict[str, Any]: ...
+    ) -> StatusReply: ...
 
-    def why(self, consumer: str, now: float) -> dict[str, Any]: ...
+    def why(self, consumer: str, now: float) -> WhyReply: ...
 
     def concerns(self, client: ClientId) -> bool: ...
 
@@ -144,11 +147,11 @@ class Inbox:
 
     def status(
         self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
-    ) -> dict[str, Any]:
+    ) -> StatusReply:
         """A page of the status as `reader` may see it; None: an operator."""
         return self._core.status(self._clock(), reader, after, STATUS_PAGE)
 
-    def why(self, consumer: str) -> dict[str, Any]:
+    def why(self, consumer: str) -> WhyReply:
         return self._core.why(consumer, self._clock())
 
     def concerns(self, client: ClientId) -> bool:
@@ -218,7 +221,7 @@ class Inbox:
 
     def _state(self) -> str:
         try:
-            return json.dumps(self.status(NO_READER), default=str)
+            return json.dumps(to_map(self.status(NO_READER)), default=str)
         except Exception as error:  # noqa: BLE001 - the state may be what is broken; this is its last word
             return f"unreadable: {error!r}"
 

@@ -3,7 +3,7 @@
 Each class gets one encoder and one decoder, generated on first use, as the standard library generates `__init__`.
 
 Rules of the plain form:
-- A field that has its default is left out; a missing field takes its default.
+- A field that has its default is left out, unless its class has `WHOLE = True`; a missing field takes its default.
 - A class with `COMPACT = True` is the list of its fields (`[epoch, serial]`).
 - A class with `TAG = (key, value)` says its kind under that key; a union of such classes is decoded by it.
 - Text enumerations are their values. Numbers stay as they are.
@@ -59,7 +59,7 @@ def _encoder(cls: type) -> _Convert:
         always.append(f"{tag[0]!r}: {tag[1]!r}")
     for field in fields(cls):
         name = field.name
-        if _is_required(field):
+        if _is_required(field) or getattr(cls, "WHOLE", False):
             always.append(f"{name!r}: {_encoding(hints[name], f'o.{name}', space)}")
         else:
             plain = _encoding(hints[name], "v", space)

@@ -7,6 +7,8 @@ The type says who must act: `CallerError` (the program that asked), `OperatorErr
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+from vram_arbiter.schemas.wire.errors import ErrorView
+
 
 class VramError(Exception):
     """Root of the product's errors.
@@ -23,6 +25,10 @@ class VramError(Exception):
         self.message = message
         self.hint = hint
         self.details: dict[str, Any] = dict(details or {})
+
+    def view(self) -> ErrorView:
+        """The `error` of a reply."""
+        return ErrorView(self.code, self.message, self.hint, self.details)
 
     def to_wire(self) -> dict[str, Any]:
         """The `error` map of a reply."""

@@ -51,7 +51,8 @@ from vram_arbiter.arbiter.core.features.parking import HostRam
 from vram_arbiter.arbiter.core.features.resizing import Resizing
 from vram_arbiter.arbiter.core.features.standby import Standby
 from vram_arbiter.arbiter.core.inspection import Inspection
-from vram_arbiter.arbiter.core.model.state import Core, Refused
+from vram_arbiter.arbiter.core.model.refusals import Refused
+from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.model.turn import Turn
 from vram_arbiter.arbiter.core.report import explain, figures
 from vram_arbiter.arbiter.core.requests import (
@@ -68,6 +69,8 @@ from vram_arbiter.arbiter.core.scheduling import deadlock, grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import StatusReply
 
 DUE_MAX = 64
 """Timers that one Tick serves. What is due beyond them is served by the next one, at once, so that thousands of waits that end together do
@@ -168,13 +171,13 @@ class Arbiter:
         reader: ProcessKey | None = None,
         after: explain.PageKey | None = None,
         limit: int | None = None,
-    ) -> dict[str, Any]:
-        """Return the shape of `schemas.wire.StatusReply`. `reader`: the process that asks; None: an operator, for all tokens."""
+    ) -> StatusReply:
+        """Return a page of the status. `reader`: the process that asks; None: an operator, for all tokens."""
         self._core.now = max(self._core.now, now)
         return explain.status(self._core, self._standby.host.status(), reader, after, limit)
 
-    def why(self, consumer: str, now: float) -> dict[str, Any]:
-        """Shape of `schemas.wire.WhyReply`."""
+    def why(self, consumer: str, now: float) -> WhyReply:
+        """Explain why a consumer is not running."""
         self._core.now = max(self._core.now, now)
         return explain.why(self._core, consumer)
 
@@ -229,9 +232,9 @@ class Arbiter:
             else:
                 _REQUESTS[type(event)](core, event)
         except Refused as refused:
-            core.refuse(event.client, event.request, refused)
+            core.refuse(event.client, event.request, refused.refusal)
             if isinstance(event, AcquireRequested | Reacquired | ResizeAsked):
-                refusals.note(core, event, refused)
+                refusals.note(core, event, refused.refusal)
 
     def _run_due(self) -> None:
         core = self._core

@@ -5,36 +5,35 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.replies import AnyReply
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Answer a request. `body` is merged into {"re", "epoch", "ok": true}."""
+    """Answer a request."""
 
     client: ClientId
     request: RequestId
-    body: Mapping[str, Any]
+    body: AnyReply
 
 
 @dataclass(frozen=True, slots=True)
 class Refuse:
-    """Answer a request with a typed error; `code` is one of `schemas.errors.CODES`."""
+    """Answer a request with a typed error."""
 
     client: ClientId
     request: RequestId
-    code: str
-    message: str
-    hint: str
-    details: Mapping[str, Any]
+    refusal: Refusal
 
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """Send a push; `body` holds "push" and its fields (shapes in `schemas.wire`). A client that is away gets nothing: the
-    lease's ttl and re-attachment cover that."""
+    """Send a push. A client that is away gets nothing: the lease's TTL and reattachment cover that."""
 
     client: ClientId
-    body: Mapping[str, Any]
+    body: AnyPush
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,9 @@ from vram_arbiter.arbiter.core.events import (
     Spec,
 )
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
+from vram_arbiter.arbiter.core.model.refusals import End
+from vram_arbiter.schemas.wire.codes import Order
+from vram_arbiter.schemas.wire.errors import Refusal
 
 if TYPE_CHECKING:
     from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -57,7 +60,7 @@ class Feature:
         """
         return False
 
-    def on_refused(self, core: "Core", spec: Spec, why: str) -> None:
+    def on_refused(self, core: "Core", spec: Spec, refusal: Refusal) -> None:
         """A request was refused: no GPU can ever hold it."""
 
     def on_request(self, core: "Core", request: Lease) -> bool:
@@ -74,19 +77,19 @@ class Feature:
         If it is to be parked, every feature is asked.
         """
 
-    def give_up(self, core: "Core", lease: Lease, to: LeaseState, code: str, why: str) -> bool:
+    def give_up(self, core: "Core", lease: Lease, to: LeaseState, refusal: End) -> bool:
         """End a lease that would outlive its release. Return whether it was one.
 
         Its holder is gone, or does not want it any more.
         """
         return False
 
-    def on_dismissed(self, core: "Core", lease: Lease, why: str) -> None:
+    def on_dismissed(self, core: "Core", lease: Lease, order: Order) -> None:
         """An operator evicted a lease."""
 
     # -- scheduling --------------------------------------------------------------------------------
     def blocks(self, gpu: "Gpu") -> str:
-        """Say why this feature keeps a GPU from the requests of all others (`Gpu.keeper`)."""
+        """Return the name of the group that this feature keeps a GPU for (`Gpu.keeper`)."""
         return ""
 
     def owns(self, request: Lease) -> bool:
@@ -101,7 +104,7 @@ class Feature:
         return False
 
     def protects(self, lease: Lease) -> str:
-        """Say why a holder must not be revoked for others now; "" if it may be."""
+        """Return the name of the group that keeps a holder from being revoked for others; "" if none does."""
         return ""
 
     def unclaimed(self, lease: Lease) -> bool:

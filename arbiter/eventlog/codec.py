@@ -200,7 +200,7 @@ def summary(effects: Sequence[Effect]) -> str:
     return " ".join(
         f"Note:{effect.kind}"
         if isinstance(effect, Note)
-        else f"Push:{effect.body.get('push')}"
+        else f"Push:{effect.body.TAG[1]}"
         if isinstance(effect, Push)
         else type(effect).__name__
         for effect in effects

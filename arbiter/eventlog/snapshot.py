@@ -19,7 +19,7 @@ from typing import Any, cast
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.eventlog.codec import CodecError
 
-_HOMES = ("vram_arbiter.arbiter.core.", "vram_arbiter.schemas.ids")
+_HOMES = ("vram_arbiter.arbiter.core.", "vram_arbiter.schemas.ids", "vram_arbiter.schemas.wire.")
 
 type Ref = list[int]
 

@@ -13,6 +13,9 @@ from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.wire.errors import ErrorView, Refusal
+from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.replies import AnyReply
 
 log = logging.getLogger(__name__)
 
@@ -23,11 +26,11 @@ _NOTHING: Mapping[str, JournalUnavailable] = {}
 class Outbox(Protocol):
     """The way to the clients (`rpc.session.SessionTable`)."""
 
-    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None: ...
+    def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None: ...
 
-    def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None: ...
+    def refuse(self, client: ClientId, request: RequestId, error: ErrorView) -> None: ...
 
-    def push(self, client: ClientId, body: Mapping[str, Any]) -> None: ...
+    def push(self, client: ClientId, body: AnyPush) -> None: ...
 
     def broadcast(self, event: Mapping[str, Any]) -> None: ...
 
@@ -49,9 +52,17 @@ class Traces(Protocol):
 
     def outgoing(self, effects: Sequence[fx.Effect]) -> None: ...
 
-    def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]: ...
+    def revoke(self, body: AnyPush) -> AnyPush: ...
 
     def wrote(self, seconds: float, *, failed: bool) -> None: ...
+
+
+class Words(Protocol):
+    """What the engine's codes are in words (`rpc.words`)."""
+
+    def error_view(self, refusal: Refusal) -> ErrorView: ...
+
+    def event(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]: ...
 
 
 class Executor:
@@ -66,6 +77,7 @@ class Executor:
         post: Callable[[ev.Event], None],
         log_event: Callable[[Mapping[str, Any]], None],
         signal: Callable[[ProcessKey, str], None],
+        words: Words,
         traces: Traces | None = None,
     ) -> None:
         self._outbox = outbox
@@ -75,6 +87,7 @@ class Executor:
         self._post = post
         self._log_event = log_event
         self._signal = signal
+        self._words = words
         self._traces = traces
         self.owed: dict[str, None] = {}
         """Records still to be deleted: the disk was full when they ended. The next write does it."""
@@ -102,7 +115,7 @@ class Executor:
                     refused[effect.key.removeprefix("lease:")] = why
                 if (why := refused.get(_lease_of(effect) or "")) is not None:
                     if isinstance(effect, fx.Reply):
-                        self._outbox.refuse(effect.client, effect.request, why.to_wire())
+                        self._outbox.refuse(effect.client, effect.request, why.view())
                     continue
             if isinstance(effect, fx.Note):
                 notes.append(effect)
@@ -111,7 +124,7 @@ class Executor:
             elif not isinstance(effect, _RECORDS):
                 self._say(effect)
         for note in notes:
-            event = self._history.append(note.kind, note.data)
+            event = self._history.append(note.kind, self._words.event(note.kind, note.data))
             self._log_event(event)
             self._outbox.broadcast(event)
         for sample in samples:
@@ -127,9 +140,8 @@ class Executor:
                 )
             case fx.Signal(process, kind):
                 self._signal(process, kind)
-            case fx.Refuse(client, request, code, message, hint, details):
-                error = {"code": code, "message": message, "hint": hint, "details": dict(details)}
-                self._outbox.refuse(client, request, error)
+            case fx.Refuse(client, request, refusal):
+                self._outbox.refuse(client, request, self._words.error_view(refusal))
 
     def settle(self) -> None:
         """Try again to delete what could not be deleted, if anything is left of that."""
@@ -172,11 +184,11 @@ class Executor:
 
 
 def _lease_of(effect: fx.Effect) -> str | None:
-    """The lease that an effect speaks of, if any."""
+    """The lease that an effect is about, if any."""
     match effect:
         case fx.Reply(_, _, body) | fx.Push(_, body):
-            lease = body.get("lease")
-            found = lease.get("lease_id") if isinstance(lease, Mapping) else body.get("lease_id")
+            lease = getattr(body, "lease", None)
+            found = getattr(body, "lease_id", None) if lease is None else lease.lease_id
         case fx.Note(_, data):
             found = data.get("lease_id")
         case _:

@@ -21,6 +21,7 @@ from typing import Any, Self
 from vram_arbiter.arbiter.host.disk_writer import DiskBehind, DiskFailed, DiskWriter
 from vram_arbiter.arbiter.host.journal_files import is_corruption, put_aside
 from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.wire.replies import HistoryReply
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ AT_ONCE = frozenset({"operator"})
 CLEAN_END = "stopped"
 """Kind of the last event of an orderly stop."""
 
-Done = Callable[[Mapping[str, Any]], None]
+Done = Callable[[HistoryReply], None]
 Event = Mapping[str, Any]
 
 _SCHEMA = """
@@ -132,20 +133,20 @@ class History:
             found = [
                 e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)
             ]
-            done({"events": found[:limit], "last_seq": self._last_seq})
+            done(HistoryReply(tuple(found[:limit]), self._last_seq))
             return
 
         def answer(found: list[Event] | DiskFailed) -> None:
             if isinstance(found, DiskFailed):
-                done({"events": [], "last_seq": self._last_seq, "problem": str(found)})
+                done(HistoryReply((), self._last_seq, str(found)))
             else:
-                done({"events": found, "last_seq": self._last_seq})
+                done(HistoryReply(tuple(found), self._last_seq))
 
         try:
             disk.ask(lambda: store.find(after, limit, kinds), answer)
         except DiskBehind:
             problem = "the disk of the history does not answer"
-            done({"events": [], "last_seq": self._last_seq, "problem": problem})
+            done(HistoryReply((), self._last_seq, problem))
 
     def close(self) -> None:
         """Write what is left and end the writer."""

@@ -5,9 +5,9 @@ in progress end when it is revoked, unloads, releases. Must not know the schedul
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
@@ -26,6 +26,8 @@ from vram_arbiter.arbiter.core.events import (
 from vram_arbiter.arbiter.lab.outcome import Tally
 from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.schemas.wire.pushes import AnyPush, DeniedPush, GrantedPush, RevokePush
+from vram_arbiter.schemas.wire.views import LeaseView
 
 START_S = 1000.0
 """The engine's clock at the beginning."""
@@ -268,13 +270,13 @@ class Actor:
             AcquireRequested(self.client, self._asked, f"n{self._asked}", spec, job.wait_timeout_s)
         )
 
-    def answered(self, request: RequestId, lease: Mapping[str, Any] | None) -> None:
+    def answered(self, request: RequestId, lease: LeaseView | None) -> None:
         """Handle a reply. Only the reply of the acquire matters."""
         if request != self._asked or lease is None:
             return
         self._asked = None
-        self._lease = LeaseId(lease["lease_id"])
-        if lease["state"] == "loading":
+        self._lease = LeaseId(lease.lease_id)
+        if lease.state == "loading":
             self._granted(lease)
 
     def refused(self, request: RequestId, code: str) -> None:
@@ -286,14 +288,17 @@ class Actor:
         elif (use := self._use_requests.get(request)) in self._using and use is not None:
             self._pending.appendleft(self._using.pop(use))
 
-    def told(self, body: Mapping[str, Any]) -> None:
+    def told(self, body: AnyPush) -> None:
         """Handle a push."""
-        match body["push"]:
-            case "granted":
-                self._granted(body["lease"])
-            case "denied" if body["lease_id"] == self._lease:
+        match body:
+            case GrantedPush(lease):
+                self._granted(lease)
+            case DeniedPush(lease_id) if lease_id == self._lease:
                 self._give_up()
-            case "revoke" if body["lease_id"] == self._lease and self._state in ("held", "loading"):
+            case RevokePush(lease_id) if lease_id == self._lease and self._state in (
+                "held",
+                "loading",
+            ):
                 self._asked_to_leave()
             case _:
                 pass
@@ -307,12 +312,14 @@ class Actor:
             self._pass_on()
         self._go()
 
-    def _granted(self, lease: Mapping[str, Any]) -> None:
+    def _granted(self, lease: LeaseView) -> None:
         assert self._job is not None, "granted without a job"
         self._state = "loading"
-        self._lease = LeaseId(lease["lease_id"])
-        self._token = Token(*lease["token"])
-        self._gpu = GpuId(lease["gpu"])
+        assert lease.token is not None, f"{lease.lease_id} has no token"
+        assert lease.gpu is not None, f"{lease.lease_id} has no GPU"
+        self._lease = LeaseId(lease.lease_id)
+        self._token = lease.token
+        self._gpu = GpuId(lease.gpu)
         self._round += 1
         turn = self._round
         if not self._stage.cards[self._gpu].set(

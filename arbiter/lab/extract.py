@@ -28,6 +28,7 @@ from vram_arbiter.arbiter.eventlog.replay import Replayed, replay
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan, Workload
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.replies import AcquireReply
 
 POLLING_S = 0.05
 """Duration of a verification on a GPU without lag: two readings that agree."""
@@ -174,8 +175,10 @@ class _Reader:
         client = arbiter.inspect().clients.get(event.client)
         for effect in effects:
             match effect:
-                case Reply(_, request, body) if request == event.request and client is not None:
-                    lease = LeaseId(body["lease"]["lease_id"])
+                case Reply(_, request, AcquireReply(lease=view)) if (
+                    request == event.request and client is not None
+                ):
+                    lease = LeaseId(view.lease_id)
                     self._away.pop(lease, None)
                     if lease not in self._stories:
                         self._stories[lease] = _Story(

@@ -35,9 +35,13 @@ from vram_arbiter.arbiter.core.events import (
     UseBegan,
     UseEnded,
 )
+from vram_arbiter.arbiter.core.model.refusals import Revoked, TooLarge
 from vram_arbiter.arbiter.lab.workload import CardPlan
 from vram_arbiter.schemas.errors import CallerError
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, Token
+from vram_arbiter.schemas.wire.pushes import GrantedPush, RevokePush
+from vram_arbiter.schemas.wire.replies import AcquireReply, DoneReply
+from vram_arbiter.schemas.wire.views import LeaseView
 
 OLLAMA_MODELS = 3
 OLLAMA_POLL_S = 0.25
@@ -99,12 +103,16 @@ class Rules(ABC):
             case ReadyReported(client, request, lease):
                 model = self._models[lease]
                 model.state = "held"
-                self._out.append(Reply(client, request, {}))
+                self._out.append(Reply(client, request, DoneReply()))
                 self._note("switch", model, switched=bool(model.evicted))
             case UseBegan(client, request, lease, _, use, _):
                 if self._models[lease].state == "leaving":
                     self._out.append(
-                        Refuse(client, request, "lease_revoking", "it is being unloaded", "", {})
+                        Refuse(
+                            client,
+                            request,
+                            Revoked(self._models[lease].spec.consumer, "leaving", "use"),
+                        )
                     )
                 else:
                     self._models[lease].uses.add(use)
@@ -135,22 +143,31 @@ class Rules(ABC):
         self._serial += 1
         model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
         if event.spec.steady_bytes > self._card.total_bytes:
-            self._out.append(
-                Refuse(event.client, event.request, "vram_insufficient", "too large", "", {})
-            )
+            size, total = event.spec.steady_bytes, self._card.total_bytes
+            refusal = TooLarge(event.spec.consumer, size, size, total, 0)
+            self._out.append(Refuse(event.client, event.request, refusal))
             return
         self._queue.append(model)
-        self._out.append(Reply(event.client, event.request, {"lease": self._view(model)}))
+        reply = AcquireReply("queued", self._view(model))
+        self._out.append(Reply(event.client, event.request, reply))
 
-    def _view(self, model: _Model) -> dict[str, Any]:
-        state = "queued" if model.state == "queued" else "loading"
-        token = Token(1, self._serial)
-        return {
-            "lease_id": model.id,
-            "state": state,
-            "token": [token.epoch, token.serial],
-            "gpu": self._card.info.id,
-        }
+    def _view(self, model: _Model) -> LeaseView:
+        spec = model.spec
+        return LeaseView(
+            lease_id=model.id,
+            token=Token(1, self._serial),
+            state="queued" if model.state == "queued" else "loading",
+            consumer=spec.consumer,
+            model=str(spec.key),
+            gpu=self._card.info.id,
+            mode="shared",
+            priority=spec.priority,
+            evictable=spec.evictable,
+            charge_bytes=spec.load_peak_bytes,
+            uses=len(model.uses),
+            pid=0,
+            since_s=0.0,
+        )
 
     def _note(self, kind: str, model: _Model, **facts: Any) -> None:
         self._out.append(
@@ -163,7 +180,7 @@ class Rules(ABC):
         model.state = "loading"
         facts: Mapping[str, Any] = {"charge_bytes": model.spec.load_peak_bytes, "reason": reason}
         self._note("granted", model, waited_ms=(self._now - model.arrived_at) * 1e3, **facts)
-        self._out.append(Push(model.client, {"push": "granted", "lease": self._view(model)}))
+        self._out.append(Push(model.client, GrantedPush(self._view(model))))
 
     def _ask(self, model: _Model, wanted_by: _Model) -> None:
         """Unload when its requests are served, including the one that it was loaded for."""
@@ -173,13 +190,17 @@ class Rules(ABC):
         if model.owed:
             model.wanted_by = wanted_by
         else:
-            self._out.append(Push(model.client, {"push": "revoke", "lease_id": model.id}))
+            self._revoke(model)
+
+    def _revoke(self, model: _Model) -> None:
+        push = RevokePush(model.id, Token(1, self._serial), "", 0.0, len(model.uses), park=False)
+        self._out.append(Push(model.client, push))
 
     def _served(self, model: _Model) -> None:
         model.owed = False
         if model.wanted_by is not None:
             model.wanted_by = None
-            self._out.append(Push(model.client, {"push": "revoke", "lease_id": model.id}))
+            self._revoke(model)
 
     def _gone(self, lease: LeaseId) -> None:
         self._models.pop(lease, None)

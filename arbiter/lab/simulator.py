@@ -137,9 +137,9 @@ class _World:
     def _perform(self, effect: Effect) -> None:
         match effect:
             case Reply(client, request, body):
-                self.actors[client].answered(request, body.get("lease"))
-            case Refuse(client, request, code, _, _, _):
-                self.actors[client].refused(request, code)
+                self.actors[client].answered(request, getattr(body, "lease", None))
+            case Refuse(client, request, refusal):
+                self.actors[client].refused(request, refusal.code)
             case Push(client, body):
                 self.actors[client].told(body)
             case Sample(gpu) if gpu not in self._reading:

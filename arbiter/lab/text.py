@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vram_arbiter.arbiter.eventlog.text import cut
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.runtime.printable import makes_printable, printable
 
 DECISIONS = frozenset(
@@ -31,7 +32,7 @@ def timeline_lines(
     decided = [(at, kind, data) for at, kind, data in timeline if kind in DECISIONS]
     lines = [f"decisions under {policy} (the first {min(limit, len(decided))} of {len(decided)})"]
     for at, kind, data in decided[:limit]:
-        why = data.get("reason") or data.get("verdict") or ""
+        why = words.event(kind, data).get("reason") or data.get("verdict") or ""
         lines.append(
             cut(f"{at:9.3f} s  {kind:<12}  {data.get('consumer', ''):<12}  {why}".rstrip())
         )

@@ -12,8 +12,13 @@ from typing import Any
 import msgpack
 from pydantic import ValidationError
 
+from vram_arbiter.arbiter.rpc import words
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import BadRequest, UnknownOp, VramError
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.requests import OPS, REQUEST, Request
 
 FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
@@ -95,22 +100,22 @@ def _bad_request(op: str, error: ValidationError) -> BadRequest:
     )
 
 
-def encode(body: Mapping[str, Any]) -> bytes:
-    """One reply or push to one frame."""
-    packed: bytes = msgpack.packb(body, use_bin_type=True)
+def encode(message: Mapping[str, Any]) -> bytes:
+    """One message to one frame."""
+    packed: bytes = msgpack.packb(message, use_bin_type=True)
     return packed
 
 
-def reply(request_id: int, epoch: int, body: Mapping[str, Any]) -> bytes:
+def reply(request_id: int, epoch: int, body: AnyReply) -> bytes:
     """`{"re", "epoch", "ok": true, …}`"""
-    return encode({"re": request_id, "epoch": epoch, "ok": True, **body})
+    return encode({"re": request_id, "epoch": epoch, "ok": True, **to_map(words.reply(body))})
 
 
-def refusal(request_id: int | None, epoch: int, error: Mapping[str, Any]) -> bytes:
+def refusal(request_id: int | None, epoch: int, error: ErrorView) -> bytes:
     """`{"re", "epoch", "ok": false, "error"}`; `re` is null where the request had no readable id."""
-    return encode({"re": request_id, "epoch": epoch, "ok": False, "error": error})
+    return encode({"re": request_id, "epoch": epoch, "ok": False, "error": to_map(error)})
 
 
-def push(seq: int, epoch: int, body: Mapping[str, Any]) -> bytes:
+def push(seq: int, epoch: int, body: AnyPush) -> bytes:
     """`{"push", "seq", "epoch", …}`"""
-    return encode({**body, "seq": seq, "epoch": epoch})
+    return encode({**to_map(words.push(body)), "seq": seq, "epoch": epoch})

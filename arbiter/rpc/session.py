@@ -7,7 +7,7 @@ process that the kernel named when it was accepted; every limit's breach is a ty
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from vram_arbiter.arbiter.core import events as ev
@@ -24,7 +24,6 @@ from vram_arbiter.arbiter.rpc.shares import (
     share_of,
     spend,
 )
-from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -40,7 +39,17 @@ from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
-from vram_arbiter.schemas.wire.replies import WelcomeReply
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.pushes import AnyPush, EventPush
+from vram_arbiter.schemas.wire.replies import (
+    AnyReply,
+    DoneReply,
+    HistoryReply,
+    PingReply,
+    StatusReply,
+    WelcomeReply,
+)
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
@@ -83,9 +92,9 @@ class Decisions(Protocol):
 
     def status(
         self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
-    ) -> dict[str, Any]: ...
+    ) -> StatusReply: ...
 
-    def why(self, consumer: str) -> dict[str, Any]: ...
+    def why(self, consumer: str) -> WhyReply: ...
 
     def concerns(self, client: ClientId) -> bool:
         """Whether a lease, a request or a use is this client's."""
@@ -104,7 +113,7 @@ class Watch(Protocol):
         ...
 
 
-HistoryReader = Callable[[int, int, tuple[str, ...], Callable[[Mapping[str, Any]], None]], None]
+HistoryReader = Callable[[int, int, tuple[str, ...], Callable[[HistoryReply], None]], None]
 """`read(after, limit, kinds, done)`: `done` is called on the loop's thread, at once or later, with the body of the reply."""
 
 
@@ -197,7 +206,7 @@ class SessionTable:
                 "value": settings.rate_per_s,
                 "process_value": settings.process_rate_per_s,
             },
-        ).to_wire()
+        ).view()
 
     # -- in ----------------------------------------------------------------------------------------------------
     def connected(self, connection: Connection) -> None:
@@ -220,9 +229,7 @@ class SessionTable:
                 None if isinstance(payload, Oversize) else codec.id_of(payload, REFUSED_MAX_BYTES)
             )
             connection.send(codec.refusal(request_id, self._settings.epoch, self._too_fast))
-            self._log_refusal(
-                connection, session, self._too_fast["code"], self._too_fast["message"]
-            )
+            self._log_refusal(connection, session, self._too_fast.code, self._too_fast.message)
             return False
         try:
             if isinstance(payload, Oversize):  # 2
@@ -282,16 +289,16 @@ class SessionTable:
         return len(self._sessions)
 
     # -- out ---------------------------------------------------------------------------------------------------
-    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
+    def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
             session.connection.send(codec.reply(request, self._settings.epoch, body))
 
-    def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
+    def refuse(self, client: ClientId, request: RequestId, error: ErrorView) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
             session.connection.send(codec.refusal(request, self._settings.epoch, error))
-            self._log_refusal(session.connection, session, error["code"], error["message"])
+            self._log_refusal(session.connection, session, error.code, error.message)
 
-    def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
+    def push(self, client: ClientId, body: AnyPush) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
             session.seq += 1
             session.connection.send(codec.push(session.seq, self._settings.epoch, body))
@@ -299,7 +306,7 @@ class SessionTable:
     def broadcast(self, event: Mapping[str, Any]) -> None:
         """One history event to every subscriber. One that does not read loses events and can fetch them by `history`."""
         for client in list(self._subscribers):
-            self.push(client, {"push": "event", "event": event})
+            self.push(client, EventPush(event))
 
     # -- steps -------------------------------------------------------------------------------------------------
     def _hello(self, connection: Connection, entry: _Entry, hello: w.Hello, now: float) -> None:
@@ -398,7 +405,7 @@ class SessionTable:
             heartbeat_s=settings.heartbeat_s,
             grace_s=settings.grace_s,
         )
-        self.reply(session.client, RequestId(hello.id), to_map(welcome))
+        self.reply(session.client, RequestId(hello.id), welcome)
 
     def _hello_again(self, session: Session, hello: w.Hello) -> None:
         """A repeated hello is answered again; under another name it is another client's, which needs its own connection."""
@@ -500,7 +507,7 @@ class SessionTable:
             del self._moved[old]
 
     def _refuse(self, connection: Connection, request_id: int | None, error: VramError) -> None:
-        connection.send(codec.refusal(request_id, self._settings.epoch, error.to_wire()))
+        connection.send(codec.refusal(request_id, self._settings.epoch, error.view()))
         entry = self._entries.get(connection.serial)
         self._log_refusal(
             connection, None if entry is None else entry.session, error.code, error.message
@@ -521,17 +528,11 @@ class SessionTable:
             case w.Hello():
                 self._hello_again(session, request)
             case w.Ping():
-                self.reply(client, re, {"server": self._settings.server})
+                self.reply(client, re, PingReply(self._settings.server))
             case w.Status():
                 reader = None if session.role == "operator" else session.peer.process
                 page = request.after
-                self._decisions.when_read(
-                    lambda: self.reply(
-                        client,
-                        re,
-                        {**self._decisions.status(reader, page), "problems": self._problems()},
-                    )
-                )
+                self._decisions.when_read(lambda: self._status(client, re, reader, page))
             case w.Why():
                 consumer = request.consumer
                 self._decisions.when_read(
@@ -547,7 +548,7 @@ class SessionTable:
             case w.Subscribe():
                 self._subscribe(session, re)
             case w.Bye():
-                self.reply(client, re, {})
+                self.reply(client, re, DoneReply())
                 self._leave(session, ev.BYE)
             case _:
                 if request.op in HOLDING and not session.leased:
@@ -558,6 +559,16 @@ class SessionTable:
                 )
                 assert event is not None, f"{request.op} is answered by nothing"
                 self._decisions.post(event)
+
+    def _status(
+        self,
+        client: ClientId,
+        request: RequestId,
+        reader: ProcessKey | None,
+        page: tuple[int, float, int] | None,
+    ) -> None:
+        status = self._decisions.status(reader, page)
+        self.reply(client, request, replace(status, problems=tuple(self._problems())))
 
     def _subscribe(self, session: Session, request: RequestId) -> None:
         most, peer = self._settings.subscribers_max, session.peer
@@ -576,7 +587,7 @@ class SessionTable:
                         details={"limit": limit, "value": allowed},
                     )
         self._subscribers[session.client] = session
-        self.reply(session.client, request, {})
+        self.reply(session.client, request, DoneReply())
 
 
 def _too_large(message: Oversize, *, stranger: bool) -> MessageTooLarge:

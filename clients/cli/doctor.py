@@ -126,13 +126,13 @@ def _card(gpu: dict[str, Any]) -> Finding:
         return Finding(
             what,
             False,
-            f"{gpu['name']}: the probe does not answer, nothing is granted ({gpu['blocked']})",
+            f"{gpu['name']}: the probe does not answer, nothing is granted ({(gpu['blocked'] or {}).get('text', '')})",
         )
     if gpu["pressure_bytes"]:
         over = format_bytes(gpu["pressure_bytes"])
         return Finding(what, False, f"{gpu['name']}: {over} more are held than were granted")
-    if gpu["blocked"]:
-        return Finding(what, None, f"{gpu['name']}: no grants now: {gpu['blocked']}")
+    if gpu["blocked"] is not None:
+        return Finding(what, None, f"{gpu['name']}: no grants now: {gpu['blocked']['text']}")
     reads = {
         "unified": "memory shared with the CPU, read from /proc/meminfo",
         "fake": "a simulated card",

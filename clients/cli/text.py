@@ -97,8 +97,8 @@ def _gpu_lines(gpu: Message) -> list[str]:
         )
     if gpu["pressure_bytes"]:
         lines.append(f"  pressure: {size(gpu['pressure_bytes'])} more than was granted")
-    if gpu["blocked"]:
-        lines.append(f"  no grants now: {gpu['blocked']}")
+    if gpu["blocked"] is not None:
+        lines.append(f"  no grants now: {gpu['blocked']['text']}")
     for process in gpu["processes"]:
         used = "?" if process.get("used_bytes") is None else size(process["used_bytes"])
         who = f"pid {process['pid']} {process.get('name') or ''}".rstrip()
@@ -189,7 +189,7 @@ def _why_details(lease: Message) -> list[str]:
     for blocker in lease["blockers"]:
         lines.append(
             f"  blocked   by {blocker['consumer']} ({blocker['lease_id']}): {size(blocker['bytes'])}, "
-            f"{blocker['state']}, {blocker['condition']}"
+            f"{blocker['state']}, {blocker['text']}"
         )
     lines.append(f"  next      {lease['next']}")
     lines += [f"  then      {step['text']}" for step in lease.get("plan", ())]

@@ -13,12 +13,7 @@ from vram_arbiter.schemas.codec import from_map
 from vram_arbiter.schemas.wire import explained, pushes
 from vram_arbiter.schemas.wire import replies as r
 from vram_arbiter.schemas.wire.errors import ErrorView
-
-type AnyReply = (
-    r.DoneReply | r.WelcomeReply | r.PingReply | r.AcquireReply | r.ReadyReply | r.UsesReply | r.StateReply | r.ReleaseReply
-    | r.RenewReply | r.ReattachReply | r.OomReply | r.StatusReply | r.HistoryReply | r.OperatorReply | r.DrainReply
-    | explained.WhyReply
-)  # fmt: skip
+from vram_arbiter.schemas.wire.replies import AnyReply as AnyReply
 
 REPLIES: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {

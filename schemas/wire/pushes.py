@@ -5,16 +5,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.wire.codes import Order
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.views import LeaseView
-
-
-@dataclass(frozen=True, slots=True)
-class OrderView:
-    """An operator's order: `by` has the operator's name, uid and pid."""
-
-    by: str
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,14 +18,15 @@ class RevokePush:
 
     lease_id: str
     token: Token
-    reason: str  # in words
     wanted_by: str  # the consumer that the room is for; "" where there is none
     deadline_in_s: float
+    uses: int  # what still runs on the lease; `unloading` is refused before 0
+    park: bool  # host RAM for its weights is booked: release with `parked`
+    reason: str = ""  # the cause in words; the engine leaves it empty
     cause: str = ""  # waiter, pressure, operator
-    order: OrderView | None = None  # an operator wants it
+    gang: str = ""  # of the request that wants the room
+    order: Order | None = None  # an operator wants it
     priority: int | None = None  # of the request that wants the room
-    uses: int = 0  # what still runs on the lease; `unloading` is refused before 0
-    park: bool = False  # host RAM for its weights is booked: release with `parked`
     traceparent: str = ""  # of the eviction, or of the waiter: the unloading belongs to that trace
 
 

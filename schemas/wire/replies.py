@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.views import GpuView, HostRamView, LeaseView, Totals
 
 
@@ -55,7 +56,7 @@ class StateReply:
     """Answer to `revoke_ack`, `unloading` and `cancel`."""
 
     state: str
-    uses: int = 0
+    uses: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +114,8 @@ class StatusReply:
     clients: int
     host_ram: HostRamView
     drained: str  # the operator that drained the arbiter, and why; "" while it grants
+    problems: tuple[str, ...]  # what is wrong with the daemon's own files, in words
     next: tuple[int, float, int] | None = None  # there may be more: ask again with this as `after`
-    problems: tuple[str, ...] = ()  # what is wrong with the daemon's own files, in words
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,3 +140,9 @@ class DrainReply:
     """Answer to `drain` and `resume`: the operator that drained the arbiter, and why; "" while it grants."""
 
     drained: str
+
+
+type AnyReply = (
+    DoneReply | WelcomeReply | PingReply | AcquireReply | ReadyReply | UsesReply | StateReply | ReleaseReply | RenewReply
+    | ReattachReply | OomReply | StatusReply | HistoryReply | OperatorReply | DrainReply | WhyReply
+)  # fmt: skip

@@ -3,6 +3,33 @@
 from dataclasses import dataclass
 
 from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.wire.codes import Block
+
+
+@dataclass(frozen=True, slots=True)
+class GangView:
+    """A gang that is not complete: `members` of `size` have asked."""
+
+    id: str
+    phase: str  # gathering, waiting, loading
+    members: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class BlockView:
+    """Why nothing is granted on a GPU.
+
+    `names`: holders that have not reattached, the consumer that loads, or the gang; `more` of them are not named.
+    `text`: the same in words; the engine leaves it empty.
+    """
+
+    code: Block
+    names: tuple[str, ...] = ()
+    more: int = 0
+    problem: str = ""  # of the probe, or the operator's order
+    bytes: int = 0  # pressure
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +60,7 @@ class LeaseView:
     yielded: int = 0  # uses that pause
     grows: str | None = None  # the lease that this request asks more bytes for
     resizing: str = ""  # growing or shrinking
-    gang: str = ""  # until all of it is held: name, phase, members that asked of all
+    gang: GangView | None = None  # until all of it is held
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +91,7 @@ class GpuView:
     measured_used_bytes: int | None  # None: unknown, blocks grants
     sample_age_s: float | None
     pressure_bytes: int
-    blocked: str  # why nothing is granted now, "" if grants are possible
+    blocked: BlockView | None  # None: grants are possible
     processes: tuple[ProcessView, ...]
 
 

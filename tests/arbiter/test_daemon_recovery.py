@@ -316,7 +316,10 @@ def test_a_card_whose_capacity_changes_is_unknown_until_it_is_as_it_was(
         assert f"{capacity_bytes} bytes of memory, {before} at the start" in told["event"]["reason"]
         assert client.acquire("waiter", GIB)["state"] == "queued"
         gpu = client.ask("status")["gpus"][0]
-        assert (gpu["measured_used_bytes"], "impossible reading" in gpu["blocked"]) == (None, True)
+        assert (gpu["measured_used_bytes"], "impossible reading" in gpu["blocked"]["text"]) == (
+            None,
+            True,
+        )
         change_card(arbiter, lambda config: config.update(capacity_bytes=before))
         assert client.push("granted")["lease"]["consumer"] == "waiter"
 

@@ -3,13 +3,17 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from tests.support.messages import IDLE_STATUS, no_reason
 from vram_arbiter.arbiter.core.effects import Effect, Note
 from vram_arbiter.arbiter.core.events import ClientLeft, Event, Resumed, Tick
 from vram_arbiter.arbiter.inbox import ANSWERS_AT_ONCE, QUESTIONS_MAX, Inbox
 from vram_arbiter.schemas.ids import ClientId, GpuId
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import StatusReply
 
 PATIENCE_S = 60.0
 
@@ -42,16 +46,16 @@ class ScriptedCore:
     def next_deadline(self) -> float | None:
         return self.deadline
 
-    def status(self, now: float, *page: object) -> dict[str, Any]:
+    def status(self, now: float, *page: object) -> StatusReply:
         if self.broken:
             raise KeyError("state")
-        return {"now": now}
+        return replace(IDLE_STATUS, uptime_s=now)
 
     def stale(self, now: float) -> list[GpuId]:
         return self.unread
 
-    def why(self, consumer: str, now: float) -> dict[str, Any]:
-        return {"consumer": consumer, "now": now}
+    def why(self, consumer: str, now: float) -> WhyReply:
+        return no_reason(consumer)
 
     def footprints(self) -> dict[str, dict[str, list[int]]]:
         return {"detector m": {"steady": [5]}}
@@ -92,8 +96,8 @@ def test_the_clock_is_monotonic_time() -> None:
         before = time.monotonic()
         inbox.post(left("a"))
         assert before <= core.times[0] <= time.monotonic()
-        assert inbox.status(None)["now"] >= core.times[0]
-        assert inbox.why("c")["consumer"] == "c"
+        assert inbox.status(None).uptime_s >= core.times[0]
+        assert inbox.why("c").consumer == "c"
         assert inbox.learnt() == {"detector": {"load_s": 2.0}}
         assert inbox.footprints() == {"detector m": {"steady": [5]}}
 

@@ -21,6 +21,8 @@ from vram_arbiter.schemas.ids import (
     Token,
     UseId,
 )
+from vram_arbiter.schemas.wire.pushes import GrantedPush
+from vram_arbiter.schemas.wire.replies import AcquireReply
 
 CARD = GpuId("GPU-0")
 STEP_S = 0.001
@@ -71,7 +73,7 @@ class Bench:
             (time.perf_counter() - start) * 1e6
         )
         for effect in effects:
-            if isinstance(effect, Push) and effect.body["push"] == "granted":
+            if isinstance(effect, Push) and isinstance(effect.body, GrantedPush):
                 raise RuntimeError("nobody fits on this card")
         if any(isinstance(effect, Sample) for effect in effects):
             self.read()
@@ -88,9 +90,11 @@ class Bench:
         )  # fmt: skip
         event = ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
         reply = next(effect for effect in self.handle(event) if isinstance(effect, Reply))
-        lease = LeaseId(reply.body["lease"]["lease_id"])
-        if reply.body["state"] == "loading":
-            self.tokens[lease] = (client, Token(*reply.body["lease"]["token"]))
+        assert isinstance(reply.body, AcquireReply)
+        view = reply.body.lease
+        lease = LeaseId(view.lease_id)
+        if view.state == "loading" and view.token is not None:
+            self.tokens[lease] = (client, view.token)
         else:
             self.queued.append((client, lease))
         return lease

@@ -270,7 +270,7 @@ class Stage:
         ready = await self.until("ready", "detector")
         assert ended["seq"] < gone["seq"] < granted["seq"] < ready["seq"], self.events
         assert gone["verdict"] in verdicts, gone
-        assert granted["reason"] == "back from standby: there is room and nobody waits"
+        assert granted["reason"] == "back from standby: there is room and nothing waits"
         assert (
             sum(e["kind"] == "granted" and e.get("consumer") == "detector" for e in self.events)
             == 1

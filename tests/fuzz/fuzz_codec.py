@@ -35,7 +35,7 @@ def try_codec(frame: bytes) -> None:
         try:
             codec.decode(tried, MESSAGE_MAX_BYTES)
         except codec.Undecodable as bad:
-            if len(codec.refusal(bad.request_id, 1, bad.error.to_wire())) > ANSWER_MAX_BYTES:
+            if len(codec.refusal(bad.request_id, 1, bad.error.view())) > ANSWER_MAX_BYTES:
                 raise AssertionError(f"the answer to {tried[:64]!r} is long") from bad
 
 

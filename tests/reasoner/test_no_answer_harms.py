@@ -27,6 +27,7 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import GoalRejected, LeaseRevoking, LlmError, WaitTimeout
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.tools import ToolCall, skill_tool_name
+from vram_arbiter.schemas.wire.pushes import LostPush
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -65,7 +66,9 @@ class World:
             state = self.driver.state(lease)
             assert state in ("held", "revoking"), f"{lease} is in use and {state}"
         lost = [
-            e.body for e in self.driver.effects if isinstance(e, Push) and e.body["push"] == "lost"
+            e.body
+            for e in self.driver.effects
+            if isinstance(e, Push) and isinstance(e.body, LostPush)
         ]
         assert not lost, f"a lease was taken away: {lost}"
 

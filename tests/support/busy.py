@@ -31,7 +31,7 @@ def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDri
                     min_residency_s=random.choice((0.0, 2.0)),
                     wait_timeout_s=random.choice((None, 5.0)),
                 )
-                for view in driver.arbiter.status(driver.now)["leases"]:
+                for view in driver.status()["leases"]:
                     lease = LeaseId(view["lease_id"])
                     if view["consumer"] == name and lease not in held:
                         held[lease] = person

@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import msgpack
+
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import (
     Effect,
@@ -54,10 +56,13 @@ from vram_arbiter.arbiter.core.events import (
     UseEnded,
     UseYielded,
 )
+from vram_arbiter.arbiter.core.model.refusals import NotJournaled
 from vram_arbiter.arbiter.core.report.explain import NOTE_KINDS
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.records import check_record
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import from_map, to_map
 from vram_arbiter.schemas.ids import (
     ClientId,
     GpuId,
@@ -68,6 +73,7 @@ from vram_arbiter.schemas.ids import (
     Token,
     UseId,
 )
+from vram_arbiter.schemas.wire.errors import ErrorView
 
 READING_S = 0.001
 """How long a simulated reading takes."""
@@ -197,17 +203,10 @@ class CoreDriver:
         for effect in effects:
             if held_back and _names(effect, held_back[0].key.removeprefix("lease:")):
                 if isinstance(effect, Reply):
-                    details = {"key": held_back[0].key}
-                    performed.append(
-                        Refuse(
-                            effect.client,
-                            effect.request,
-                            "journal_unavailable",
-                            self.journal_failing,
-                            "",
-                            details,
-                        )
-                    )
+                    key = held_back[0].key
+                    lease = key.removeprefix("lease:")
+                    held_back_by = NotJournaled(lease, key, self.journal_failing)
+                    performed.append(Refuse(effect.client, effect.request, held_back_by))
                 continue  # held back with its record, as the executor does
             performed.append(effect)
             match effect:
@@ -309,8 +308,27 @@ class CoreDriver:
     # -- looking ---------------------------------------------------------------------------------------------------
     def view(self, lease: LeaseId) -> dict[str, Any] | None:
         """The lease as `status` shows it; None when it is over."""
-        views = self.arbiter.status(self.now)["leases"]
+        views = self.status()["leases"]
         return next((view for view in views if view["lease_id"] == lease), None)
+
+    def status(
+        self,
+        reader: ProcessKey | None = None,
+        after: Sequence[Any] | None = None,
+        limit: int | None = None,
+    ) -> dict[str, Any]:
+        """The status as the wire shows it."""
+        page: Any = None if after is None else tuple(after)
+        return as_wire(words.reply(self.arbiter.status(self.now, reader, page, limit)))
+
+    def blocked(self, index: int = 0) -> str:
+        """Why nothing is granted on a GPU, a code; "" if grants are possible."""
+        why = self.gpu(index)["blocked"]
+        return "" if why is None else str(why["code"])
+
+    def why(self, consumer: str) -> dict[str, Any]:
+        """The answer to `why` as the wire shows it, with its words."""
+        return as_wire(words.reply(self.arbiter.why(consumer, self.now)))
 
     def state(self, lease: LeaseId) -> str:
         view = self.view(lease)
@@ -318,14 +336,15 @@ class CoreDriver:
 
     def notes(self, kind: str) -> list[Mapping[str, Any]]:
         return [
-            effect.data
+            words.event(effect.kind, effect.data)
             for effect in self.effects
             if isinstance(effect, Note) and effect.kind == kind
         ]
 
     def pushes(self, kind: str, lease: LeaseId | None = None) -> list[Mapping[str, Any]]:
         """Pushes of a kind; those about one lease if it is given."""
-        found = [e.body for e in self.effects if isinstance(e, Push) and e.body["push"] == kind]
+        pushed = [e.body for e in self.effects if isinstance(e, Push)]
+        found = [as_wire(words.push(body)) for body in pushed if body.TAG[1] == kind]
         return [
             b
             for b in found
@@ -334,7 +353,7 @@ class CoreDriver:
 
     def gpu(self, index: int = 0) -> dict[str, Any]:
         """The card as `status` shows it."""
-        shown: dict[str, Any] = self.arbiter.status(self.now)["gpus"][index]
+        shown: dict[str, Any] = self.status()["gpus"][index]
         return shown
 
 
@@ -429,7 +448,7 @@ class Consumer:
             raise AssertionError(
                 f"{self.name} was refused: {[e for e in effects if isinstance(e, Refuse)]}"
             )
-        lease = LeaseId(reply.body["lease"]["lease_id"])
+        lease = LeaseId(reply.body.lease.lease_id)
         self.specs[lease] = self.spec(load_peak_bytes, steady_bytes, **spec)
         return lease
 
@@ -654,12 +673,19 @@ class Consumer:
         return self.release(lease, parked=parked)
 
 
-def refusal(effects: Sequence[Effect]) -> Refuse:
+def as_wire(message: object) -> dict[str, Any]:
+    """A message as a client reads it: codes are texts, tuples are lists."""
+    found: dict[str, Any] = msgpack.unpackb(msgpack.packb(to_map(message)))
+    return found
+
+
+def refusal(effects: Sequence[Effect]) -> ErrorView:
     """The one refusal among effects. Raises AssertionError if there is none."""
     found = [effect for effect in effects if isinstance(effect, Refuse)]
     if len(found) != 1:
         raise AssertionError(f"{len(found)} refusals in {list(effects)}")
-    return found[0]
+    error = as_wire(words.error_view(found[0].refusal))
+    return from_map(ErrorView, error)
 
 
 def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
@@ -667,7 +693,7 @@ def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
     found = [effect for effect in effects if isinstance(effect, Reply)]
     if len(found) != 1:
         raise AssertionError(f"{len(found)} replies in {list(effects)}")
-    return found[0].body
+    return as_wire(words.reply(found[0].body))
 
 
 def _well_formed(effects: Sequence[Effect]) -> None:
@@ -683,10 +709,8 @@ def _names(effect: Effect, lease: str) -> bool:
     """Is this effect about a lease? As the executor decides what to hold back with a record that could not be written."""
     match effect:
         case Reply() | Push():
-            return lease in (
-                effect.body.get("lease_id"),
-                effect.body.get("lease", {}).get("lease_id"),
-            )
+            view = getattr(effect.body, "lease", None)
+            return lease in (getattr(effect.body, "lease_id", None), view and view.lease_id)
         case Note():
             return effect.data.get("lease_id") == lease
         case _:

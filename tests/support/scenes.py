@@ -51,7 +51,7 @@ def place(driver: CoreDriver, lease: LeaseId) -> str | None:
 def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
     """What `why` says of a consumer with one lease."""
     found: dict[str, Any]
-    (found,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    (found,) = driver.why(consumer)["leases"]
     return found
 
 

@@ -4,13 +4,16 @@ A holder is only ever *asked*. It unloads by itself at its safe point; the core 
 deadline was agreed by the holder itself (`on_overstay` of its own lease), and is never done to a process that uses anything.
 """
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from vram_arbiter.arbiter.core.effects import Signal
-from vram_arbiter.arbiter.core.model.lease import Cause, Eviction, Lease, LeaseState, Order
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.codes import Cause, Order, Why
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.pushes import DeniedPush, RevokePush
 
 
 def ask(
@@ -18,7 +21,6 @@ def ask(
     gpu: Gpu,
     holder: Lease,
     waiter: Lease | None,
-    reason: str,
     *,
     order: Order | None = None,
 ) -> None:
@@ -33,15 +35,15 @@ def ask(
         charge_bytes=gpu.ledger.charge_bytes(holder.id),
         wanted_by=None if waiter is None else waiter.id,
         wanted_consumer="" if waiter is None else waiter.spec.consumer,
-        reason=reason,
         cause=cause,
+        gang="" if waiter is None or waiter.spec.gang is None else waiter.spec.gang[0],
         order=order,
         asked_at=core.now,
         next_push_at=core.now + core.settings.revoke_resend_s,
         traceparent=None if waiter is None else waiter.request.traceparent,
     )
     gpu.evictions.append(eviction)
-    core.move(holder, LeaseState.REVOKING, reason)
+    core.move(holder, LeaseState.REVOKING, Why.REVOKED)
     core.want_sample(gpu, core.now)
     _push_now(core, holder, eviction)
     if holder.spec.on_overstay != "wait":
@@ -53,7 +55,7 @@ def ask(
         wanted_by_lease=eviction.wanted_by,
         uses=len(holder.uses),
         cause=eviction.cause,
-        reason=eviction.reason,
+        **({"gang": eviction.gang} if eviction.gang else {}),
     )
 
 
@@ -63,24 +65,22 @@ def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
     waiter, order = None, eviction.order
     if eviction.wanted_by is not None and order is None:
         waiter = core.waiting.get(eviction.wanted_by)
+    why = eviction.why
     core.push(
         holder,
-        {
-            "push": "revoke",
-            "lease_id": holder.id,
-            "token": [holder.token.epoch, holder.token.serial],
-            "reason": f"evicted by {order}" if order else eviction.reason,
-            "cause": "operator" if order else eviction.cause,
-            **({"order": {"by": order.by, "reason": order.reason}} if order else {}),
-            "wanted_by": eviction.wanted_consumer,
-            **({"priority": waiter.spec.priority} if waiter is not None else {}),
-            "deadline_in_s": max(
-                0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now
-            ),
-            "uses": len(holder.uses),
-            "park": any(feature.can_park(holder) for feature in holder.features),
-            **({"traceparent": eviction.traceparent} if eviction.traceparent else {}),
-        },
+        RevokePush(
+            lease_id=holder.id,
+            token=holder.token,
+            wanted_by=why.wanted_by,
+            deadline_in_s=max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
+            cause=why.cause,
+            gang=why.gang,
+            order=order,
+            priority=None if waiter is None else waiter.spec.priority,
+            uses=len(holder.uses),
+            park=any(feature.can_park(holder) for feature in holder.features),
+            traceparent=eviction.traceparent or "",
+        ),
     )
 
 
@@ -159,21 +159,8 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
         core.wake(core.gpus[gpu_id])  # it may be served on another card now
     if waiter is None or not waiter.spec.deny_on_deadline:
         return
-    message = f"{holder.spec.consumer} did not leave within {core.settings.revoke_deadline_s:g} s"
-    deny(
-        core,
-        waiter,
-        {
-            "code": "holder_busy",
-            "message": message,
-            "hint": "try again later, or wait: on_deadline=wait",
-            "details": {
-                "lease_id": holder.id,
-                "consumer": holder.spec.consumer,
-                "uses": len(holder.uses),
-            },
-        },
-    )
+    deadline_s, uses = core.settings.revoke_deadline_s, len(holder.uses)
+    deny(core, waiter, no.HolderOutstays(holder.id, holder.spec.consumer, uses, deadline_s))
 
 
 def on_overstay_due(core: Core, lease_id: str) -> None:
@@ -200,7 +187,8 @@ def on_overstay_due(core: Core, lease_id: str) -> None:
         signal=kind,
         pid=holder.process.pid,
         wanted_by=eviction.wanted_consumer,
-        reason=f"asked {core.now - eviction.asked_at:.1f} s ago, idle, and its lease says on_overstay={holder.spec.on_overstay}",
+        asked_s=core.now - eviction.asked_at,
+        on_overstay=holder.spec.on_overstay,
     )
     if kind == "term" and holder.spec.on_overstay == "kill":
         core.timers.set(("overstay", holder.id), core.now + core.settings.terminate_grace_s)
@@ -221,20 +209,16 @@ def _process_in_use(core: Core, holder: Lease) -> bool:
     )
 
 
-def deny(core: Core, waiter: Lease, error: Mapping[str, Any]) -> None:
-    """End a waiter's wait with a typed error."""
-    core.move(waiter, LeaseState.DENIED, str(error["message"]))
+def deny(core: Core, waiter: Lease, refusal: Refusal) -> None:
+    """End a waiter's wait with a refusal."""
+    core.move(waiter, LeaseState.DENIED, refusal.code)
     core.dequeue(waiter)
     if waiter.request.answered or waiter.request.id is None:
-        core.push(
-            waiter,
-            {"push": "denied", "lease_id": waiter.request.extends or waiter.id, "error": error},
-        )
+        core.push(waiter, DeniedPush(waiter.request.extends or waiter.id, refusal.view()))
     else:  # it has only just asked
-        refused = Refused(error["code"], error["message"], error["hint"], **error["details"])
-        core.refuse(waiter.client, waiter.request.id, refused)
-    core.note("denied", waiter, code=error["code"], reason=error["message"])
-    core.end(waiter, error)
+        core.refuse(waiter.client, waiter.request.id, refusal)
+    core.note("denied", waiter, code=refusal.code, refusal=refusal)
+    core.end(waiter, refusal)
 
 
 def _set_timer(core: Core, holder: Lease, eviction: Eviction) -> None:

@@ -18,12 +18,18 @@ from vram_arbiter.arbiter.core.events import AcquireRequested, Spec
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model.refusals import GangEnd, Refused
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report.standing import Standing
 from vram_arbiter.arbiter.core.scheduling import grants, policy
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.codes import Block, Wait
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.explained import Because
+from vram_arbiter.schemas.wire.views import GangView
 
 SEARCH_MAX = 4096
 """Placements to examine. A gang with more possible ones may wait although one of them fits."""
@@ -66,6 +72,10 @@ class Gang:
         """Ledger entry of what the next member needs on top of its steady bytes while it loads."""
         return LeaseId(f"gang:{self.name}")
 
+    def view(self) -> GangView:
+        """Return how reports show it."""
+        return GangView(self.name, self.phase, len(self.members), self.size)
+
     def planned_on(self, lease: Lease) -> GpuId | None:
         """Return the GPU on which room is being made for a member."""
         return next((gpu_id for gpu_id, some in self.planned.items() if lease in some), None)
@@ -93,25 +103,17 @@ class Gangs(Feature):
         if gang is None:
             return False
         if gang.size != size:
-            raise Refused(
-                "bad_request",
-                f"gang {name} has {gang.size} members, not {size}",
-                "agree on one size",
-                size=gang.size,
-            )
+            raise Refused(no.GangMismatch(name, gang.size, size))
         if len(gang.members) >= gang.size:
-            raise Refused(
-                "bad_request",
-                f"all {size} members of gang {name} have come",
-                "use an id of its own for each gang",
-            )
+            raise Refused(no.GangMismatch(name, gang.size, size))
         return False
 
-    def on_refused(self, core: Core, spec: Spec, why: str) -> None:
+    def on_refused(self, core: Core, spec: Spec, refusal: Refusal) -> None:
         """Break the gang of a refused member: it can never be complete."""
         gang = None if spec.gang is None else self.by_name.get(spec.gang[0])
         if gang is not None and gang.phase == "gathering":
-            self._break(core, gang, why)
+            broken = no.BrokenGang(gang.name, GangEnd.REFUSED, because=refusal.code)
+            self._break(core, gang, broken)
 
     def on_request(self, core: Core, request: Lease) -> bool:
         """Keep a member out of the queues until all have asked."""
@@ -136,16 +138,8 @@ class Gangs(Feature):
         waiting = gang.waiting()
         if not _place(core, waiting, lambda gpu, some: self._ever_fits(gang, gpu, some)):
             needed = sum(_needs(waiting).values())
-            budgets = {gpu.info.id: gpu.ledger.budget_bytes for gpu in core.gpus.values()}
-            self._break(
-                core,
-                gang,
-                f"its {len(waiting)} members need {needed} bytes together, "
-                "more than the GPUs can ever hold",
-                code="vram_insufficient",
-                needed_bytes=needed,
-                budget_bytes=budgets,
-            )
+            budgets = {str(gpu.info.id): gpu.ledger.budget_bytes for gpu in core.gpus.values()}
+            self._break(core, gang, no.GangTooLarge(gang.name, len(waiting), needed, budgets))
             return
         gang.phase = "waiting"
         ageing_s = core.settings.ageing_s_per_point if core.settings.scheduling.by_priority else 0.0
@@ -190,16 +184,16 @@ class Gangs(Feature):
             return
         placement = self._plan(core, gang)
         if placement is None:
-            _say(waiting, "nobody who could make room for the whole gang may be asked now")
+            _say(waiting, Wait.NO_VICTIM)
             policy.wake_when_evictable(core, gpu, _bundle(gang, waiting))
             return
-        _say(waiting, "room is being made for the whole gang")
+        _say(waiting, Wait.MAKING_ROOM)
         for gpu, some in _by_gpu(core, placement):
             bundle, going = _bundle(gang, some), policy.leaving(gpu)
             if policy.fits(gpu, bundle, going):
                 continue
             for victim in policy.choose_victims(core, gpu, bundle, going) or ():
-                eviction.ask(core, gpu, victim, some[0], f"gang {gang.name} needs the room")
+                eviction.ask(core, gpu, victim, some[0])
 
     def _plan(self, core: Core, gang: Gang) -> _Placement | None:
         """Return where room can be made for all waiting members, preferably where it is made."""
@@ -255,7 +249,7 @@ class Gangs(Feature):
                 lease.request.gpus, lease.gpu, lease.request.reason = (
                     (gpu.info.id,),
                     gpu.info.id,
-                    "",
+                    None,
                 )
                 gpu.ledger.reserve(lease.id, lease.process, lease.request.steady_bytes, core.now)
             _set_headroom(core, gpu, gang, _headroom_bytes(some))
@@ -264,11 +258,11 @@ class Gangs(Feature):
                 _approved(gpu, one) for one in [*here, gang.headroom_id]
             )
             core.wake(gpu)
-        _note(core, gang, "loading", "all fit")
+        _note(core, gang, "loading")
 
     def blocks(self, gpu: Gpu) -> str:
-        """Say which gang loads on a GPU."""
-        return f"gang {self.loading[gpu.info.id].name} is loading"
+        """Return the name of the gang that loads on a GPU."""
+        return self.loading[gpu.info.id].name
 
     def _next_load(self, core: Core, gpu: Gpu, gang: Gang) -> Lease | None:
         lease = next(iter(gang.waiting_on(gpu)), None)
@@ -283,7 +277,7 @@ class Gangs(Feature):
         headroom = _approved(gpu, gang.headroom_id)
         extra = max(0, more - headroom)
         if gpu.ledger.approved_bytes() + extra > gpu.ledger.budget_bytes:
-            self._break(core, gang, "a member holds more than it declared, the rest no longer fits")
+            self._break(core, gang, no.BrokenGang(gang.name, GangEnd.MEMBER_TOO_LARGE))
             return None
         over = gpu.ledger.total_bytes() + extra - gpu.ledger.budget_bytes
         if over > 0:
@@ -303,11 +297,9 @@ class Gangs(Feature):
         going = policy.leaving(gpu)
         victims = [] if going else policy.choose_relief(core, gpu, going, over)
         for victim in victims:
-            eviction.ask(core, gpu, victim, lease, f"gang {gang.name} needs the room")
+            eviction.ask(core, gpu, victim, lease)
         if not going and not victims:
-            self._break(
-                core, gang, "others hold more than they were granted, the rest no longer fits"
-            )
+            self._break(core, gang, no.BrokenGang(gang.name, GangEnd.OTHERS_TOO_LARGE))
 
     def _is_free(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -> bool:
         """Return whether readings show a member's bytes as free.
@@ -322,10 +314,10 @@ class Gangs(Feature):
         if room is None or policy.sample_is_behind(gpu):
             _want_reading(core, gpu, [lease])
             return False
-        lease.request.reason = "its bytes are kept for it, but measured memory is not free yet"
+        lease.request.reason = Wait.NOT_FREE
         since = gang.short_since.setdefault(gpu.info.id, core.now)
         if core.now - since > core.settings.verify_timeout_s:
-            self._break(core, gang, "measured memory did not come back, the rest no longer fits")
+            self._break(core, gang, no.BrokenGang(gang.name, GangEnd.NOT_FREED))
         else:
             core.read_again(gpu, core.settings.load_probe_s)
         return False
@@ -347,15 +339,14 @@ class Gangs(Feature):
             fallen = next((one for one in gang.members if one.state not in _STANDING), None)
             if fallen is not None:
                 ended = core.ended.get(fallen.id)
-                why = "" if ended is None or ended.error is None else f": {ended.error['message']}"
-                self._break(
-                    core, gang, f"{fallen.spec.consumer} ({fallen.id}) is {fallen.state}{why}"
-                )
+                because = "" if ended is None or ended.error is None else ended.error.code
+                who = (fallen.spec.consumer, fallen.id, str(fallen.state), because)
+                self._break(core, gang, no.BrokenGang(gang.name, GangEnd.FALLEN, *who))
             elif len(gang.members) == gang.size and all(
                 one.state is LeaseState.HELD for one in gang.members
             ):
                 self._dissolve(core, gang)
-                _note(core, gang, "complete", "all are held")
+                _note(core, gang, "complete")
             elif gang.phase == "loading":
                 for gpu_id in gang.gpus:
                     _trim(core, core.gpus[gpu_id], gang)
@@ -364,20 +355,12 @@ class Gangs(Feature):
         found = [self.by_name[name] for name in names if name in self.by_name]
         return sorted(found, key=lambda gang: (gang.first_at, gang.name))
 
-    def _break(
-        self, core: Core, gang: Gang, why: str, code: str = "gang_broken", **details: object
-    ) -> None:
+    def _break(self, core: Core, gang: Gang, refusal: no.BrokenGang | no.GangTooLarge) -> None:
         waiting = [lease for lease in gang.waiting() if lease.id in core.waiting]
         self._dissolve(core, gang)
-        _note(core, gang, "broken", why)
-        error = {
-            "code": code,
-            "message": f"gang {gang.name}: {why}",
-            "hint": "ask for all of it again",
-            "details": {"gang": gang.name, "why": why, **details},
-        }
+        _note(core, gang, "broken", refusal)
         for lease in waiting:
-            eviction.deny(core, lease, error)
+            eviction.deny(core, lease, refusal)
 
     def _dissolve(self, core: Core, gang: Gang) -> None:
         """Forget a gang and withdraw what is reserved for it."""
@@ -421,13 +404,13 @@ class Gangs(Feature):
         """Break a gang whose other members did not ask again after a restart."""
         gang = self.by_name.get(subject)
         if gang is not None and gang.phase == "gathering":
-            self._break(core, gang, "not all of it came back after the restart")
+            self._break(core, gang, no.BrokenGang(gang.name, GangEnd.INCOMPLETE))
 
     # -- answers -----------------------------------------------------------------------------------
     def protects(self, lease: Lease) -> str:
         """A member is not revoked before its gang is complete."""
         gang = self.of.get(lease.id)
-        return "" if gang is None else f"belongs to gang {gang.name}, which is not complete"
+        return "" if gang is None else gang.name
 
     def unplaced(self) -> Iterator[Lease]:
         """Members that gather or load are in no queue."""
@@ -451,7 +434,7 @@ class Gangs(Feature):
         gang = self.of.get(lease.id)
         if gang is None:
             return {}
-        return {"gang": f"{gang.name}: {gang.phase}, {len(gang.members)} of {gang.size}"}
+        return {"gang": gang.view()}
 
     def standing(self, core: Core, lease: Lease) -> Standing | None:
         """Tell how a member waits with its gang, or what a granted one's gang still lacks."""
@@ -469,12 +452,11 @@ class Gangs(Feature):
         return Standing(
             gpu=gpu,
             request=_as_waiter(gang, gpu, lease) if queued else lease,
-            group=f"gang {gang.name}",
+            gang=gang.view(),
+            lacks=tuple(_lacking(gang, lease)),
             fellows=tuple(gang.waiting()) if queued else (lease,),
             loads=None if gang.phase == "gathering" else tuple(loads),
             reserved_bytes=reserved_bytes,
-            condition=f"gang {gang.phase}",
-            outlook=_outlook(gang, lease),
             gives_up=_gives_up(core, gang, gpu),
         )
 
@@ -554,13 +536,13 @@ def _has_room(core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
         _want_reading(core, gpu, some)
         return False
     if room < need:
-        gpu.blocked = "the ledger has room, the card does not: measured memory is not free yet"
-        _say(some, gpu.blocked)
+        gpu.blocked = Block.NOT_FREE
+        _say(some, Wait.NOT_FREE)
     return room >= need
 
 
 def _want_reading(core: Core, gpu: Gpu, some: Iterable[Lease]) -> None:
-    _say(some, "waits for a fresh reading of the card")
+    _say(some, Wait.READING)
     core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
 
 
@@ -615,50 +597,29 @@ def _gpu_of(gang: Gang, lease: Lease) -> GpuId:
     return lease.gpu or gang.planned_on(lease) or lease.request.planned_gpu or lease.request.gpus[0]
 
 
-# -- words -----------------------------------------------------------------------------------------
-def _note(core: Core, gang: Gang, phase: str, reason: str) -> None:
+# -- reports ---------------------------------------------------------------------------------------
+def _note(core: Core, gang: Gang, phase: str, refusal: Refusal | None = None) -> None:
     members = [lease.id for lease in gang.members]
-    core.note("gang", gang=gang.name, phase=phase, members=members, reason=reason)
+    why: dict[str, Any] = {} if refusal is None else {"refusal": refusal}
+    core.note("gang", gang=gang.name, phase=phase, members=members, **why)
 
 
-def _say(some: Iterable[Lease], reason: str) -> None:
+def _say(some: Iterable[Lease], reason: Wait) -> None:
     for lease in some:
         lease.request.reason = reason
 
 
-def _outlook(gang: Gang, lease: Lease) -> str:
-    """Say what a member waits for, or what the gang of a granted one still lacks."""
-    if lease.state is not LeaseState.QUEUED:
-        return _lacks(gang, lease)
-    if gang.phase == "gathering":
-        return (
-            f"waits for the rest of gang {gang.name}: {len(gang.members)} of {gang.size} have come"
-        )
-    if gang.phase == "loading":
-        return (
-            lease.request.reason
-            or "its bytes are kept for it; it loads when those of "
-            f"gang {gang.name} before it are ready"
-        )
-    return f"waits as one of gang {gang.name}: {lease.request.reason or 'behind others'}"
+def _lacking(gang: Gang, lease: Lease) -> list[Lease]:
+    """Return the other members that are not held yet."""
+    return [one for one in gang.members if one is not lease and one.state is not LeaseState.HELD]
 
 
-def _lacks(gang: Gang, lease: Lease) -> str:
-    others = [one for one in gang.members if one is not lease and one.state is not LeaseState.HELD]
-    lacks = [f"{one.spec.consumer} ({one.id}) is {one.state}" for one in others]
-    missing = gang.size - len(gang.members)
-    lacks += [f"{missing} of {gang.size} have to come back"] if missing else []
-    return f"gang {gang.name} is complete once {'all are' if lacks else 'it is'} held" + (
-        f": {', '.join(lacks)}" if lacks else ""
-    )
-
-
-def _gives_up(core: Core, gang: Gang, gpu: Gpu) -> tuple[float, str] | None:
+def _gives_up(core: Core, gang: Gang, gpu: Gpu) -> tuple[float, Because] | None:
     """Return when a gang that gathers or loads is broken, and on which condition."""
     if gang.phase == "gathering":
         at = core.timers.due(("gang", gang.name))
-        return None if at is None else (at, "if the rest has not come back")
+        return None if at is None else (at, Because.INCOMPLETE)
     since = gang.short_since.get(gpu.info.id)
     if gang.phase == "waiting" or since is None:
         return None
-    return since + core.settings.verify_timeout_s, "if its memory is not free then"
+    return since + core.settings.verify_timeout_s, Because.SHORT

@@ -7,6 +7,7 @@ that the promise is kept, until the weights are resident again or the lease is o
 from dataclasses import dataclass, field
 
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.views import HostRamView
 
 
 @dataclass(slots=True)
@@ -44,9 +45,9 @@ class HostRam:
         self.booked.pop(lease, None)
         self.found.discard(lease)
 
-    def status(self) -> dict[str, int]:
-        """Return `schemas.wire.HostRamView`."""
-        return {"budget_bytes": self.budget_bytes, "parked_bytes": self.used_bytes()}
+    def status(self) -> HostRamView:
+        """The budget and what is booked of it."""
+        return HostRamView(self.budget_bytes, self.used_bytes())
 
     def granted_bytes(self) -> int:
         """Return what was booked because it fitted: never more than the budget."""

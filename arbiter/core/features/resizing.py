@@ -11,13 +11,18 @@ from dataclasses import dataclass, field, replace
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ResizeAsked
 from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Request
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_waiters
 from vram_arbiter.arbiter.core.requests.requests import bad_state, own_lease
 from vram_arbiter.arbiter.core.scheduling.policy import largest_growth_bytes
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.codes import Why
+from vram_arbiter.schemas.wire.pushes import ResizedPush
+from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 @dataclass(slots=True)
@@ -55,19 +60,17 @@ class Resizing(Feature):
         if target > charge and self._growth_target(core, lease) != target:
             _check_ever_fits(gpu, lease, target, charge)
             check_waiters(core, core.clients[event.client], lease.spec.priority)
-            self._abandon(core, lease, "another size is asked for")
+            self._abandon(core, lease, Why.RESIZED)
             self._begin_growth(core, gpu, lease, event, target - charge)
         elif target < charge and self._shrink_target(lease) != target:
-            self._abandon(core, lease, "another size is asked for")
+            self._abandon(core, lease, Why.RESIZED)
             self._begin_shrink(core, gpu, lease, target)
         elif target == charge:
-            self._abandon(core, lease, "another size is asked for")
+            self._abandon(core, lease, Why.RESIZED)
         _declare(lease, event, target)
         core.record_lease(lease)  # a restart must not read a smaller holder as one that is gone
         state = self._resizing(lease) or "held"
-        core.reply(
-            event.client, event.request, {"state": state, "lease": explain.view(core, lease)}
-        )
+        core.reply(event.client, event.request, AcquireReply(state, explain.view(core, lease)))
 
     def _growth_target(self, core: Core, lease: Lease) -> int | None:
         growth = self.growths.get(lease.id)
@@ -85,7 +88,7 @@ class Resizing(Feature):
             return "growing"
         return "shrinking" if lease.id in self.shrinks else ""
 
-    def _abandon(self, core: Core, lease: Lease, why: str) -> None:
+    def _abandon(self, core: Core, lease: Lease, why: Why) -> None:
         """End the resize of a lease, if there is one."""
         self._end_shrink(core, lease)
         growth_id = self.growths.get(lease.id)
@@ -93,7 +96,7 @@ class Resizing(Feature):
             growth = core.leases[growth_id]
             core.move(growth, LeaseState.CANCELLED, why)
             core.dequeue(growth)
-            core.note("cancelled", growth, reason=why)
+            core.note("cancelled", growth, why=why)
             core.end(growth, None)
 
     # -- growing -----------------------------------------------------------------------------------
@@ -128,7 +131,7 @@ class Resizing(Feature):
                 wait_timeout_s=event.wait_timeout_s,
                 extends=lease.id,
             ),
-            story=[(core.now, LeaseState.QUEUED, f"growth of {lease.id}")],
+            story=[(core.now, LeaseState.QUEUED, Why.GROWTH)],
         )
         self.watch(growth)
         self.watch(lease)
@@ -136,8 +139,7 @@ class Resizing(Feature):
         core.enqueue(growth)
         self.growths[lease.id] = growth.id
         position = gpu.queue.position(growth)
-        reason = f"{lease.id} grows by {more_bytes}"
-        core.note("queued", growth, position=position, grows=lease.id, reason=reason)
+        core.note("queued", growth, position=position, grows=lease.id, more_bytes=more_bytes)
 
     def grant(self, core: Core, gpu: Gpu, request: Lease) -> bool:
         """Add the bytes of a growth to its lease; record it before the holder is told."""
@@ -145,7 +147,7 @@ class Resizing(Feature):
             return False
         lease, more_bytes = core.leases[request.request.extends], request.request.load_peak_bytes
         core.dequeue(request)
-        core.move(request, LeaseState.RELEASED, f"merged into {lease.id}")
+        core.move(request, LeaseState.RELEASED, Why.MERGED)
         core.end(request, None)
         charge = gpu.ledger.charge_of(lease.id)
         booked, approved = charge.booked_bytes + more_bytes, charge.approved_bytes + more_bytes
@@ -204,12 +206,10 @@ class Resizing(Feature):
         """Forget a growth that ended, and end the resize of a lease that is released."""
         if lease.request.extends is not None:
             del self.growths[lease.request.extends]
-        elif lease.state is LeaseState.UNLOADING:
-            self._abandon(core, lease, "it unloads")
-        elif lease.state is LeaseState.VERIFYING:
-            self._abandon(core, lease, "it let go")
+        elif lease.state is LeaseState.UNLOADING or lease.state is LeaseState.VERIFYING:
+            self._abandon(core, lease, Why.LEAVES)
         elif lease.state in (LeaseState.EXPIRED, LeaseState.LOST):
-            self._abandon(core, lease, "the lease is over")
+            self._abandon(core, lease, Why.OVER)
 
     def size_changes(self, lease: Lease) -> bool:
         """Return whether the lease may show bytes that its holder has freed already."""
@@ -225,29 +225,17 @@ class Resizing(Feature):
 
 def _check_resizable(lease: Lease) -> None:
     if lease.state in LEAVING:
-        raise Refused(
-            "lease_revoking",
-            f"{lease.spec.consumer} was asked to leave",
-            "leave; ask for the new size when it is granted again",
-            state=str(lease.state),
-        )
+        raise Refused(no.Revoked(lease.spec.consumer, lease.state, "resize"))
     if lease.state is not LeaseState.HELD:
-        raise bad_state(lease, "only a held lease is resized")
+        raise bad_state(lease, Misfit.NOT_RESIZABLE)
 
 
 def _check_ever_fits(gpu: Gpu, lease: Lease, target: int, charge: int) -> None:
     room = largest_growth_bytes(gpu, lease)
     if target - charge <= room:
         return
-    raise Refused(
-        "vram_insufficient",
-        f"{lease.spec.consumer} would need {target} bytes; "
-        f"alone on its GPU it can have {charge + room}",
-        "stay smaller",
-        needed_bytes=target,
-        capacity_bytes=gpu.info.capacity_bytes,
-        reserve_bytes=gpu.info.reserve_bytes,
-    )
+    sizes = (target, charge + room, gpu.info.capacity_bytes, gpu.info.reserve_bytes)
+    raise Refused(no.GrowthTooLarge(lease.spec.consumer, *sizes))
 
 
 def _declare(lease: Lease, event: ResizeAsked, target: int) -> None:
@@ -287,11 +275,5 @@ def _tell(core: Core, gpu: Gpu, lease: Lease, changed_bytes: int) -> None:
     core.record_lease(lease)
     token = lease.token
     assert token is not None, f"{lease.id} is resident without a token"
-    pair = [token.epoch, token.serial]
-    core.push(
-        lease, {"push": "resized", "lease_id": lease.id, "token": pair, "charge_bytes": charge}
-    )
-    reason = "the bytes did not come back in time"
-    if changed_bytes:
-        reason = "grown" if changed_bytes > 0 else "shrunk"
-    core.note("resized", lease, charge_bytes=charge, changed_bytes=changed_bytes, reason=reason)
+    core.push(lease, ResizedPush(lease.id, token, charge))
+    core.note("resized", lease, charge_bytes=charge, changed_bytes=changed_bytes)

@@ -23,6 +23,7 @@ from vram_arbiter.arbiter.core.features.parking import HostRam
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.arbiter.core.learning import costs, drift
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     EXPIRING,
@@ -31,7 +32,8 @@ from vram_arbiter.arbiter.core.model.lease import (
     Lease,
     LeaseState,
 )
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model.refusals import End, Misfit, Refused
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.report.standing import Standing
 from vram_arbiter.arbiter.core.requests.limits import check_waiters
@@ -44,8 +46,10 @@ from vram_arbiter.arbiter.core.requests.requests import (
 )
 from vram_arbiter.arbiter.core.scheduling import grants, placement, policy
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId
-
-NOT_BACK = "its holder did not come back after the restart"
+from vram_arbiter.schemas.wire.codes import Order, Why
+from vram_arbiter.schemas.wire.explained import Return
+from vram_arbiter.schemas.wire.pushes import GrantedPush, LostPush
+from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,19 +114,11 @@ class Standby(Feature):
         """Book host RAM for the weights that a holder says it keeps there."""
         count = lease.spec.park_bytes
         if exiting or not count:
-            what = "a process that exits keeps nothing" if exiting else "its spec has no park_bytes"
-            raise bad_state(lease, f"it cannot be parked: {what}")
+            raise bad_state(lease, Misfit.EXITS if exiting else Misfit.NO_PARK_BYTES)
         if lease.id in self.host.booked or self.host.book(lease.id, count):
             return
         budget, booked = self.host.budget_bytes, self.host.used_bytes()
-        raise Refused(
-            "host_ram_insufficient",
-            f"{count} bytes of host RAM are asked for; of a budget of {budget} {booked} are booked",
-            "release without parking, or raise host.park_budget_bytes",
-            needed_bytes=count,
-            budget_bytes=budget,
-            booked_bytes=booked,
-        )
+        raise Refused(no.NoHostRam(count, budget, booked))
 
     def next_state(self, lease: Lease) -> LeaseState | None:
         """Return where a released lease is, or goes after its verdict, if it lives on."""
@@ -178,13 +174,12 @@ class Standby(Feature):
         lease.request.answered = True
         _expect(core, lease)
         self._enter(core, lease)
-        how = "by itself when there is room" if absence.comes_back else "when its holder asks"
         core.note(
             str(lease.state),
             lease,
             left_for=absence.left_for,
             parked_bytes=self.host.booked.get(lease.id, 0),
-            reason=f"comes back {how}",
+            comes_back=absence.comes_back,
         )
         if absence.recall is not None:
             recall, absence.recall = absence.recall, None
@@ -197,7 +192,7 @@ class Standby(Feature):
         core.record_lease(lease)
         _wake(core, lease)
 
-    def on_dismissed(self, core: Core, lease: Lease, why: str) -> None:
+    def on_dismissed(self, core: Core, lease: Lease, order: Order) -> None:
         """Do not bring back what an operator evicts.
 
         On standby a lease ends; parked it stays until its holder asks.
@@ -205,17 +200,19 @@ class Standby(Feature):
         absence = self._of(lease)
         absence.comes_back, absence.recall = False, None
         if lease.state is LeaseState.STANDBY:
-            _push_lost(core, lease, why)
-            _end(core, lease, LeaseState.CANCELLED, "lease_lost", why)
+            refusal = no.Lost(lease.id, Why.EVICTED, order=order)
+            assert lease.token is not None, f"{lease.id} is away and was never granted"
+            core.push(lease, LostPush(lease.id, lease.token, refusal.view()))
+            _end(core, lease, LeaseState.CANCELLED, refusal)
             return
         absence.dismissed = lease.state is not LeaseState.PARKED
         if lease.spec.standby or lease.state is LeaseState.PARKED:
             core.record_lease(lease)
 
-    def give_up(self, core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> bool:
+    def give_up(self, core: Core, lease: Lease, to: LeaseState, refusal: End) -> bool:
         """End a lease that is away. One that is on its way there ends with its verdict."""
         if lease.state in AWAY:
-            _end(core, lease, to, code, why)
+            _end(core, lease, to, refusal)
             return True
         absence = self.absences.get(lease.id)
         if lease.state is not LeaseState.VERIFYING or absence is None:
@@ -254,11 +251,7 @@ class Standby(Feature):
         client = client_of(core, event.client)
         lease = lease_for(core, event.lease, event.token)
         if lease.process != client.process:
-            raise Refused(
-                "not_permitted",
-                f"{lease.id} belongs to process {lease.process.pid}",
-                "ask as its holder",
-            )
+            raise Refused(no.NotHolder(lease.id, lease.process.pid))
         if lease.state in AWAY:
             self._want_back(core, lease, event)
             return
@@ -267,14 +260,9 @@ class Standby(Feature):
             lease.request.traceparent = event.traceparent
             absence.recall = absence.recall or Recall(core.now, event.wait_timeout_s)
         elif lease.state is not LeaseState.QUEUED:
-            raise bad_state(
-                lease,
-                "only a lease that is away, or being measured on its way there, is called back",
-            )
+            raise bad_state(lease, Misfit.NOT_AWAY)
         core.hand_to(lease, client.id)
-        core.reply(
-            event.client, event.request, {"state": "queued", "lease": explain.view(core, lease)}
-        )
+        core.reply(event.client, event.request, AcquireReply("queued", explain.view(core, lease)))
 
     def _find(self, core: Core, process: ProcessKey, spec: Spec) -> Lease | None:
         if not self.away:
@@ -319,7 +307,7 @@ class Standby(Feature):
     ) -> None:
         """Queue a lease that is away as of `asked_at`. Without a request its grant is pushed."""
         del self.away[lease.id]
-        core.move(lease, LeaseState.QUEUED, "wanted again")
+        core.move(lease, LeaseState.QUEUED, Why.WANTED)
         core.timers.clear(("away", lease.id))  # after a restart: its holder reattached
         lease.attached = True
         core.hand_to(lease, client)
@@ -424,7 +412,7 @@ class Standby(Feature):
             core.wake(core.gpus[GpuId(subject)])
             return
         lease = core.leases[LeaseId(subject)]
-        _end(core, lease, LeaseState.CANCELLED, "lease_lost", NOT_BACK)
+        _end(core, lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
 
     # -- across a restart --------------------------------------------------------------------------
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
@@ -475,14 +463,14 @@ class Standby(Feature):
             core.timers.clear(("away", lease.id))
             _wake(core, lease)
         elif lease.token != item.token:
-            core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+            core.push(lease, GrantedPush(explain.view(core, lease)))
         elif lease.state in EXPIRING:
             absence = self._of(lease)
             absence.comes_back = lease.spec.standby and not absence.dismissed
             absence.parks = item.parked
             if item.parked:
                 self.host.find(lease.id, lease.spec.park_bytes)
-            let_go(core, lease, exiting=False, why="let go, says its holder")
+            let_go(core, lease, exiting=False, why=Why.LET_GO_BEFORE)
 
     # -- answers -----------------------------------------------------------------------------------
     def can_park(self, lease: Lease) -> bool:
@@ -522,31 +510,29 @@ class Standby(Feature):
         if lease.state not in AWAY:
             return None
         gpu = core.gpus[lease.request.planned_gpu or lease.request.gpus[0]]
-        where = "parked" if lease.state is LeaseState.PARKED else "on standby"
-        outlook = where + self._outlook(core, lease)
-        return Standing(gpu, lease, (lease,), (lease,), outlook=outlook)
+        back, ahead, due_s = self._outlook(core, lease)
+        return Standing(gpu, lease, (lease,), (lease,), back=back, ahead=ahead, due_s=due_s)
 
-    def _outlook(self, core: Core, lease: Lease) -> str:
+    def _outlook(self, core: Core, lease: Lease) -> tuple[Return, str, float | None]:
+        """Return what a lease that is away waits for, the consumer before it, and in how many seconds it returns."""
         absence = self.absences[lease.id]
         if not lease.attached:
-            return f", but {NOT_BACK}"
+            return Return.HOLDER, "", None
         if not absence.comes_back:
-            return " in host RAM until its holder asks for it"
+            return Return.ASKED, "", None
         gpu = core.gpus[lease.request.gpus[0]]
-        blocked = policy.blocked(core, gpu)
-        head = gpu.queue.head()
-        if head is not None:
-            return f": {head.spec.consumer} waits, and goes first"
-        if blocked:
-            return f": {blocked}"
+        if (head := gpu.queue.head()) is not None:
+            return Return.BEHIND, head.spec.consumer, None
+        if policy.blocked(core, gpu):
+            return Return.BLOCKED, "", None
         if self._left_for_is_here(gpu, lease):
-            return f" until {absence.left_for} has left"
+            return Return.LEFT_FOR, absence.left_for, None
         if not policy.fits(gpu, lease):
-            return " until there is room; it asks nobody to leave"
+            return Return.NO_ROOM, "", None
         due_at = self._quiet_at(gpu, lease)
         if due_at > core.now:
-            return f": comes back in {due_at - core.now:.1f} s if the card stays quiet"
-        return ": comes back with the next reading of the card, or after those before it"
+            return Return.QUIET, "", due_at - core.now
+        return Return.READING, "", None
 
 
 def _concerns(spec: Spec) -> bool:
@@ -584,34 +570,11 @@ def _expect(core: Core, lease: Lease) -> None:
     request.load_peak_bytes, request.steady_bytes = drift.expected_bytes(core, lease.spec)
 
 
-def _end(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
+def _end(core: Core, lease: Lease, to: LeaseState, refusal: End) -> None:
     """End a lease that is away: nothing has to be measured."""
-    core.move(lease, to, why)
-    core.note(str(to), lease, reason=why)
-    core.end(lease, _error(lease, code, why))
-
-
-def _push_lost(core: Core, lease: Lease, why: str) -> None:
-    token = lease.token
-    assert token is not None, f"{lease.id} is away and was never granted"
-    core.push(
-        lease,
-        {
-            "push": "lost",
-            "lease_id": lease.id,
-            "token": [token.epoch, token.serial],
-            "error": _error(lease, "lease_lost", why),
-        },
-    )
-
-
-def _error(lease: Lease, code: str, why: str) -> dict[str, Any]:
-    return {
-        "code": code,
-        "message": f"{lease.id}: {why}",
-        "hint": "acquire again",
-        "details": {},
-    }
+    core.move(lease, to, refusal.why)
+    core.note(str(to), lease, why=refusal.why)
+    core.end(lease, refusal)
 
 
 def _wake(core: Core, lease: Lease) -> None:

@@ -9,8 +9,10 @@ from typing import Final
 
 from vram_arbiter.arbiter.core.events import Spec
 from vram_arbiter.arbiter.core.learning.drift import model_name
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import Failures, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model.refusals import Refused
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import GpuId
 
 FREE: Final = 2
@@ -45,14 +47,7 @@ def check(core: Core, spec: Spec, load_peak_bytes: int, gpus: tuple[GpuId, ...])
         return
     if any(_costs_nobody(core.gpus[gpu], spec, load_peak_bytes) for gpu in gpus):
         return
-    raise Refused(
-        "load_failing",
-        f"{spec.consumer} failed {seen.count} times in a row to load {spec.key}: {seen.cause}",
-        f"nobody is made to leave for it for {wait_s:.0f} s more; look at its own log",
-        failures=seen.count,
-        cause=seen.cause,
-        retry_in_s=wait_s,
-    )
+    raise Refused(no.LoadFails(spec.consumer, str(spec.key), seen.count, seen.cause, wait_s))
 
 
 def _pause_s(seen: Failures) -> float:

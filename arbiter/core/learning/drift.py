@@ -5,14 +5,13 @@ all the same, so only one *above* the declared is drift. What is resident is fol
 one card shows one sum: nothing is learnt from it. Changes no charge: a footprint counts from the next acquire on.
 """
 
-from typing import Any
-
 from vram_arbiter.arbiter.core.events import Spec
 from vram_arbiter.arbiter.core.learning.footprints import PARTS, Part
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.model.verification import Verification
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.explained import FootprintView
 
 _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
 
@@ -112,7 +111,7 @@ def drift_bytes(core: Core, gpu: Gpu, lease: Lease) -> int:
     return drift if abs(drift) > core.settings.verify_tolerance_bytes else 0
 
 
-def footprint(core: Core, lease: Lease) -> dict[str, Any]:
+def footprint(core: Core, lease: Lease) -> FootprintView:
     """Declared against learnt, for `why`: bytes per part; learnt 0: never measured."""
     spec = lease.spec
     declared = {
@@ -122,7 +121,9 @@ def footprint(core: Core, lease: Lease) -> dict[str, Any]:
     }
     learnt = {part: core.footprints.p95_bytes(model_name(spec), part) for part in PARTS}
     held = 0 if lease.gpu is None else held_bytes(core.gpu_of(lease), lease)
-    return {"declared_bytes": declared, "learnt_bytes": learnt, "held_bytes": held or None}
+    return FootprintView(
+        declared, {str(part): count for part, count in learnt.items()}, held or None
+    )
 
 
 def _note_drift(core: Core, lease: Lease, part: Part, measured: int) -> None:
@@ -139,5 +140,4 @@ def _note_drift(core: Core, lease: Lease, part: Part, measured: int) -> None:
         declared_bytes=declared,
         measured_bytes=measured,
         drift_bytes=drift,
-        reason=f"its {part.replace('_', ' ')} is {'above' if drift > 0 else 'below'} what it declared",
     )

@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from vram_arbiter.arbiter.core.events import MemorySampled, Spec
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.schemas.wire.codes import Cause, Order, RevokeCause, Wait
 
 if TYPE_CHECKING:
     from vram_arbiter.arbiter.core.hooks import Feature
@@ -93,21 +94,6 @@ class Use:
     began_at: float
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
-    """An operator's word: who gave it (name, uid, pid) and why."""
-
-    by: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"{self.by}: {self.reason}" if self.reason else self.by
-
-
-Cause = Literal["waiter", "pressure", "operator"]
-"""Why a holder is revoked: for a request, because the GPU holds more than its budget, or by hand."""
-
-
 @dataclass(slots=True)
 class Eviction:
     """One holder's way out, from the first `revoke` to the verdict. Times are monotonic seconds."""
@@ -117,7 +103,6 @@ class Eviction:
     charge_bytes: int
     wanted_by: LeaseId | None  # None: nobody waits, the card is under pressure
     wanted_consumer: str
-    reason: str
     cause: Cause
     asked_at: float
     next_push_at: float
@@ -130,9 +115,16 @@ class Eviction:
     released_at: float | None = None
     verdict_at: float | None = None
     verdict: str = ""
+    gang: str = ""  # of the waiter
     order: Order | None = None  # an operator wanted it
     # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited for
     traceparent: str | None = None
+
+    @property
+    def why(self) -> RevokeCause:
+        """Why the holder is revoked."""
+        cause = "operator" if self.order else self.cause
+        return RevokeCause(cause, self.wanted_consumer, self.gang, self.order)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +157,7 @@ class Request:
     answered: bool = False  # the end of the wait is told by push
     wait_timeout_s: float | None = None
     traceparent: str | None = None
-    reason: str = ""  # why it waits, in words
+    reason: Wait | None = None  # why it waits
     planned_gpu: GpuId | None = None  # where holders were revoked for it
     extends: LeaseId | None = None  # a request for more bytes of that resident lease
     rank: float | None = None  # a place in the queues that a feature gave it

@@ -30,7 +30,6 @@ from vram_arbiter.arbiter.core.model.lease import (
     Failures,
     Lease,
     LeaseState,
-    Order,
     Use,
 )
 from vram_arbiter.arbiter.core.model.residents import Residents
@@ -40,6 +39,10 @@ from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.core.timers import Timers
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.schemas.wire.codes import Block, Order, RevokeCause
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.replies import AnyReply
 
 ENDED_REMEMBERED = 1024
 LEARNT_REMEMBERED = 32
@@ -50,25 +53,6 @@ NOT_COUNTED = (-1, -1)
 _LOADING = frozenset({LeaseState.LOADING})
 _MOVING = LEAVING | _LOADING
 IDLE_PROBE_S = 10.0  # how long after the last client a card is still read in the background
-
-
-class Refused(Exception):
-    """A request cannot be done; raised before anything has changed. `code` is a wire code."""
-
-    def __init__(self, code: str, message: str, hint: str, **details: Any) -> None:
-        super().__init__(message)
-        self.code = code
-        self.message = message
-        self.hint = hint
-        self.details = details
-
-    def wire(self) -> dict[str, Any]:
-        return {
-            "code": self.code,
-            "message": self.message,
-            "hint": self.hint,
-            "details": self.details,
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +73,9 @@ class Ended:
     nonce: str
     token: Token | None
     state: LeaseState
-    error: Mapping[str, Any] | None
+    error: Refusal | None
     earlier_nonces: tuple[str, ...] = ()
-    evicted: str = ""  # who made it leave, and why, in words
+    revoked: RevokeCause | None = None  # it was evicted
 
 
 @dataclass(slots=True)
@@ -139,7 +123,7 @@ class Gpu:
     read_from: float = 0.0  # no reading that began earlier counts (resume from suspend)
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
     changed_at: float = 0.0  # last grant, ready or verdict
-    blocked: str = ""
+    blocked: Block | None = None
     keeper: Feature | None = None  # keeps it from the requests of all others
     pressed: bool = False  # a pressure note is out
 
@@ -218,15 +202,13 @@ class Core:
             self.wake(gpu)
 
     # -- effects ---------------------------------------------------------------------------------------------------
-    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
+    def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None:
         self.turn.effects.append(Reply(client, request, body))
 
-    def refuse(self, client: ClientId, request: RequestId, refused: Refused) -> None:
-        self.turn.effects.append(
-            Refuse(client, request, refused.code, refused.message, refused.hint, refused.details)
-        )
+    def refuse(self, client: ClientId, request: RequestId, refusal: Refusal) -> None:
+        self.turn.effects.append(Refuse(client, request, refusal))
 
-    def push(self, lease: Lease, body: Mapping[str, Any]) -> None:
+    def push(self, lease: Lease, body: AnyPush) -> None:
         self.turn.effects.append(Push(self.voice_of(lease), body))
 
     def note(self, kind: str, lease: Lease | None = None, **data: Any) -> None:
@@ -425,7 +407,7 @@ class Core:
             self.gpus[gpu_id].queue.discard(lease)
             self.wake(self.gpus[gpu_id])
 
-    def end(self, lease: Lease, error: Mapping[str, Any] | None) -> None:
+    def end(self, lease: Lease, error: Refusal | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
@@ -439,7 +421,7 @@ class Core:
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")
         earlier = tuple(lease.request.earlier_nonces)
-        evicted = "" if lease.departure.eviction is None else lease.departure.eviction.reason
+        revoked = None if lease.departure.eviction is None else lease.departure.eviction.why
         ended = Ended(
             lease.id,
             lease.process,
@@ -448,7 +430,7 @@ class Core:
             lease.state,
             error,
             earlier,
-            evicted,
+            revoked,
         )
         self.remember(ended)
 

@@ -1,6 +1,7 @@
-"""Answers for people and programs: views of leases, `status`, `why`, and the record of a switch. Reads only."""
+"""Views of leases and GPUs, `status`, `why`, and the record of a switch: typed data without words. Reads only."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from heapq import merge, nsmallest
 from itertools import chain, islice
 from math import inf
@@ -8,21 +9,33 @@ from operator import attrgetter
 from statistics import median
 from typing import Any
 
+from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.arbiter.core.learning import drift
 from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import outlook
-from vram_arbiter.arbiter.core.report.blockers import (
-    ago,
-    gib,
-    loading,
-    unloading,
-    uses,
-    who_blocks,
-)
+from vram_arbiter.arbiter.core.report.blockers import holder, who_blocks
 from vram_arbiter.arbiter.core.report.standing import Standing, standing_of
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.codes import Block
+from vram_arbiter.schemas.wire.explained import (
+    Action,
+    Blocker,
+    Explanation,
+    Situation,
+    Step,
+    WhyReply,
+)
+from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.views import (
+    BlockView,
+    GpuView,
+    HostRamView,
+    LeaseView,
+    ProcessView,
+    Totals,
+)
 
 NOTE_KINDS: tuple[str, ...] = (
     "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
@@ -48,53 +61,53 @@ type PageKey = tuple[int, float, int]
 
 EXPLAINED_MAX = 8
 """Leases of one answer to `why`."""
+MISSING_NAMED = 3
+"""Holders that have not reattached and are named; the others are counted."""
 
 
 # -- views -------------------------------------------------------------------------------------------------------------
-def view_for(core: Core, lease: Lease, reader: ProcessKey | None) -> dict[str, Any]:
-    """A lease as `reader` may see it: its token is shown to the holder's process and to an operator (None) only, since a token is all
-    that is needed to mark a use, which keeps a lease from being evicted."""
+def view_for(core: Core, lease: Lease, reader: ProcessKey | None) -> LeaseView:
+    """A lease as `reader` may see it.
+
+    Its token is shown to the holder's process and to an operator (None) only: a token is all that is needed to mark a
+    use, which keeps a lease from being evicted.
+    """
     shown = view(core, lease)
-    if reader is not None and reader != lease.process:
-        shown["token"] = None
-    return shown
+    return shown if reader is None or reader == lease.process else replace(shown, token=None)
 
 
-def view(core: Core, lease: Lease) -> dict[str, Any]:
-    """`schemas.wire.LeaseView`, for the lease's holder or an operator."""
+def view(core: Core, lease: Lease) -> LeaseView:
+    """A lease as its holder or an operator may see it."""
     gpu = None if lease.gpu is None else core.gpus[lease.gpu]
-    shown: dict[str, Any] = {
-        "lease_id": lease.id,
-        "token": None if lease.token is None else [lease.token.epoch, lease.token.serial],
-        "state": str(lease.state),
-        "consumer": lease.spec.consumer,
-        "model": str(lease.spec.key),
-        "gpu": lease.gpu,
-        "mode": "exclusive" if lease.spec.exclusive else "shared",
-        "priority": lease.spec.priority,
-        "evictable": lease.evictable,
-        "charge_bytes": _charge_bytes(lease, gpu),
-        "uses": len(lease.uses),
-        "pid": lease.process.pid,
-        "since_s": core.now - lease.since,
-        "waited_s": (core.now if lease.state is LeaseState.QUEUED else lease.granted_at)
-        - lease.request.arrived_at,
-    }
-    if lease.token is not None:
-        shown["granted_s"] = core.now - lease.held_from
-    if lease.pinned is not None:
-        shown["pinned"] = str(lease.pinned)
-    if lease.uses.paused:
-        shown["yielded"] = len(lease.uses.paused)
+    queued = lease.state is LeaseState.QUEUED
+    shown: dict[str, Any] = {}
     for feature in lease.features:
         shown.update(feature.view(core, lease))
-    if lease.state is LeaseState.QUEUED:
+    if queued:
         shown["position"] = _best_position(core, lease)
-    elif lease.state is not LeaseState.VERIFYING and lease.state not in AWAY:
-        if drifted := drift.drift_bytes(core, core.gpu_of(lease), lease):
-            shown["drift_bytes"] = drifted
+    elif gpu is not None and lease.state is not LeaseState.VERIFYING:
+        shown["drift_bytes"] = drift.drift_bytes(core, gpu, lease)
         shown["ttl_left_s"] = max(0.0, lease.expires_at - core.now)
-    return shown
+    return LeaseView(
+        lease_id=lease.id,
+        token=lease.token,
+        state=lease.state,
+        consumer=lease.spec.consumer,
+        model=str(lease.spec.key),
+        gpu=lease.gpu,
+        mode="exclusive" if lease.spec.exclusive else "shared",
+        priority=lease.spec.priority,
+        evictable=lease.evictable,
+        charge_bytes=_charge_bytes(lease, gpu),
+        uses=len(lease.uses),
+        pid=lease.process.pid,
+        since_s=core.now - lease.since,
+        waited_s=(core.now if queued else lease.granted_at) - lease.request.arrived_at,
+        granted_s=None if lease.token is None else core.now - lease.held_from,
+        pinned="" if lease.pinned is None else str(lease.pinned),
+        yielded=len(lease.uses.paused),
+        **shown,
+    )
 
 
 def _charge_bytes(lease: Lease, gpu: Gpu | None) -> int:
@@ -104,84 +117,99 @@ def _charge_bytes(lease: Lease, gpu: Gpu | None) -> int:
     return 0 if lease.state in AWAY else lease.request.load_peak_bytes
 
 
-def gpu_view(core: Core, gpu: Gpu) -> dict[str, Any]:
-    """`schemas.wire.GpuView`."""
+def gpu_view(core: Core, gpu: Gpu) -> GpuView:
+    """A GPU: what is charged, measured and blocked."""
     ledger = gpu.ledger
     known = gpu.sample is not None and gpu.failed_at is None
-    return {
-        "gpu": gpu.info.id,
-        "index": gpu.info.index,
-        "name": gpu.info.name,
-        "source": gpu.info.source,
-        "capacity_bytes": gpu.info.capacity_bytes,
-        "reserve_bytes": gpu.info.reserve_bytes,
-        "charged_bytes": ledger.booked_bytes(),
-        "stowaway_bytes": ledger.stowaway_bytes(),
-        "measured_used_bytes": gpu.sample.used_bytes if known and gpu.sample is not None else None,
-        "sample_age_s": None if gpu.sample is None else core.now - gpu.sample.taken_at,
-        "pressure_bytes": ledger.pressure_bytes(),
-        "blocked": policy.blocked(core, gpu) or gpu.blocked,
-        "processes": _processes(gpu),
-    }
+    return GpuView(
+        gpu=gpu.info.id,
+        index=gpu.info.index,
+        name=gpu.info.name,
+        source=gpu.info.source,
+        capacity_bytes=gpu.info.capacity_bytes,
+        reserve_bytes=gpu.info.reserve_bytes,
+        charged_bytes=ledger.booked_bytes(),
+        stowaway_bytes=ledger.stowaway_bytes(),
+        measured_used_bytes=gpu.sample.used_bytes if known and gpu.sample is not None else None,
+        sample_age_s=None if gpu.sample is None else core.now - gpu.sample.taken_at,
+        pressure_bytes=ledger.pressure_bytes(),
+        blocked=block_view(core, gpu),
+        processes=tuple(_processes(gpu)),
+    )
 
 
-def _processes(gpu: Gpu) -> list[dict[str, Any]]:
-    names: dict[int, tuple[str, int | None]] = {}
+def block_view(core: Core, gpu: Gpu) -> BlockView | None:
+    """Why nothing is granted on a GPU now, with its values; None if grants are possible."""
+    code = policy.blocked(core, gpu) or gpu.blocked
+    match code:
+        case None:
+            return None
+        case Block.RECOVERING:
+            missing = core.recovering or ()
+            known = [core.leases[one] for one in sorted(missing) if one in core.leases]
+            names = tuple(f"{one.spec.consumer} (pid {one.process.pid})" for one in known)
+            return BlockView(code, names[:MISSING_NAMED], more=len(names[MISSING_NAMED:]))
+        case Block.DRAINED:
+            return BlockView(code, problem=str(core.drain))
+        case Block.UNREADABLE:
+            return BlockView(code, problem=gpu.failure)
+        case Block.LOADING:
+            loading = gpu.in_state(LeaseState.LOADING)[:1]
+            return BlockView(code, tuple(one.spec.consumer for one in loading))
+        case Block.GANG:
+            return BlockView(code, (policy.kept_by(gpu),))
+        case Block.PRESSURE:
+            return BlockView(code, bytes=gpu.ledger.pressure_bytes())
+        case _:
+            return BlockView(code)
+
+
+def _processes(gpu: Gpu) -> Iterator[ProcessView]:
+    listed: dict[int, ProcessUse] = {}
     if gpu.sample is not None:
-        names = {use.process.pid: (use.name, use.used_bytes) for use in gpu.sample.listed}
-    shown = [
-        {
-            "pid": account.process.pid,
-            "name": names.get(account.process.pid, ("", None))[0],
-            "used_bytes": names.get(account.process.pid, ("", None))[1],
-            "lease_ids": sorted(account.charges),
-            "charged_bytes": account.booked_bytes(),
-            "residue_bytes": account.residue_bytes,
-            "stowaway": False,
-        }
-        for account in gpu.ledger.accounts.values()
-    ]
-    shown += [
-        {
-            "pid": stranger.process.pid,
-            "name": stranger.name,
-            "used_bytes": stranger.used_bytes,
-            "lease_ids": [],
-            "charged_bytes": 0,
-            "residue_bytes": 0,
-            "stowaway": True,
-        }
-        for stranger in gpu.ledger.strangers.values()
-    ]
-    return shown
+        listed = {use.process.pid: use for use in gpu.sample.listed}
+    for account in gpu.ledger.accounts.values():
+        use = listed.get(account.process.pid)
+        yield ProcessView(
+            pid=account.process.pid,
+            name="" if use is None else use.name,
+            used_bytes=None if use is None else use.used_bytes,
+            lease_ids=tuple(sorted(account.charges)),
+            charged_bytes=account.booked_bytes(),
+            residue_bytes=account.residue_bytes,
+            stowaway=False,
+        )
+    for stowaway in gpu.ledger.strangers.values():
+        pid, used = stowaway.process.pid, stowaway.used_bytes
+        yield ProcessView(pid, stowaway.name, used, (), 0, 0, stowaway=True)
 
 
 def status(
     core: Core,
-    host_ram: Mapping[str, int],
+    host_ram: HostRamView,
     reader: ProcessKey | None = None,
     after: PageKey | None = None,
     limit: int | None = None,
-) -> dict[str, Any]:
-    """Return `schemas.wire.StatusReply` with the leases that follow `after`, at most `limit` of them.
+) -> StatusReply:
+    """Return the status with the leases that follow `after`, at most `limit` of them.
 
     A page costs what it holds, however many wait: the queues are sorted already. `reader`: see `view_for`.
     """
     leases = list(islice(_listed(core, after, limit), limit))
-    shown: dict[str, Any] = {
-        "epoch": core.settings.epoch,
-        "phase": "serving" if core.recovering is None else "recovering",
-        "uptime_s": core.now - core.started_at,
-        "gpus": [gpu_view(core, gpu) for gpu in core.gpus.values()],
-        "leases": [view_for(core, lease, reader) for lease in leases],
-        "totals": {"leases": len(core.leases), "waiting": len(core.waiting)},
-        "clients": len(core.clients),
-        "host_ram": dict(host_ram),
-        "drained": "" if core.drain is None else str(core.drain),
-    }
-    if leases and len(leases) == limit:
-        shown["next"] = list(_page_key(core, leases[-1]))
-    return shown
+    more = leases and len(leases) == limit
+    return StatusReply(
+        epoch=core.settings.epoch,
+        phase="serving" if core.recovering is None else "recovering",
+        uptime_s=core.now - core.started_at,
+        gpus=tuple(gpu_view(core, gpu) for gpu in core.gpus.values()),
+        leases=tuple(view_for(core, lease, reader) for lease in leases),
+        totals=Totals(leases=len(core.leases), waiting=len(core.waiting)),
+        clients=len(core.clients),
+        host_ram=host_ram,
+        drained="" if core.drain is None else str(core.drain),
+        problems=(),
+        next=_page_key(core, leases[-1]) if more else None,
+    )
 
 
 def _page_key(core: Core, lease: Lease) -> PageKey:
@@ -239,55 +267,50 @@ def _best_position(core: Core, lease: Lease) -> int:
 
 
 # -- why ---------------------------------------------------------------------------------------------------------------
-def why(core: Core, consumer: str) -> dict[str, Any]:
-    """`schemas.wire.WhyReply`: why a consumer is not running, or that it is. A lease's id stands for that lease.
+def why(core: Core, consumer: str) -> WhyReply:
+    """Explain why a consumer is not running, or that it is. A lease's id stands for that lease.
 
-    Of a consumer with many leases the oldest are explained: each costs a search for what may make room.
+    Of a consumer with many leases the oldest are explained: each costs a search for victims.
     """
     named = core.leases.get(LeaseId(consumer))
     mine = (
         [named] if named else [one for one in core.leases.values() if one.spec.consumer == consumer]
     )
-    told: dict[str, Any] = {
-        "consumer": consumer,
-        "leases": [_with_plan(core, lease) for lease in mine[:EXPLAINED_MAX]],
-    }
-    if more := len(mine[EXPLAINED_MAX:]):
-        told["more"] = more
-    return told
+    told = tuple(_with_plan(core, lease) for lease in mine[:EXPLAINED_MAX])
+    return WhyReply(consumer, told, more=len(mine[EXPLAINED_MAX:]))
 
 
-def _with_plan(core: Core, lease: Lease) -> dict[str, Any]:
-    """What happens next with its instant, where one is planned; it also gives an estimate where nobody was asked yet."""
+def _with_plan(core: Core, lease: Lease) -> Explanation:
+    """Explain a lease with the steps to come; they also give an estimate where no holder was revoked yet."""
     told = explain_lease(core, lease)
-    told["plan"] = []
-    if lease.state is LeaseState.QUEUED:
-        standing = standing_of(core, lease)
-        told["plan"] = plan = outlook.steps(core, standing, lease)
-        if told["eta_s"] is None and (eta := _eta_of_plan(core, standing, plan)) is not None:
-            told["eta_s"], told["eta_source"] = eta, "learnt"
+    if lease.state is not LeaseState.QUEUED:
+        return told
+    standing = standing_of(core, lease)
+    plan = outlook.steps(core, standing, lease)
+    told = replace(told, plan=tuple(plan))
+    if told.eta_s is None and (eta := _eta_of_plan(core, standing, plan)) is not None:
+        return replace(told, eta_s=eta, eta_source="learnt")
     return told
 
 
-def _eta_of_plan(core: Core, standing: Standing, plan: Sequence[dict[str, Any]]) -> float | None:
-    """Seconds until it is loaded if everybody who is to be asked takes as long as usual. None: never seen, or nothing planned."""
+def _eta_of_plan(core: Core, standing: Standing, plan: Sequence[Step]) -> float | None:
+    """Seconds until it is loaded if every holder to be revoked takes as long as usual. None: never seen, or nothing planned."""
     load = _load_s(core, standing)
     ends: list[float] = []
     for step in plan:
-        if step["action"] == "ask":
+        if step.action is Action.ASK:
             phases = [
-                core.learnt_s(step["consumer"], phase)
-                for phase in ("drain_s", "unload_s", "verify_s")
+                core.learnt_s(step.consumer, phase) for phase in ("drain_s", "unload_s", "verify_s")
             ]
             known = [seconds for seconds in phases if seconds is not None]
             if len(known) < len(phases):
                 return None
-            ends.append(float(step["in_s"]) + sum(known))
+            ends.append((step.in_s or 0.0) + sum(known))
     return load + max(ends) if load is not None and ends else None
 
 
-def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
-    """One lease: what it needs, who stands in its way on which condition, what happens next and when."""
+def explain_lease(core: Core, lease: Lease) -> Explanation:
+    """One lease: what it needs, what is in its way on which condition, and when it is loaded."""
     standing = standing_of(core, lease)
     gpu, kept = standing.gpu, standing.reserved_bytes
     free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
@@ -296,140 +319,114 @@ def explain_lease(core: Core, lease: Lease) -> dict[str, Any]:
     free += kept
     added = lease.request.load_peak_bytes if kept else policy.added_bytes(gpu, standing.request)
     deficit = max(0, added - free)
-    blockers = who_blocks(core, gpu, standing.request, deficit)
     position = _place(core, standing)
-    condition, then = _condition(core, standing, lease, blockers, position)
+    blockers = who_blocks(core, gpu, standing.request, deficit)
+    leaving = _leaving(core, gpu)
+    condition = _situation(core, standing, lease, position, blocked=bool(blockers))
     eta = _eta(core, standing, lease)
-    together = f" with {standing.group}" if standing.request.request.needs is not None else ""
-    head = f"{lease.spec.consumer}{together} needs {gib(added)}, {gib(max(0, free))} are free{' or kept for it' if kept else ''}"
-    head += f", {gib(deficit)} are missing" if deficit else ""
-    if lease.request.load_peak_bytes > (declared := lease.spec.load_peak_bytes):
-        head += f" ({gib(declared)} declared, {gib(lease.request.load_peak_bytes)} learnt)"
-    return {
-        "lease_id": lease.id,
-        "state": str(lease.state),
-        "position": position,
-        "needed_bytes": added,
-        "free_bytes": max(0, free),
-        "deficit_bytes": deficit,
-        "condition": condition,
-        "blockers": blockers,
-        "next": then,
-        "eta_s": eta,
-        "eta_source": "none" if eta is None else "learnt",
-        "footprint": drift.footprint(core, lease),
-        "text": f"{head}: {then}",
-    }
+    raised = lease.request.load_peak_bytes > lease.spec.load_peak_bytes
+    return Explanation(
+        lease_id=lease.id,
+        consumer=lease.spec.consumer,
+        state=lease.state,
+        position=position,
+        needed_bytes=added,
+        free_bytes=max(0, free),
+        deficit_bytes=deficit,
+        condition=condition,
+        blockers=blockers,
+        eta_s=eta,
+        eta_source="none" if eta is None else "learnt",
+        footprint=drift.footprint(core, lease),
+        plan=(),
+        ahead=behind(core, lease),
+        wait=lease.request.reason,
+        block=block_view(core, gpu),
+        leaving=leaving if condition is Situation.MAKING_ROOM else (),
+        measuring=tuple(one.consumer for one in gpu.verifications.values()),
+        kept=bool(kept),
+        expected_bytes=lease.request.load_peak_bytes if raised else None,
+        gang=standing.gang,
+    )
 
 
 def _place(core: Core, standing: Standing) -> int:
-    """Its place in the queue; a group has the place of its foremost member."""
+    """Its place in the queue; a gang has the place of its foremost member."""
     return min(_best_position(core, member) for member in standing.fellows)
 
 
-def wait_reason(core: Core, lease: Lease) -> str:
-    """Why a waiter waits, in words. Short for those who stand behind others: only the head has blockers of its own."""
+def behind(core: Core, lease: Lease) -> str:
+    """Return the consumer of the request before this one, "" if there is none: only the head has blockers of its own."""
     standing = standing_of(core, lease)
-    position = _place(core, standing)
-    if position > 1:
-        return _behind(core, standing, position)
-    return str(explain_lease(core, lease)["text"])
-
-
-def _behind(core: Core, standing: Standing, position: int) -> str:
-    who = f"waits as one of {standing.group}" if standing.group else "waits"
+    if _place(core, standing) <= 1:
+        return ""
     foremost = min(standing.fellows, key=lambda member: _best_position(core, member))
     ahead = standing_of(core, foremost).gpu.queue.ahead_of(foremost)
-    return f"{who} behind {core.waiting[ahead].spec.consumer if ahead else 'others'} as number {position}"
+    return core.waiting[ahead].spec.consumer if ahead else "others"
 
 
-def _explain_resident(core: Core, standing: Standing, lease: Lease, free: int) -> dict[str, Any]:
+def blocked_for(core: Core, lease: Lease) -> BlockView | None:
+    """Why nothing is granted on the GPU that a request waits for."""
+    return block_view(core, standing_of(core, lease).gpu)
+
+
+def _explain_resident(core: Core, standing: Standing, lease: Lease, free: int) -> Explanation:
     gpu = standing.gpu
-    says = {
-        LeaseState.LOADING: f"it was granted and {loading(core, lease)}",
-        LeaseState.HELD: f"it is resident, {uses(lease)}",
-        LeaseState.REVOKING: f"it was asked to leave for {_wanted_by(lease)}, {uses(lease)}",
-        LeaseState.UNLOADING: f"it {unloading(core, lease)}",
-        LeaseState.VERIFYING: "it let go; its bytes are being measured",
-    }.get(lease.state, "")
-    says = "; ".join(filter(None, (says, standing.outlook)))
-    if drift.drift_bytes(core, gpu, lease):
-        held = drift.held_bytes(gpu, lease)
-        says += f"; it holds {gib(held)}, {gib(lease.spec.steady_bytes)} were declared"
-    return {
-        "lease_id": lease.id,
-        "state": str(lease.state),
-        "position": 0,
-        "needed_bytes": 0,
-        "free_bytes": max(0, free),
-        "deficit_bytes": 0,
-        "condition": str(lease.state),
-        "blockers": [],
-        "next": says,
-        "eta_s": None,
-        "eta_source": "none",
-        "footprint": drift.footprint(core, lease),
-        "text": f"{lease.spec.consumer}: {says}",
-    }
+    away = lease.state in AWAY
+    return Explanation(
+        lease_id=lease.id,
+        consumer=lease.spec.consumer,
+        state=lease.state,
+        position=0,
+        needed_bytes=0,
+        free_bytes=max(0, free),
+        deficit_bytes=0,
+        condition=Situation.AWAY if away else Situation.RESIDENT,
+        blockers=(),
+        eta_s=None,
+        eta_source="none",
+        footprint=drift.footprint(core, lease),
+        plan=(),
+        ahead=standing.ahead,
+        block=block_view(core, gpu),
+        gang=standing.gang,
+        lacks=tuple(holder(core, standing_of(core, one).gpu, one) for one in standing.lacks),
+        holder=None if away else holder(core, gpu, lease),
+        revoked=None if lease.departure.eviction is None else lease.departure.eviction.why,
+        drifted=bool(drift.drift_bytes(core, gpu, lease)),
+        back=standing.back,
+        due_s=standing.due_s,
+    )
 
 
-def _condition(
-    core: Core,
-    standing: Standing,
-    lease: Lease,
-    blockers: Sequence[dict[str, Any]],
-    position: int,
-) -> tuple[str, str]:
-    """(short condition, what happens next in words)."""
+def _situation(
+    core: Core, standing: Standing, lease: Lease, position: int, *, blocked: bool
+) -> Situation:
     gpu = standing.gpu
-    if standing.condition and position <= 1:
-        return standing.condition, standing.outlook
-    leaving = [other for other in gpu.residents.values() if other.state in LEAVING]
+    if standing.gang is not None and position <= 1:
+        phases = {"gathering": Situation.GATHERING, "loading": Situation.GANG_LOADS}
+        return phases.get(standing.gang.phase, Situation.GANG_WAITS)
     if position > 1:
-        return "queued", _behind(core, standing, position)
+        return Situation.BEHIND
+    leaving = any(other.state in LEAVING for other in gpu.residents.values())
     if leaving and lease.request.planned_gpu == gpu.info.id:
-        return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
-    blocked = policy.blocked(core, gpu)
-    if blocked:
-        loads = [
-            f"{one.spec.consumer} {loading(core, one)}"
-            for one in gpu.in_state(LeaseState.LOADING)[:1]
-        ]
-        return (
-            "blocked",
-            f"waits: {loads[0] if loads and loads[0].startswith(blocked) else blocked}",
-        )
+        return Situation.MAKING_ROOM
+    if policy.blocked(core, gpu):
+        return Situation.BLOCKED
     if leaving:
-        return "room is being made", "; ".join(_leaving_next(core, gpu, other) for other in leaving)
-    if gpu.verifications:
-        names = ", ".join(v.consumer for v in gpu.verifications.values())
-        return "measuring", f"waits until the bytes of {names} are measured gone"
-    if blockers:
-        return "no room", "waits for " + ", ".join(
-            f"{b['consumer']} ({b['condition']})" for b in blockers
-        )
-    return "measuring", lease.request.reason or "waits for a reading of the card"
+        return Situation.MAKING_ROOM
+    if blocked and not gpu.verifications:
+        return Situation.NO_ROOM
+    return Situation.MEASURING
 
 
-def _leaving_next(core: Core, gpu: Gpu, holder: Lease) -> str:
-    charge = gib(gpu.ledger.charge_bytes(holder.id))
-    name = holder.spec.consumer
-    if holder.state is LeaseState.REVOKING and holder.uses:
-        running = len(holder.uses)
-        plural = "use" if running == 1 else "uses"
-        return (
-            f"waits for {name} to finish {running} {plural} (asked {ago(core, holder)}), "
-            f"then it unloads and {charge} are verified"
-        )
-    if holder.state is LeaseState.REVOKING:
-        return f"waits for {name} to unload (asked {ago(core, holder)}), then {charge} are verified"
-    if holder.state is LeaseState.UNLOADING:
-        return f"{name} {unloading(core, holder) if holder.departure.hangs else 'unloads'}, then {charge} are verified"
-    return f"{charge} of {name} are being verified"
+def _leaving(core: Core, gpu: Gpu) -> tuple[Blocker, ...]:
+    residents = gpu.residents.values()
+    return tuple(holder(core, gpu, other) for other in residents if other.state in LEAVING)
 
 
 def _load_s(core: Core, standing: Standing) -> float | None:
-    """How long its load usually takes, with those of its group that load before it. None: never seen, or not known yet."""
+    """How long its load usually takes, with those of its gang that load before it. None: never seen, or not known yet."""
     if standing.loads is None:
         return None
     times = [core.learnt_s(one.spec.consumer, "load_s") for one in standing.loads]
@@ -441,19 +438,19 @@ def _eta(core: Core, standing: Standing, lease: Lease) -> float | None:
     """Seconds until it is loaded, from learnt medians. None if anything on the way was never seen."""
     gpu = standing.gpu
     slowest = 0.0
-    for holder in gpu.residents.values():
-        if holder.state not in LEAVING:
+    for other in gpu.residents.values():
+        if other.state not in LEAVING:
             continue
         phases = {
             LeaseState.REVOKING: ("drain_s", "unload_s", "verify_s"),
             LeaseState.UNLOADING: ("unload_s", "verify_s"),
             LeaseState.VERIFYING: ("verify_s",),
-        }[holder.state]
-        times = [core.learnt_s(holder.spec.consumer, phase) for phase in phases]
+        }[other.state]
+        times = [core.learnt_s(other.spec.consumer, phase) for phase in phases]
         known = [seconds for seconds in times if seconds is not None]
         if len(known) < len(times):
             return None
-        slowest = max(slowest, sum(known) - (core.now - holder.since))
+        slowest = max(slowest, sum(known) - (core.now - other.since))
     load = _load_s(core, standing)
     kept = lease.id in gpu.ledger.reserved
     if load is None or (not slowest and not kept and not policy.fits(gpu, standing.request)):
@@ -467,12 +464,6 @@ def medians(core: Core) -> dict[str, dict[str, float]]:
         consumer: {phase: median(seen) for phase, seen in phases.items()}
         for consumer, phases in core.durations.items()
     }
-
-
-def _wanted_by(lease: Lease) -> str:
-    return (
-        lease.departure.eviction.wanted_consumer if lease.departure.eviction else ""
-    ) or "relief of pressure"
 
 
 # -- switch --------------------------------------------------------------------------------------------------------------

@@ -1,22 +1,20 @@
-"""What the arbiter will do next for a waiter, and at which instant where that is planned. Reads only; for people who ask `why`.
+"""What the arbiter does next for a waiter, and at which instant where that is planned: typed steps without words.
 
-A step is `{"action", "consumer", "lease_id", "in_s", "text"}`; `in_s` None: it depends on somebody, no instant is planned.
-Not on the path of a decision: looking ahead costs a search for victims per instant.
+Reads only, for answers to `why`. Not on the path of a decision: looking ahead costs a search for victims per instant.
 """
 
-from typing import Any
+from math import inf
 
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report.standing import Standing
 from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.schemas.wire.explained import Action, Because, Step
 
 LOOKED_AT_MAX = 16
-"""Instants at which somebody could be asked that are looked at, the nearest first."""
+"""Number of future eviction times to examine."""
 LOOKS_AT_HOLDERS_MAX = 400
 """Beside many holders fewer instants are looked at: each look weighs all of them."""
-
-type Step = dict[str, Any]
 
 
 def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
@@ -30,148 +28,91 @@ def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
         found = _of_head(core, gpu, standing.request) if mine else []
     if waiter.request.wait_timeout_s is not None:
         at = waiter.request.arrived_at + waiter.request.wait_timeout_s
-        found.append(
-            _step(core, "give_up", waiter, at, "gives up", "when its wait timeout is over")
-        )
-    return sorted(found, key=lambda step: float("inf") if step["in_s"] is None else step["in_s"])
+        found.append(_step(core, Action.GIVE_UP, waiter, at, Because.TIMEOUT))
+    return sorted(found, key=lambda step: inf if step.in_s is None else step.in_s)
 
 
 def _of_unqueued(core: Core, gpu: Gpu, standing: Standing, waiter: Lease) -> list[Step]:
-    """Of a request that waits for the rest of its group, or with its bytes reserved for its turn to load."""
+    """Of a request that waits for the rest of its gang, or with its bytes reserved for its turn to load."""
     found: list[Step] = []
     if waiter.id in gpu.ledger.reserved:
         found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
-        found = found or [
-            _next_reading(core, gpu, "its bytes are kept for it, the card has to show them")
-        ]
+        found = found or [_next_reading(core, gpu, Because.KEPT)]
     if standing.gives_up is not None:
         at, because = standing.gives_up
-        found.append(_step(core, "break", None, at, f"gives {standing.group} up", because))
+        gang = "" if standing.gang is None else standing.gang.id
+        found.append(_step(core, Action.BREAK, None, at, because, gang=gang))
     return found
 
 
 def _load_ends(core: Core, lease: Lease) -> Step:
-    what = f"lets {lease.spec.consumer} finish loading"
-    return _step(core, "loaded", lease, _learnt_end(core, lease), what, "one loads at a time")
+    return _step(core, Action.LOADED, lease, _learnt_end(core, lease), Because.ONE_LOAD)
 
 
 def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     if core.recovering is not None:
         ends = [core.leases[lease].expires_at for lease in core.recovering if lease in core.leases]
         at = max(ends, default=None)
-        return [
-            _step(
-                core,
-                "serve",
-                None,
-                at,
-                "grants again",
-                "when every holder has come back or its time is over",
-            )
-        ]
+        return [_step(core, Action.SERVE, None, at, Because.ACCOUNTED)]
     if gpu.failed_at is not None or gpu.sample is None:
-        return [_next_reading(core, gpu, "nothing is granted on a card that cannot be read")]
+        return [_next_reading(core, gpu, Because.UNREADABLE)]
     found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
     found += [_leaving(core, gpu, waiter, lease) for lease in gpu.in_state(*LEAVING)]
     going = policy.leaving(gpu)
     if found or policy.blocked(core, gpu):
         return found
     if policy.fits(gpu, waiter, going):
-        return [_next_reading(core, gpu, "the ledger has room, the card has to show it")]
+        return [_next_reading(core, gpu, Because.MEASUREMENT)]
     return _asking(core, gpu, waiter)
 
 
 def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
-    """Whom it will ask, and when: at the first instant at which somebody may be asked whose leaving is enough."""
+    """Which holders will be revoked, and when: at the first instant at which a sufficient set may be."""
     going = policy.leaving(gpu)
     looks = max(1, min(LOOKED_AT_MAX, LOOKS_AT_HOLDERS_MAX // (1 + len(gpu.residents))))
     for at in sorted({core.now, *policy.ask_times(core, gpu, waiter)})[:looks]:
         victims = policy.choose_victims(core, gpu, waiter, going, at)
-        if victims is None:
-            continue
-        return [
-            _step(
-                core,
-                "ask",
-                victim,
-                at,
-                f"asks {victim.spec.consumer}",
-                _because(core, waiter, victim, at),
-            )
-            for victim in victims
-        ]
+        if victims is not None:
+            return [
+                _step(core, Action.ASK, victim, at, _because(core, waiter, victim, at))
+                for victim in victims
+            ]
     if missing := [lease for lease in gpu.in_state(LeaseState.HELD) if not lease.attached]:
         last = max(missing, key=lambda lease: lease.expires_at)
-        what, because = f"gives {last.spec.consumer} up", "unless it comes back before that"
-        return [_step(core, "wait", last, last.expires_at, what, because)]
-    return [
-        _step(
-            core,
-            "wait",
-            None,
-            None,
-            "asks nobody",
-            "those who could make room are pinned or in use above its priority",
-        )
-    ]
+        return [_step(core, Action.WAIT, last, last.expires_at, Because.NOT_BACK)]
+    return [_step(core, Action.WAIT, None, None, Because.NO_VICTIM)]
 
 
-def _because(core: Core, waiter: Lease, victim: Lease, at: float) -> str:
+def _because(core: Core, waiter: Lease, victim: Lease, at: float) -> Because:
     if at <= core.now:
-        return "as soon as the card is looked at again"
+        return Because.NEXT_READING
     if at == policy.residency_ends_at(core, victim, waiter):
-        return "when its minimum residency ends"
-    return (
-        "when the waiter's priority has aged to its own"
-        if victim.in_use
-        else "when enough may be asked together"
-    )
+        return Because.RESIDENCY
+    return Because.AGEING if victim.in_use else Because.TOGETHER
 
 
 def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
-    name = holder.spec.consumer
     verification = gpu.verifications.get(holder.id)
     if verification is not None:
         latest = max(0.0, verification.deadline_at - core.now)
-        because = (
-            f"a verdict comes in {latest:.1f} s at the latest"
-            if latest
-            else "until its bytes are measured gone"
-        )
-        return _step(
-            core,
-            "measure",
-            holder,
-            verification.next_poll_at,
-            f"measures {name}'s bytes again",
-            because,
-        )
+        because = Because.VERDICT if latest else Because.MEASURED_GONE
+        at = verification.next_poll_at
+        return _step(core, Action.MEASURE, holder, at, because, latest_s=latest or None)
     eviction = holder.departure.eviction
     if eviction is None or eviction.overdue:
-        because = "its unloading may hang" if holder.departure.hangs else "it is on its way out"
-        return _step(core, "wait", holder, None, f"waits for {name} to let go", because)
-    at = (
-        holder.since if holder.state is LeaseState.UNLOADING else eviction.asked_at
-    ) + core.settings.revoke_deadline_s
-    then = (
-        "is denied"
-        if waiter.spec.deny_on_deadline
-        else "waits on, and the holder's own rule applies"
-    )
-    return _step(
-        core,
-        "deadline",
-        holder,
-        at,
-        f"waits for {name} to let go",
-        f"after that {waiter.spec.consumer} {then}",
-    )
+        because = Because.HANGING if holder.departure.hangs else Because.LEAVING
+        return _step(core, Action.WAIT, holder, None, because)
+    unloads = holder.state is LeaseState.UNLOADING
+    began_at = holder.since if unloads else eviction.asked_at
+    at = began_at + core.settings.revoke_deadline_s
+    because = Because.DENIED if waiter.spec.deny_on_deadline else Because.WAITS_ON
+    return _step(core, Action.DEADLINE, holder, at, because, waiter=waiter.spec.consumer)
 
 
-def _next_reading(core: Core, gpu: Gpu, because: str) -> Step:
+def _next_reading(core: Core, gpu: Gpu, because: Because) -> Step:
     times = [core.timers.due((kind, gpu.info.id)) for kind in ("verify", "probe")]
     at = min((time for time in times if time is not None), default=None)
-    return _step(core, "read", None, at, "reads the card again", because)
+    return _step(core, Action.READ, None, at, because)
 
 
 def _learnt_end(core: Core, lease: Lease) -> float | None:
@@ -180,20 +121,23 @@ def _learnt_end(core: Core, lease: Lease) -> float | None:
 
 
 def _step(
-    core: Core, action: str, lease: Lease | None, at: float | None, what: str, because: str
+    core: Core,
+    action: Action,
+    lease: Lease | None,
+    at: float | None,
+    because: Because,
+    *,
+    gang: str = "",
+    waiter: str = "",
+    latest_s: float | None = None,
 ) -> Step:
-    in_s = None if at is None else max(0.0, at - core.now)
-    when = (
-        ""
-        if in_s is None
-        else f" for {in_s:.1f} s more"
-        if action == "deadline"
-        else f" in {in_s:.1f} s"
+    return Step(
+        action=action,
+        consumer="" if lease is None else lease.spec.consumer,
+        lease_id=None if lease is None else lease.id,
+        in_s=None if at is None else max(0.0, at - core.now),
+        because=because,
+        gang=gang,
+        waiter=waiter,
+        latest_s=latest_s,
     )
-    return {
-        "action": action,
-        "consumer": "" if lease is None else lease.spec.consumer,
-        "lease_id": None if lease is None else lease.id,
-        "in_s": in_s,
-        "text": f"{what}{when}, {because}",
-    }

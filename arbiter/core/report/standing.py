@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
+from vram_arbiter.schemas.wire.explained import Because, Return
+from vram_arbiter.schemas.wire.views import GangView
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,11 +16,13 @@ class Standing:
     request: Lease  # as it is admitted there: the requests of a group count as one
     fellows: tuple[Lease, ...]  # requests that have one place in the queues together
     loads: tuple[Lease, ...] | None  # to be loaded there, up to this one; None: not known yet
-    group: str = ""  # name of the group that it is granted with
+    gang: GangView | None = None  # that it is granted with
+    lacks: tuple[Lease, ...] = ()  # other members of it that are not held
+    back: Return | None = None  # what it waits for where it is away
+    ahead: str = ""  # consumer before it then
+    due_s: float | None = None
     reserved_bytes: int = 0  # charged already, for its turn to load
-    condition: str = ""
-    outlook: str = ""
-    gives_up: tuple[float, str] | None = None  # when its group is broken, and on which condition
+    gives_up: tuple[float, Because] | None = None  # when its gang is broken, and why
 
 
 def standing_of(core: Core, lease: Lease) -> Standing:

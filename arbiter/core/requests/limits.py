@@ -7,7 +7,8 @@ becomes an event (`rpc`).
 from collections.abc import Iterable
 
 from vram_arbiter.arbiter.core.model.lease import Lease, Use
-from vram_arbiter.arbiter.core.model.state import Client, Core, Refused
+from vram_arbiter.arbiter.core.model.refusals import Limit, LimitReached, Refused, Share
+from vram_arbiter.arbiter.core.model.state import Client, Core
 from vram_arbiter.schemas import defaults
 
 
@@ -19,48 +20,42 @@ def check_waiters(core: Core, client: Client, priority: int) -> None:
     mine, users = core.waiting_by(client.process, client.uid)
     _check(
         "waiters_max",
-        "requests wait",
-        "let some of them be answered first, or raise limits.waiters_max",
-        ("of this process", mine, _share(places, settings.process_share)),
-        (f"of uid {client.uid}", users, _share(places, settings.user_share * (1 - kept))),
-        ("of all users", len(core.waiting), _share(places, 1 - kept)),
+        (Share.PROCESS, mine, _share(places, settings.process_share)),
+        (Share.USER, users, _share(places, settings.user_share * (1 - kept))),
+        (Share.ALL, len(core.waiting), _share(places, 1 - kept)),
+        uid=client.uid,
     )
 
 
 def check_leases(core: Core, client: Client) -> None:
     """May this connection have one lease more?"""
     owned = core.count_of_client(client.id)
-    _check(
-        "leases_per_client_max",
-        "leases are held or asked for",
-        "release some, or raise limits.leases_per_client_max",
-        ("by this connection", owned, core.settings.leases_per_client_max),
-    )
+    most = core.settings.leases_per_client_max
+    _check("leases_per_client_max", (Share.CONNECTION, owned, most))
 
 
 def check_uses(core: Core, lease: Lease, client: Client) -> None:
     """May this client mark a use of the lease? The holder's own uses are counted apart: others cannot take its places."""
     places = core.settings.uses_per_lease_max
-    what, todo = f"uses of {lease.id} run or pause", "end some, or raise limits.uses_per_lease_max"
     uses = lease.all_uses()
     own = sum(use.process == lease.process for use in uses)
     if client.process == lease.process:
-        _check("uses_per_lease_max", what, todo, ("of its holder", own, places))
+        _check("uses_per_lease_max", (Share.HOLDER, own, places), lease_id=lease.id)
         return
     settings = core.settings
     mine = sum(use.process == client.process for use in uses)
     others = (use for use in uses if use.process != lease.process)
     _check(
         "uses_per_lease_max",
-        what,
-        todo,
-        ("of this process", mine, _share(places, settings.process_share)),
+        (Share.PROCESS, mine, _share(places, settings.process_share)),
         (
-            f"of uid {client.uid}",
+            Share.USER,
             _of_user(core, others, client.uid),
             _share(places, settings.user_share),
         ),
-        ("of others than its holder", len(uses) - own, places),
+        (Share.OTHERS, len(uses) - own, places),
+        lease_id=lease.id,
+        uid=client.uid,
     )
 
 
@@ -73,14 +68,10 @@ def _share(places: int, fraction: float) -> int:
     return max(1, int(places * fraction))
 
 
-def _check(limit: str, what: str, todo: str, *shares: tuple[str, int, int]) -> None:
-    for whose, count, value in shares:
-        if count >= value:
-            raise Refused(
-                "limit_exceeded",
-                f"{count} {what} {whose}, the limit is {value}",
-                todo,
-                limit=limit,
-                value=value,
-                share=whose,
-            )
+def _check(
+    limit: Limit, *shares: tuple[Share, int, int], lease_id: str = "", uid: int | None = None
+) -> None:
+    for share, count, most in shares:
+        if count >= most:
+            user = uid if share is Share.USER else None
+            raise Refused(LimitReached(limit, most, share, count, lease_id, user))

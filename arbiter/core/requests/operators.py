@@ -10,12 +10,16 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState, Order
-from vram_arbiter.arbiter.core.model.state import Core, Refused
+from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.refusals import Impractical, Refused
+from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.expiry import expire
 from vram_arbiter.arbiter.core.requests.requests import client_of, ended_error
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.codes import Order
+from vram_arbiter.schemas.wire.replies import DrainReply, OperatorReply
 
 DRAIN_KEY = "drain"
 """Journal key of a drain."""
@@ -37,12 +41,10 @@ def on_operator(core: Core, event: OperatorAsked) -> None:
             {"evict": evict, "pin": pin, "unpin": unpin, "release_dead": release_dead}[
                 event.action
             ](core, lease, order)
-            body = (
-                {"lease": explain.view(core, lease)} if lease.id in core.leases else {"lease": None}
-            )
-            core.reply(event.client, event.request, {"state": str(lease.state), **body})
+            view = explain.view(core, lease) if lease.id in core.leases else None
+            core.reply(event.client, event.request, OperatorReply(lease.state, view))
             return
-    core.reply(event.client, event.request, {"drained": drained(core)})
+    core.reply(event.client, event.request, DrainReply(drained(core)))
 
 
 def find(core: Core, target: str) -> Lease:
@@ -55,21 +57,11 @@ def find(core: Core, target: str) -> Lease:
     if len(resident) == 1:
         return resident[0]
     if resident:
-        raise Refused(
-            "bad_request",
-            f"{target} has {len(resident)} leases",
-            "name one of them: " + ", ".join(lease.id for lease in resident),
-            leases=[lease.id for lease in resident],
-        )
+        raise Refused(no.Ambiguous(target, tuple(lease.id for lease in resident)))
     ended = core.ended.get(LeaseId(target))
-    if ended is not None:
-        why = ended_error(ended)
-        raise Refused(
-            why.code, why.message, "it is over; its story is in `vramctl history`", **why.details
-        )
-    raise Refused(
-        "unknown_lease", f"there is no lease or consumer {target!r}", "see `vramctl status`"
-    )
+    if ended is None:
+        raise Refused(no.NoTarget(target))
+    raise Refused(no.TargetOver.of(ended_error(ended).refusal))
 
 
 def evict(core: Core, lease: Lease, order: Order) -> None:
@@ -89,22 +81,15 @@ def evict(core: Core, lease: Lease, order: Order) -> None:
         _note(core, "evict", order, lease, repeated=True)
         return
     if lease.state is not LeaseState.HELD:
-        raise _refused_state(lease, "only a resident lease can be evicted")
+        raise _impractical(lease, Impractical.NOT_RESIDENT)
     if not lease.evictable:
-        by = "an operator pinned it" if lease.pinned else "its holder asked never to be evicted"
-        hint = (
-            "unpin it first"
-            if lease.pinned
-            else "end its program: a pinned holder is never made to leave"
-        )
-        raise Refused(
-            "bad_state",
-            f"{lease.id} is pinned: {by}",
-            hint,
-            state=str(lease.state),
+        by_operator = lease.pinned is not None
+        raise _impractical(
+            lease,
+            Impractical.PINNED_BY_OPERATOR if by_operator else Impractical.PINNED_BY_HOLDER,
         )
     gpu = core.gpu_of(lease)
-    eviction.ask(core, gpu, lease, None, f"evicted by {order}", order=order)
+    eviction.ask(core, gpu, lease, None, order=order)
     _dismiss(core, lease, order)
     _note(core, "evict", order, lease, uses=len(lease.uses))
 
@@ -113,13 +98,13 @@ def _dismiss(core: Core, lease: Lease, order: Order) -> None:
     if lease.departure.eviction is not None:
         lease.departure.eviction.order = order
     for feature in lease.features:
-        feature.on_dismissed(core, lease, f"evicted by {order}")
+        feature.on_dismissed(core, lease, order)
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:
     """Nobody makes this lease leave until it is unpinned. A waiter may be pinned too: it holds from its grant on."""
     if lease.state in LEAVING:
-        raise _refused_state(lease, "it was asked to leave already")
+        raise _impractical(lease, Impractical.LEAVING)
     lease.pinned = order
     _pins_changed(core, lease)
     _note(core, "pin", order, lease)
@@ -128,12 +113,7 @@ def pin(core: Core, lease: Lease, order: Order) -> None:
 def unpin(core: Core, lease: Lease, order: Order) -> None:
     """Undo an operator's pin. What the holder itself asked for stands."""
     if lease.pinned is None:
-        hint = (
-            "nothing to undo"
-            if lease.spec.evictable
-            else "its holder asked never to be evicted; that is its own to change"
-        )
-        raise Refused("bad_state", f"no operator pinned {lease.id}", hint, state=str(lease.state))
+        raise _impractical(lease, Impractical.NOT_PINNED)
     lease.pinned = None
     _pins_changed(core, lease)
     _note(core, "unpin", order, lease)
@@ -142,20 +122,14 @@ def unpin(core: Core, lease: Lease, order: Order) -> None:
 def release_dead(core: Core, lease: Lease, order: Order) -> None:
     """Give up a lease whose holder is not heard of, before its time to live is over. Its bytes are measured gone as ever."""
     if lease.state not in EXPIRING:
-        raise _refused_state(lease, "nobody holds it")
+        raise _impractical(lease, Impractical.NOT_HELD)
     if lease.uses:
-        raise _refused_state(lease, "it is in use; a holder in use is never given up")
+        raise _impractical(lease, Impractical.IN_USE)
     silent_s = core.now - (lease.expires_at - lease.spec.ttl_s)
     if lease.attached and silent_s < lease.spec.ttl_s * SILENT_SHARE:
-        raise Refused(
-            "bad_state",
-            f"the holder of {lease.id} was heard of {silent_s:.1f} s ago: it is not dead",
-            "evict it instead" if lease.evictable else "end its program: it is pinned",
-            state=str(lease.state),
-            silent_s=silent_s,
-        )
+        raise _impractical(lease, Impractical.HOLDER_LIVES, silent_s)
     _note(core, "release_dead", order, lease, silent_s=silent_s)
-    expire(core, lease, f"{lease.id} was given up by {order}")
+    expire(core, lease, order)
 
 
 def drain(core: Core, order: Order) -> None:
@@ -204,10 +178,6 @@ def _note(core: Core, action: str, order: Order, lease: Lease | None = None, **f
     core.note("operator", lease, action=action, by=order.by, reason=order.reason, **facts)
 
 
-def _refused_state(lease: Lease, what: str) -> Refused:
-    return Refused(
-        "bad_state",
-        f"{lease.id} is {lease.state}: {what}",
-        "see `vramctl status`",
-        state=str(lease.state),
-    )
+def _impractical(lease: Lease, problem: Impractical, silent_s: float | None = None) -> Refused:
+    evictable = lease.spec.evictable if problem is Impractical.NOT_PINNED else lease.evictable
+    return Refused(no.BadTargetState(lease.id, lease.state, problem, evictable, silent_s))

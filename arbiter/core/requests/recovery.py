@@ -21,15 +21,16 @@ from vram_arbiter.arbiter.core.events import (
 )
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.learning import drift
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     Lease,
     LeaseState,
-    Order,
     Request,
     Use,
 )
-from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu, Refused
+from vram_arbiter.arbiter.core.model.refusals import Refused
+from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Gpu
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests import operators, uses
 from vram_arbiter.arbiter.core.requests.requests import (
@@ -42,6 +43,8 @@ from vram_arbiter.arbiter.core.scheduling import placement
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ModelKey, ProcessKey, Token
+from vram_arbiter.schemas.wire.codes import Order, Why
+from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
 
 EMPTY_JOURNAL = LeaseId("journal")
 """Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL and the fence grace."""
@@ -127,7 +130,7 @@ def _remembered(core: Core, record: Mapping[str, Any], state: LeaseState) -> Lea
         Token(*record["token"]),
         state,
         core.now,
-        "recovered from the journal",
+        Why.RECOVERED,
     )
     lease.attached = False
     lease.held_from = min(core.now, float(record.get("held_from", core.now)))
@@ -155,7 +158,12 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
         begin_for_lease(core, gpu, lease, alive=True, grace_s=grace_s, fenced_at=fenced_at)
         core.remember(
             Ended(
-                lease_id, process, lease.request.nonce, token, LeaseState.LOST, lost_error(lease_id)
+                lease_id,
+                process,
+                lease.request.nonce,
+                token,
+                LeaseState.LOST,
+                no.Lost(lease_id, Why.NOT_HELD),
             )
         )
         return
@@ -212,30 +220,21 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
     )
 
 
-def lost_error(lease_id: LeaseId) -> dict[str, Any]:
-    return {
-        "code": "lease_lost",
-        "message": f"{lease_id} is no longer held",
-        "hint": "unload, then acquire again",
-        "details": {},
-    }
-
-
 # -- coming back -------------------------------------------------------------------------------------------------------
 def on_reattached(core: Core, event: Reattached) -> None:
     """A client tells what it still holds. Every lease is answered for itself; nothing is lost because of a neighbour."""
     client = client_of(core, event.client)
-    answers: list[dict[str, Any]] = []
+    answers: list[ReattachedView] = []
     for item in event.leases:
         try:
             lease = _reattach(core, client, item)
         except Refused as refused:
-            answers.append({"lease_id": item.lease, "kept": False, "error": refused.wire()})
+            error = refused.refusal.view()
+            answers.append(ReattachedView(item.lease, kept=False, error=error))
         else:
-            answers.append(
-                {"lease_id": item.lease, "kept": True, "lease": explain.view(core, lease)}
-            )
-    core.reply(event.client, event.request, {"leases": answers})
+            view = explain.view(core, lease)
+            answers.append(ReattachedView(item.lease, kept=True, lease=view))
+    core.reply(event.client, event.request, ReattachReply(tuple(answers)))
 
 
 def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
@@ -248,17 +247,9 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
         lease.token = item.token
         core.record_lease(lease)
     elif lease.token != item.token and not _missed_its_grant(lease, client, item):
-        raise Refused(
-            "stale_token",
-            f"{item.token} is not the token of {item.lease}",
-            "unload, then acquire again",
-        )
+        raise Refused(no.WrongToken(item.lease, str(item.token)))
     elif lease.process != client.process:
-        raise Refused(
-            "not_permitted",
-            f"{item.lease} belongs to process {lease.process.pid}",
-            "ask as its holder",
-        )
+        raise Refused(no.NotHolder(item.lease, lease.process.pid))
     core.hand_to(lease, client.id)
     if not lease.attached:
         lease.attached = True
@@ -330,12 +321,11 @@ def _seen_bytes(gpu: Gpu, process: ProcessKey) -> int:
 def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
     """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
     if core.recovering is None or item.token.epoch >= core.settings.epoch:
-        raise Refused("lease_lost", f"{item.lease} is not known", "unload, then acquire again")
+        raise Refused(no.Lost(item.lease, Why.UNKNOWN))
     gpus = placement.selected(core, item.spec)
     if not gpus:
-        raise Refused(
-            "unknown_gpu", f"there is no GPU {item.spec.gpu!r}", "unload, then acquire again"
-        )
+        known = tuple(gpu.info.id for gpu in core.gpus.values())
+        raise Refused(no.UnknownGpu(item.spec.gpu, known))
     spec = item.spec
     peak, steady = drift.expected_bytes(core, spec)
     request = Request(
@@ -353,7 +343,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         item.token,
         _adopted_state(item),
         core.now,
-        "adopted: the journal did not know it",
+        Why.ADOPTED,
     )
     lease.client = client.id
     lease.observed.reported_bytes = item.measured_bytes

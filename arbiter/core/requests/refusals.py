@@ -5,14 +5,15 @@ refusals are counted, and the next note says how many were left out.
 """
 
 from vram_arbiter.arbiter.core.events import AcquireRequested, Reacquired, ResizeAsked
-from vram_arbiter.arbiter.core.model.state import Core, Refusals, Refused
+from vram_arbiter.arbiter.core.model.state import Core, Refusals
+from vram_arbiter.schemas.wire.errors import Refusal
 
 AT_ONCE = 16
 """Refusals of one process that are noted one by one; after that one a second."""
 PROCESSES_REMEMBERED = 1024
 
 
-def note(core: Core, event: AcquireRequested | Reacquired | ResizeAsked, refused: Refused) -> None:
+def note(core: Core, event: AcquireRequested | Reacquired | ResizeAsked, refusal: Refusal) -> None:
     """Say that a request was refused, by whom it was asked and why."""
     client = core.clients.get(event.client)
     if client is None:
@@ -36,7 +37,7 @@ def note(core: Core, event: AcquireRequested | Reacquired | ResizeAsked, refused
         lease,
         **who,
         pid=client.process.pid,
-        code=refused.code,
-        reason=refused.message,
+        code=refusal.code,
+        refusal=refusal,
         **left_out,
     )

@@ -19,6 +19,7 @@ from vram_arbiter.arbiter.core.events import (
 )
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.learning import costs, crashes, drift
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     EXPIRING,
@@ -27,37 +28,36 @@ from vram_arbiter.arbiter.core.model.lease import (
     Request,
     Use,
 )
-from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refused
+from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused
+from vram_arbiter.arbiter.core.model.state import Client, Core, Ended
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_leases, check_waiters
 from vram_arbiter.arbiter.core.scheduling import placement
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token
-
-_HINT_ACQUIRE = "unload, then acquire again"
+from vram_arbiter.schemas.wire.codes import Why
+from vram_arbiter.schemas.wire.replies import (
+    AcquireReply,
+    GoneLease,
+    OomReply,
+    ReadyReply,
+    ReleaseReply,
+    RenewReply,
+    StateReply,
+)
 
 
 # -- who and which -------------------------------------------------------------------------------------------------
 def client_of(core: Core, client: ClientId) -> Client:
     known = core.clients.get(client)
     if known is None:
-        raise Refused(
-            "unknown_session", "this connection has not said hello", "say hello, then re-attach"
-        )
+        raise Refused(no.NoSession())
     return known
 
 
 def ended_error(ended: Ended) -> Refused:
     """The answer to a late message on a lease that is over."""
-    if ended.error is not None:
-        error = ended.error
-        return Refused(
-            str(error["code"]), str(error["message"]), str(error["hint"]), **error["details"]
-        )
-    told = f": {ended.evicted}" if ended.evicted else ""
-    return Refused(
-        "bad_state", f"{ended.lease} is {ended.state}{told}", _HINT_ACQUIRE, state=str(ended.state)
-    )
+    return Refused(ended.error or no.LeaseOver(ended.lease, ended.state, ended.revoked))
 
 
 def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:
@@ -67,19 +67,11 @@ def lease_for(core: Core, lease_id: LeaseId, token: Token) -> Lease:
         ended = core.ended.get(lease_id)
         if ended is not None:
             raise ended_error(ended)
-        raise Refused(
-            "unknown_lease",
-            f"there is no lease {lease_id}",
-            "acquire one; after a restart: re-attach",
-        )
+        raise Refused(no.NoLease(lease_id))
     if lease.token is None:
-        raise bad_state(lease, "it is still queued")
+        raise bad_state(lease, Misfit.STILL_QUEUED)
     if lease.token != token:
-        raise Refused(
-            "stale_token",
-            f"{token} is not the token of {lease_id}",
-            "use the token that came with the grant",
-        )
+        raise Refused(no.WrongToken(lease_id, str(token)))
     return lease
 
 
@@ -88,11 +80,7 @@ def own_lease(core: Core, client: ClientId, lease_id: LeaseId, token: Token) -> 
     process = client_of(core, client).process
     lease = lease_for(core, lease_id, token)
     if lease.process != process:
-        raise Refused(
-            "not_permitted",
-            f"{lease_id} belongs to process {lease.process.pid}",
-            "ask as its holder",
-        )
+        raise Refused(no.NotHolder(lease.id, lease.process.pid))
     touch(core, lease)
     return lease
 
@@ -104,15 +92,9 @@ def touch(core: Core, lease: Lease) -> None:
         core.timers.set(("ttl", lease.id), lease.expires_at)
 
 
-def bad_state(lease: Lease, what: str) -> Refused:
-    return Refused(
-        "bad_state",
-        f"{lease.id} is {lease.state}: {what}",
-        "see the lease's story",
-        state=str(lease.state),
-        uses=len(lease.uses),
-        story=lease.told(),
-    )
+def bad_state(lease: Lease, misfit: Misfit, use_id: str = "") -> Refused:
+    story, uses = lease.told(), len(lease.uses)
+    return Refused(no.BadLeaseState(lease.id, lease.state, uses, misfit, story, use_id))
 
 
 # -- waiting ---------------------------------------------------------------------------------------------------------
@@ -131,7 +113,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         gpus = placement.places(core, spec, load_peak)
     except Refused as refused:
         for feature in core.hooked["on_refused"]:
-            feature.on_refused(core, spec, refused.message)
+            feature.on_refused(core, spec, refused.refusal)
         raise
     check_waiters(core, client, spec.priority)
     if spec.gang is None:
@@ -176,7 +158,7 @@ def new_lease(
             wait_timeout_s=event.wait_timeout_s,
             traceparent=event.traceparent,
         ),
-        story=[(core.now, LeaseState.QUEUED, "acquired")],
+        story=[(core.now, LeaseState.QUEUED, Why.ACQUIRED)],
     )
     core.add(lease)
     core.nonces[client.process, event.nonce] = lease.id
@@ -194,10 +176,17 @@ def answer_queued(core: Core) -> None:
         ):
             lease.request.answered = True
             view = explain.view(core, lease)
+            behind = explain.behind(core, lease)
+            block = None if behind else explain.blocked_for(core, lease)
             core.note(
-                "queued", lease, position=view["position"], reason=explain.wait_reason(core, lease)
+                "queued",
+                lease,
+                position=view.position,
+                wait=lease.request.reason,
+                behind=behind,
+                **({"block": block} if block else {}),
             )
-            core.reply(lease.client, lease.request.id, {"state": "queued", "lease": view})
+            core.reply(lease.client, lease.request.id, AcquireReply("queued", view))
 
 
 def _known_by(core: Core, event: AcquireRequested, client: Client) -> Lease | None:
@@ -215,7 +204,7 @@ def _answer_again(core: Core, event: AcquireRequested, lease: Lease) -> None:
     """A repeat is answered as its lease is. The newest connection of a process is the one that listens."""
     core.hand_to(lease, event.client)
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
-    core.reply(event.client, event.request, {"state": state, "lease": explain.view(core, lease)})
+    core.reply(event.client, event.request, AcquireReply(state, explain.view(core, lease)))
 
 
 def cancel(core: Core, event: CancelRequested) -> None:
@@ -225,60 +214,38 @@ def cancel(core: Core, event: CancelRequested) -> None:
     if lease is None:
         ended = core.ended.get(event.lease)
         if ended is not None and ended.state is LeaseState.CANCELLED:
-            core.reply(event.client, event.request, {"state": "cancelled"})
+            core.reply(event.client, event.request, StateReply("cancelled"))
             return
-        raise (
-            ended_error(ended)
-            if ended
-            else Refused("unknown_lease", f"there is no lease {event.lease}", "")
-        )
+        raise (ended_error(ended) if ended else Refused(no.NoLease(event.lease)))
     if lease.process != client.process:
-        raise Refused(
-            "not_permitted",
-            f"{lease.id} belongs to process {lease.process.pid}",
-            "ask as its holder",
-        )
-    why = "its holder gave up"
+        raise Refused(no.NotHolder(lease.id, lease.process.pid))
+    given_up = no.CancelledRequest(lease.id, Why.HOLDER_GAVE_UP)
     if any(
-        feature.give_up(core, lease, LeaseState.CANCELLED, "cancelled", why)
-        for feature in lease.features
+        feature.give_up(core, lease, LeaseState.CANCELLED, given_up) for feature in lease.features
     ):
         if lease.state is LeaseState.VERIFYING:  # over with its verdict
             core.record_lease(lease)
-        core.reply(event.client, event.request, {"state": str(lease.state)})
+        core.reply(event.client, event.request, StateReply(lease.state))
         return
     if lease.state is not LeaseState.QUEUED:
-        raise bad_state(lease, "it is granted already, release it")
-    cancel_waiter(core, lease, why)
-    core.reply(event.client, event.request, {"state": "cancelled"})
+        raise bad_state(lease, Misfit.GRANTED)
+    cancel_waiter(core, lease, Why.HOLDER_GAVE_UP)
+    core.reply(event.client, event.request, StateReply("cancelled"))
 
 
-def cancel_waiter(core: Core, lease: Lease, why: str) -> None:
+def cancel_waiter(core: Core, lease: Lease, why: Why, by: str = "") -> None:
     """A revoke that was sent for it stands: the holder may be unloading by now."""
     core.move(lease, LeaseState.CANCELLED, why)
     core.dequeue(lease)
-    core.note("cancelled", lease, reason=why)
-    core.end(
-        lease,
-        {
-            "code": "cancelled",
-            "message": f"{lease.id}: {why}",
-            "hint": "acquire again",
-            "details": {},
-        },
-    )
+    core.note("cancelled", lease, why=why, **({"by": by} if by else {}))
+    core.end(lease, no.CancelledRequest(lease.id, why, by))
 
 
 def on_wait_timeout(core: Core, lease_id: str) -> None:
     lease = core.waiting[LeaseId(lease_id)]
+    waited_s = core.now - lease.request.arrived_at
     why = explain.explain_lease(core, lease)
-    error = {
-        "code": "wait_timeout",
-        "message": f"{lease.spec.consumer} waited {core.now - lease.request.arrived_at:.1f} s: {why['text']}",
-        "hint": "wait longer, or make room",
-        "details": {"why": why},
-    }
-    eviction.deny(core, lease, error)
+    eviction.deny(core, lease, no.TimedOut(lease.spec.consumer, waited_s, why))
 
 
 # -- holding -----------------------------------------------------------------------------------------------------------
@@ -286,12 +253,12 @@ def ready(core: Core, event: ReadyReported) -> None:
     """Loaded: from now on the steady bytes are charged, or what the holder measured."""
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.state is LeaseState.HELD:  # a repeat
-        core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+        core.reply(event.client, event.request, ReadyReply(explain.view(core, lease)))
         return
     if lease.state is not LeaseState.LOADING:
-        raise bad_state(lease, "only a loading lease becomes ready")
+        raise bad_state(lease, Misfit.NOT_LOADING)
     become_held(core, lease, event.measured_bytes)
-    core.reply(event.client, event.request, {"lease": explain.view(core, lease)})
+    core.reply(event.client, event.request, ReadyReply(explain.view(core, lease)))
     core.record_lease(lease)
     core.learn(lease.spec.consumer, "load_s", core.now - lease.granted_at)
     core.note(
@@ -307,7 +274,7 @@ def ready(core: Core, event: ReadyReported) -> None:
 
 def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     """Mark the lease held."""
-    core.move(lease, LeaseState.HELD, "ready")
+    core.move(lease, LeaseState.HELD, Why.READY)
     lease.ready_at = lease.uses.last_at = core.now
     _charge_held(core, lease, measured_bytes)
 
@@ -334,7 +301,7 @@ def renew(core: Core, event: Renewed) -> None:
     """Keep leases alive. One that expired stays expired."""
     client = client_of(core, event.client)
     alive: list[str] = []
-    gone: list[dict[str, object]] = []
+    gone: list[GoneLease] = []
     for lease_id, token in event.leases:
         lease = core.leases.get(lease_id)
         if (
@@ -348,37 +315,37 @@ def renew(core: Core, event: Renewed) -> None:
             own_lease(core, event.client, lease_id, token)
             alive.append(lease_id)
         except Refused as refused:
-            gone.append({"lease_id": lease_id, "error": refused.wire()})
-    core.reply(event.client, event.request, {"alive": alive, "gone": gone})
+            gone.append(GoneLease(lease_id, refused.refusal.view()))
+    core.reply(event.client, event.request, RenewReply(tuple(alive), tuple(gone)))
 
 
 # -- leaving -----------------------------------------------------------------------------------------------------------
 def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
     lease = own_lease(core, event.client, event.lease, event.token)
     eviction.acknowledge(core, lease, event.safe_point_eta_s)
-    core.reply(event.client, event.request, {"state": str(lease.state), "uses": len(lease.uses)})
+    core.reply(event.client, event.request, StateReply(lease.state, len(lease.uses)))
 
 
 def unloading(core: Core, event: UnloadStarted) -> None:
     """The holder is at its safe point and unloads. Refused while anybody uses the lease: this is the safe-point rule."""
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.state is LeaseState.UNLOADING:  # a repeat
-        core.reply(event.client, event.request, {"state": str(lease.state)})
+        core.reply(event.client, event.request, StateReply(lease.state))
         return
     if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
-        raise bad_state(lease, "only a held lease is unloaded; a loading one is released")
-    if running := len(lease.uses):
-        raise bad_state(lease, f"{running} uses still run; wait for the `revoke` that says 0 uses")
+        raise bad_state(lease, Misfit.NOT_UNLOADABLE)
+    if lease.uses:
+        raise bad_state(lease, Misfit.IN_USE)
     gpu = core.gpu_of(lease)
-    end_uses(core, lease, "unloaded while it paused")
-    core.move(lease, LeaseState.UNLOADING, "at its safe point")
+    end_uses(core, lease, Why.PAUSED)
+    core.move(lease, LeaseState.UNLOADING, Why.SAFE_POINT)
     lease.departure.hangs = False
     core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
     lease.departure.baseline = gpu.sample
     if lease.departure.eviction is not None:
         lease.departure.eviction.unloading_at = core.now
         core.learn(lease.spec.consumer, "drain_s", core.now - lease.departure.eviction.asked_at)
-    core.reply(event.client, event.request, {"state": str(lease.state)})
+    core.reply(event.client, event.request, StateReply(lease.state))
     core.note("unloading", lease, asked=lease.departure.eviction is not None)
     core.wake(gpu)
 
@@ -389,21 +356,19 @@ def release(core: Core, event: ReleaseReported) -> None:
     ended = core.ended.get(event.lease)
     same = ended is not None and (ended.token, ended.process) == (event.token, process)
     if ended is not None and same and ended.state is LeaseState.RELEASED:  # a repeat
-        core.reply(
-            event.client, event.request, {"state": str(ended.state), "next": str(ended.state)}
-        )
+        core.reply(event.client, event.request, ReleaseReply(ended.state, ended.state))
         return
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:  # else: a repeat
         for feature in core.features if event.parked else lease.features:
             feature.on_release(core, event, lease)
-        why = "exits" if event.exiting else "let go"
+        why = Why.EXITS if event.exiting else Why.LET_GO
         let_go(core, lease, exiting=event.exiting, why=why)
     after = core.next_state(lease) or LeaseState.RELEASED
-    core.reply(event.client, event.request, {"state": str(lease.state), "next": str(after)})
+    core.reply(event.client, event.request, ReleaseReply(lease.state, after))
 
 
-def end_uses(core: Core, lease: Lease, why: str) -> None:
+def end_uses(core: Core, lease: Lease, why: Why) -> None:
     """The bytes go: every use that is still on the lease ends with them, pausing ones too."""
     for use in lease.all_uses():
         if (use.process, use.id) in lease.uses:
@@ -412,18 +377,19 @@ def end_uses(core: Core, lease: Lease, why: str) -> None:
     lease.uses.paused.clear()
 
 
-def note_ended(core: Core, lease: Lease, use: Use, why: str) -> None:
+def note_ended(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> None:
     core.note(
         "use_ended",
         lease,
         use_id=use.id,
         label=use.label,
         ms=(core.now - use.began_at) * 1e3,
-        reason=why,
+        why=why,
+        **({"by": by} if by else {}),
     )
 
 
-def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
+def let_go(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
     """From any resident state to verification. Uses that others left on it end with it."""
     gpu = core.gpu_of(lease)
     end_uses(core, lease, why)
@@ -439,7 +405,7 @@ def let_go(core: Core, lease: Lease, *, exiting: bool, why: str) -> None:
         )
     begin_for_lease(core, gpu, lease, alive=True)
     core.record_lease(lease)
-    core.note("released", lease, exiting=exiting, was=str(before), reason=why)
+    core.note("released", lease, exiting=exiting, was=before, why=why)
     core.wake(gpu)
 
 
@@ -447,7 +413,7 @@ def oom(core: Core, event: OomReported) -> None:
     """An allocation failed. If the holder asked for more than it was granted, its footprint was wrong: learn it."""
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.gpu is None:
-        raise bad_state(lease, "it holds nothing")
+        raise bad_state(lease, Misfit.HOLDS_NOTHING)
     gpu = core.gpu_of(lease)
     charge = gpu.ledger.charge_bytes(lease.id)
     allocated = charge if event.allocated_bytes is None else event.allocated_bytes
@@ -456,7 +422,7 @@ def oom(core: Core, event: OomReported) -> None:
     if learnt:
         core.footprints.out_of_memory(drift.model_name(lease.spec), wanted)
     core.want_sample(gpu, core.now)
-    core.reply(event.client, event.request, {"learnt_load_peak_bytes": wanted if learnt else None})
+    core.reply(event.client, event.request, OomReply(wanted if learnt else None))
     core.note(
         "oom",
         lease,
@@ -464,7 +430,4 @@ def oom(core: Core, event: OomReported) -> None:
         allocated_bytes=event.allocated_bytes,
         charge_bytes=charge,
         learnt_load_peak_bytes=wanted if learnt else None,
-        reason="it needs more than it declared"
-        if learnt
-        else "somebody else holds what was granted to it",
     )

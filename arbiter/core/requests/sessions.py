@@ -13,14 +13,17 @@ from vram_arbiter.arbiter.core.events import (
     JournalFailed,
     ProcessDied,
 )
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Client, Core, Refused
+from vram_arbiter.arbiter.core.model.state import Client, Core
 from vram_arbiter.arbiter.core.requests.expiry import lose
 from vram_arbiter.arbiter.core.requests.recovery import account_for
 from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, let_go
 from vram_arbiter.arbiter.core.requests.uses import end_use
 from vram_arbiter.arbiter.core.verification.schedule import on_process_died
 from vram_arbiter.schemas.ids import ClientId, LeaseId
+from vram_arbiter.schemas.wire.codes import Why
+from vram_arbiter.schemas.wire.pushes import DeniedPush
 
 
 def on_connected(core: Core, event: ClientConnected) -> None:
@@ -67,21 +70,21 @@ def on_left(core: Core, event: ClientLeft) -> None:
     core.last_client_at = core.now
     for lease in _concerned(core, core.leases_of_client(event.client)):
         for use in [use for use in lease.all_uses() if use.client == event.client]:
-            end_use(core, lease, use, f"its client left: {event.reason}")
+            end_use(core, lease, use, Why.CLIENT_LEFT, event.reason)
         if lease.client != event.client or lease.process != client.process:
             continue
         if lease.state is LeaseState.QUEUED:
-            cancel_waiter(core, lease, f"its client left: {event.reason}")
+            cancel_waiter(core, lease, Why.CLIENT_LEFT, event.reason)
         elif lease.state not in EXPIRING:
-            why = f"its client left: {event.reason}"
-            _give_up(core, lease, LeaseState.CANCELLED, "cancelled", why)
+            left = no.CancelledRequest(lease.id, Why.CLIENT_LEFT, event.reason)
+            _give_up(core, lease, LeaseState.CANCELLED, left)
         elif event.reason == BYE:
-            let_go(core, lease, exiting=False, why="its client said bye")
+            let_go(core, lease, exiting=False, why=Why.BYE)
 
 
-def _give_up(core: Core, lease: Lease, to: LeaseState, code: str, why: str) -> None:
+def _give_up(core: Core, lease: Lease, to: LeaseState, refusal: no.End) -> None:
     for feature in lease.features:
-        feature.give_up(core, lease, to, code, why)
+        feature.give_up(core, lease, to, refusal)
 
 
 def concerns(core: Core, client: ClientId) -> bool:
@@ -122,22 +125,21 @@ def on_died(core: Core, event: ProcessDied) -> None:
         on_process_died(core, gpu, process)
     for lease in _concerned(core, core.leases_of(process)):
         for use in [use for use in lease.all_uses() if use.process == process]:
-            end_use(core, lease, use, "its process died")
+            end_use(core, lease, use, Why.PROCESS_DIED)
         if lease.process == process:
             _bereave(core, lease)
 
 
 def _bereave(core: Core, lease: Lease) -> None:
     account_for(core, lease.id)
+    died = no.Lost(lease.id, Why.PROCESS_DIED, lease.process.pid)
     if lease.state is LeaseState.QUEUED:
-        cancel_waiter(core, lease, "its process died")
+        cancel_waiter(core, lease, Why.PROCESS_DIED)
     elif lease.state in EXPIRING:
-        message = f"{lease.id}: process {lease.process.pid} died"
-        core.note("lost", lease, reason=message)
-        error = {"code": "lease_lost", "message": message, "hint": "acquire again", "details": {}}
-        lose(core, lease, LeaseState.LOST, error, alive=False)
+        core.note("lost", lease, why=Why.PROCESS_DIED, pid=lease.process.pid)
+        lose(core, lease, LeaseState.LOST, died, alive=False)
     else:  # a verification goes on: only the residue is no longer expected
-        _give_up(core, lease, LeaseState.LOST, "lease_lost", "its process died")
+        _give_up(core, lease, LeaseState.LOST, died)
 
 
 def on_journal_failed(core: Core, event: JournalFailed) -> None:
@@ -153,14 +155,9 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
     gpu = core.gpu_of(lease)
     gpu.ledger.withdraw(lease.id, core.now)
     core.forget(event.key)
-    refused = Refused(
-        "journal_unavailable",
-        f"the grant of {lease.id} could not be written: {event.reason}",
-        "look at the daemon's log and its disk",
-        key=event.key,
-    )
-    core.move(lease, LeaseState.DENIED, refused.message)
+    refusal = no.NotJournaled(lease.id, event.key, event.reason)
+    core.move(lease, LeaseState.DENIED, refusal.code)
     if lease.request.id is None:  # else: whoever held the reply back has refused the request
-        core.push(lease, {"push": "denied", "lease_id": lease.id, "error": refused.wire()})
-    core.note("denied", lease, code=refused.code, reason=refused.message)
-    core.end(lease, refused.wire())
+        core.push(lease, DeniedPush(lease.id, refusal.view()))
+    core.note("denied", lease, code=refusal.code, refusal=refusal)
+    core.end(lease, refusal)

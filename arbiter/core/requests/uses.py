@@ -14,12 +14,16 @@ from typing import Any, Final
 
 from vram_arbiter.arbiter.core.events import UseBegan, UseEnded, UseYielded
 from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Use
-from vram_arbiter.arbiter.core.model.state import Core, Refused
+from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused
+from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.requests.limits import check_uses
 from vram_arbiter.arbiter.core.requests.requests import bad_state, client_of, lease_for, note_ended
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, UseId
+from vram_arbiter.schemas.wire.codes import Why
+from vram_arbiter.schemas.wire.replies import UsesReply
 
 FROM_JOURNAL: Final = ClientId("")
 """The client of a use that was marked before a restart, until its process says it again."""
@@ -33,20 +37,15 @@ def begin(core: Core, event: UseBegan) -> None:
     if key in lease.uses:  # a repeat, perhaps on a new connection: it ends with that one
         known = lease.uses[key]
         lease.uses[key] = replace(known, client=client.id)
-        core.reply(event.client, event.request, {"uses": len(lease.uses)})
+        core.reply(event.client, event.request, UsesReply(len(lease.uses)))
         if known.client == FROM_JOURNAL:
             _note_begun(core, lease, known, resumed=True)
         return
     if lease.state in LEAVING:
-        told = "" if lease.departure.eviction is None else f": {lease.departure.eviction.reason}"
-        raise Refused(
-            "lease_revoking",
-            f"{lease.spec.consumer} was asked to leave{told}",
-            "wait until it is granted again",
-            state=str(lease.state),
-        )
+        revoked = None if lease.departure.eviction is None else lease.departure.eviction.why
+        raise Refused(no.Revoked(lease.spec.consumer, lease.state, "use", revoked))
     if lease.state is not LeaseState.HELD:
-        raise bad_state(lease, "only a held lease can be used")
+        raise bad_state(lease, Misfit.NOT_HELD)
     paused = lease.uses.paused.get(key)
     if paused is None:
         check_uses(core, lease, client)
@@ -55,7 +54,7 @@ def begin(core: Core, event: UseBegan) -> None:
     lease.uses.last_at = core.now
     if _is_kept(lease, use):
         core.record_lease(lease)  # before the reply: from then on its user counts on it
-    core.reply(event.client, event.request, {"uses": len(lease.uses)})
+    core.reply(event.client, event.request, UsesReply(len(lease.uses)))
     _note_begun(core, lease, use, resumed=paused is not None)
 
 
@@ -83,8 +82,8 @@ def yield_(core: Core, event: UseYielded) -> None:
         core.note("use_yielded", lease, use_id=use.id, label=use.label, uses=len(lease.uses))
         _safe_point(core, lease)
     elif key not in lease.uses.paused:
-        raise bad_state(lease, f"it has no use {event.use} of yours to yield")
-    core.reply(event.client, event.request, {"uses": len(lease.uses)})
+        raise bad_state(lease, Misfit.NO_SUCH_USE, event.use)
+    core.reply(event.client, event.request, UsesReply(len(lease.uses)))
 
 
 def end(core: Core, event: UseEnded) -> None:
@@ -94,11 +93,11 @@ def end(core: Core, event: UseEnded) -> None:
     key = (client.process, event.use)
     use = lease.uses.get(key) or lease.uses.paused.get(key)
     if use is not None:
-        end_use(core, lease, use, "ended")
-    core.reply(event.client, event.request, {"uses": len(lease.uses)})
+        end_use(core, lease, use, Why.ENDED)
+    core.reply(event.client, event.request, UsesReply(len(lease.uses)))
 
 
-def end_use(core: Core, lease: Lease, use: Use, why: str) -> None:
+def end_use(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> None:
     """A use is over, whether it was busy or paused."""
     key = (use.process, use.id)
     busy = key in lease.uses
@@ -107,7 +106,7 @@ def end_use(core: Core, lease: Lease, use: Use, why: str) -> None:
         lease.uses.last_at = core.now
     else:
         del lease.uses.paused[key]
-    note_ended(core, lease, use, why)
+    note_ended(core, lease, use, why, by)
     if busy:
         _safe_point(core, lease)
 
@@ -147,4 +146,4 @@ def on_users_due(core: Core, lease_id: str) -> None:
     """Who has not come back to its use by now has it no more."""
     lease = core.leases[LeaseId(lease_id)]
     for use in [use for use in lease.uses.values() if use.client == FROM_JOURNAL]:
-        end_use(core, lease, use, "its process did not come back to it after the restart")
+        end_use(core, lease, use, Why.USER_NOT_BACK)

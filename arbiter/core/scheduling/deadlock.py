@@ -10,17 +10,16 @@ of the newest in the circle, before anybody is asked to leave for it.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 WAITS_MAX = 64
 """A process that waits for more than so many leases at a time is not looked at: each look weighs all of them."""
-HINT = "`yield` the use, release first, or mark the wait `independent`"
 
 
 def resolve(core: Core) -> None:
@@ -193,33 +192,22 @@ def _way_back(start: Lease, waits_for: Callable[[Lease], list[Lease]]) -> list[L
 
 # -- telling -----------------------------------------------------------------------------------------------------------
 def _deny(core: Core, waiter: Lease, cycle: list[Lease]) -> None:
-    links = [_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle)]
-    story = "; ".join(f"{link['consumer']} (pid {link['pid']}) {_words(link)}" for link in links)
-    refused = Refused("would_deadlock", f"this wait would never end: {story}", HINT, cycle=links)
-    eviction.deny(core, waiter, refused.wire())
+    links = (_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle))
+    eviction.deny(core, waiter, no.Deadlock(tuple(links)))
 
 
-def _link(core: Core, waiter: Lease, following: Lease) -> dict[str, Any]:
+def _link(core: Core, waiter: Lease, following: Lease) -> no.CycleLink:
     used = core.users.get(following.process, {}).values()
     theirs = {lease.id: lease for lease in used if lease.gpu in waiter.request.gpus}
     held = {lease.id: lease for lease in core.users.get(waiter.process, {}).values()}
-    return {
-        "pid": waiter.process.pid,
-        "consumer": waiter.spec.consumer,
-        "lease_id": waiter.id,
-        "waits_for": [_named(lease) for lease in theirs.values()] or [_named(following)],
-        "holds": [_named(lease) for lease in held.values()],
-    }
+    return no.CycleLink(
+        pid=waiter.process.pid,
+        consumer=waiter.spec.consumer,
+        lease_id=waiter.id,
+        waits_for=tuple(map(_named, theirs.values())) or (_named(following),),
+        holds=tuple(map(_named, held.values())),
+    )
 
 
-def _named(lease: Lease) -> dict[str, Any]:
-    return {"lease_id": lease.id, "consumer": lease.spec.consumer, "state": str(lease.state)}
-
-
-def _words(link: Mapping[str, Any]) -> str:
-    def names(key: str) -> str:
-        return " and ".join(f"{one['consumer']} ({one['lease_id']})" for one in link[key])
-
-    return (
-        f"uses {names('holds')} and " if link["holds"] else ""
-    ) + f"waits for {names('waits_for')}"
+def _named(lease: Lease) -> no.NamedLease:
+    return no.NamedLease(lease.id, lease.spec.consumer, lease.state)

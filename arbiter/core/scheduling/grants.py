@@ -23,6 +23,9 @@ from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.arbiter.core.verification.evidence import note_pressure
 from vram_arbiter.schemas.ids import GpuId, LeaseId
+from vram_arbiter.schemas.wire.codes import Block, Wait, Why
+from vram_arbiter.schemas.wire.pushes import GrantedPush
+from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 def schedule(core: Core) -> None:
@@ -65,7 +68,7 @@ def _serve(core: Core, gpu: Gpu) -> None:
     leaving = policy.leaving(gpu)
     planned = policy.fits(gpu, head, leaving)
     if planned:
-        head.request.reason = "room is being made"
+        head.request.reason = Wait.MAKING_ROOM
     elif _ask_victims(core, gpu, head, leaving):  # 6
         leaving, planned = policy.leaving(gpu), True
     _backfill(core, gpu, head, leaving, planned=planned)  # 7
@@ -77,7 +80,7 @@ def _relieve(core: Core, gpu: Gpu) -> None:
     if over <= 0:
         return
     for victim in policy.choose_relief(core, gpu, leaving, over):
-        eviction.ask(core, gpu, victim, None, "the card holds more than its budget")
+        eviction.ask(core, gpu, victim, None)
     policy.wake_when_evictable(core, gpu, None)
 
 
@@ -86,33 +89,31 @@ def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
     room = policy.measured_room_bytes(core, gpu)
     need = policy.measured_need_bytes(gpu, lease)
     if room is None or (room < need and policy.sample_is_behind(gpu)):
-        lease.request.reason = "waits for a fresh reading of the card"
+        lease.request.reason = Wait.READING
         core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
         return
     if room < need:
-        lease.request.reason = (
-            "the ledger has room, the card does not: measured memory is not free yet"
-        )
-        gpu.blocked = lease.request.reason
+        lease.request.reason = Wait.NOT_FREE
+        gpu.blocked = Block.NOT_FREE
         return
     grant(core, gpu, lease)
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
     if policy.residue_under_measurement(gpu):
-        head.request.reason = "a dead process's memory is being measured"
+        head.request.reason = Wait.RESIDUE
         return False
     plan = policy.choose_victims(core, gpu, head, leaving)
     if plan is None:
-        head.request.reason = "nobody who could make room may be asked now"
+        head.request.reason = Wait.NO_VICTIM
         policy.wake_when_evictable(core, gpu, head)
         return False
     if len(head.request.gpus) > 1 and not policy.is_best_place(core, gpu, head, plan):
         return False
     head.request.planned_gpu = gpu.info.id
-    head.request.reason = "room is being made"
+    head.request.reason = Wait.MAKING_ROOM
     for victim in plan:
-        eviction.ask(core, gpu, victim, head, f"{head.spec.consumer} needs the room")
+        eviction.ask(core, gpu, victim, head)
     for gpu_id in head.request.gpus:
         core.wake(core.gpus[gpu_id])  # those behind it there are no longer behind it
     return True
@@ -176,9 +177,9 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     token = core.next_token()
     lease.token = token
     lease.gpu = gpu.info.id
-    core.move(lease, LeaseState.LOADING, "came back by itself" if by_itself else "granted")
+    core.move(lease, LeaseState.LOADING, Why.RETURNED if by_itself else Why.GRANTED)
     lease.granted_at = lease.held_from = core.now
-    lease.request.reason = ""
+    lease.request.reason = None
     gpu.residents[lease.id] = lease
     gpu.ledger.charge(
         lease.id,
@@ -193,13 +194,12 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     core.timers.set(("ttl", lease.id), lease.expires_at)
     core.record_lease(lease, gates=True)
     if lease.request.answered:
-        core.push(lease, {"push": "granted", "lease": explain.view(core, lease)})
+        core.push(lease, GrantedPush(explain.view(core, lease)))
         lease.request.id = None
     else:
         assert lease.request.id is not None, f"{lease.id} was never asked for"
-        core.reply(
-            lease.client, lease.request.id, {"state": "loading", "lease": explain.view(core, lease)}
-        )
+        view = explain.view(core, lease)
+        core.reply(lease.client, lease.request.id, AcquireReply("loading", view))
         lease.request.answered = True
     core.note(
         "granted",
@@ -208,17 +208,8 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
         waited_ms=(core.now - lease.request.arrived_at) * 1e3,
         evicted=[e.consumer for e in lease.request.evicted],
         **({"by_itself": True} if by_itself else {}),
-        reason=_why_now(lease, by_itself=by_itself),
     )
     gpu.blocked = policy.blocked(core, gpu)
-
-
-def _why_now(lease: Lease, *, by_itself: bool) -> str:
-    if by_itself:
-        return "back from standby: there is room and nobody waits"
-    if lease.request.evicted:
-        return "fits after " + ", ".join(e.consumer for e in lease.request.evicted) + " left"
-    return "fits"
 
 
 def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:

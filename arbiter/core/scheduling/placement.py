@@ -5,7 +5,9 @@ sends no revoke.
 """
 
 from vram_arbiter.arbiter.core.events import Spec
-from vram_arbiter.arbiter.core.model.state import Core, Gpu, Refused
+from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.refusals import Refused
+from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import GpuId
 
 
@@ -20,25 +22,11 @@ def places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
     """Cards that a new waiter stands in the queues of. Raises Refused if there is none that it could ever be granted on."""
     gpus = selected(core, spec)
     if not gpus:
-        raise Refused(
-            "unknown_gpu",
-            f"there is no GPU {spec.gpu!r}",
-            "give an uuid, an index or `any`",
-            known=[gpu.info.id for gpu in core.gpus.values()],
-        )
+        raise Refused(no.UnknownGpu(spec.gpu, tuple(gpu.info.id for gpu in core.gpus.values())))
     able = tuple(gpu.info.id for gpu in gpus if load_peak <= gpu.ledger.budget_bytes)
     if able:
         return able
     largest = max(gpus, key=lambda gpu: (gpu.ledger.budget_bytes, -gpu.info.index))
-    raised = load_peak > max(spec.load_peak_bytes, spec.steady_bytes, spec.residue_bytes)
-    learnt = f" ({spec.load_peak_bytes} declared, more was measured)" if raised else ""
-    raise Refused(
-        "vram_insufficient",
-        f"{spec.consumer} needs {load_peak} bytes{learnt}; the card has {largest.info.capacity_bytes} "
-        f"less a reserve of {largest.info.reserve_bytes}",
-        "use a smaller model or a lower precision",
-        needed_bytes=load_peak,
-        declared_bytes=spec.load_peak_bytes,
-        capacity_bytes=largest.info.capacity_bytes,
-        reserve_bytes=largest.info.reserve_bytes,
-    )
+    info = largest.info
+    sizes = (load_peak, spec.load_peak_bytes, info.capacity_bytes, info.reserve_bytes)
+    raise Refused(no.TooLarge(spec.consumer, *sizes))

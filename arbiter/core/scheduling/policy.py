@@ -4,7 +4,7 @@ Nothing here changes anything but when a card is looked at again (`wake_when_evi
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from math import inf
 
@@ -13,13 +13,13 @@ from vram_arbiter.arbiter.core.ledger.ledger import NOTHING
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.codes import Block
 
 EXACT_SEARCH_MAX = 12  # candidates; beyond that the search is greedy
 _WAKE_SLACK_S = (
     0.001  # so that a wake-up for an ageing step does not come a rounding error too early
 )
 
-MISSING_NAMED = 3
 _LEAVING = (LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING)  # in a fixed order
 
 type _Covers = Callable[[Mapping[LeaseId, int]], bool]
@@ -27,38 +27,26 @@ type _Choice = Callable[[Core, Sequence[Lease], _Covers, Mapping[LeaseId, int]],
 
 
 # -- fits ------------------------------------------------------------------------------------------------------------
-def blocked(core: Core, gpu: Gpu) -> str:
-    """Why nothing can be granted on this card now, whoever asks; "" if grants are possible."""
+def blocked(core: Core, gpu: Gpu) -> Block | None:
+    """Return why nothing can be granted on a GPU now, for any request; None if grants are possible."""
     if core.recovering is not None:
-        return f"recovering after a restart: {_missing(core, core.recovering)} must come back first"
+        return Block.RECOVERING
     if core.drain is not None:
-        return f"drained by {core.drain}"
+        return Block.DRAINED
     if gpu.failed_at is not None:
-        return f"the card cannot be read: {gpu.failure}"
+        return Block.UNREADABLE
     if gpu.sample is None:
-        return "the card has not been read yet"
-    if loading := gpu.in_state(LeaseState.LOADING):
-        return f"{loading[0].spec.consumer} is loading"
+        return Block.UNREAD
+    if gpu.in_state(LeaseState.LOADING):
+        return Block.LOADING
     if gpu.keeper is not None:
-        return gpu.keeper.blocks(gpu)
-    if gpu.pressed:
-        return f"pressure: {gpu.ledger.pressure_bytes()} bytes more than the budget are held"
-    return ""
+        return Block.GANG
+    return Block.PRESSURE if gpu.pressed else None
 
 
-def _missing(core: Core, missing: Collection[LeaseId]) -> str:
-    """Who has not come back since a restart, by name. They live: whoever died meanwhile was lost at once."""
-    holders = [core.leases[lease_id] for lease_id in sorted(missing) if lease_id in core.leases]
-    if not holders:
-        return "holders that the journal may not name"
-    names = ", ".join(
-        f"{lease.spec.consumer} (pid {lease.process.pid})" for lease in holders[:MISSING_NAMED]
-    )
-    return (
-        names
-        if len(holders) <= MISSING_NAMED
-        else f"{names} and {len(holders) - MISSING_NAMED} more"
-    )
+def kept_by(gpu: Gpu) -> str:
+    """Return the name of the group that a feature keeps a GPU for; "" if none does."""
+    return "" if gpu.keeper is None else gpu.keeper.blocks(gpu)
 
 
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:
@@ -270,7 +258,12 @@ def may_ask(lease: Lease) -> bool:
     """
     if not (lease.evictable and lease.attached):
         return False
-    return not any(feature.protects(lease) for feature in lease.features)
+    return not protected_by(lease)
+
+
+def protected_by(lease: Lease) -> str:
+    """Return the name of the group that keeps a holder from being revoked; "" if none does."""
+    return next(filter(None, (feature.protects(lease) for feature in lease.features)), "")
 
 
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:

@@ -79,7 +79,6 @@ def _note_stowaways(core: Core, gpu: Gpu, known: dict[ProcessKey, int]) -> None:
                 pid=stranger.process.pid,
                 name=stranger.name,
                 used_bytes=stranger.used_bytes,
-                reason="holds bytes without a lease; charged as reserve",
             )
 
 
@@ -128,7 +127,6 @@ def note_pressure(core: Core, gpu: Gpu) -> None:
             for process, count in over.items()
             if count > tolerance
         ],
-        reason="more is held than the budget" if pressure_bytes else "pressure is over",
     )
 
 

@@ -14,7 +14,7 @@ begun is ended, by a fact or at the daemon's end, and their number is bounded. M
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from opentelemetry import trace
@@ -22,7 +22,10 @@ from opentelemetry.context import Context
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from vram_arbiter.arbiter.core import effects as fx
+from vram_arbiter.arbiter.core.model.refusals import LimitReached
 from vram_arbiter.schemas.runtime.telemetry import names as names
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.pushes import AnyPush, RevokePush
 
 OPEN_MAX = 32_768
 """Spans of acquires that are open at a time, and as many of evictions: twice the waiters that the default limits allow. The oldest is
@@ -105,25 +108,25 @@ class LeaseTelemetry:
                     told.append(effect.data["code"])  # counted with its event
         for effect in effects:
             match effect:
-                case fx.Push(_, body) if body["push"] == "revoke" and body["lease_id"] in asked:
-                    self._begin_evict(
-                        asked.pop(body["lease_id"]), body.get("traceparent"), self._wall_ns()
-                    )
-                case fx.Refuse(_, _, code, _, _, details) if code in told:
-                    told.remove(code)
-                case fx.Refuse(_, _, code, _, _, details) if _refuses_a_lease(code, details):
-                    self._counts.denied(code)
+                case fx.Push(_, RevokePush() as push) if push.lease_id in asked:
+                    traceparent = push.traceparent or None
+                    self._begin_evict(asked.pop(push.lease_id), traceparent, self._wall_ns())
+                case fx.Refuse(_, _, refusal) if refusal.code in told:
+                    told.remove(refusal.code)
+                case fx.Refuse(_, _, refusal) if _refuses_a_lease(refusal):
+                    self._counts.denied(refusal.code)
 
-    def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]:
+    def revoke(self, body: AnyPush) -> AnyPush:
         """A push on its way out; a `revoke` names its own span, so that the holder's unloading becomes its child."""
-        if body["push"] != "revoke":
+        if not isinstance(body, RevokePush):
             return body
-        leaving = self._leaving.get(body["lease_id"])
+        leaving = self._leaving.get(body.lease_id)
         if leaving is None or leaving.evict is None:
             return body
         own: dict[str, str] = {}
         _W3C.inject(own, trace.set_span_in_context(leaving.evict, Context()))
-        return {**body, **own}  # nothing is added where only metrics are on
+        # nothing is added where only metrics are on
+        return replace(body, traceparent=own.get("traceparent", body.traceparent))
 
     def wrote(self, seconds: float, *, failed: bool) -> None:
         """One transaction of the journal."""
@@ -282,7 +285,7 @@ class LeaseTelemetry:
                 names.ATTR_CONSUMER: asked["consumer"],
                 names.ATTR_GPU: str(asked["gpu"]),
                 names.ATTR_WANTED_BY: asked["wanted_by"],
-                names.ATTR_REASON: str(asked["reason"])[:REASON_CHARS],
+                names.ATTR_REASON: str(asked["cause"]),
             },
         )
         # it was never measured: asked again, the earlier way out has no end of its own
@@ -394,11 +397,11 @@ def _end(span: trace.Span, at_ns: int, failed: str = "") -> None:
     span.end(max(at_ns, getattr(span, "start_time", None) or 0))
 
 
-def _refuses_a_lease(code: str, details: Mapping[str, Any]) -> bool:
+def _refuses_a_lease(refusal: Refusal) -> bool:
     """Of what is refused at once, what is the refusal of a lease."""
-    if code == "limit_exceeded":
-        return details.get("limit") in ("waiters_max", "leases_per_client_max")
-    return code in ("vram_insufficient", "load_failing", "unknown_gpu")
+    if isinstance(refusal, LimitReached):
+        return refusal.limit in ("waiters_max", "leases_per_client_max")
+    return refusal.code in ("vram_insufficient", "load_failing", "unknown_gpu")
 
 
 def _bytes(event: Event, key: str) -> dict[str, Any]:

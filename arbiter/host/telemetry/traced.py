@@ -13,6 +13,7 @@ from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
 from vram_arbiter.schemas.runtime.telemetry import names as names
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.wire.pushes import AnyPush
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +29,7 @@ class Harmless:
     def outgoing(self, effects: Sequence[Effect]) -> None:
         self._ask(lambda leases: leases.outgoing(effects), None)
 
-    def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]:
+    def revoke(self, body: AnyPush) -> AnyPush:
         return self._ask(lambda leases: leases.revoke(body), body)
 
     def observe(self, event: Mapping[str, Any]) -> Mapping[str, str]:

@@ -21,6 +21,7 @@ from vram_arbiter.schemas.ids import (
     RequestId,
     Token,
 )
+from vram_arbiter.schemas.wire.replies import AcquireReply
 
 CARD = GpuId("GPU-0")
 FEW, MANY = 5, 500
@@ -82,9 +83,11 @@ class Counted:
 
     def acquire(self, client: ClientId) -> tuple[LeaseId, Token]:
         effects = self.tell(self.asking(client))
-        lease = next(effect for effect in effects if isinstance(effect, Reply)).body["lease"]
-        assert lease["state"] == "loading"
-        return LeaseId(lease["lease_id"]), Token(*lease["token"])
+        bodies = [effect.body for effect in effects if isinstance(effect, Reply)]
+        lease = next(body.lease for body in bodies if isinstance(body, AcquireReply))
+        assert lease.state == "loading"
+        assert lease.token is not None
+        return LeaseId(lease.lease_id), lease.token
 
     def load(self, lease: tuple[LeaseId, Token], client: ClientId) -> None:
         self.tell(ev.ReadyReported(client, self.request(), *lease, None))

@@ -10,10 +10,11 @@ from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
-from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Order, Use
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
+from vram_arbiter.schemas.wire.codes import Order
 
 GIB = d.GIB
 X = ProcessKey(5, 5)

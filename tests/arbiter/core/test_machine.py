@@ -13,7 +13,7 @@ from typing import Any
 import hypothesis.strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.core_driver import Consumer, CoreDriver, as_wire
 from tests.support.engine_state import state_of
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Push, Reply
@@ -148,7 +148,7 @@ class Leases(RuleBasedStateMachine):
         reply = next((effect for effect in effects if isinstance(effect, Reply)), None)
         if reply is None:  # it can never fit
             return None
-        lease = LeaseId(reply.body["lease"]["lease_id"])
+        lease = LeaseId(as_wire(reply.body)["lease"]["lease_id"])
         person.specs[lease] = person.spec(size, steady, **spec)
         self.mine[lease] = person
         if bound is not None:
@@ -347,13 +347,10 @@ class Leases(RuleBasedStateMachine):
 
     def tokens_grow(self) -> None:
         for effect in self.driver.effects[self.seen :]:
-            if (
-                isinstance(effect, Reply | Push)
-                and effect.body.get("lease", {}).get("state") == "loading"
-            ):
-                token = effect.body["lease"]["token"]
-                assert not self.tokens or tuple(token) > tuple(self.tokens[-1])
-                self.tokens.append(token)
+            view = getattr(effect.body, "lease", None) if isinstance(effect, Reply | Push) else None
+            if view is not None and view.state == "loading":
+                assert not self.tokens or view.token > self.tokens[-1]
+                self.tokens.append(view.token)
         self.seen = len(self.driver.effects)
 
     def no_lost_wake_up(self) -> None:
@@ -400,7 +397,7 @@ class Leases(RuleBasedStateMachine):
             self.driver.advance(TURN_S)
             turn += 1
             waited = self.driver.now - began
-            assert waited <= WAIT_MAX_S or not waiting, self.driver.arbiter.status(self.driver.now)
+            assert waited <= WAIT_MAX_S or not waiting, self.driver.status()
 
     def cooperate(self) -> None:
         for lease in self.in_use():

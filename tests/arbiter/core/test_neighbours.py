@@ -129,6 +129,6 @@ def test_13_a_probe_failure_is_not_free_memory() -> None:
     waiter = driver.consumer("a").acquire(1 * GIB)
     driver.advance(10.0)
     assert driver.state(waiter) == "queued"
-    assert "cannot be read" in driver.gpu()["blocked"]
+    assert "cannot be read" in driver.gpu()["blocked"]["text"]
     driver.card.failing = ""
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)

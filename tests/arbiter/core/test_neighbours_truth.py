@@ -142,7 +142,7 @@ def test_2_an_unload_that_frees_a_fraction_is_charged_for_the_rest_and_named() -
     assert driver.gpu()["charged_bytes"] == int(4.5 * GIB) - 82 * MIB
     waiter = driver.consumer("vlm").acquire(4 * GIB)
     assert driver.state(waiter) == "queued"
-    assert "det" in driver.arbiter.why("vlm", driver.now)["leases"][0]["text"]
+    assert "det" in driver.why("vlm")["leases"][0]["text"]
 
 
 def test_2_what_a_process_keeps_is_learnt() -> None:
@@ -153,7 +153,7 @@ def test_2_what_a_process_keeps_is_learnt() -> None:
     det.release(lease)
     driver.advance(d.VERIFY_TIMEOUT_S + 1.0)
     det.acquire(4 * GIB, residue_bytes=450 * MIB)
-    (told,) = driver.arbiter.why("det", driver.now)["leases"]
+    (told,) = driver.why("det")["leases"]
     assert told["footprint"]["learnt_bytes"]["residue"] == 700 * MIB
 
 
@@ -164,7 +164,7 @@ def test_2_stranded_bytes_have_an_owner() -> None:
     driver.card.set(BROWSER, int(5.4 * GIB), driver.now)
     driver.advance(1.5)
     driver.consumer("vlm").acquire(4 * GIB)
-    (told,) = driver.arbiter.why("vlm", driver.now)["leases"]
+    (told,) = driver.why("vlm")["leases"]
     assert ("ollama runner", int(5.4 * GIB)) in {
         (b["consumer"], b["bytes"]) for b in told["blockers"]
     }

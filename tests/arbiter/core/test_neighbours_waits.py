@@ -36,7 +36,7 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
     (note,) = driver.notes("deadline_passed")
     assert note["consumer"] == "stuck"
     assert driver.state(small) == "loading", "its bytes are not waited for any more"
-    told = driver.arbiter.why("w", driver.now)["leases"][0]
+    told = driver.why("w")["leases"][0]
     assert "'is unloading for 31 s and may hang: end its process (pid" in str(told["blockers"])
     assert "waits for stuck to let go, its unloading may hang" in [
         step["text"] for step in told["plan"]
@@ -62,16 +62,14 @@ def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_
     stuck.unloading(lease)
     driver.advance(29.0)
     (step,) = (
-        step
-        for step in driver.arbiter.why("w", driver.now)["leases"][0]["plan"]
-        if step["action"] == "deadline"
+        step for step in driver.why("w")["leases"][0]["plan"] if step["action"] == "deadline"
     )
     assert step["in_s"] == pytest.approx(1.0, abs=0.1)
     driver.advance(1.5)
     assert driver.state(waiter) == "over"
     (push,) = driver.pushes("denied", waiter)
     assert push["error"]["code"] == "holder_busy"
-    assert "hang" in driver.arbiter.why("stuck", driver.now)["leases"][0]["text"]
+    assert "hang" in driver.why("stuck")["leases"][0]["text"]
     stuck.hold(0)
     stuck.release(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=2.0)
@@ -289,14 +287,14 @@ def test_22_a_load_without_progress_is_named_with_its_bytes() -> None:
     for gib in (1, 2):
         vlm.hold(gib * GIB)
         driver.advance(20.0)
-    moving = driver.arbiter.why("w", driver.now)["leases"][0]
-    assert "is loading for 40 s, 2.00 GiB so far" in moving["blockers"][0]["condition"]
-    assert "nothing new for 20 s" in moving["blockers"][0]["condition"]
+    moving = driver.why("w")["leases"][0]
+    assert "is loading for 40 s, 2.00 GiB so far" in moving["blockers"][0]["text"]
+    assert "nothing new for 20 s" in moving["blockers"][0]["text"]
     driver.advance(70.0)
-    (stalled,) = driver.arbiter.why("w", driver.now)["leases"]
+    (stalled,) = driver.why("w")["leases"]
     assert "nothing new for 90 s" in stalled["text"]
-    assert "nothing new for 90 s" in driver.arbiter.why("vlm", driver.now)["leases"][0]["text"]
+    assert "nothing new for 90 s" in driver.why("vlm")["leases"][0]["text"]
     vlm.hold(3 * GIB)
     driver.advance(2.0)
-    assert "nothing new for" not in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+    assert "nothing new for" not in driver.why("w")["leases"][0]["text"]
     assert driver.state(lease) == "loading", "said, and nothing is done to it"

@@ -1,6 +1,6 @@
 """The loop that the product exists for: detector, VLM and policy on one card of 8 GiB."""
 
-from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.core_driver import Consumer, CoreDriver, refusal
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 
@@ -82,12 +82,12 @@ def test_find_navigate_grab_and_find_again() -> None:
     assert driver.pushes("revoke", policy)[-1]["uses"] == 1
     robot.vlm.unload(vlm)
     robot.policy.ack(policy, 3.0)
-    refused = robot.policy.unloading(policy)
-    assert "bad_state" in repr(refused), "not before the safe point"
+    refused = refusal(robot.policy.unloading(policy))
+    assert refused.code == "bad_state", "not before the safe point"
     driver.advance(3.0)
     assert driver.state(detector) == "queued"
     assert driver.state(policy) == "revoking"
-    text = driver.arbiter.why("detector", driver.now)["leases"][0]["text"]
+    text = driver.why("detector")["leases"][0]["text"]
     assert (
         "waits for policy to finish 1 use (asked 3.0 s ago), then it unloads and 4.00 GiB are verified"
         in text

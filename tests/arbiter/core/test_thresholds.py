@@ -231,7 +231,8 @@ def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
     named = ", ".join(f"m{n} (pid {who.process.pid})" for n, who in enumerate(people[:3]))
     more = " and 1 more" if count == 4 else ""
     assert (
-        driver.gpu()["blocked"] == f"recovering after a restart: {named}{more} must come back first"
+        driver.gpu()["blocked"]["text"]
+        == f"recovering after a restart: {named}{more} must come back first"
     )
 
 
@@ -344,7 +345,9 @@ def test_the_headroom_goes_to_the_member_that_loads_and_what_it_does_not_need_st
         "bytes": 2400 * MIB,
         "state": "queued",
         "uses": 0,
-        "condition": "has its bytes kept for its turn in gang g",
+        "condition": "turn",
+        "by": "g",
+        "text": "has its bytes kept for its turn in gang g",
     }
     ready_with(members[0], 2000 * MIB)
     assert driver.state(members[1][1]) == "loading"

@@ -8,6 +8,7 @@ from typing import Any, NewType, get_args, get_origin, get_type_hints
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.messages import revoke
 from vram_arbiter.arbiter.core.effects import JournalDelete, Note, Push, Reply, Sample
 from vram_arbiter.arbiter.core.events import AcquireRequested, Event, Tick
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
@@ -94,7 +95,7 @@ def test_what_is_no_data_is_refused() -> None:
 def test_the_digest_sees_order_kind_and_every_value() -> None:
     reply = Reply(ClientId("c"), RequestId(1), {"lease": {"uses": 1}})
     rest = [
-        Push(ClientId("c"), {"push": "revoke"}),
+        Push(ClientId("c"), revoke()),
         Note("granted", {"bytes": 1}),
         Sample(GpuId("g")),
         JournalDelete("g"),

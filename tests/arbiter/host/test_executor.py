@@ -1,16 +1,26 @@
 """Effects are performed in order, and nothing is said about a grant that could not be written down."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+from tests.support.messages import lease_view, revoke
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core.model.refusals import LeaseOver
 from vram_arbiter.arbiter.host.executor import Executor
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.errors import JournalUnavailable
-from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId, Token
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.pushes import AnyPush, GrantedPush, ResizedPush, RevokePush
+from vram_arbiter.schemas.wire.replies import AcquireReply, StateReply
 
 A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
-LEASE = {"lease_id": "L1-1", "state": "loading"}
+LEASE = AcquireReply("loading", lease_view())
+GRANTED = GrantedPush(lease_view())
+REVOKE = revoke("L1-9")
+RESIZED = ResizedPush("L1-1", Token(1, 2), 5)
 
 
 class Recorder:
@@ -20,16 +30,16 @@ class Recorder:
         self.done: list[tuple[Any, ...]] = []
         self.disk_full = False
         self.executor = Executor(
-            self, self, self, self.sample, self.post, self.log_event, self.signal
+            self, self, self, self.sample, self.post, self.log_event, self.signal, words
         )
 
-    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
+    def reply(self, client: ClientId, request: RequestId, body: object) -> None:
         self.done.append(("reply", client, request, body))
 
-    def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
-        self.done.append(("refuse", client, request, error["code"]))
+    def refuse(self, client: ClientId, request: RequestId, error: ErrorView) -> None:
+        self.done.append(("refuse", client, request, error.code))
 
-    def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
+    def push(self, client: ClientId, body: object) -> None:
         self.done.append(("push", client, body))
 
     def broadcast(self, event: Mapping[str, Any]) -> None:
@@ -69,18 +79,18 @@ def test_answers_go_out_in_order_then_facts_then_readings() -> None:
         [
             fx.JournalPut("lease:L1-1", {"a": 1}),
             fx.JournalDelete("lease:L1-0"),
-            fx.Reply(A, ONE, {"lease": LEASE}),
-            fx.Push(A, {"push": "revoke"}),
+            fx.Reply(A, ONE, LEASE),
+            fx.Push(A, REVOKE),
             fx.Sample(GPU),
-            fx.Note("granted", {"lease_id": "L1-1"}),
-            fx.Refuse(A, ONE, "bad_state", "m", "h", {}),
+            fx.Note("granted", {"lease_id": "L1-1", "evicted": []}),
+            fx.Refuse(A, ONE, LeaseOver("L1-1", "released")),
             fx.JournalDelete("lease:L1-1"),
         ]
     )
     assert recorder.done == [
         ("journal", ("lease:L1-1", {"a": 1}), ("lease:L1-0", None), ("lease:L1-1", None)),
-        ("reply", A, ONE, {"lease": LEASE}),
-        ("push", A, {"push": "revoke"}),
+        ("reply", A, ONE, LEASE),
+        ("push", A, REVOKE),
         ("refuse", A, ONE, "bad_state"),
         ("history", "granted"),
         ("log", "granted"),
@@ -95,17 +105,17 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
     recorder.executor.perform(
         [
             fx.JournalPut("lease:L1-1", {"a": 1}, gates=True),
-            fx.Reply(A, ONE, {"state": "loading", "lease": LEASE}),
-            fx.Note("granted", {"lease_id": "L1-1"}),
-            fx.Push(A, {"push": "granted", "lease": LEASE}),
-            fx.Push(A, {"push": "revoke", "lease_id": "L1-9"}),
+            fx.Reply(A, ONE, LEASE),
+            fx.Note("granted", {"lease_id": "L1-1", "evicted": []}),
+            fx.Push(A, GRANTED),
+            fx.Push(A, REVOKE),
             fx.Sample(GPU),
         ]
     )
     assert recorder.done == [
         ("post", ev.JournalFailed("lease:L1-1", "disk full")),
         ("refuse", A, ONE, "journal_unavailable"),
-        ("push", A, {"push": "revoke", "lease_id": "L1-9"}),
+        ("push", A, REVOKE),
         ("sample", GPU),
     ]
 
@@ -117,17 +127,17 @@ def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be
     recorder.executor.perform(
         [
             fx.JournalPut("lease:L1-0", {"state": "verifying"}),
-            fx.Reply(A, RequestId(2), {"state": "verifying"}),
-            fx.Push(A, {"push": "queued", "lease_id": "L1-1"}),
+            fx.Reply(A, RequestId(2), StateReply("verifying")),
+            fx.Push(A, RESIZED),
             fx.JournalPut("lease:L1-1", {"a": 1}, gates=True),
-            fx.Push(A, {"push": "granted", "lease": LEASE}),
+            fx.Push(A, GRANTED),
         ]
     )
     assert recorder.done == [
         ("post", ev.JournalFailed("lease:L1-0", "disk full", gates=False)),
         ("post", ev.JournalFailed("lease:L1-1", "disk full")),
-        ("reply", A, RequestId(2), {"state": "verifying"}),
-        ("push", A, {"push": "queued", "lease_id": "L1-1"}),
+        ("reply", A, RequestId(2), StateReply("verifying")),
+        ("push", A, RESIZED),
     ]
 
 
@@ -139,12 +149,12 @@ def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None
         [
             fx.JournalPut("lease:L1-1", {"state": "verifying"}),
             fx.Note("released", {"lease_id": "L1-1"}),
-            fx.Reply(A, ONE, {"lease": LEASE}),
+            fx.Reply(A, ONE, LEASE),
         ]
     )
     assert recorder.done == [
         ("post", ev.JournalFailed("lease:L1-1", "disk full", gates=False)),
-        ("reply", A, ONE, {"lease": LEASE}),
+        ("reply", A, ONE, LEASE),
         ("history", "released"),
         ("log", "released"),
         ("broadcast", "released"),
@@ -154,8 +164,8 @@ def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None
 def test_a_record_that_cannot_be_deleted_stops_nobody() -> None:
     recorder = Recorder()
     recorder.disk_full = True
-    recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.Reply(A, ONE, {"lease": LEASE})])
-    assert recorder.done == [("reply", A, ONE, {"lease": LEASE})]
+    recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.Reply(A, ONE, LEASE)])
+    assert recorder.done == [("reply", A, ONE, LEASE)]
 
 
 def test_a_record_that_a_full_disk_could_not_delete_goes_with_the_next_write() -> None:
@@ -203,8 +213,9 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
         def outgoing(self, effects: Sequence[fx.Effect]) -> None:
             recorder.done.append(("outgoing", len(effects)))
 
-        def revoke(self, body: Mapping[str, Any]) -> Mapping[str, Any]:
-            return {**body, "traceparent": "mine"}
+        def revoke(self, body: AnyPush) -> AnyPush:
+            assert isinstance(body, RevokePush)
+            return replace(body, traceparent="mine")
 
         def wrote(self, seconds: float, *, failed: bool) -> None:
             recorder.done.append(("wrote", seconds >= 0, failed))
@@ -217,13 +228,14 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
         recorder.post,
         recorder.log_event,
         recorder.signal,
+        words,
         Traces(),
     )
-    push = fx.Push(A, {"push": "revoke", "lease_id": "L1-1"})
+    push = fx.Push(A, REVOKE)
     executor.perform([fx.JournalPut("lease:L1-1", {}), push])
     assert [done[0] for done in recorder.done] == ["outgoing", "journal", "wrote", "push"]
     assert recorder.done[2] == ("wrote", True, False)
-    assert recorder.done[-1][2] == {"push": "revoke", "lease_id": "L1-1", "traceparent": "mine"}
+    assert recorder.done[-1][2] == replace(REVOKE, traceparent="mine")
     recorder.disk_full = True
     executor.perform([fx.JournalPut("lease:L1-2", {})])
     assert ("wrote", True, True) in recorder.done

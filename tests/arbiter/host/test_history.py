@@ -20,6 +20,7 @@ from vram_arbiter.arbiter.host.history import (
     SKIPPED_AFTER_CRASH,
     History,
 )
+from vram_arbiter.schemas.wire.replies import HistoryReply
 
 PATIENCE_S = 60.0
 
@@ -44,8 +45,8 @@ def with_history(
 
 async def read(
     history: History, after: int = 0, limit: int = 500, kinds: tuple[str, ...] = ()
-) -> Mapping[str, Any]:
-    answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
+) -> HistoryReply:
+    answer: asyncio.Future[HistoryReply] = asyncio.get_running_loop().create_future()
     history.read(after, limit, kinds, answer.set_result)
     return await answer
 
@@ -57,14 +58,14 @@ def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
         assert abs(event["at_wall_s"] - time.time()) < PATIENCE_S
         history.append("ready", {})
         history.append("granted", {"lease_id": "L1-2"})
-        assert [e["seq"] for e in (await read(history))["events"]] == [1, 2, 3]
-        assert [e["seq"] for e in (await read(history, after=1))["events"]] == [2, 3]
-        assert [e["seq"] for e in (await read(history, limit=1))["events"]] == [1]
-        assert [e["lease_id"] for e in (await read(history, kinds=("granted",)))["events"]] == [
+        assert [e["seq"] for e in (await read(history)).events] == [1, 2, 3]
+        assert [e["seq"] for e in (await read(history, after=1)).events] == [2, 3]
+        assert [e["seq"] for e in (await read(history, limit=1)).events] == [1]
+        assert [e["lease_id"] for e in (await read(history, kinds=("granted",))).events] == [
             "L1-1",
             "L1-2",
         ]
-        assert (await read(history, after=99)) == {"events": [], "last_seq": 3}
+        assert (await read(history, after=99)) == HistoryReply((), 3)
 
     with_history(tmp_path, test)
 
@@ -76,16 +77,16 @@ def test_numbering_goes_on_after_an_orderly_stop(tmp_path: Path) -> None:
 
     async def second(history: History) -> None:
         assert history.append("ready", {})["seq"] == 3
-        events = (await read(history))["events"]
+        events = (await read(history)).events
         assert [(e["seq"], e["kind"]) for e in events] == [
             (1, "granted"),
             (2, CLEAN_END),
             (3, "ready"),
         ]
         assert events[0]["lease_id"] == "L1-1"
-        assert [
-            e["seq"] for e in (await read(history, kinds=("granted", "nonsense")))["events"]
-        ] == [1]
+        assert [e["seq"] for e in (await read(history, kinds=("granted", "nonsense"))).events] == [
+            1
+        ]
 
     with_history(tmp_path, first)
     with_history(tmp_path, second)
@@ -106,13 +107,13 @@ def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
     async def test(history: History) -> None:
         for number in range(RING_EVENTS + 50):
             history.append("odd" if number % 2 else "even", {"number": number})
-        old = (await read(history, after=10, limit=3))["events"]
+        old = (await read(history, after=10, limit=3)).events
         assert [e["seq"] for e in old] == [11, 12, 13]
-        assert [e["number"] for e in (await read(history, kinds=("odd",), limit=2))["events"]] == [
+        assert [e["number"] for e in (await read(history, kinds=("odd",), limit=2)).events] == [
             1,
             3,
         ]
-        assert len((await read(history, limit=5000))["events"]) == RING_EVENTS + 50
+        assert len((await read(history, limit=5000)).events) == RING_EVENTS + 50
 
     with_history(tmp_path, test)
 
@@ -123,7 +124,7 @@ def test_number_and_age_are_bounded(tmp_path: Path) -> None:
             history.append("x", {})
 
     async def look(history: History) -> None:
-        assert (await read(history))["events"][0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
+        assert (await read(history)).events[0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
 
     with_history(tmp_path, many, max_events=100)
     with_history(tmp_path, look, max_events=100)
@@ -147,7 +148,7 @@ def test_a_wild_wall_clock_only_dates_events(tmp_path: Path) -> None:
         history.start(asyncio.get_running_loop())
         for number in range(len(WILD)):
             history.append("x", {"number": number})
-        found = (await read(history))["events"]
+        found = (await read(history)).events
         assert [(e["seq"], e["number"], e["at_wall_s"]) for e in found] == [
             (number + 1, number, at) for number, at in enumerate(WILD)
         ]
@@ -186,7 +187,7 @@ def test_a_broken_database_is_put_aside(tmp_path: Path) -> None:
     assert list(tmp_path.glob("history.sqlite.corrupt-*"))
 
     async def again(history: History) -> None:
-        assert len((await read(history))["events"]) == 1
+        assert len((await read(history)).events) == 1
 
     with_history(tmp_path, again)
 
@@ -197,7 +198,7 @@ def test_without_a_disk_it_lives_in_memory(tmp_path: Path) -> None:
     async def test(history: History) -> None:
         for _ in range(RING_EVENTS + 5):
             history.append("x", {})
-        assert (await read(history))["events"][0]["seq"] == 6
+        assert (await read(history)).events[0]["seq"] == 6
 
     with_history(tmp_path, test)
 
@@ -248,7 +249,7 @@ def test_a_disk_that_hangs_lets_no_more_pile_up_than_the_bound() -> None:
 
 def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:
     disk = HangingDisk()
-    answers: list[Mapping[str, Any]] = []
+    answers: list[HistoryReply] = []
 
     async def run() -> None:
         history = History(cast(Any, disk), 0)
@@ -258,18 +259,16 @@ def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:
         assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
         for _ in range(QUESTIONS_MAX + 1):
             history.read(0, 1, (), answers.append)
-        assert [answer["problem"] for answer in answers] == [
-            "the disk of the history does not answer"
-        ]
+        assert [answer.problem for answer in answers] == ["the disk of the history does not answer"]
         disk.goes_on.set()
         async with asyncio.timeout(PATIENCE_S):
             while len(answers) <= QUESTIONS_MAX:
                 await asyncio.sleep(0.01)
-            assert all(answer["events"] == [{"seq": 1}] for answer in answers[1:])
+            assert all(answer.events == ({"seq": 1},) for answer in answers[1:])
             history.read(0, 1, (), answers.append)
             while len(answers) <= QUESTIONS_MAX + 1:
                 await asyncio.sleep(0.01)
-        assert "problem" not in answers[-1], "there is room again"
+        assert not answers[-1].problem, "there is room again"
         history.close()
 
     asyncio.run(run())
@@ -301,7 +300,7 @@ def test_an_event_that_cannot_be_read_does_not_hide_the_others(
     async def test(history: History) -> None:
         for _ in range(RING_EVENTS + 5):
             history.append("x", {})
-        found = (await read(history, limit=3))["events"]
+        found = (await read(history, limit=3)).events
         assert [event["seq"] for event in found] == [1, 3, SKIPPED_AFTER_CRASH + 4]
         assert (found[1]["kind"], found[1]["at_wall_s"]) == ("unreadable", 9e9)
 

@@ -75,7 +75,7 @@ def start_with(settings: Settings, texts: dict[str, str]) -> Opened:
             core.handle(MemorySampled(gpu.id, now, d.GIB, gpu.capacity_bytes, ()), now)
         core.handle(Tick(), now)
         assert codec.reply(1, 1, core.status(now))
-    assert core.status(now)["phase"] == "serving"
+    assert core.status(now).phase == "serving"
     return opened
 
 

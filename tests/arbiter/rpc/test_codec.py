@@ -12,6 +12,10 @@ from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
+from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.pushes import ResizedPush
+from vram_arbiter.schemas.wire.replies import UsesReply
 from vram_arbiter.schemas.wire.requests import Acquire, Footprint, Gang, LeaseSpec, Ping, Reattach
 
 LIMIT = 1 << 20
@@ -180,7 +184,7 @@ def outcome(payload: bytes) -> codec.Undecodable | None:
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_request_or_a_typed_error(payload: bytes) -> None:
     bad = outcome(payload)
-    assert bad is None or codec.refusal(bad.request_id, 1, bad.error.to_wire())
+    assert bad is None or codec.refusal(bad.request_id, 1, bad.error.view())
 
 
 _VALUES = st.recursive(
@@ -214,20 +218,21 @@ def test_any_fields_are_a_request_or_a_typed_error(
     bad = outcome(pack(**{**fields, "op": op, "id": request_id}))
     if bad is not None:
         assert bad.request_id == request_id
-        assert codec.refusal(bad.request_id, 1, bad.error.to_wire())
+        assert codec.refusal(bad.request_id, 1, bad.error.view())
 
 
 def test_replies_have_the_shape_of_the_wire() -> None:
-    assert msgpack.unpackb(codec.reply(4, 2, {"a": 1})) == {"re": 4, "epoch": 2, "ok": True, "a": 1}
-    error = {"code": "bad_frame", "message": "m", "hint": "", "details": {}}
-    assert msgpack.unpackb(codec.refusal(None, 2, error)) == {
-        "re": None,
-        "epoch": 2,
-        "ok": False,
-        "error": error,
-    }
-    assert msgpack.unpackb(codec.push(8, 2, {"push": "lost"})) == {
-        "push": "lost",
+    reply = codec.reply(4, 2, UsesReply(1))
+    assert msgpack.unpackb(reply) == {"re": 4, "epoch": 2, "ok": True, "uses": 1}
+    error = {"code": "bad_frame", "message": "m", "hint": "h", "details": {"a": 1}}
+    refusal = codec.refusal(None, 2, ErrorView("bad_frame", "m", "h", {"a": 1}))
+    assert msgpack.unpackb(refusal) == {"re": None, "epoch": 2, "ok": False, "error": error}
+    push = codec.push(8, 2, ResizedPush("L1-1", Token(1, 2), 5))
+    assert msgpack.unpackb(push) == {
+        "push": "resized",
+        "lease_id": "L1-1",
+        "token": [1, 2],
+        "charge_bytes": 5,
         "seq": 8,
         "epoch": 2,
     }

@@ -17,15 +17,20 @@ from tests.support.connections import KeptConnection, peer_of
 from tests.support.core_driver import SimCard
 from tests.support.engine_state import state_of
 from tests.support.hostile import Forger, pack
+from tests.support.messages import IDLE_STATUS, NO_EVENTS, no_reason
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.executor import Executor
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
 
 GPU = GpuId("GPU-0")
 STRANGER_UID = 54_321
@@ -47,11 +52,11 @@ class Recording:
     def when_read(self, answer: Callable[[], None]) -> None:
         answer()
 
-    def status(self, *page: object) -> dict[str, Any]:
-        return {}
+    def status(self, *page: object) -> StatusReply:
+        return IDLE_STATUS
 
-    def why(self, consumer: str) -> dict[str, Any]:
-        return {"consumer": consumer, "leases": []}
+    def why(self, consumer: str) -> WhyReply:
+        return no_reason(consumer)
 
     def concerns(self, client: ClientId) -> bool:
         return True
@@ -70,7 +75,14 @@ class RealCore:
         self.card = SimCard(GPU, 8 * d.GIB)
         self.arbiter = Arbiter(Settings(epoch=1, gpus=(info,)), self.plant.now)
         self.executor = Executor(
-            self.plant.outbox, self, self, self._sample, self.post, lambda event: None, self._signal
+            self.plant.outbox,
+            self,
+            self,
+            self._sample,
+            self.post,
+            lambda event: None,
+            self._signal,
+            words,
         )
         self._queue: deque[ev.Event] = deque()
         self._busy = False
@@ -94,10 +106,10 @@ class RealCore:
 
     def status(
         self, reader: ProcessKey | None = None, after: tuple[int, float, int] | None = None
-    ) -> dict[str, Any]:
+    ) -> StatusReply:
         return self.arbiter.status(self.plant.now, reader, after, d.STATUS_PAGE)
 
-    def why(self, consumer: str) -> dict[str, Any]:
+    def why(self, consumer: str) -> WhyReply:
         return self.arbiter.why(consumer, self.plant.now)
 
     def concerns(self, client: ClientId) -> bool:
@@ -176,9 +188,9 @@ class Plant:
         after: int,
         limit: int,
         kinds: tuple[str, ...],
-        done: Callable[[Mapping[str, Any]], None],
+        done: Callable[[HistoryReply], None],
     ) -> None:
-        done({"events": [], "last_seq": 0})
+        done(NO_EVENTS)
 
     def connection(self, via: bytes, peer: Peer) -> KeptConnection:
         if via not in self.connections:
@@ -300,7 +312,7 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
     counts = attack_table(plant, draw, forger, 60)
     assert set(counts) <= {1}, f"every frame is answered exactly once: {counts}"
     core.advance(draw.choice([0.0, 1.0, 40.0]))
-    (mine,) = (view for view in core.status()["leases"] if view["consumer"] == "victim")
+    (mine,) = (view for view in to_map(core.status())["leases"] if view["consumer"] == "victim")
     assert (mine["state"], mine["token"], mine["lease_id"]) == (
         "held",
         lease["token"],
@@ -309,7 +321,7 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
     assert plant.ask(b"victim", VICTIM, "renew", leases=[on])["alive"] == [lease["lease_id"]]
     plant.everybody_dies()
     core.advance(60.0)
-    status = core.status()
+    status = to_map(core.status())
     assert (status["leases"], status["clients"], status["gpus"][0]["charged_bytes"]) == ([], 0, 0)
     assert not plant.leftovers()
     assert not core.journal, "nothing is kept for a next start"
@@ -322,7 +334,7 @@ def test_at_the_limit_of_sessions_hellos_are_refused_and_remembered_by_nobody(
     plant = Plant(real=True, sessions_max=sessions_max)
     answers = [plant.hello(b"h%d" % number, ATTACKERS[0]) for number in range(2000)]
     assert sum(answer["ok"] for answer in answers) == sessions_max
-    assert len(plant.table) == plant.core.status()["clients"] == sessions_max
+    assert len(plant.table) == plant.core.status().clients == sessions_max
     plant.everybody_dies()
     assert not plant.leftovers()
 
@@ -331,11 +343,11 @@ def test_an_instance_that_reconnects_for_ever_is_one_session() -> None:
     plant = Plant(real=True)
     for number in range(3000):
         assert plant.hello(b"r%d" % number, ATTACKERS[0], instance="same")["ok"]
-    assert len(plant.table) == plant.core.status()["clients"] == 1
+    assert len(plant.table) == plant.core.status().clients == 1
     assert plant.leftovers()["_moved"] == 1, "only the connection before this one is remembered"
     plant.everybody_dies()
     assert not plant.leftovers()
-    assert plant.core.status()["clients"] == 0
+    assert plant.core.status().clients == 0
 
 
 def test_acquire_and_cancel_for_ever_keeps_nothing() -> None:
@@ -363,4 +375,4 @@ def test_acquire_and_cancel_for_ever_keeps_nothing() -> None:
     assert len(inside.nonces) <= 1025
     assert isinstance(core.executor, Executor)
     assert ClientId("c1") in inside.clients
-    assert not any(isinstance(effect, fx.Push) for effect in inside.out)
+    assert not any(isinstance(effect, fx.Push) for effect in inside.turn.effects)

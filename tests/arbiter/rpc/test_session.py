@@ -9,6 +9,7 @@ import msgpack
 import pytest
 
 from tests.support.connections import KeptConnection, peer_of
+from tests.support.messages import IDLE_STATUS, NO_EVENTS, lease_view, no_reason, revoke
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
 from vram_arbiter.schemas import defaults as d
@@ -24,6 +25,10 @@ from vram_arbiter.schemas.ids import (
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as wire
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.pushes import GrantedPush
+from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
 
 ME = peer_of(os.getpid())
 PARENT = peer_of(os.getppid())
@@ -56,21 +61,22 @@ class Bench:
 
     def status(
         self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
-    ) -> dict[str, Any]:
-        return {"phase": "serving", "reader": str(reader), "after": after}
+    ) -> StatusReply:
+        self.asked_status = (reader, after)
+        return IDLE_STATUS
 
-    def why(self, consumer: str) -> dict[str, Any]:
-        return {"consumer": consumer, "leases": []}
+    def why(self, consumer: str) -> WhyReply:
+        return no_reason(consumer)
 
     def history(
         self,
         after: int,
         limit: int,
         kinds: tuple[str, ...],
-        done: Callable[[Mapping[str, Any]], None],
+        done: Callable[[HistoryReply], None],
     ) -> None:
         self.questions.append((after, limit, kinds))
-        done({"events": [], "last_seq": 0})
+        done(NO_EVENTS)
 
     def concerns(self, client: ClientId) -> bool:
         return client in self.concerned
@@ -214,11 +220,10 @@ def test_roles(session_bench: Bench) -> None:
     assert session_bench.hello(via=b"x", peer=STRANGER)["ok"]
     assert session_bench.hello(via=b"o", role="operator")["role"] == "operator"
     session_bench.hello(via=b"v", role="observer")
-    assert session_bench.ask("status", b"v")["reader"] == str(ME.process), (
-        "only its own tokens are for it"
-    )
-    assert session_bench.ask("status", b"o", after=[1, 2.5, 3])["reader"] == "None"
-    assert session_bench.ask("status", b"o", after=[1, 2.5, 3])["after"] == [1, 2.5, 3]
+    assert session_bench.ask("status", b"v")["ok"]
+    assert session_bench.asked_status[0] == ME.process, "only its own tokens are for it"
+    assert session_bench.ask("status", b"o", after=[1, 2.5, 3])["ok"]
+    assert session_bench.asked_status == (None, (1, 2.5, 3))
     lease = {"lease_id": "L1-1", "token": [1, 1]}
     for op, fields in (
         ("ready", lease),
@@ -360,9 +365,7 @@ def test_a_dead_process_takes_its_sessions_along(session_bench: Bench) -> None:
     session_bench.hello(b"b")
     session_bench.table.process_died(ME.process)
     assert len(session_bench.table) == 0
-    session_bench.table.push(
-        session_bench.client(), {"push": "revoke"}
-    )  # no session: nothing happens
+    session_bench.table.push(session_bench.client(), revoke())  # no session: nothing happens
     assert not any("push" in message for message in session_bench.connections[b"a"].sent)
     session_bench.hang_up(b"a")  # the router hears of the death too
     assert session_bench.left() == []
@@ -440,7 +443,7 @@ def test_an_instance_on_a_new_connection_replaces_its_old_one(session_bench: Ben
     assert len(session_bench.table) == 1
     assert session_bench.left() == [], "nothing is lost by reconnecting"
     for via in (b"b", b"c"):
-        session_bench.table.push(session_bench.client(via), {"push": "granted"})
+        session_bench.table.push(session_bench.client(via), GrantedPush(lease_view()))
         assert session_bench.connections[b"c"].sent[-1]["push"] == "granted", (
             "it reaches the new connection"
         )
@@ -646,7 +649,7 @@ def test_one_process_does_not_take_all_subscriptions() -> None:
 def test_pushes_are_numbered_per_session(session_bench: Bench) -> None:
     session_bench.hello(b"a")
     for _ in range(3):
-        session_bench.table.push(session_bench.client(), {"push": "revoke"})
+        session_bench.table.push(session_bench.client(), revoke())
     sent = session_bench.connections[b"a"].sent
     assert [message["seq"] for message in sent if "push" in message] == [1, 2, 3]
 
@@ -655,7 +658,7 @@ def test_an_unreachable_peer_is_no_error(session_bench: Bench) -> None:
     session_bench.hello()
     connection = session_bench.connections[b"a"]
     connection.reachable = False
-    session_bench.table.push(session_bench.client(), {"push": "revoke"})
+    session_bench.table.push(session_bench.client(), revoke())
     assert session_bench.ask("ping") == {}
     connection.reachable = True
     assert session_bench.ask("ping")["ok"]
@@ -679,7 +682,7 @@ def test_every_refusal_is_in_the_log_with_its_reason(
     session_bench.hello()
     session_bench.ask("evict", target="L3-1", reason="by hand")
     session_bench.table.refuse(
-        session_bench.client(), RequestId(9), {"code": "vram_insufficient", "message": "9 GiB of 8"}
+        session_bench.client(), RequestId(9), ErrorView("vram_insufficient", "9 GiB of 8")
     )
     said = [record.getMessage() for record in caplog.records if record.name == "arbiter.refusals"]
     whose = f"pid {ME.process.pid}, uid {ME.uid}"

@@ -60,7 +60,7 @@ GPU = {
     "measured_used_bytes": 6 * GIB,
     "sample_age_s": 0.4,
     "pressure_bytes": 0,
-    "blocked": "pressure",
+    "blocked": {"code": "pressure", "text": "pressure"},
     "processes": [
         {"pid": 8, "name": "Xorg", "used_bytes": GIB, "residue_bytes": 0, "stowaway": True},
         {"pid": 7, "name": "python", "used_bytes": GIB, "residue_bytes": GIB, "stowaway": False},
@@ -105,7 +105,8 @@ WHY = {
                     "consumer": "x",
                     "bytes": GIB,
                     "state": "held",
-                    "condition": "in use",
+                    "condition": "in_use",
+                    "text": "in use",
                 }
             ],
             "next": "it unloads",

@@ -19,7 +19,7 @@ GPU = {
     "measured_used_bytes": 5 * GIB + 100 * MIB,
     "sample_age_s": 0.42,
     "pressure_bytes": 0,
-    "blocked": "",
+    "blocked": None,
     "processes": [],
 }
 LEASE = {
@@ -100,7 +100,7 @@ def test_status_of_a_card_in_trouble() -> None:
         "sample_age_s": None,
         "stowaway_bytes": 200 * MIB,
         "pressure_bytes": GIB,
-        "blocked": "the probe failed",
+        "blocked": {"code": "unreadable", "text": "the probe failed"},
         "processes": processes,
     }
     assert text.status_lines(
@@ -128,7 +128,8 @@ def test_why_somebody_waits() -> None:
         "bytes": 5 * GIB,
         "state": "revoking",
         "uses": 1,
-        "condition": "1 use running",
+        "condition": "in_use",
+        "text": "1 use running",
     }
     entry = {
         "lease_id": "L1-3",
@@ -136,7 +137,7 @@ def test_why_somebody_waits() -> None:
         "needed_bytes": 4 * GIB,
         "free_bytes": 3 * GIB,
         "deficit_bytes": GIB,
-        "condition": "room is being made",
+        "condition": "making_room",
         "blockers": [blocker],
         "next": "it unloads",
         "eta_s": 1.25,

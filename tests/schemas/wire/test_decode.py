@@ -24,7 +24,7 @@ def test_a_grant_is_read_from_older_and_newer_arbiters() -> None:
 
 
 def test_a_push_is_read_by_its_kind() -> None:
-    revoke = {"push": "revoke", "seq": 1, "epoch": 1, "lease_id": "L1-1", "token": [1, 2], "reason": "r", "wanted_by": "w"}  # fmt: skip
+    revoke = {"push": "revoke", "seq": 1, "epoch": 1, "lease_id": "L1-1", "token": [1, 2], "reason": "r", "wanted_by": "w", "uses": 0, "park": False}  # fmt: skip
     push = decode_push({**revoke, "deadline_in_s": 3.0, "order": {"by": "ops", "reason": "test"}})
     assert isinstance(push, RevokePush)
     assert (push.token, push.order and push.order.by, push.uses) == (Token(1, 2), "ops", 0)

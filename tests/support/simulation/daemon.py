@@ -23,10 +23,15 @@ from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.records import check_record
 from vram_arbiter.arbiter.inbox import Inbox
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.replies import AnyReply, HistoryReply
 
 CHECK_ALL_EVERY = 4
 """Events: what every event may have broken is checked after each by the core itself, the tables under that now and then."""
@@ -133,7 +138,7 @@ class SimDaemon:
                 operators_gid=None,
             ),
             self._inbox,
-            lambda after, limit, kinds, done: done({"events": [], "last": 0}),
+            lambda after, limit, kinds, done: done(HistoryReply((), 0)),
             self,
             lambda: clock.now,
         )
@@ -145,6 +150,7 @@ class SimDaemon:
             self._post,
             lambda event: None,
             lambda process, kind: clock.say(f"{kind} for {process}"),
+            words,
         )
         records = self.journal.opened.records
         clock.say(f"daemon starts, epoch {epoch}, {len(records)} records")
@@ -274,20 +280,20 @@ class _Outbox:
     def __init__(self, daemon: SimDaemon, sessions: SessionTable) -> None:
         self._daemon, self._sessions = daemon, sessions
 
-    def reply(self, client: ClientId, request: RequestId, body: Mapping[str, Any]) -> None:
+    def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None:
         self._daemon.crash_point("before a reply")
-        self._daemon.clock.say(f"reply {client} {request} {_brief(body)}")
+        self._daemon.clock.say(f"reply {client} {request} {_brief(to_map(body))}")
         self._sessions.reply(client, request, body)
         self._daemon.crash_point("after a reply")
 
-    def refuse(self, client: ClientId, request: RequestId, error: Mapping[str, Any]) -> None:
+    def refuse(self, client: ClientId, request: RequestId, error: ErrorView) -> None:
         self._daemon.crash_point("before a refusal")
-        self._daemon.clock.say(f"refuse {client} {request} {error['code']}: {error['message']}")
+        self._daemon.clock.say(f"refuse {client} {request} {error.code}: {error.message}")
         self._sessions.refuse(client, request, error)
 
-    def push(self, client: ClientId, body: Mapping[str, Any]) -> None:
+    def push(self, client: ClientId, body: AnyPush) -> None:
         self._daemon.crash_point("before a push")
-        self._daemon.clock.say(f"push {client} {_brief(body)}")
+        self._daemon.clock.say(f"push {client} {_brief(to_map(body))}")
         self._sessions.push(client, body)
         self._daemon.crash_point("after a push")
 

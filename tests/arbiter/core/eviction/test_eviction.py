@@ -69,7 +69,12 @@ def test_a_waiter_that_said_deny_is_denied_at_the_deadline() -> None:
     driver.advance(30.1)
     (denied,) = driver.pushes("denied", waiter)
     assert denied["error"]["code"] == "holder_busy"
-    assert denied["error"]["details"] == {"lease_id": lease, "consumer": "det", "uses": 1}
+    assert denied["error"]["details"] == {
+        "lease_id": lease,
+        "consumer": "det",
+        "uses": 1,
+        "deadline_s": 30.0,
+    }
     assert driver.state(lease) == "revoking", "the revoke stands"
     det.ack(lease)
     driver.advance(1.0)

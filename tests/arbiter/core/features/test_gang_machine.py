@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis.strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
 
-from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.core_driver import Consumer, CoreDriver, as_wire
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Effect, Refuse, Reply
 from vram_arbiter.arbiter.core.features import gangs as features_gangs
@@ -57,7 +57,7 @@ class Gangs(RuleBasedStateMachine):
         if reply is None:
             assert any(isinstance(effect, Refuse) for effect in effects)
             return None
-        lease = LeaseId(reply.body["lease"]["lease_id"])
+        lease = LeaseId(as_wire(reply.body)["lease"]["lease_id"])
         who.specs[lease] = who.spec(size, steady, **spec)
         self.mine[lease] = who
         return lease
@@ -124,7 +124,7 @@ class Gangs(RuleBasedStateMachine):
 
     def fits(self) -> None:
         shown = self.driver.card.shown(self.driver.now)
-        assert sum(shown.values()) <= CAPACITY, (shown, self.driver.arbiter.status(self.driver.now))
+        assert sum(shown.values()) <= CAPACITY, (shown, self.driver.status())
 
     @rule(lease=leases, who=st.integers(0, 4))
     def use(self, lease: LeaseId, who: int) -> None:
@@ -209,7 +209,7 @@ class Gangs(RuleBasedStateMachine):
         for lease, (state, token) in held.items():
             effects: list[Effect] = self.mine[lease].reattach(lease, token, held=state != "loading")
             if any(
-                effect.body["leases"][0]["kept"] is False
+                as_wire(effect.body)["leases"][0]["kept"] is False
                 for effect in effects
                 if isinstance(effect, Reply)
             ):
@@ -242,11 +242,11 @@ class Gangs(RuleBasedStateMachine):
             if not waiting:
                 break
             self.driver.advance(0.5)
-        assert not waiting, self.driver.arbiter.status(self.driver.now)
+        assert not waiting, self.driver.status()
         for n in range(5):
             self.die(n)
         self.driver.advance(15.0)
-        assert self.driver.gpu()["charged_bytes"] == 0, self.driver.arbiter.status(self.driver.now)
+        assert self.driver.gpu()["charged_bytes"] == 0, self.driver.status()
         core = self.driver.arbiter.inspect()
         assert not core.users
         gangs = core.feature(features_gangs.Gangs)

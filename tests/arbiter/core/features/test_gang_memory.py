@@ -32,7 +32,7 @@ def to_peak_and_down(who: Consumer, lease: LeaseId) -> None:
 
 def why_text(driver: CoreDriver, lease: LeaseId) -> str:
     consumer = (driver.view(lease) or {})["consumer"]
-    return str(driver.arbiter.why(consumer, driver.now)["leases"][0]["text"])
+    return str(driver.why(consumer)["leases"][0]["text"])
 
 
 @pytest.mark.parametrize("lists", [True, False])

@@ -47,7 +47,7 @@ def parked(driver: CoreDriver, **spec: Any) -> tuple[Consumer, LeaseId, Consumer
 
 
 def ram(driver: CoreDriver) -> int:
-    shown: int = driver.arbiter.status(driver.now)["host_ram"]["parked_bytes"]
+    shown: int = driver.status()["host_ram"]["parked_bytes"]
     return shown
 
 
@@ -131,7 +131,7 @@ def test_parked_it_is_charged_its_residue_on_the_card_and_its_weights_in_ram() -
     policy.unload(wanted)
     driver.advance(10.0)
     assert driver.state(lease) == "parked", "it is not on standby"
-    (why,) = driver.arbiter.why("vlm", driver.now)["leases"]
+    (why,) = driver.why("vlm")["leases"]
     assert why["text"] == "vlm: parked in host RAM until its holder asks for it"
     assert answer(vlm.reacquire(lease))["state"] == "loading"
     assert driver.gpu()["charged_bytes"] == 5 * GIB, (
@@ -148,7 +148,7 @@ def test_parked_and_on_standby_it_comes_back_by_itself() -> None:
     vlm, lease, policy, wanted = parked(driver, standby=True)
     assert driver.state(lease) == "parked"
     assert driver.notes("parked")[-1]["reason"] == "comes back by itself when there is room"
-    (why,) = driver.arbiter.why("vlm", driver.now)["leases"]
+    (why,) = driver.why("vlm")["leases"]
     assert why["text"] == "vlm: parked until policy has left"
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)

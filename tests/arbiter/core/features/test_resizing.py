@@ -206,13 +206,13 @@ def test_a_growth_makes_others_leave_and_is_a_waiter_like_any_other() -> None:
     view = driver.view(lease)
     assert view is not None
     assert view["resizing"] == "growing"
-    (growth,) = [v for v in driver.arbiter.status(driver.now)["leases"] if v.get("grows") == lease]
+    (growth,) = [v for v in driver.status()["leases"] if v.get("grows") == lease]
     assert (growth["state"], growth["charge_bytes"], growth["position"]) == ("queued", 2 * GIB, 1)
     driver.until(lambda: driver.state(other) == "revoking", limit_s=0.1)
     assert driver.state(lease) == "held", "it never makes itself leave"
     det.unload(other)
     driver.until(lambda: charge(driver, lease) == 6 * GIB)
-    assert not [v for v in driver.arbiter.status(driver.now)["leases"] if "grows" in v]
+    assert not [v for v in driver.status()["leases"] if "grows" in v]
     assert driver.arbiter.inspect().gpus[GpuId("GPU-0")].evictions == []
 
 
@@ -362,7 +362,7 @@ def test_a_lease_outlives_its_growth(end: str) -> None:
     det, other = held(driver, "det", 3)
     det.use_begin(other)
     vlm.resize(lease, 6 * GIB)
-    views = driver.arbiter.status(driver.now)["leases"]
+    views = driver.status()["leases"]
     (growth,) = (view["lease_id"] for view in views if view.get("grows") == lease)
     if end == "canceled":
         vlm.cancel(growth)

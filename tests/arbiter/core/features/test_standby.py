@@ -33,7 +33,8 @@ def test_the_detector_returns_by_itself_after_the_grab() -> None:
     assert view is not None
     assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
     assert (
-        driver.notes("granted")[-1]["reason"] == "back from standby: there is room and nobody waits"
+        driver.notes("granted")[-1]["reason"]
+        == "back from standby: there is room and nothing waits"
     )
     assert driver.notes("switch")[-1]["switched"] is False
 
@@ -50,7 +51,7 @@ def test_what_standby_looks_like() -> None:
     driver.advance(600.0)
     assert driver.state(lease) == "standby", "nobody has to renew it"
     assert answer(det.renew((lease, det.token(lease))))["alive"] == [lease]
-    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    (why,) = driver.why("det")["leases"]
     assert why["text"] == "det: on standby until policy has left"
 
 
@@ -92,8 +93,8 @@ def test_it_asks_nobody_to_leave() -> None:
     assert (driver.state(lease), driver.state(vlm_lease)) == ("standby", "held"), (
         "5 + 4 do not fit on 8"
     )
-    (why,) = driver.arbiter.why("det", driver.now)["leases"]
-    assert why["text"] == "det: on standby until there is room; it asks nobody to leave"
+    (why,) = driver.why("det")["leases"]
+    assert why["text"] == "det: on standby until there is room; it asks no holder to leave"
 
 
 def test_it_never_delays_a_waiter() -> None:
@@ -108,7 +109,7 @@ def test_it_never_delays_a_waiter() -> None:
     driver.advance(60.0)
     assert driver.state(big) == "queued"
     assert driver.state(lease) == "standby", "5 would fit, but somebody waits"
-    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    (why,) = driver.why("det")["leases"]
     assert why["text"] == "det: on standby: big waits, and goes first"
 
 
@@ -118,7 +119,7 @@ def test_it_waits_until_the_card_has_been_quiet() -> None:
     _, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
     policy.unload(wanted)
     driver.advance(1.0)
-    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    (why,) = driver.why("det")["leases"]
     assert "comes back in 1." in why["text"]
     again = policy.acquire(5 * GIB)
     assert driver.state(again) == "loading", "the next goal does not wait for the detector"
@@ -200,7 +201,7 @@ def test_a_small_one_does_not_take_the_place_of_the_one_before_it() -> None:
     driver.advance(20.0)
     assert driver.state(people["det"][1]) == "standby", "5.2 do not fit beside 2 and a stowaway"
     assert driver.state(people["tiny"][1]) == "standby", "2.4 would, but then the 5.2 never could"
-    (why,) = driver.arbiter.why("tiny", driver.now)["leases"]
+    (why,) = driver.why("tiny")["leases"]
     assert "after those before it" in why["text"]
     other.unload(resident)
     driver.until(lambda: driver.state(people["det"][1]) == "loading", limit_s=2.0)
@@ -278,7 +279,7 @@ def test_a_blocked_card_brings_nobody_back() -> None:
     driver.card.failing = "NVML_ERROR_UNKNOWN"
     driver.advance(20.0)
     assert driver.state(lease) == "standby"
-    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    (why,) = driver.why("det")["leases"]
     assert "cannot be read" in why["text"]
     driver.card.failing = ""
     driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)

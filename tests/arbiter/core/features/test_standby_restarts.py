@@ -6,6 +6,7 @@ from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import ClientConnected, Recovered
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, Token
+from vram_arbiter.schemas.wire.pushes import GrantedPush
 
 GIB = d.GIB
 
@@ -20,7 +21,7 @@ def test_a_restart_keeps_it_and_waits_for_its_holder() -> None:
     policy.unload(wanted)
     driver.advance(1.0)
     assert driver.state(lease) == "standby", "its holder has not come back"
-    (why,) = driver.arbiter.why("det", driver.now)["leases"]
+    (why,) = driver.why("det")["leases"]
     assert "its holder did not come back after the restart" in why["text"]
     det.connect()
     (kept,) = answer(det.reattach(lease, token, away=True))["leases"]
@@ -74,7 +75,7 @@ def test_only_leases_on_standby_in_the_journal_hold_up_nobody() -> None:
     records = {key: record for key, record in driver.journal.items() if key == f"lease:{lease}"}
     fresh = CoreDriver(8 * GIB)
     fresh.post(Recovered(records))
-    assert fresh.arbiter.status(fresh.now)["phase"] == "serving"
+    assert fresh.status()["phase"] == "serving"
     assert fresh.state(lease) == "standby"
     assert token == Token(1, 2)
 
@@ -254,6 +255,6 @@ def test_a_return_that_cannot_be_journalled_is_not_made() -> None:
     assert driver.state(lease) == "over"
     assert driver.pushes("denied", lease)[-1]["error"]["code"] == "journal_unavailable"
     assert not any(
-        isinstance(e, Push) and e.body["push"] == "granted" for e in driver.effects[-20:]
+        isinstance(e, Push) and isinstance(e.body, GrantedPush) for e in driver.effects[-20:]
     )
     assert driver.gpu()["charged_bytes"] == 0

@@ -171,7 +171,7 @@ class Crowd:
         for card in self.driver.cards.values():
             shown = card.shown(self.driver.now)
             assert sum(count for process, count in shown.items() if process != STRANGER) <= BUDGET
-        status = self.driver.arbiter.status(self.driver.now)
+        status = self.driver.status()
         assert status["host_ram"]["parked_bytes"] == sum(
             v.get("parked_bytes", 0) for v in status["leases"]
         )
@@ -202,9 +202,7 @@ def live_at_random(seed: int, steps: int) -> tuple[Crowd, collections.Counter[st
             ):  # type: ignore[arg-type,index]
                 crowd.step(person)
         crowd.driver.advance(0.3)
-    assert not [x for x in crowd.leases if crowd.driver.state(x) == "queued"], (
-        crowd.driver.arbiter.status(crowd.driver.now)
-    )
+    assert not [x for x in crowd.leases if crowd.driver.state(x) == "queued"], crowd.driver.status()
     kinds = collections.Counter(e.kind for e in crowd.driver.effects if isinstance(e, Note))
     return crowd, kinds
 

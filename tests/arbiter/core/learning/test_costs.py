@@ -135,9 +135,9 @@ def test_two_that_throw_each_other_out_stay_for_what_a_switch_costs() -> None:
     wanted = pair.want()
     pair.driver.advance(0.1)
     assert pair.driver.state(pair.lease) == "held"
-    why = pair.driver.arbiter.why("b", pair.driver.now)["leases"]
+    why = pair.driver.why("b")["leases"]
     (blocker,) = next(one["blockers"] for one in why if one["lease_id"] == wanted)
-    assert "they keep throwing each other out" in blocker["condition"]
+    assert "they keep throwing each other out" in blocker["text"]
     core = state_of(pair.driver.arbiter)
     expected = costs.hold_s(core, core.leases[pair.lease], core.leases[wanted])
     assert pair.switch(wanted) == pytest.approx(expected, abs=0.2)

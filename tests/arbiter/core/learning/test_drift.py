@@ -37,7 +37,7 @@ def charge(driver: CoreDriver, lease: LeaseId) -> float:
 
 
 def learnt(driver: CoreDriver, consumer: str) -> dict[str, float]:
-    (lease,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    (lease,) = driver.why(consumer)["leases"]
     return {part: count / GIB for part, count in lease["footprint"]["learnt_bytes"].items()}
 
 
@@ -82,10 +82,7 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
     view = driver.view(lease)
     assert view is not None
     assert view["drift_bytes"] == GIB
-    assert (
-        "it holds 3.00 GiB, 2.00 GiB were declared"
-        in driver.arbiter.why("det", driver.now)["leases"][0]["text"]
-    )
+    assert "it holds 3.00 GiB, 2.00 GiB were declared" in driver.why("det")["leases"][0]["text"]
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=20.0)
     again = driver.consumer("det").acquire(2 * GIB)
@@ -208,10 +205,7 @@ def test_why_says_that_a_waiter_needs_more_than_it_declared() -> None:
     det.load(lease)
     det.use_begin(lease)
     driver.consumer("w").acquire(2 * GIB)
-    assert (
-        "(2.00 GiB declared, 5.00 GiB learnt)"
-        in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
-    )
+    assert "(2.00 GiB declared, 5.00 GiB learned)" in driver.why("w")["leases"][0]["text"]
 
 
 def test_a_lease_that_comes_back_after_a_restart_is_measured_on() -> None:

@@ -3,10 +3,11 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Order
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.residents import Residents
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
+from vram_arbiter.schemas.wire.codes import Order
 
 
 def crowd(count: int) -> tuple[Residents, list[Lease]]:

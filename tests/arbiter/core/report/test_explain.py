@@ -24,7 +24,7 @@ def test_status_shows_holders_first_then_the_queue_in_order() -> None:
     driver.card.names[ProcessKey(9, 9)] = "browser"
     driver.card.set(ProcessKey(9, 9), 100 * MIB, driver.now)
     driver.advance(1.5)
-    status = driver.arbiter.status(driver.now)
+    status = driver.status()
     assert [view["consumer"] for view in status["leases"]] == ["busy", "urgent", "late"]
     assert [view.get("position") for view in status["leases"]] == [None, 1, 2]
     assert (status["epoch"], status["phase"], status["clients"]) == (1, "serving", 3)
@@ -46,11 +46,11 @@ def test_before_the_first_reading_nothing_is_known() -> None:
     driver = CoreDriver(8 * GIB, start=False)
     gpu = driver.gpu()
     assert (gpu["measured_used_bytes"], gpu["sample_age_s"], gpu["processes"]) == (None, None, [])
-    assert gpu["blocked"] == "the card has not been read yet"
+    assert gpu["blocked"]["text"] == "the GPU has not been read yet"
 
 
 def test_why_of_a_stranger_is_empty() -> None:
-    assert CoreDriver().arbiter.why("nobody", 0.0) == {"consumer": "nobody", "leases": []}
+    assert CoreDriver().why("nobody") == {"consumer": "nobody", "leases": []}
 
 
 def test_why_of_a_resident_lease_says_what_it_is_doing() -> None:
@@ -87,7 +87,7 @@ def test_why_follows_the_way_of_the_holder() -> None:
     det.use_begin(lease, "u2")
     driver.consumer("vlm").acquire(int(3.3 * GIB))
     first = why(driver, "vlm")
-    assert first["condition"] == "no room"
+    assert first["condition"] == "no_room"
     assert first["blockers"] == [
         {
             "lease_id": lease,
@@ -95,7 +95,9 @@ def test_why_follows_the_way_of_the_holder() -> None:
             "bytes": int(5.3 * GIB),
             "state": "held",
             "uses": 2,
-            "condition": "may stay 2.0 s more (minimum residency)",
+            "condition": "residency",
+            "seconds": pytest.approx(2.0, abs=0.02),
+            "text": "may stay 2.0 s more (minimum residency)",
         }
     ]
     assert first["deficit_bytes"] == int(3.3 * GIB) - (8 * GIB - 300 * MIB - int(5.3 * GIB))
@@ -105,10 +107,10 @@ def test_why_follows_the_way_of_the_holder() -> None:
     says.append(why(driver, "vlm")["next"])
     det.use_end(lease, "u2")
     says.append(why(driver, "vlm")["next"])
-    assert why(driver, "vlm")["blockers"][0]["condition"].startswith("was asked to leave 0.1 s ago")
+    assert why(driver, "vlm")["blockers"][0]["text"].startswith("was asked to leave 0.1 s ago")
     det.unloading(lease)
     says.append(why(driver, "vlm")["next"])
-    assert [b["condition"] for b in why(driver, "vlm")["blockers"]] == ["is unloading"]
+    assert [b["text"] for b in why(driver, "vlm")["blockers"]] == ["is unloading"]
     det.hold(0)
     det.release(lease)
     says.append(why(driver, "vlm")["next"])
@@ -130,7 +132,7 @@ def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
     held(driver, "calm", 1)
     driver.consumer("w").acquire(8 * GIB)
     keeper, keeper_lease = held(driver, "keeper", 1, residue_bytes=450 * MIB, evictable=False)
-    conditions = {b["consumer"]: b["condition"] for b in why(driver, "w")["blockers"]}
+    conditions = {b["consumer"]: b["text"] for b in why(driver, "w")["blockers"]}
     assert conditions == {
         "busy": "is in use and has priority 90, the waiter 50",
         "even": "is in use",
@@ -146,7 +148,9 @@ def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
         "bytes": 450 * MIB,
         "state": "residue",
         "uses": 0,
-        "condition": "keeps its context until it exits",
+        "condition": "context",
+        "pid": keeper.process.pid,
+        "text": "keeps its context until it exits",
     } in blockers
 
 
@@ -156,7 +160,7 @@ def test_why_behind_others_and_behind_a_load() -> None:
     driver.consumer("first").acquire(1 * GIB)
     driver.consumer("second").acquire(1 * GIB)
     assert why(driver, "first")["next"] == "waits: det is loading"
-    assert [b["condition"] for b in why(driver, "first")["blockers"]] == ["is loading"]
+    assert [b["text"] for b in why(driver, "first")["blockers"]] == ["is loading"]
     assert why(driver, "second")["next"] == "waits behind first as number 2"
 
 
@@ -169,7 +173,7 @@ def test_why_when_only_measurements_are_missing() -> None:
     driver = CoreDriver(8 * GIB)
     driver.advance(20.0)
     driver.consumer("w").acquire(5 * GIB)
-    assert why(driver, "w")["next"] == "waits for a fresh reading of the card"
+    assert why(driver, "w")["next"] == "waits for a fresh reading of the GPU"
     assert lease
 
 
@@ -188,7 +192,7 @@ def test_a_waiter_of_another_plan_sees_the_room_being_made() -> None:
     first = driver.consumer("first")
     first.cancel(first.acquire(5 * GIB))
     driver.consumer("w").acquire(5 * GIB)
-    assert why(driver, "w")["condition"] == "room is being made"
+    assert why(driver, "w")["condition"] == "making_room"
     assert driver.state(lease) == "revoking"
     assert det.name == "det"
 
@@ -245,11 +249,8 @@ def test_a_lease_may_be_asked_about_by_its_id() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
-    assert (
-        driver.arbiter.why(waiter, driver.now)["leases"]
-        == driver.arbiter.why("vlm", driver.now)["leases"]
-    )
-    assert [told["lease_id"] for told in driver.arbiter.why(lease, driver.now)["leases"]] == [lease]
+    assert driver.why(waiter)["leases"] == driver.why("vlm")["leases"]
+    assert [told["lease_id"] for told in driver.why(lease)["leases"]] == [lease]
 
 
 def test_every_note_that_is_ever_said_is_listed() -> None:

@@ -14,7 +14,7 @@ GIB, MIB = d.GIB, d.MIB
 
 def blockers(driver: CoreDriver, consumer: str) -> list[tuple[Any, ...]]:
     return [
-        (b["consumer"], b["lease_id"], b["bytes"] / GIB, b["state"], b["condition"])
+        (b["consumer"], b["lease_id"], b["bytes"] / GIB, b["state"], b["text"])
         for b in why(driver, consumer)["blockers"]
     ]
 
@@ -42,12 +42,12 @@ def test_every_member_that_waits_says_what_the_gang_needs_and_who_is_in_its_way(
     driver.advance(1.0)
     for member in ("policy", "reward"):
         told = why(driver, member)
-        assert told["condition"] == "gang waiting"
+        assert told["condition"] == "gang_waits"
         assert told["needed_bytes"] == 3 * GIB + 2 * GIB + 1 * GIB, (
             "all their steady bytes and one headroom"
         )
         assert told["deficit_bytes"] == 6 * GIB - told["free_bytes"]
-        assert "nobody who could make room for the whole gang may be asked now" in told["next"]
+        assert "no holder that could make room for the whole gang may be asked now" in told["next"]
         assert blockers(driver, member) == [
             ("busy", lease, 5.0, "held", "is in use and has priority 60, the waiter 50"),
             ("idle", idle, 2.0, "held", "is idle and may be asked"),
@@ -80,7 +80,7 @@ def test_one_that_waits_for_its_turn_names_who_loads() -> None:
     driver.advance(0.5)
     told = why(driver, "reward")
     assert (told["condition"], told["needed_bytes"], told["deficit_bytes"]) == (
-        "gang loading",
+        "gang_loads",
         3 * GIB,
         0,
     )

@@ -13,7 +13,7 @@ GIB = d.GIB
 
 
 def plan(driver: CoreDriver, consumer: str = "w") -> list[dict[str, Any]]:
-    (entry,) = driver.arbiter.why(consumer, driver.now)["leases"]
+    (entry,) = driver.why(consumer)["leases"]
     steps: list[dict[str, Any]] = entry["plan"]
     return steps
 
@@ -79,7 +79,7 @@ def test_nobody_is_asked_where_nobody_could_make_room() -> None:
     )
     assert (
         step["text"]
-        == "asks nobody, those who could make room are pinned or in use above its priority"
+        == "asks no holder, those that could make room are pinned or in use above its priority"
     )
 
 
@@ -95,7 +95,7 @@ def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
     assert (step["action"], step["in_s"]) == ("ask", 0.0)
-    assert step["text"] == "asks holder in 0.0 s, as soon as the card is looked at again"
+    assert step["text"] == "asks holder in 0.0 s, as soon as the GPU is looked at again"
 
 
 def test_a_holder_on_its_way_out() -> None:
@@ -159,7 +159,7 @@ def test_a_card_that_cannot_be_read_and_one_that_shows_no_room() -> None:
     step = only(driver)
     assert (step["action"], step["text"].split(",")[1]) == (
         "read",
-        " nothing is granted on a card that cannot be read",
+        " nothing is granted on a GPU that cannot be read",
     )
     assert 0 < step["in_s"] <= d.PROBE_PERIOD_S
 
@@ -167,7 +167,7 @@ def test_a_card_that_cannot_be_read_and_one_that_shows_no_room() -> None:
     silent.card.silent = True
     silent.advance(3)
     silent.consumer("w").acquire(3 * GIB)
-    assert only(silent)["text"].endswith("the ledger has room, the card has to show it")
+    assert only(silent)["text"].endswith("the ledger has room, the GPU has to show it")
 
 
 def test_pressure_plans_nothing_of_its_own() -> None:
@@ -205,13 +205,13 @@ def test_the_estimate_counts_those_who_will_be_asked() -> None:
     driver = CoreDriver(settings={"learnt": learnt})
     held(driver, "detector", 6, min_residency_s=2.0)
     driver.consumer("w").acquire(4 * GIB)
-    (entry,) = driver.arbiter.why("w", driver.now)["leases"]
+    (entry,) = driver.why("w")["leases"]
     assert entry["eta_source"] == "learnt"
     assert entry["eta_s"] == pytest.approx(7.0, abs=0.1)
     unknown = CoreDriver(settings={"learnt": {"w": {"load_s": 3.0}}})
     held(unknown, "detector", 6, min_residency_s=2.0)
     unknown.consumer("w").acquire(4 * GIB)
-    (entry,) = unknown.arbiter.why("w", unknown.now)["leases"]
+    (entry,) = unknown.why("w")["leases"]
     assert (entry["eta_s"], entry["eta_source"]) == (None, "none")
 
 

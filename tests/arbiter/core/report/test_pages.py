@@ -16,7 +16,7 @@ def pages(driver: CoreDriver, limit: int) -> list[list[dict[str, Any]]]:
     found: list[list[dict[str, Any]]] = []
     after = None
     while True:
-        page = driver.arbiter.status(driver.now, None, after, limit)
+        page = driver.status(None, after, limit)
         found.append(page["leases"])
         if "next" not in page:
             return found
@@ -45,7 +45,7 @@ def test_pages_hold_every_lease_once_whatever_their_size() -> None:
     """Regression: one reply with thousands of leases held the loop for seconds."""
     driver = crowd()
     (whole,) = pages(driver, 1000)
-    assert whole == driver.arbiter.status(driver.now)["leases"]
+    assert whole == driver.status()["leases"]
     assert len(whole) == 14
     assert [view["state"] for view in whole[:4]] == ["standby", "loading", "loading", "queued"]
     for limit in (1, 2, 5, 14):
@@ -56,9 +56,7 @@ def test_pages_hold_every_lease_once_whatever_their_size() -> None:
 
 def test_waiters_are_listed_in_the_order_in_which_they_are_served() -> None:
     driver = crowd()
-    waiting = [
-        view for view in driver.arbiter.status(driver.now)["leases"] if view["state"] == "queued"
-    ]
+    waiting = [view for view in driver.status()["leases"] if view["state"] == "queued"]
     for index in ("0", "1"):
         places = [
             view["position"]
@@ -67,7 +65,7 @@ def test_waiters_are_listed_in_the_order_in_which_they_are_served() -> None:
         ]
         assert places == sorted(places)
     urgent = driver.consumer("urgent").acquire(5 * GIB, priority=100)
-    (page,) = [driver.arbiter.status(driver.now, None, (1, float("-inf"), 0), 1)]
+    (page,) = [driver.status(None, (1, float("-inf"), 0), 1)]
     assert [view["lease_id"] for view in page["leases"]] == [urgent]
     assert page["totals"] == {"leases": 15, "waiting": 12}
 
@@ -77,10 +75,10 @@ def test_a_page_goes_on_where_the_last_one_ended_though_that_lease_is_gone() -> 
     driver.consumer("holder").acquire(7 * GIB)
     people = [driver.consumer(f"p{number}") for number in range(4)]
     leases = [person.acquire(5 * GIB) for person in people]
-    first = driver.arbiter.status(driver.now, None, None, 2)
+    first = driver.status(None, None, 2)
     assert first["leases"][-1]["lease_id"] == leases[0]
     people[0].cancel(leases[0])
-    rest = driver.arbiter.status(driver.now, None, tuple(first["next"]), 10)
+    rest = driver.status(None, tuple(first["next"]), 10)
     assert [view["lease_id"] for view in rest["leases"]] == leases[1:]
     assert "next" not in rest
 
@@ -90,10 +88,10 @@ def test_why_explains_the_oldest_leases_of_a_consumer_with_many() -> None:
     driver.consumer("holder").acquire(7 * GIB)
     crowd = driver.consumer("crowd")
     leases = [crowd.acquire(5 * GIB) for _ in range(EXPLAINED_MAX + 3)]
-    told = driver.arbiter.why("crowd", driver.now)
+    told = driver.why("crowd")
     assert [lease["lease_id"] for lease in told["leases"]] == leases[:EXPLAINED_MAX]
     assert told["more"] == 3
-    alone = driver.arbiter.why(leases[-1], driver.now)
+    alone = driver.why(leases[-1])
     assert [lease["lease_id"] for lease in alone["leases"]] == leases[-1:]
     assert "more" not in alone
 
@@ -105,7 +103,7 @@ def test_of_many_blockers_the_largest_are_told() -> None:
         person.load(person.acquire((1 + number) * d.MIB))
         driver.advance(0.01)
     driver.consumer("alone").acquire(GIB, exclusive=True)
-    (lease,) = driver.arbiter.why("alone", driver.now)["leases"]
+    (lease,) = driver.why("alone")["leases"]
     assert len(lease["blockers"]) == BLOCKERS_MAX
     assert {blocker["consumer"] for blocker in lease["blockers"]}.isdisjoint(
         f"small{number}" for number in range(5)

@@ -12,6 +12,7 @@ from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.requests.recovery import spec_from_record
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.codes import Wait, Why
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -62,7 +63,7 @@ def test_a_card_as_it_is_shown() -> None:
         "stowaway_bytes": 0,
         "measured_used_bytes": 2 * GIB,
         "pressure_bytes": 0,
-        "blocked": "",
+        "blocked": None,
     }
     assert (process["name"], process["used_bytes"], process["charged_bytes"]) == (
         "det",
@@ -74,16 +75,18 @@ def test_a_card_as_it_is_shown() -> None:
 def test_why_of_a_resident_lease_asks_for_nothing() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease = held(driver, "det", 2)
-    told = only(driver.arbiter.why("det", driver.now)["leases"])
+    told = only(driver.why("det")["leases"])
     told.pop("footprint")
+    assert told.pop("holder")["condition"] == "idle"
     assert told == {
         "lease_id": lease,
+        "consumer": "det",
         "state": "held",
         "position": 0,
         "needed_bytes": 0,
         "free_bytes": 6 * GIB - d.RESERVE_BYTES,
         "deficit_bytes": 0,
-        "condition": "held",
+        "condition": "resident",
         "blockers": [],
         "next": "it is resident, idle",
         "eta_s": None,
@@ -100,7 +103,7 @@ def test_an_estimate_says_that_it_was_learnt() -> None:
     vlm = driver.consumer("vlm")
     waiting = vlm.acquire(2 * GIB)  # fits; only the other one's load is in the way
     assert driver.state(waiting) == "queued"
-    told = only(driver.arbiter.why("vlm", driver.now)["leases"])
+    told = only(driver.why("vlm")["leases"])
     assert (told["eta_s"], told["eta_source"]) == (2.0, "learnt")
 
 
@@ -144,7 +147,7 @@ def test_refusals_of_operators_say_why() -> None:
             )
         ).message
 
-    assert told("release_dead", waiting) == f"{waiting} is queued: nobody holds it"
+    assert told("release_dead", waiting) == f"{waiting} is queued: it has no holder"
     other = CoreDriver(8 * GIB)
     _, lease = held(other, "det", 5)
     order(other, "pin", lease)
@@ -336,7 +339,7 @@ def test_an_adopted_lease_says_where_it_comes_from() -> None:
     driver.restart(keep_journal=False)
     det.connect()
     det.reattach(lease, token)
-    assert core_lease(driver, lease).story[0][2] == "adopted: the journal did not know it"
+    assert core_lease(driver, lease).story[0][2] == Why.ADOPTED
 
 
 # -- waiting beside what nobody owns -----------------------------------------------------------------------------------
@@ -357,9 +360,7 @@ def test_the_head_says_what_keeps_the_engine_from_asking() -> None:
     det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     waiting = driver.consumer("vlm").acquire(5 * GIB, priority=d.PRIORITY - 10)
-    assert (
-        core_lease(driver, waiting).request.reason == "nobody who could make room may be asked now"
-    )
+    assert core_lease(driver, waiting).request.reason == Wait.NO_VICTIM
 
 
 def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
@@ -371,7 +372,7 @@ def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
     _, lease = held(driver, "det", 5)
     gone.die()
     waiting = driver.consumer("vlm").acquire(3 * GIB)
-    assert core_lease(driver, waiting).request.reason == "a dead process's memory is being measured"
+    assert core_lease(driver, waiting).request.reason == Wait.RESIDUE
     assert driver.state(lease) == "held"
 
 

@@ -16,7 +16,7 @@ def doubting() -> CoreDriver:
 
 
 def phase(driver: CoreDriver) -> str:
-    return str(driver.arbiter.status(driver.now)["phase"])
+    return str(driver.status()["phase"])
 
 
 def test_holders_that_came_back_are_not_enough() -> None:
@@ -30,7 +30,10 @@ def test_holders_that_came_back_are_not_enough() -> None:
     waiter = driver.consumer("waiter").acquire(GIB)
     driver.advance(WAIT_S - 1.0)
     assert (driver.state(waiter), phase(driver)) == ("queued", "recovering")
-    assert "holders that the journal may not name must come back first" in driver.gpu()["blocked"]
+    assert (
+        "holders that the journal may not name must come back first"
+        in driver.gpu()["blocked"]["text"]
+    )
     assert DOUBT_KEY in driver.journal, "the next start would doubt as well"
     driver.advance(2.0)
     assert (driver.state(waiter), phase(driver)) == ("loading", "serving")

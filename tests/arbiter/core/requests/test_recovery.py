@@ -33,9 +33,9 @@ def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5)
     driver.restart()
-    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    assert driver.status()["phase"] == "recovering"
     assert driver.gpu()["charged_bytes"] == 5 * GIB
-    assert "recovering" in driver.gpu()["blocked"]
+    assert "recovering" in driver.gpu()["blocked"]["text"]
     vlm = driver.consumer("vlm")
     waiter = vlm.acquire(1 * GIB)
     assert driver.state(waiter) == "queued", "nothing is granted before everybody is accounted for"
@@ -48,7 +48,7 @@ def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
         [1, 2],
     )
     driver.until(lambda: driver.state(waiter) == "loading")
-    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.status()["phase"] == "serving"
     assert vlm.token(waiter) > token, "tokens grow across restarts"
     det.use_end(lease, "goal", token)
     det.unload(lease)
@@ -147,7 +147,7 @@ def test_whoever_has_not_come_back_is_named() -> None:
     for n in range(5):
         held_with_token(driver, f"m{n}", 1)
     driver.restart()
-    told = str(driver.gpu()["blocked"])
+    told = str(driver.gpu()["blocked"]["text"])
     assert told.startswith("recovering after a restart: m0 (pid ")
     assert told.endswith(") and 2 more must come back first")
     driver = CoreDriver(8 * GIB)
@@ -165,7 +165,7 @@ def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> No
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.card.lag_s = 0.5
     det.die()
-    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.status()["phase"] == "serving"
     assert driver.state(waiter) == "queued"
     took = driver.until(lambda: driver.state(waiter) == "loading")
     assert took >= 0.5
@@ -181,7 +181,7 @@ def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
     driver.until(lambda: driver.state(loading) == "loading")
     driver.card.held.clear()
     driver.restart()
-    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.status()["phase"] == "serving"
     assert (driver.state(lease), driver.state(loading)) == ("held", "loading")
     loader.die()
     small = driver.consumer("small").acquire(2 * GIB)
@@ -189,9 +189,9 @@ def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
     driver.consumer("w").acquire(1 * GIB, exclusive=True)
     driver.advance(3.0)
     assert not driver.pushes("revoke", lease), "who uses it may be on the way back"
-    (waiting,) = driver.arbiter.why("w", driver.now)["leases"]
+    (waiting,) = driver.why("w")["leases"]
     (blocker,) = (one for one in waiting["blockers"] if one["lease_id"] == lease)
-    assert blocker["condition"].startswith("has not come back since the restart, is given up in 1")
+    assert blocker["text"].startswith("has not come back since the restart, is given up in 1")
     assert driver.gpu()["charged_bytes"] == 7 * GIB
     det.connect()
     assert answer(det.reattach(lease, token, uses=["goal"]))["leases"][0]["kept"] is True
@@ -205,7 +205,7 @@ def test_who_does_not_come_back_to_an_empty_card_is_given_up_in_time() -> None:
     driver.restart()
     waiter = driver.consumer("w").acquire(5 * GIB)
     assert driver.state(lease) == "held"
-    (step,) = driver.arbiter.why("w", driver.now)["leases"][0]["plan"]
+    (step,) = driver.why("w")["leases"][0]["plan"]
     assert step["text"] == "gives det up in 15.0 s, unless it comes back before that"
     took = driver.until(lambda: driver.state(waiter) == "loading")
     assert 15.0 - 0.02 < took < 15.1, "its ttl, and the grace"
@@ -222,9 +222,9 @@ def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer
     vlm.connect()
     vlm.unloading(other)
     vlm.release(other)
-    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    assert driver.status()["phase"] == "recovering"
     vlm.hold(0)
-    driver.until(lambda: driver.arbiter.status(driver.now)["phase"] == "serving", limit_s=0.1)
+    driver.until(lambda: driver.status()["phase"] == "serving", limit_s=0.1)
     assert (driver.state(lease), driver.state(other)) == ("held", "over")
 
 
@@ -240,9 +240,7 @@ def test_verifications_and_debts_go_on_after_the_restart() -> None:
     driver.restart()
     assert driver.gpu()["charged_bytes"] == 6 * GIB
     assert driver.state(lease) == "verifying"
-    assert driver.arbiter.status(driver.now)["phase"] == "serving", (
-        "nobody has to come back for these"
-    )
+    assert driver.status()["phase"] == "serving", "nobody has to come back for these"
     (gone,) = answer(vlm.connect() + vlm.reattach(other, Token(1, 4)))["leases"]
     assert gone["error"]["code"] == "lease_lost"
     driver.until(lambda: driver.gpu()["charged_bytes"] == 450 * MIB, limit_s=5.0)
@@ -288,9 +286,9 @@ def test_a_lost_journal_believes_holders_for_a_while() -> None:
     future = answer(det.reattach(LeaseId("L9-1"), Token(9, 1), spec=spec))["leases"][0]
     assert future["error"]["code"] == "lease_lost"
     driver.advance(14.0)
-    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    assert driver.status()["phase"] == "recovering"
     driver.advance(1.1)
-    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.status()["phase"] == "serving"
     assert driver.gpu()["charged_bytes"] == 7 * GIB
     loader.load(loading)
     assert driver.state(lease) == "revoking"
@@ -331,7 +329,7 @@ def test_a_lease_that_shrank_just_before_the_restart_is_not_taken_for_gone() -> 
 def test_a_lost_journal_and_an_empty_card_serve_at_once() -> None:
     driver = CoreDriver(8 * GIB)
     driver.restart(keep_journal=False)
-    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.status()["phase"] == "serving"
     assert driver.consumer("det").acquire(5 * GIB)
 
 
@@ -339,7 +337,7 @@ def test_one_empty_card_of_two_is_not_enough() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     driver.cards[GpuId("GPU-1")].set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.restart(keep_journal=False)
-    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    assert driver.status()["phase"] == "recovering"
 
 
 def test_records_of_a_card_that_is_gone_are_dropped() -> None:
@@ -402,9 +400,7 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
     assert not [key for key in again.journal if key.startswith("residue:")], (
         "nobody would ever take it out"
     )
-    assert {lease, "L1-9"} <= {
-        view["lease_id"] for view in again.arbiter.status(again.now)["leases"]
-    }
+    assert {lease, "L1-9"} <= {view["lease_id"] for view in again.status()["leases"]}
     assert again.gpu()["pressure_bytes"] > 0, "what was never approved is pressure"
 
 
@@ -433,8 +429,5 @@ def test_records_of_sub_leases_come_back_as_plain_leases() -> None:
     runner.hold(0)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=60.0)
     assert (driver.state(root), driver.state(leaf)) == ("over", "held")
-    charge = {
-        view["lease_id"]: view["charge_bytes"]
-        for view in driver.arbiter.status(driver.now)["leases"]
-    }
+    charge = {view["lease_id"]: view["charge_bytes"] for view in driver.status()["leases"]}
     assert charge[leaf] == 4 * GIB

@@ -61,7 +61,7 @@ def test_what_is_refused_at_once_is_noted_with_its_reason(
     person = full_queue.consumer("big")
     ask(person)
     (note,) = full_queue.notes("refused")
-    refused = refusal([effect for effect in full_queue.effects if hasattr(effect, "code")])
+    refused = refusal(full_queue.effects)
     assert (note["code"], note["reason"]) == (code, refused.message)
     assert (note["consumer"], note["pid"], "lease_id" in note) == (
         "big",
@@ -73,7 +73,7 @@ def test_what_is_refused_at_once_is_noted_with_its_reason(
 def test_timeouts_and_cancels_are_noted_too(full_queue: CoreDriver) -> None:
     full_queue = CoreDriver(8 * GIB)
     held(full_queue, "holder", 5, priority=99)[0].use_begin(
-        full_queue.arbiter.status(full_queue.now)["leases"][0]["lease_id"]
+        full_queue.status()["leases"][0]["lease_id"]
     )
     bounded, fickle = full_queue.consumer("bounded"), full_queue.consumer("fickle")
     bounded.acquire(5 * GIB, wait_timeout_s=1.0)

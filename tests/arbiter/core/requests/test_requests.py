@@ -9,6 +9,7 @@ from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sam
 from vram_arbiter.arbiter.core.events import AcquireRequested
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token
+from vram_arbiter.schemas.wire.codes import Block
 
 GIB = d.GIB
 
@@ -31,10 +32,10 @@ def test_a_grant_is_journalled_before_it_is_told(driver: CoreDriver) -> None:
     assert put.key == "lease:L1-1"
     assert put.record["state"] == "loading"
     assert put.record["token"] == [1, 2]
-    assert reply.body["state"] == "loading"
-    assert reply.body["lease"]["token"] == [1, 2]
-    assert reply.body["lease"]["charge_bytes"] == 5 * GIB
-    assert note.data["reason"] == "fits"
+    told = answer(effects)
+    assert (told["state"], told["lease"]["token"]) == ("loading", [1, 2])
+    assert told["lease"]["charge_bytes"] == 5 * GIB
+    assert (note.kind, note.data["evicted"]) == ("granted", [])
 
 
 def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: CoreDriver) -> None:
@@ -46,7 +47,8 @@ def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: Core
     assert answer(effects)["lease"]["token"] is None
     assert answer(effects)["lease"]["position"] == 1
     assert isinstance(effects[0], Note)
-    assert "det is loading" in effects[0].data["reason"]
+    block = effects[0].data["block"]
+    assert (block.code, block.names) == (Block.LOADING, ("det",))
     waiting = LeaseId(answer(effects)["lease"]["lease_id"])
     assert kinds(det.release(first)) == ["Sample", "JournalPut", "Note:released", "Reply"]
     driver.until(lambda: driver.state(waiting) == "loading")
@@ -75,6 +77,7 @@ def test_what_can_never_fit_fails_at_once(driver: CoreDriver) -> None:
     refused = refusal(driver.consumer("big").try_acquire(8 * GIB))
     assert refused.code == "vram_insufficient"
     assert refused.details == {
+        "consumer": "big",
         "needed_bytes": 8 * GIB,
         "declared_bytes": 8 * GIB,
         "capacity_bytes": 8 * GIB,
@@ -93,8 +96,8 @@ def test_beside_a_pinned_holder_a_request_waits(driver: CoreDriver, spec: dict[s
     second = driver.consumer("second").acquire(6 * GIB, **spec)
     driver.advance(4.0)
     assert (driver.state(bounded), driver.state(second)) == ("queued", "queued")
-    (blocker,) = driver.arbiter.why("big", driver.now)["leases"][0]["blockers"]
-    assert (blocker["consumer"], blocker["condition"]) == ("pin", "is pinned")
+    (blocker,) = driver.why("big")["leases"][0]["blockers"]
+    assert (blocker["consumer"], blocker["text"]) == ("pin", "is pinned")
     driver.advance(2.0)
     (denied,) = driver.pushes("denied", bounded)
     assert denied["error"]["code"] == "wait_timeout"
@@ -286,7 +289,7 @@ def test_a_release_in_use_is_a_fact_and_ends_the_uses(driver: CoreDriver) -> Non
     runner.use_begin(lease, "goal", det.token(lease))
     det.hold(0)
     det.release(lease, exiting=True)
-    assert driver.notes("use_ended")[0]["reason"] == "exits"
+    assert driver.notes("use_ended")[0]["why"] == "exits"
     driver.until(lambda: driver.state(lease) == "over")
     assert driver.gpu()["charged_bytes"] == 0
 
@@ -322,7 +325,7 @@ def test_an_out_of_memory_within_the_grant_is_somebody_elses_doing(driver: CoreD
     lease = det.acquire(4 * GIB)
     effects = det.oom(lease, 1 * GIB, 2 * GIB)
     assert answer(effects)["learnt_load_peak_bytes"] is None
-    assert "somebody else" in driver.notes("oom")[0]["reason"]
+    assert "another process" in driver.notes("oom")[0]["reason"]
     assert any(isinstance(effect, Sample) for effect in effects)
     assert not any(isinstance(effect, Push) for effect in effects)
 

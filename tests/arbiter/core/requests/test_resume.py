@@ -105,9 +105,9 @@ def test_a_recovery_without_a_journal_waits_anew_too() -> None:
     driver.advance(14.0)
     driver.post(Resumed(NIGHT_S))
     driver.advance(14.0)
-    assert driver.arbiter.status(driver.now)["phase"] == "recovering"
+    assert driver.status()["phase"] == "recovering"
     driver.advance(1.5)
-    assert driver.arbiter.status(driver.now)["phase"] == "serving"
+    assert driver.status()["phase"] == "serving"
 
 
 def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:

@@ -183,7 +183,7 @@ def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
     driver.journal_failing = "disk full"
     det.try_acquire(5 * GIB)
     refused = [effect for effect in driver.effects if isinstance(effect, Refuse)]
-    assert [refuse.code for refuse in refused] == ["journal_unavailable"]
+    assert [refuse.refusal.code for refuse in refused] == ["journal_unavailable"]
     assert driver.gpu()["charged_bytes"] == 0
     notes = [effect.kind for effect in driver.effects if isinstance(effect, Note)]
     assert notes[-2:] == ["journal_failed", "denied"]
@@ -269,7 +269,7 @@ def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_
     for number in range(3):
         det.client = ClientId(f"new{number}")
         driver.post(ClientConnected(det.client, det.process, 1000, "det", "det-c101"))
-    assert driver.arbiter.status(driver.now)["clients"] == 3
+    assert driver.status()["clients"] == 3
     det.leave("silent")
     assert (driver.state(queued), driver.state(theirs)) == ("over", "queued")
     views = (driver.view(held), driver.view(lent))
@@ -284,4 +284,4 @@ def test_a_connection_that_says_hello_as_another_instance_is_only_that() -> None
     driver.post(ClientConnected(det.client, det.process, 1000, "det", "second"))
     back = ClientId("back")
     driver.post(ClientConnected(back, det.process, 1000, "det", "det-c101"))
-    assert driver.arbiter.status(driver.now)["clients"] == 2, "nobody was taken over"
+    assert driver.status()["clients"] == 2, "nobody was taken over"

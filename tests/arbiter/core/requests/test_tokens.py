@@ -21,15 +21,16 @@ def test_a_token_is_shown_to_its_holder_and_to_an_operator_only() -> None:
     stranger = driver.consumer("stranger")
 
     def shown(*reader: Any) -> dict[str, Any]:
-        (view,) = driver.arbiter.status(driver.now, *reader)["leases"]
+        (view,) = driver.status(*reader)["leases"]
         return dict(view)
 
     assert Token(*shown()["token"]) == Token(*shown(det.process)["token"]) == token
     assert shown(stranger.process)["token"] is None
     refused = refusal(stranger.use_begin(lease, token=Token(1, 99)))
-    assert (refused.code, refused.details) == ("stale_token", {}), (
-        "the right token is not given away"
-    )
+    assert (refused.code, refused.details) == (
+        "stale_token",
+        {"lease_id": lease, "token": "1.99"},
+    ), "the right token is not given away"
 
 
 def test_nothing_that_is_said_to_others_holds_a_token() -> None:
@@ -63,8 +64,8 @@ def test_nothing_that_is_said_to_others_holds_a_token() -> None:
     for effect in [
         *told,
         *notes,
-        driver.arbiter.status(driver.now, other.process),
-        driver.arbiter.why("det", driver.now),
+        driver.status(other.process),
+        driver.why("det"),
     ]:
         assert not any(serial in repr(effect) for serial in own), effect
 

@@ -4,6 +4,7 @@ from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.pushes import RevokePush
 
 GIB = d.GIB
 
@@ -25,7 +26,7 @@ def test_a_yielded_use_lets_the_holder_leave_before_the_job_has_ended(driver: Co
     effects = job.use_yield(lease)
     assert answer(effects)["uses"] == 0
     pushed = [e.body for e in effects if isinstance(e, Push)]
-    assert [(p["push"], p["uses"]) for p in pushed] == [("revoke", 0)], (
+    assert [isinstance(one, RevokePush) and one.uses for one in pushed] == [0], (
         "it is told that it may unload"
     )
     assert driver.view(lease)["yielded"] == 1  # type: ignore[index]
@@ -87,7 +88,7 @@ def test_one_use_that_yields_beside_a_busy_one_changes_nothing_for_the_holder(
     effects = job.use_yield(lease, "u2")
     assert answer(effects)["uses"] == 1
     assert not [e for e in effects if isinstance(e, Push)]
-    assert "1 use running, 1 paused" in driver.arbiter.why("job", driver.now)["leases"][0]["text"]
+    assert "1 use running, 1 paused" in driver.why("job")["leases"][0]["text"]
 
 
 def test_yielded_uses_count_to_the_limit(driver: CoreDriver) -> None:

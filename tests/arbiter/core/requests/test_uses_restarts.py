@@ -58,9 +58,7 @@ def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder() -> None:
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver)
     restarted(driver, sidecar, lease, token)
-    assert driver.arbiter.status(driver.now)["phase"] == "serving", (
-        "nobody waits for the user to come back"
-    )
+    assert driver.status()["phase"] == "serving", "nobody waits for the user to come back"
     assert shown(driver, lease)["uses"] == 1
     vlm = driver.consumer("vlm").acquire(5 * GIB, priority=90)
     live_on(driver, sidecar, lease, token, PATIENCE_S - 1.0)

@@ -130,7 +130,7 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     again = driver.consumer("vlm").try_acquire(1 * GIB)
     assert not [e for e in again if isinstance(e, Sample)], "one is under way"
     driver.advance(0.01)
-    assert [view["state"] for view in driver.arbiter.status(driver.now)["leases"]] == [
+    assert [view["state"] for view in driver.status()["leases"]] == [
         "loading",
         "queued",
     ]
@@ -147,7 +147,7 @@ def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(1.5)
     assert driver.state(waiter) == "queued"
-    assert "measured memory is not free yet" in driver.gpu()["blocked"]
+    assert "measured memory is not free yet" in driver.gpu()["blocked"]["text"]
     driver.card.set(STRANGER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
 
@@ -208,7 +208,7 @@ def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
     waiter = driver.consumer("w")
     driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
     assert driver.notes("stowaway")[-1]["used_bytes"] == 2 * GIB
-    assert "pressure" in driver.gpu()["blocked"]
+    assert "pressure" in driver.gpu()["blocked"]["text"]
     assert [driver.state(lease) for lease in (calm_lease, other_lease, busy_lease)] == [
         "revoking",
         "held",

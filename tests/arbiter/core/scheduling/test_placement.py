@@ -142,7 +142,7 @@ def test_a_lease_that_is_away_from_a_card_that_is_gone_ends(two_gpus: CoreDriver
     det.connect()
     (told,) = answer(det.reattach(lease, token, away=True))["leases"]
     assert (told["kept"], told["error"]["code"]) == (False, "lease_lost")
-    assert (two_gpus.arbiter.why("det", two_gpus.now)["leases"], two_gpus.state(wanted)) == (
+    assert (two_gpus.why("det")["leases"], two_gpus.state(wanted)) == (
         [],
         "over",
     )

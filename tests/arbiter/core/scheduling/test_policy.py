@@ -11,6 +11,7 @@ from vram_arbiter.arbiter.core.model.state import Gpu
 from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.codes import Block
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -218,7 +219,7 @@ def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
     core = state_of(driver.arbiter)
     gpu = next(iter(core.gpus.values()))
     assert policy.measured_room_bytes(core, gpu) is None
-    assert policy.blocked(core, gpu) == "the card has not been read yet"
+    assert policy.blocked(core, gpu) == Block.UNREAD
     assert policy.sample_is_behind(gpu)
     driver.advance(0.01)
     assert policy.measured_room_bytes(core, gpu) == 8 * GIB

@@ -308,10 +308,7 @@ def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
     ]
     assert driver.state(waiter) == "queued"
     assert driver.gpu()["stowaway_bytes"] == 1 * GIB
-    assert (
-        "browser (holds bytes without a lease)"
-        in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
-    )
+    assert "browser (holds bytes without a lease)" in driver.why("w")["leases"][0]["text"]
     driver.card.set(STRANGER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 

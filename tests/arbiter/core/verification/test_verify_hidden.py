@@ -41,7 +41,7 @@ def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_b
     assert driver.state(waiter) == "queued"
     assert (
         f"keeps more than its context until its process (pid {det.process.pid})"
-        in driver.arbiter.why("w", driver.now)["leases"][0]["text"]
+        in driver.why("w")["leases"][0]["text"]
     )
     det.hold(450 * MIB)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)

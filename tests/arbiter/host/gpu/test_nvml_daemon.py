@@ -118,7 +118,7 @@ def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
     assert waiter["state"] == "queued"
     (card,) = client.ask("status")["gpus"]
     assert card["measured_used_bytes"] is None
-    assert "cannot be read" in card["blocked"]
+    assert "cannot be read" in card["blocked"]["text"]
     assert client.ask("ping")["ok"], "the daemon itself hangs on nothing"
     nvml.write()
     event(client, "probe_ok")

@@ -22,6 +22,7 @@ from tests.support.scenes import sent_away
 from vram_arbiter.arbiter.core.effects import Note, Push
 from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.telemetry import names as names
 
@@ -49,7 +50,12 @@ def exported() -> dict[str, set[str]]:
     for push in (effect for effect in driver.effects if isinstance(effect, Push)):
         assert telemetry.revoke(push.body) == push.body, "no span of ours to name"
     for note in (effect for effect in driver.effects if isinstance(effect, Note)):
-        event = {"seq": 1, "at_wall_s": 1.8e9, "kind": note.kind, **note.data}
+        event = {
+            "seq": 1,
+            "at_wall_s": 1.8e9,
+            "kind": note.kind,
+            **words.event(note.kind, note.data),
+        }
         assert telemetry.observe(event) == {}
     numbers.wrote(0.001, failed=False)
     figures = {**driver.arbiter.figures(), "journal_healthy": True}

@@ -23,7 +23,9 @@ from vram_arbiter.arbiter.host.telemetry import spans as otel
 from vram_arbiter.arbiter.host.telemetry.metrics import OTHERS, LeaseMetrics
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
 from vram_arbiter.arbiter.host.telemetry.traced import Harmless
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.ids import ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
@@ -62,9 +64,14 @@ class Listener:
     def hear(self, batch: list[Effect], now: float) -> None:
         self.now = now
         self.telemetry.outgoing(batch)
-        self.pushed += [dict(self.telemetry.revoke(e.body)) for e in batch if isinstance(e, Push)]
+        self.pushed += [to_map(self.telemetry.revoke(e.body)) for e in batch if isinstance(e, Push)]
         for note in (e for e in batch if isinstance(e, Note)):
-            event = {"seq": 1, "at_wall_s": WALL_S + now, "kind": note.kind, **note.data}
+            event = {
+                "seq": 1,
+                "at_wall_s": WALL_S + now,
+                "kind": note.kind,
+                **words.event(note.kind, note.data),
+            }
             self.ids.append((note.kind, dict(self.telemetry.observe(event))))
 
     def spans(self, name: str | None = None) -> list[ReadableSpan]:
@@ -465,7 +472,7 @@ def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
     engine = Arbiter(busy.settings, START_S)
     for now, event in busy.events:
         heard.hear(engine.handle(event, now), now)
-    states = {view["lease_id"]: view["state"] for view in engine.status(busy.now)["leases"]}
+    states = {view.lease_id: view.state for view in engine.status(busy.now).leases}
     measured = {
         v.lease for gpu in engine.inspect().gpus.values() for v in gpu.verifications.values()
     }

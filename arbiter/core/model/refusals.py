@@ -1,0 +1,414 @@
+"""Refusals of the engine: one class per cause, with the values that explain it.
+
+They hold codes and values only. Words are made in `arbiter.rpc.words`, so rewording a message changes no decision and
+no replay. The fields are the `details` of the error on the wire.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import ClassVar, Literal
+
+from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Why
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.explained import Explanation
+
+
+class Refused(Exception):
+    """A request cannot be done; raised before anything has changed."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(repr(refusal))
+        self.refusal = refusal
+
+
+# -- sessions and tokens -----------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class NoSession(Refusal):
+    """The connection has not said hello."""
+
+    code: ClassVar = "unknown_session"
+
+
+@dataclass(frozen=True, slots=True)
+class NoLease(Refusal):
+    """No lease has this id."""
+
+    code: ClassVar = "unknown_lease"
+
+    lease_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class WrongToken(Refusal):
+    """`token` is what the request named, never the right one."""
+
+    code: ClassVar = "stale_token"
+
+    lease_id: str
+    token: str
+
+
+@dataclass(frozen=True, slots=True)
+class NotHolder(Refusal):
+    """The lease belongs to another process."""
+
+    code: ClassVar = "not_permitted"
+
+    lease_id: str
+    pid: int
+
+
+# -- states ------------------------------------------------------------------------------------------------------------
+class Misfit(StrEnum):
+    """Why a request does not fit the state of its lease."""
+
+    STILL_QUEUED = "still_queued"
+    NOT_AWAY = "not_away"
+    GRANTED = "granted"
+    NOT_LOADING = "not_loading"
+    NOT_HELD = "not_held"
+    NOT_UNLOADABLE = "not_unloadable"
+    NOT_RESIZABLE = "not_resizable"
+    IN_USE = "in_use"
+    EXITS = "exits"
+    NO_PARK_BYTES = "no_park_bytes"
+    HOLDS_NOTHING = "holds_nothing"
+    NO_SUCH_USE = "no_such_use"
+
+
+@dataclass(frozen=True, slots=True)
+class BadLeaseState(Refusal):
+    """A holder's request does not fit the state of its lease; `story` lists its last steps."""
+
+    code: ClassVar = "bad_state"
+
+    lease_id: str
+    state: str
+    uses: int
+    misfit: Misfit
+    story: str
+    use_id: str = ""
+
+
+class Impractical(StrEnum):
+    """Why an operator's action does not fit a lease."""
+
+    NOT_RESIDENT = "not_resident"
+    LEAVING = "leaving"
+    NOT_HELD = "not_held"
+    IN_USE = "in_use"
+    PINNED_BY_OPERATOR = "pinned_by_operator"
+    PINNED_BY_HOLDER = "pinned_by_holder"
+    NOT_PINNED = "not_pinned"
+    HOLDER_LIVES = "holder_lives"
+
+
+@dataclass(frozen=True, slots=True)
+class BadTargetState(Refusal):
+    """An operator's action does not fit the lease; `silent_s`: since its holder was heard."""
+
+    code: ClassVar = "bad_state"
+
+    lease_id: str
+    state: str
+    problem: Impractical
+    evictable: bool = True
+    silent_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ambiguous(Refusal):
+    """An operator named a consumer without a lease, or with several."""
+
+    code: ClassVar = "bad_request"
+
+    target: str
+    leases: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NoTarget(Refusal):
+    """No lease and no consumer has this name."""
+
+    code: ClassVar = "unknown_lease"
+
+    target: str
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseOver(Refusal):
+    """A late message on a lease that ended in order; `revoked`: it was evicted."""
+
+    code: ClassVar = "bad_state"
+
+    lease_id: str
+    state: str
+    revoked: RevokeCause | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TargetOver(Refusal):
+    """An operator named a lease that is over: the refusal that its holder would get, with `code` of that."""
+
+    code: str  # type: ignore[misc]  # of `ended`
+    ended: Refusal
+
+    @classmethod
+    def of(cls, ended: Refusal) -> "TargetOver":
+        """Return the refusal of an operator's action on a lease that ended so."""
+        return cls(ended.code, ended)
+
+
+@dataclass(frozen=True, slots=True)
+class Revoked(Refusal):
+    """The holder was asked to leave, so no use begins (`use`) and no size changes (`resize`)."""
+
+    code: ClassVar = "lease_revoking"
+
+    consumer: str
+    state: str
+    wanted: Literal["use", "resize"]
+    revoked: RevokeCause | None = None
+
+
+# -- bytes and places --------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class UnknownGpu(Refusal):
+    """The selector names no GPU."""
+
+    code: ClassVar = "unknown_gpu"
+
+    gpu: str
+    known: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TooLarge(Refusal):
+    """A request can never fit. `needed_bytes` exceeds `declared_bytes` where more was measured before."""
+
+    code: ClassVar = "vram_insufficient"
+
+    consumer: str
+    needed_bytes: int
+    declared_bytes: int
+    capacity_bytes: int
+    reserve_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class GrowthTooLarge(Refusal):
+    """A lease can never grow so far; `room_bytes`: what it can have alone on its GPU."""
+
+    code: ClassVar = "vram_insufficient"
+
+    consumer: str
+    needed_bytes: int
+    room_bytes: int
+    capacity_bytes: int
+    reserve_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class NoHostRam(Refusal):
+    """No room in host RAM for parked weights."""
+
+    code: ClassVar = "host_ram_insufficient"
+
+    needed_bytes: int
+    budget_bytes: int
+    booked_bytes: int
+
+
+type Limit = Literal["waiters_max", "leases_per_client_max", "uses_per_lease_max"]
+
+
+class Share(StrEnum):
+    """Whose share of limited places is used up."""
+
+    CONNECTION = "connection"
+    PROCESS = "process"
+    USER = "user"
+    ALL = "all"
+    HOLDER = "holder"
+    OTHERS = "others"  # than the holder
+
+
+@dataclass(frozen=True, slots=True)
+class LimitReached(Refusal):
+    """`count` places of a share are used, `value` are allowed; `uid` for the share of a user."""
+
+    code: ClassVar = "limit_exceeded"
+
+    limit: Limit
+    value: int
+    share: Share
+    count: int
+    lease_id: str = ""
+    uid: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LoadFails(Refusal):
+    """The model died in its load `failures` times in a row; no holder is revoked for it for `retry_in_s`."""
+
+    code: ClassVar = "load_failing"
+
+    consumer: str
+    model: str
+    failures: int
+    cause: str  # of the last failure, a code
+    retry_in_s: float
+
+
+# -- ends --------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class CancelledRequest(Refusal):
+    """A request ended because of its own client. `by` is the reason of a client that left."""
+
+    code: ClassVar = "cancelled"
+
+    lease_id: str
+    why: Why
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedOut(Refusal):
+    """A request waited as long as it wanted to."""
+
+    code: ClassVar = "wait_timeout"
+
+    consumer: str
+    waited_s: float
+    why: Explanation
+
+
+@dataclass(frozen=True, slots=True)
+class HolderOutstays(Refusal):
+    """A holder did not leave in time, and the waiter did not want to wait longer."""
+
+    code: ClassVar = "holder_busy"
+
+    lease_id: str
+    consumer: str
+    uses: int
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Expired(Refusal):
+    """The lease was not renewed in time, or an operator gave its silent holder up."""
+
+    code: ClassVar = "lease_expired"
+
+    lease_id: str
+    ttl_s: float
+    why: Why = Why.NOT_RENEWED
+    order: Order | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Lost(Refusal):
+    """The lease is over, and its holder did not end it."""
+
+    code: ClassVar = "lease_lost"
+
+    lease_id: str
+    why: Why
+    pid: int | None = None
+    order: Order | None = None
+
+
+type End = Lost | CancelledRequest
+"""Why a lease without bytes ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class NotJournaled(Refusal):
+    """The grant could not be written, so it does not take place."""
+
+    code: ClassVar = "journal_unavailable"
+
+    lease_id: str
+    key: str
+    problem: str
+
+
+# -- gangs -------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class GangMismatch(Refusal):
+    """A member does not fit its gang: another size (`asked`), or all members have asked already."""
+
+    code: ClassVar = "bad_request"
+
+    gang: str
+    size: int
+    asked: int
+
+
+@dataclass(frozen=True, slots=True)
+class GangTooLarge(Refusal):
+    """All members together can never fit."""
+
+    code: ClassVar = "vram_insufficient"
+
+    gang: str
+    members: int
+    needed_bytes: int
+    budget_bytes: Mapping[str, int]
+
+
+class GangEnd(StrEnum):
+    """Why a gang is broken."""
+
+    REFUSED = "refused"  # a member was
+    FALLEN = "fallen"  # a member ended
+    INCOMPLETE = "incomplete"  # after a restart
+    MEMBER_TOO_LARGE = "member_too_large"  # one holds more than it declared
+    OTHERS_TOO_LARGE = "others_too_large"
+    NOT_FREED = "not_freed"  # measured memory did not come back
+
+
+@dataclass(frozen=True, slots=True)
+class BrokenGang(Refusal):
+    """The gang will not be granted. `consumer`, `lease_id`, `state`: the fallen member; `because`: its refusal."""
+
+    code: ClassVar = "gang_broken"
+
+    gang: str
+    why: GangEnd
+    consumer: str = ""
+    lease_id: str = ""
+    state: str = ""
+    because: str = ""  # wire code
+
+
+# -- deadlocks ---------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class NamedLease:
+    """A lease in a cycle."""
+
+    lease_id: str
+    consumer: str
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class CycleLink:
+    """A process in a cycle: it uses what it holds, and waits."""
+
+    pid: int
+    consumer: str
+    lease_id: str
+    waits_for: tuple[NamedLease, ...]
+    holds: tuple[NamedLease, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Deadlock(Refusal):
+    """The wait would never end."""
+
+    code: ClassVar = "would_deadlock"
+
+    cycle: tuple[CycleLink, ...]

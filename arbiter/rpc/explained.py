@@ -1,0 +1,298 @@
+"""Answers to `why`, and blocked GPUs, in words."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from vram_arbiter.schemas.wire.codes import Block, RevokeCause, Wait
+from vram_arbiter.schemas.wire.explained import (
+    Action,
+    Because,
+    Blocker,
+    Condition,
+    Explanation,
+    Return,
+    Situation,
+    Step,
+)
+from vram_arbiter.schemas.wire.views import BlockView, GangView, GpuView
+
+WAIT: Final[Mapping[Wait, str]] = {
+    Wait.MAKING_ROOM: "room is being made",
+    Wait.READING: "waits for a fresh reading of the GPU",
+    Wait.NOT_FREE: "the ledger has room, the GPU does not: measured memory is not free yet",
+    Wait.RESIDUE: "a dead process's memory is being measured",
+    Wait.NO_VICTIM: "no holder that could make room may be asked now",
+}
+
+
+def worded(told: Explanation) -> Explanation:
+    """Return an explanation with its words."""
+    blockers = tuple(replace(one, text=condition(one)) for one in told.blockers)
+    plan = tuple(replace(step, text=_step(step)) for step in told.plan)
+    told = replace(told, blockers=blockers, plan=plan)
+    then = _resident(told) if told.state != "queued" else _waiter(told)
+    head = told.consumer if told.state != "queued" else _needs(told)
+    return replace(told, next=then, text=f"{head}: {then}")
+
+
+def worded_gpu(gpu: GpuView) -> GpuView:
+    """Return a GPU's view with the words of its block."""
+    if gpu.blocked is None:
+        return gpu
+    return replace(gpu, blocked=replace(gpu.blocked, text=block(gpu.blocked)))
+
+
+def block(why: BlockView) -> str:
+    """Why nothing is granted on a GPU."""
+    first = why.names[0] if why.names else ""
+    match why.code:
+        case Block.RECOVERING:
+            names = _listed(why.names, why.more) or "holders that the journal may not name"
+            return f"recovering after a restart: {names} must come back first"
+        case Block.DRAINED:
+            return f"drained by {why.problem}"
+        case Block.UNREADABLE:
+            return f"the GPU cannot be read: {why.problem}"
+        case Block.UNREAD:
+            return "the GPU has not been read yet"
+        case Block.LOADING:
+            return f"{first} is loading"
+        case Block.GANG:
+            return f"gang {first} is loading"
+        case Block.PRESSURE:
+            return f"pressure: {why.bytes} bytes more than the budget are held"
+        case _:
+            return WAIT[Wait.NOT_FREE]
+
+
+def wait_for(why: BlockView | None) -> str:
+    """What a request waits for that is the first of its queue and was not looked at yet."""
+    return "waits for its turn" if why is None else f"waits: {block(why)}"
+
+
+# -- waiters -----------------------------------------------------------------------------------------------------------
+def _needs(told: Explanation) -> str:
+    together = ""
+    if told.gang is not None and told.condition is Situation.GANG_WAITS:
+        together = f" with gang {told.gang.id}"
+    kept = " or kept for it" if told.kept else ""
+    head = f"{told.consumer}{together} needs {gib(told.needed_bytes)}, {gib(told.free_bytes)} are free{kept}"
+    head += f", {gib(told.deficit_bytes)} are missing" if told.deficit_bytes else ""
+    if told.expected_bytes is not None:
+        declared = told.footprint.declared_bytes["load_peak"]
+        head += f" ({gib(declared)} declared, {gib(told.expected_bytes)} learned)"
+    return head
+
+
+def _waiter(told: Explanation) -> str:
+    gang = told.gang
+    match told.condition:
+        case Situation.GATHERING | Situation.GANG_LOADS | Situation.GANG_WAITS if gang is not None:
+            return _in_gang(told, gang)
+        case Situation.BEHIND:
+            member = "" if gang is None else f" as one of gang {gang.id}"
+            return f"waits{member} behind {told.ahead} as number {told.position}"
+        case Situation.MAKING_ROOM:
+            return "; ".join(map(_leaving, told.leaving))
+        case Situation.BLOCKED if told.block is not None:
+            loads = [one for one in told.blockers if one.condition is Condition.LOADING]
+            if told.block.code is Block.LOADING and loads:
+                return f"waits: {loads[0].consumer} {condition(loads[0])}"
+            return f"waits: {block(told.block)}"
+        case Situation.NO_ROOM:
+            names = ", ".join(f"{one.consumer} ({one.text})" for one in told.blockers)
+            return f"waits for {names}"
+    if told.measuring:
+        return f"waits until the bytes of {', '.join(told.measuring)} are measured gone"
+    return WAIT[told.wait or Wait.READING]
+
+
+def _in_gang(told: Explanation, gang: GangView) -> str:
+    if told.condition is Situation.GATHERING:
+        return f"waits for the rest of gang {gang.id}: {gang.members} of {gang.size} have come"
+    if told.condition is Situation.GANG_LOADS:
+        if told.wait is Wait.NOT_FREE:
+            return "its bytes are kept for it, but measured memory is not free yet"
+        if told.wait is not None:
+            return WAIT[told.wait]
+        return (
+            f"its bytes are kept for it; it loads when those of gang {gang.id} before it are ready"
+        )
+    why = {
+        Wait.MAKING_ROOM: "room is being made for the whole gang",
+        Wait.NO_VICTIM: "no holder that could make room for the whole gang may be asked now",
+    }
+    return f"waits as one of gang {gang.id}: {'behind others' if told.wait is None else why.get(told.wait) or WAIT[told.wait]}"
+
+
+def _leaving(one: Blocker) -> str:
+    charge, ago = gib(one.bytes), f"asked {one.seconds or 0.0:.1f} s ago"
+    match one.condition:
+        case Condition.REVOKED if one.uses:
+            uses = f"{one.uses} use{'' if one.uses == 1 else 's'}"
+            return f"waits for {one.consumer} to finish {uses} ({ago}), then it unloads and {charge} are verified"
+        case Condition.REVOKED:
+            return f"waits for {one.consumer} to unload ({ago}), then {charge} are verified"
+        case Condition.UNLOADING:
+            return f"{one.consumer} unloads, then {charge} are verified"
+        case Condition.HANGING:
+            return f"{one.consumer} {condition(one)}, then {charge} are verified"
+        case _:
+            return f"{charge} of {one.consumer} are being verified"
+
+
+def condition(one: Blocker) -> str:
+    """The condition on which a blocker's bytes come free."""
+    seconds = one.seconds or 0.0
+    return {
+        Condition.LOADING: _loading(one),
+        Condition.REVOKED: f"was asked to leave {seconds:.1f} s ago, {_uses(one)}",
+        Condition.UNLOADING: "is unloading",
+        Condition.HANGING: f"is unloading for {seconds:.0f} s and may hang: end its process (pid {one.pid})",
+        Condition.MEASURED: "let go, its bytes are being measured",
+        Condition.NOT_BACK: f"has not come back since the restart, is given up in {seconds:.1f} s",
+        Condition.GANG: f"belongs to gang {one.by}, which is not complete",
+        Condition.PINNED: f"is pinned by {one.by}" if one.by else "is pinned",
+        Condition.RESIDENCY: f"may stay {seconds:.1f} s more (minimum residency)",
+        Condition.THRASHING: f"may stay {seconds:.1f} s more (they keep throwing each other out)",
+        Condition.PRIORITY: f"is in use and has priority {one.priority}, the waiter {one.waiter_priority}",
+        Condition.IN_USE: "is in use",
+        Condition.IDLE: "is idle and may be asked",
+        Condition.CONTEXT: "keeps its context until it exits",
+        Condition.RETAINED: f"keeps more than its context until its process (pid {one.pid}) gives it back or ends",
+        Condition.DEBT: "is over, its bytes are being measured",
+        Condition.DEBT_KEPT: f"is over, and its process (pid {one.pid}) keeps its bytes until it frees them or ends",
+        Condition.STOWAWAY: "holds bytes without a lease",
+        Condition.TURN: f"has its bytes kept for its turn in gang {one.by}",
+    }[one.condition]
+
+
+def _loading(one: Blocker) -> str:
+    if one.loaded_bytes is None:
+        return "is loading"
+    told = f"is loading for {one.seconds or 0.0:.0f} s, {gib(one.loaded_bytes)} so far"
+    return told if one.quiet_s is None else f"{told}, nothing new for {one.quiet_s:.0f} s"
+
+
+def _uses(one: Blocker) -> str:
+    paused = f", {one.paused} paused" if one.paused else ""
+    running = f"{one.uses} use{'' if one.uses == 1 else 's'} running" if one.uses else "idle"
+    return running + paused
+
+
+# -- leases that are granted -------------------------------------------------------------------------------------------
+def _resident(told: Explanation) -> str:
+    says = _away(told) if told.holder is None else _holder(told, told.holder)
+    if told.gang is not None:
+        lacks = [f"{one.consumer} ({one.lease_id}) is {one.state}" for one in told.lacks]
+        missing = told.gang.size - told.gang.members
+        lacks += [f"{missing} of {told.gang.size} have to come back"] if missing else []
+        until = f"gang {told.gang.id} is complete once {'all are' if lacks else 'it is'} held"
+        says += f"; {until}" + (f": {', '.join(lacks)}" if lacks else "")
+    if told.drifted:
+        held, declared = told.footprint.held_bytes or 0, told.footprint.declared_bytes["steady"]
+        says += f"; it holds {gib(held)}, {gib(declared)} were declared"
+    return says
+
+
+def _holder(told: Explanation, holder: Blocker) -> str:
+    match told.state:
+        case "loading":
+            return f"it was granted and {_loading(holder)}"
+        case "revoking":
+            return f"it was asked to leave for {_wanted_by(told.revoked)}, {_uses(holder)}"
+        case "unloading":
+            return f"it {condition(holder)}"
+        case "verifying":
+            return "it let go; its bytes are being measured"
+        case _:
+            return f"it is resident, {_uses(holder)}"
+
+
+def _wanted_by(why: RevokeCause | None) -> str:
+    if why is None or why.cause == "pressure":
+        return "relief of pressure"
+    return why.wanted_by or "an operator"
+
+
+def _away(told: Explanation) -> str:
+    where = "parked" if told.state == "parked" else "on standby"
+    match told.back:
+        case Return.HOLDER:
+            return f"{where}, but its holder did not come back after the restart"
+        case Return.ASKED:
+            return f"{where} in host RAM until its holder asks for it"
+        case Return.BEHIND:
+            return f"{where}: {told.ahead} waits, and goes first"
+        case Return.BLOCKED if told.block is not None:
+            return f"{where}: {block(told.block)}"
+        case Return.LEFT_FOR:
+            return f"{where} until {told.ahead} has left"
+        case Return.NO_ROOM:
+            return f"{where} until there is room; it asks no holder to leave"
+        case Return.QUIET:
+            return f"{where}: comes back in {told.due_s or 0.0:.1f} s if the GPU stays quiet"
+        case _:
+            return f"{where}: comes back with the next reading of the GPU, or after those before it"
+
+
+# -- steps -------------------------------------------------------------------------------------------------------------
+def _step(step: Step) -> str:
+    when = ""
+    if step.in_s is not None:
+        more = step.action is Action.DEADLINE
+        when = f" for {step.in_s:.1f} s more" if more else f" in {step.in_s:.1f} s"
+    return f"{_action(step)}{when}, {_because(step)}"
+
+
+def _action(step: Step) -> str:
+    if step.action is Action.WAIT:
+        return {
+            Because.NO_VICTIM: "asks no holder",
+            Because.NOT_BACK: f"gives {step.consumer} up",
+        }.get(step.because, f"waits for {step.consumer} to let go")
+    return {
+        Action.ASK: f"asks {step.consumer}",
+        Action.LOADED: f"lets {step.consumer} finish loading",
+        Action.READ: "reads the GPU again",
+        Action.MEASURE: f"measures {step.consumer}'s bytes again",
+        Action.DEADLINE: f"waits for {step.consumer} to let go",
+        Action.SERVE: "grants again",
+        Action.BREAK: f"gives gang {step.gang} up",
+        Action.GIVE_UP: "gives up",
+    }[step.action]
+
+
+def _because(step: Step) -> str:
+    return {
+        Because.NEXT_READING: "as soon as the GPU is looked at again",
+        Because.RESIDENCY: "when its minimum residency ends",
+        Because.AGEING: "when the waiter's priority has aged to its own",
+        Because.TOGETHER: "when enough may be asked together",
+        Because.ONE_LOAD: "one loads at a time",
+        Because.KEPT: "its bytes are kept for it, the GPU has to show them",
+        Because.UNREADABLE: "nothing is granted on a GPU that cannot be read",
+        Because.MEASUREMENT: "the ledger has room, the GPU has to show it",
+        Because.ACCOUNTED: "when every holder has come back or its time is over",
+        Because.INCOMPLETE: "if the rest has not come back",
+        Because.SHORT: "if its memory is not free then",
+        Because.NOT_BACK: "unless it comes back before that",
+        Because.NO_VICTIM: "those that could make room are pinned or in use above its priority",
+        Because.VERDICT: f"a verdict comes in {step.latest_s or 0.0:.1f} s at the latest",
+        Because.MEASURED_GONE: "until its bytes are measured gone",
+        Because.HANGING: "its unloading may hang",
+        Because.LEAVING: "it is on its way out",
+        Because.DENIED: f"after that {step.waiter} is denied",
+        Because.WAITS_ON: f"after that {step.waiter} waits on, and the holder's own rule applies",
+        Because.TIMEOUT: "when its wait timeout is over",
+    }[step.because]
+
+
+def _listed(names: Sequence[str], more: int) -> str:
+    return ", ".join(names) + (f" and {more} more" if more else "")
+
+
+def gib(count: int) -> str:
+    """Bytes as `1.25 GiB`."""
+    return f"{count / 2**30:.2f} GiB"
