@@ -49,7 +49,8 @@ environment:
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="vram-arbiter",
-        description="Leases GPU memory to processes: one daemon per machine, no configuration needed.",
+        description="Leases GPU memory to processes: one daemon per machine, no configuration "
+        "needed.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -57,12 +58,14 @@ def parser() -> argparse.ArgumentParser:
         "--config",
         metavar="FILE",
         type=Path,
-        help="YAML file; every key is explained in configs/arbiter.yaml (default: arbiter.yaml in CONFIGURATION_DIRECTORY)",
+        help="YAML file; every key is explained in configs/arbiter.yaml (default: arbiter.yaml in "
+        "CONFIGURATION_DIRECTORY)",
     )
     made.add_argument(
         "--gpu",
         metavar="SOURCE",
-        help="auto (default), nvml: the NVIDIA cards, unified: Jetson and GB10; fake:8GiB: a simulated card in the runtime folder; fake:FOLDER: that one",
+        help="auto (default), nvml: the NVIDIA cards, unified: Jetson and GB10; fake:8GiB: a "
+        "simulated card in the runtime folder; fake:FOLDER: that one",
     )
     made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
     made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")
@@ -72,7 +75,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--operators-group",
         metavar="GROUP",
-        help="Unix group that may act by hand (evict, pin, drain); without --group it may connect as well",
+        help="Unix group that may act by hand (evict, pin, drain); without --group it may connect "
+        "as well",
     )
     made.add_argument(
         "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
@@ -148,7 +152,8 @@ def exit_code_of(error: VramError) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code; prints errors of the operator as one line without a traceback."""
     flags = parser().parse_args(argv)
-    faulthandler.enable()  # the manager's watchdog kills by SIGABRT: the log then says where the daemon was stuck
+    # the manager's watchdog kills by SIGABRT: the log then says where the daemon was stuck
+    faulthandler.enable()
     try:
         flags.config = flags.config or config_of_service(os.environ)
         config = effective_config(flags)
@@ -172,7 +177,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 )
             )
             print(
-                f"{flags.config or 'built-in configuration'}: ok (would serve {places.endpoint}, gpu {config.gpu.source})"
+                f"{flags.config or 'built-in configuration'}: ok (would serve {places.endpoint}, "
+                f"gpu {config.gpu.source})"
             )
             return 0
         set_up_logging(config.log.format, config.log.level)

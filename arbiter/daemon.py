@@ -1,8 +1,10 @@
-"""The daemon: the only place where real parts are put together, with the order of start and of stop.
+"""The daemon: the only place where real parts are put together, with the order of start and of
+stop.
 
-Start: folders and locks → journal → cards → core (told what the journal remembers; its processes are watched) → socket → READY. A failure
-on the way undoes what was done. Stop: no more requests → nothing more is decided → files are written → socket goes. Leases survive a
-stop: their holders keep what they have and re-attach. Must not decide anything about leases.
+Start: folders and locks → journal → cards → core (told what the journal remembers; its processes
+are watched) → socket → READY. A failure on the way undoes what was done. Stop: no more requests →
+nothing more is decided → files are written → socket goes. Leases survive a stop: their holders keep
+what they have and re-attach. Must not decide anything about leases.
 """
 
 import asyncio
@@ -69,8 +71,10 @@ OPEN_FILES = 65_536
 DESCRIPTOR_RESERVE = 128
 """For the daemon's own files: journal, history, event log, readings, telemetry."""
 SWITCH_S = 0.0005
-"""How long the loop may keep the interpreter from a thread that reads a card, which asks for it some twenty times per reading: with
-Python's own 5 ms a client that floods the loop makes every reading take a tenth of a second."""
+"""How long the loop may keep the interpreter from a thread that reads a card, which asks for it
+some twenty times per reading: with Python's own 5 ms a client that floods the loop makes every
+reading take a tenth of a second.
+"""
 TOKEN_SECRET_BYTES = 16
 STATUS_EVERY_S = 5.0
 KEEP_LEARNT_EVERY_S = 10.0
@@ -109,7 +113,8 @@ def find_places(config: ArbiterConfig, environ: Mapping[str, str], uid: int) -> 
 
 
 def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
-    """(backend, its name) for `gpu.source`. Raises NoGpu or ConfigError. A simulated card is never a fallback: it has to be asked for."""
+    """(backend, its name) for `gpu.source`. Raises NoGpu or ConfigError. A simulated card is never
+    a fallback: it has to be asked for."""
     kind, _, what = config.source.partition(":")
     if kind == "fake":
         return open_cards(what, runtime), "fake"
@@ -119,7 +124,8 @@ def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
 
 
 def budget(cards: Sequence[Card], config: ArbiterConfig, source: str = "") -> tuple[GpuInfo, ...]:
-    """What of each card is leased out. Raises ConfigError for a cap on a card that is not there, or a reserve larger than a card."""
+    """What of each card is leased out. Raises ConfigError for a cap on a card that is not there, or
+    a reserve larger than a card."""
     caps = dict(config.gpu.capacity_bytes)
     found = []
     for card in cards:
@@ -203,7 +209,8 @@ class Parts:
 
 
 class Daemon:
-    """`await Daemon(config, environ, version).run()` serves until SIGTERM or SIGINT and returns the exit code.
+    """`await Daemon(config, environ, version).run()` serves until SIGTERM or SIGINT and returns the
+    exit code.
 
     Raises the operator's errors (ConfigError, AlreadyRunning, NoGpu, ProbeFailed) before it serves.
     """
@@ -223,7 +230,9 @@ class Daemon:
             parts = await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):
                 asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
-            gc.freeze()  # modules live as long as we do: no collection has to look at them again, and stop the loop for it
+            # modules live as long as we do: no collection has to look at them again, and stop the
+            # loop for it
+            gc.freeze()
             notifier.ready(status_text(parts.gpus))
             beat = asyncio.get_running_loop().create_task(self._beat(parts, notifier))
             undo.callback(beat.cancel)
@@ -236,7 +245,11 @@ class Daemon:
         return self._exit_code
 
     async def _start(self, undo: contextlib.AsyncExitStack) -> Parts:
-        """1. Folders and locks. 2. Journal and history. 3. Cards. 4. Core and the parts around it. 5. The past. 6. The socket."""
+        """1.
+
+        Folders and locks. 2. Journal and history. 3. Cards. 4. Core and the parts around it. 5. The
+        past. 6. The socket.
+        """
         config, loop = self._config, asyncio.get_running_loop()
         places = find_places(config, self._environ, os.getuid())
         operators = self._group("operators_group")
@@ -424,7 +437,8 @@ class Daemon:
         return number
 
     def _router_limits(self) -> Limits:
-        """A connection may take three descriptors: its socket, and two pidfds if it is the only one of its process."""
+        """A connection may take three descriptors: its socket, and two pidfds if it is the only one
+        of its process."""
         limits = self._config.limits
         soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         return Limits(
@@ -484,14 +498,15 @@ class Daemon:
         telemetry.log_event(history.append("started", started))
 
     def _core_failed(self, error: BaseException) -> None:
-        """Nothing is decided any more; the journal holds what was granted, and the next start recovers it."""
+        """Nothing is decided any more; the journal holds what was granted, and the next start
+        recovers it."""
         log.critical("stopping: %s: %s", type(error).__name__, error)
         self._exit_code = EXIT_DEFECT
         self._stop.set()
 
     async def _beat(self, parts: Parts, notifier: Notifier) -> None:
-        """Feeds the watchdog only with an event that has just passed through the core and the executor, on this very thread: whatever is
-        stuck there starves it."""
+        """Feeds the watchdog only with an event that has just passed through the core and the
+        executor, on this very thread: whatever is stuck there starves it."""
         period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
         said, kept_at = "", time.monotonic()
         while True:
@@ -528,7 +543,8 @@ def problems(journal: Journal, history: History) -> list[str]:
 
 
 def try_records(journal: Journal, settings: Settings) -> None:
-    """Let a core that is thrown away read the journal's records; what it cannot read is put aside instead of stopping every start."""
+    """Let a core that is thrown away read the journal's records; what it cannot read is put aside
+    instead of stopping every start."""
     if not journal.opened.records:
         return
     now = time.monotonic()
@@ -540,7 +556,8 @@ def try_records(journal: Journal, settings: Settings) -> None:
 
 
 def processes_of(records: Mapping[str, Mapping[str, Any]]) -> list[ProcessKey]:
-    """The processes that the journal's records belong to, and those that use what belongs to others; each once."""
+    """The processes that the journal's records belong to, and those that use what belongs to
+    others; each once."""
     found = set()
     for record in records.values():
         users = [(user[0], user[1]) for user in record.get("users", ())]
@@ -551,7 +568,8 @@ def processes_of(records: Mapping[str, Mapping[str, Any]]) -> list[ProcessKey]:
 
 
 def raise_open_files() -> None:
-    """A connection and a pidfd per client need more than the usual soft limit of 1,024 descriptors."""
+    """A connection and a pidfd per client need more than the usual soft limit of 1,024
+    descriptors."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = OPEN_FILES if hard == resource.RLIM_INFINITY else min(OPEN_FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:

@@ -1,8 +1,10 @@
-"""The one place that owns the core: events in, one after the other, effects out to the executor, one timer for time.
+"""The one place that owns the core: events in, one after the other, effects out to the executor,
+one timer for time.
 
-All of it runs on the thread of the event loop; other threads post through `loop.call_soon_threadsafe(inbox.post, event)`. Nothing
-else may touch the core, except its reads: `status`, `why`, and the owners when a probe's reading is handed on. `now` is `time.monotonic()`: the clock of the event
-loop's timers and of the probes' time stamps.
+All of it runs on the thread of the event loop; other threads post through
+`loop.call_soon_threadsafe(inbox.post, event)`. Nothing else may touch the core, except its reads:
+`status`, `why`, and the owners when a probe's reading is handed on. `now` is `time.monotonic()`:
+the clock of the event loop's timers and of the probes' time stamps.
 """
 
 import asyncio
@@ -25,16 +27,18 @@ from vram_arbiter.schemas.wire.replies import StatusReply
 log = logging.getLogger(__name__)
 
 HELD_UP_S = 1.0
-"""A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual machine). It heard no client, so no client's
-silence counts: the core is told that it slept."""
+"""A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual
+machine). It heard no client, so no client's silence counts: the core is told that it slept."""
 TIMER_FLOOR_S = 0.0002
 """A deadline that has passed is served this soon, and not in a busy loop."""
 
 FRESH_S = 1.0
-"""Time limit for the reading that an answer waits for. After it the answer shows the old reading with its age."""
+"""Time limit for the reading that an answer waits for. After it the answer shows the old reading
+with its age."""
 ANSWERS_AT_ONCE = 4
 QUESTIONS_MAX = 1024
-"""Answers that wait for a reading at a time. One more is given at once, with the reading that there is."""
+"""Answers that wait for a reading at a time. One more is given at once, with the reading that there
+is."""
 NO_READER = ProcessKey(0, 0)
 """Reader of a status that goes to the log: it may see no token."""
 _TOKEN = re.compile(r"Token\(epoch=(\d+), serial=\d+\)")
@@ -69,18 +73,21 @@ class Core(Protocol):
 
 
 def without_tokens(event: Event) -> str:
-    """An event as the log may show it: a token authorizes uses, and the log has more readers than the lease."""
+    """An event as the log may show it: a token authorizes uses, and the log has more readers than
+    the lease."""
     return _TOKEN.sub(r"Token(epoch=\1, …)", repr(event))
 
 
 class Inbox:
     """Owns the core.
 
-    `perform` runs the effects of one event; it may post events, which are handled after it returned. `failed` is called once with the
-    exception if the core raises: its state can no longer be trusted, so nothing is handled after that. `slept_s` tells for how long the
-    machine was suspended since it was last asked; the core hears of it, and of a stop of this process alone, before any other event.
-    `record` is told of every event and what came of it (None: the core raised), before anything is performed. `sample` begins a
-    reading of a GPU, which ends in an event (`MemorySampled` or `ProbeFailed`).
+    `perform` runs the effects of one event; it may post events, which are handled after it
+    returned. `failed` is called once with the exception if the core raises: its state can no longer
+    be trusted, so nothing is handled after that. `slept_s` tells for how long the machine was
+    suspended since it was last asked; the core hears of it, and of a stop of this process alone,
+    before any other event. `record` is told of every event and what came of it (None: the core
+    raised), before anything is performed. `sample` begins a reading of a GPU, which ends in an
+    event (`MemorySampled` or `ProbeFailed`).
     """
 
     def __init__(
@@ -131,9 +138,11 @@ class Inbox:
         self._arm()
 
     def when_read(self, answer: Callable[[], None]) -> None:
-        """Call `answer` once every GPU has a fresh reading, or after FRESH_S. It is called at once if all readings are fresh.
+        """Call `answer` once every GPU has a fresh reading, or after FRESH_S. It is called at once
+        if all readings are fresh.
 
-        An idle daemon reads its GPUs seldom: without this, `status` shows what was there minutes ago as the present.
+        An idle daemon reads its GPUs seldom: without this, `status` shows what was there minutes
+        ago as the present.
         """
         stale = [] if self._closed else self._core.stale(self._clock())
         if not stale or len(self._questions) >= QUESTIONS_MAX:
@@ -167,8 +176,10 @@ class Inbox:
         return self._core.footprints()
 
     def pulse(self) -> bool:
-        """Send an event through the core and have its effects performed: True only if both came back. What feeds the watchdog: a core, a
-        journal or a loop that is stuck never gets here, and one that failed answers False."""
+        """Send an event through the core and have its effects performed: True only if both came
+        back. What feeds the watchdog: a core, a journal or a loop that is stuck never gets here,
+        and one that failed answers False.
+        """
         before = self._handled
         self.post(Tick())
         return self._handled > before
@@ -206,7 +217,8 @@ class Inbox:
         self._answer_some(self._forget_questions())
 
     def _answer_some(self, questions: list[Callable[[], None]]) -> None:
-        """A few in one turn of the loop: a thousand that waited for the same reading must not hold it for a second."""
+        """A few in one turn of the loop: a thousand that waited for the same reading must not hold
+        it for a second."""
         for answer in questions[:ANSWERS_AT_ONCE]:
             answer()
         if rest := questions[ANSWERS_AT_ONCE:]:
@@ -222,7 +234,8 @@ class Inbox:
     def _state(self) -> str:
         try:
             return json.dumps(to_map(self.status(NO_READER)), default=str)
-        except Exception as error:  # noqa: BLE001 - the state may be what is broken; this is its last word
+        # the state may be what is broken; this is its last word
+        except Exception as error:  # noqa: BLE001
             return f"unreadable: {error!r}"
 
     def _arm(self) -> None:

@@ -1,4 +1,5 @@
-"""The daemon's log: one line per fact, for people or as JSON, on stderr. Must not know where the facts come from."""
+"""The daemon's log: one line per fact, for people or as JSON, on stderr. Must not know where the
+facts come from."""
 
 import json
 import logging
@@ -34,12 +35,14 @@ _DETAILS = frozenset(
 
 REFUSALS_BURST = 50
 REFUSALS_PER_S = 5.0
-"""Refusals of one user in the log, in the long run. Those left out are counted, and the next line says how many."""
+"""Refusals of one user in the log, in the long run. Those left out are counted, and the next line
+says how many."""
 REFUSED_USERS_MAX = 256
 
 
 class RefusalLog:
-    """Refused requests in the log, with their reasons and without letting a user fill the disk with them."""
+    """Refused requests in the log, with their reasons and without letting a user fill the disk with
+    them."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -74,7 +77,8 @@ def level_of(kind: str) -> int:
 
 
 def log_event(event: Mapping[str, Any], trace: Mapping[str, str] | None = None) -> None:
-    """One event of the history as one line of the log; as JSON with `trace_id` and `span_id` of its span, if it has one."""
+    """One event of the history as one line of the log; as JSON with `trace_id` and `span_id` of its
+    span, if it has one."""
     level = level_of(str(event["kind"]))
     if events_log.isEnabledFor(level):
         events_log.log(level, "%s", sentence(event), extra={"event": dict(event), "trace": trace})

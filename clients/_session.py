@@ -162,7 +162,7 @@ class Session:
     def held(self) -> tuple[AsyncLease, ...]:
         return tuple(lease for lease in self._leases.values() if lease.state != "gone")
 
-    # -- for the client ----------------------------------------------------------------------------
+    # -- for the client
     async def acquire(
         self,
         spec: LeaseSpec,
@@ -226,7 +226,7 @@ class Session:
         finally:
             self._subscribers.remove(subscriber)
 
-    # -- for leases (`clients.eviction.Driver`) ----------------------------------------------------
+    # -- for leases (`clients.eviction.Driver`)
     def check_open(self) -> None:
         if not self._open:
             raise ArbiterUnreachable("this client is closed", hint="use it inside `async with`")
@@ -294,7 +294,7 @@ class Session:
         self._tasks.start_soon(run, name=name)
         return scope
 
-    # -- tasks -------------------------------------------------------------------------------------
+    # -- tasks
     async def _stay_connected(self) -> None:
         """Serve one socket after the other, each until contact is lost."""
         while True:
@@ -325,7 +325,7 @@ class Session:
             self.protocol.tick(self.now())
             self.pump()
 
-    # -- steps -------------------------------------------------------------------------------------
+    # -- steps
     async def _give_up_all(self) -> None:
         async def give_up(lease: AsyncLease) -> None:
             try:
@@ -431,7 +431,8 @@ class Session:
                     subscriber.put(event.event)
 
     def _note_lost_contact(self, reason: str) -> None:
-        """Log it once, however often a reconnect fails. Before the first contact, entering raises."""
+        """Log it once, however often a reconnect fails. Before the first contact, entering
+        raises."""
         if not self._closing:
             quiet = self._lost or not self._greeted.done
             log.log(

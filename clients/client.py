@@ -63,7 +63,7 @@ class AsyncClient:
             name, endpoint or arbiter_endpoint(os.environ, os.getuid()), role, connect_timeout_s
         )
 
-    # -- connection --------------------------------------------------------------------------------
+    # -- connection
     async def __aenter__(self) -> Self:
         await self._session.__aenter__()
         return self
@@ -103,7 +103,7 @@ class AsyncClient:
         """Leases that this client holds now."""
         return self._session.held
 
-    # -- leases ------------------------------------------------------------------------------------
+    # -- leases
     async def acquire(
         self,
         spec: LeaseSpec | None = None,
@@ -266,7 +266,7 @@ class AsyncClient:
         finally:
             await use.end()
 
-    # -- questions ---------------------------------------------------------------------------------
+    # -- questions
     async def ask(
         self,
         op: str,
@@ -294,7 +294,8 @@ class AsyncClient:
         return replace(first, leases=tuple(leases.values()), next=None)
 
     async def why(self, consumer: str) -> WhyReply:
-        """Return what blocks a consumer, by how many bytes, on which condition, and what is next."""
+        """Return what blocks a consumer, by how many bytes, on which condition, and what
+        is next."""
         return await self._asked(WhyReply, "why", {"consumer": consumer})
 
     async def history(

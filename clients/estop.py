@@ -56,7 +56,8 @@ def stop(endpoint: str, reason: str = "", *, timeout_s: float = ANSWER_S) -> Sto
                 outcome = reply_in(connection.recv(REPLY_MAX_BYTES))
             except (OSError, BadFrame) as error:
                 raise InternalError(
-                    f"{endpoint} has latched the stop and does not say what became of the motors: {_words(error)}",
+                    f"{endpoint} has latched the stop and does not say what became of the motors: "
+                    f"{_words(error)}",
                     hint=CUT,
                 ) from error
         return _judged(endpoint, latched, outcome)
@@ -69,7 +70,8 @@ def _latched(connection: socket.socket, reason: str) -> Reply:
 
 def _connected(endpoint: str, path: str, timeout_s: float) -> socket.socket:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
-    # of the kernel, not of Python: connect() then queues fairly where many connect, instead of being refused
+    # of the kernel, not of Python: connect() then queues fairly where many connect, instead of
+    # being refused
     limit = struct.pack("ll", int(timeout_s), int(timeout_s % 1 * 1e6))
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)

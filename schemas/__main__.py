@@ -1,7 +1,7 @@
 """`python -m vram_arbiter.schemas check FILE…` and `python -m vram_arbiter.schemas export DIR`.
 
-check   reads rSkill manifests and says `ok` or what is wrong, field by field. A folder stands for the `rskill.yaml` in it.
-export  writes the JSON Schema of every file and message into DIR.
+check   reads rSkill manifests and says `ok` or what is wrong, field by field. A folder stands for
+the `rskill.yaml` in it. export  writes the JSON Schema of every file and message into DIR.
 
 Exit status: 0 all good, 1 at least one file is invalid or could not be written, 2 wrong usage.
 """

@@ -1,7 +1,9 @@
-"""What a robot is and can, and whether a skill was made for it: its embodiment and the capabilities that the manifest asks for.
+"""What a robot is and can, and whether a skill was made for it: its embodiment and the capabilities
+that the manifest asks for.
 
-Pure. The runner says its body with the list of its skills and refuses goals that do not fit it; a planner reads the same words, so that
-what is offered and what is accepted cannot differ. A body that says nothing is fitted only by skills for any robot that ask for nothing.
+Pure. The runner says its body with the list of its skills and refuses goals that do not fit it; a
+planner reads the same words, so that what is offered and what is accepted cannot differ. A body
+that says nothing is fitted only by skills for any robot that ask for nothing.
 """
 
 from collections.abc import Mapping
@@ -39,8 +41,9 @@ class Body(BaseModel):
     def misfits(self, manifest: RSkillManifest) -> list[Finding]:
         """Why a skill is not for this robot; empty: it is.
 
-        Names and values of capabilities count. `true` has to be true, `false` must not be true, a number is the least that is needed, a
-        word has to be the same. A number never stands for a truth nor the other way round.
+        Names and values of capabilities count. `true` has to be true, `false` must not be true, a
+        number is the least that is needed, a word has to be the same. A number never stands for a
+        truth nor the other way round.
         """
         found: list[Finding] = []
         tags = manifest.embodiment_tags
@@ -69,7 +72,8 @@ UNKNOWN_BODY = Body()
 
 
 def read_body(value: object) -> Body:
-    """A body as it came over a wire. What is missing or cannot be read is a body of which nothing is known: fewer skills, never more."""
+    """A body as it came over a wire. What is missing or cannot be read is a body of which nothing
+    is known: fewer skills, never more."""
     if not isinstance(value, Mapping):
         return UNKNOWN_BODY
     try:
@@ -91,10 +95,19 @@ def _has(have: Any, wanted: Capability) -> bool:
 def _lacks(name: str, have: Capability | None, wanted: Capability) -> str:
     match wanted:
         case True:
-            return f"it needs {name}, which this robot {'lacks' if have in (None, False) else f'has as {have!r}'}"
+            return (
+                f"it needs {name}, which this robot "
+                f"{'lacks' if have in (None, False) else f'has as {have!r}'}"
+            )
         case False:
             return f"it is not for a robot with {name}"
         case int() | float():
-            return f"it needs {name} of at least {wanted:g}; this robot has {'none' if have is None else have}"
+            return (
+                f"it needs {name} of at least {wanted:g}; this robot has "
+                f"{'none' if have is None else have}"
+            )
         case _:
-            return f"it needs {name} {wanted!r}; this robot has {'none' if have is None else repr(have)}"
+            return (
+                f"it needs {name} {wanted!r}; this robot has "
+                f"{'none' if have is None else repr(have)}"
+            )

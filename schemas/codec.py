@@ -1,15 +1,20 @@
-"""Frozen dataclasses ⇄ plain maps, driven by type hints: the one codec of replies, pushes, journal records and event logs.
+"""Frozen dataclasses ⇄ plain maps, driven by type hints: the one codec of replies, pushes, journal
+records and event logs.
 
-Each class gets one encoder and one decoder, generated on first use, as the standard library generates `__init__`.
+Each class gets one encoder and one decoder, generated on first use, as the standard library
+generates `__init__`.
 
 Rules of the plain form:
-- A field that has its default is left out, unless its class has `WHOLE = True`; a missing field takes its default.
+- A field that has its default is left out, unless its class has `WHOLE = True`; a missing field
+  takes its default.
 - A class with `COMPACT = True` is the list of its fields (`[epoch, serial]`).
-- A class with `TAG = (key, value)` says its kind under that key; a union of such classes is decoded by it.
+- A class with `TAG = (key, value)` says its kind under that key; a union of such classes is decoded
+  by it.
 - Text enumerations are their values. Numbers stay as they are.
 
-A lenient decoder ignores fields and keeps codes that it does not know: they come from a newer program.
-A strict one raises CodecError for them. Standard library only; knows no message and no file.
+A lenient decoder ignores fields and keeps codes that it does not know: they come from a newer
+program. A strict one raises CodecError for them. Standard library only; knows no message and no
+file.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +47,7 @@ def from_map[T](cls: type[T], data: object, *, strict: bool = False) -> T:
     return decoded
 
 
-# -- values → maps -----------------------------------------------------------------------------------------------------
+# -- values → maps
 @cache
 def _encoder(cls: type) -> _Convert:
     """Generate `encode(value)` of a class."""
@@ -83,7 +88,8 @@ def _differs(field: "Field[Any]", space: dict[str, Any]) -> str:
 
 
 def _encoding(hint: Any, value: str, space: dict[str, Any]) -> str:
-    """Return an expression for the plain form of `value`; `value` itself where nothing has to be done."""
+    """Return an expression for the plain form of `value`; `value` itself where nothing has to be
+    done."""
     hint = _resolved(hint)
     if _stands_for_itself(hint):
         return value
@@ -129,7 +135,7 @@ def _any_plain(value: Any) -> Any:
     return to_map(value) if is_dataclass(value) else value
 
 
-# -- maps → values -----------------------------------------------------------------------------------------------------
+# -- maps → values
 @cache
 def _decoder(hint: Any, strict: bool) -> _Convert:
     """Return how a value of this hint is made from its plain form."""
@@ -176,7 +182,8 @@ def _generic_decoder(hint: Any, strict: bool) -> _Convert:
 
 
 def _union_decoder(arguments: Sequence[Any], strict: bool) -> _Convert:
-    """None and plain values stand for themselves; of several dataclasses the tag decides, else the fields."""
+    """None and plain values stand for themselves; of several dataclasses the tag decides, else the
+    fields."""
     classes = [
         found
         for found in map(_resolved, arguments)
@@ -254,7 +261,7 @@ def _generated_decoder(cls: Any, strict: bool) -> _Convert:
     return _made(f"def made(d):\n{get}    return cls({', '.join(arguments)})", space)
 
 
-# -- shared ------------------------------------------------------------------------------------------------------------
+# -- shared
 def _made(source: str, space: dict[str, Any]) -> _Convert:
     exec(source, space)
     made: _Convert = space["made"]

@@ -1,13 +1,16 @@
-"""Control modes: the thirteen ways in which a skill can command a robot, shared by manifests and actions.
+"""Control modes: the thirteen ways in which a skill can command a robot, shared by manifests and
+actions.
 
-It knows no robot and no skill: only the names, their numbers on the wire, and what each mode addresses.
+It knows no robot and no skill: only the names, their numbers on the wire, and what each mode
+addresses.
 """
 
 from enum import StrEnum
 
 
 class ControlMode(StrEnum):
-    """Action space of an actuator, a slot of an action vector, or one `Action`. The order is the wire number, 0 to 12."""
+    """Action space of an actuator, a slot of an action vector, or one `Action`. The order is the
+    wire number, 0 to 12."""
 
     JOINT_POSITION = "joint_position"
     JOINT_VELOCITY = "joint_velocity"

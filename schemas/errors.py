@@ -1,7 +1,7 @@
 """All errors that cross a process border: one tree, one table from wire codes to types.
 
-The type says who must act: `CallerError` (the program that asked), `OperatorError` (a person), `TransientError`
-(wait or retry), `InternalError` (us).
+The type says who must act: `CallerError` (the program that asked), `OperatorError` (a person),
+`TransientError` (wait or retry), `InternalError` (us).
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,8 @@ from vram_arbiter.schemas.wire.errors import ErrorView
 class VramError(Exception):
     """Root of the product's errors.
 
-    `code` is stable and goes over the wire, `message` says what happened, `hint` what to do, `details` the numbers.
+    `code` is stable and goes over the wire, `message` says what happened, `hint` what to do,
+    `details` the numbers.
     """
 
     code: ClassVar[str] = "internal"
@@ -56,7 +57,7 @@ class InternalError(VramError):
     """A defect of ours; the story is in the details."""
 
 
-# -- the wire itself ---------------------------------------------------------------------------------------------
+# -- the wire itself
 class BadFrame(CallerError):
     code = "bad_frame"  # not msgpack, not a map
 
@@ -89,7 +90,7 @@ class LimitExceeded(CallerError):
     code = "limit_exceeded"  # details.limit names it
 
 
-# -- leases -----------------------------------------------------------------------------------------------------
+# -- leases
 class VramInsufficient(CallerError):
     code = "vram_insufficient"  # can never fit: details.needed_bytes, capacity_bytes, reserve_bytes
 
@@ -101,15 +102,19 @@ class HostRamInsufficient(TransientError):
 
 
 class LoadFailing(TransientError):
-    code = "load_failing"  # its loads failed several times in a row, and an eviction would be needed: details.retry_in_s, cause
+    # its loads failed several times in a row, and an eviction would be needed: details.retry_in_s,
+    # cause
+    code = "load_failing"
 
 
 class GangBroken(TransientError):
-    code = "gang_broken"  # another member was denied, lost or gave up before all were granted: details.gang, why
+    # another member was denied, lost or gave up before all were granted: details.gang, why
+    code = "gang_broken"
 
 
 class WouldDeadlock(CallerError):
-    code = "would_deadlock"  # the wait is for what a use of this process keeps: details.cycle, the uses and waits in it
+    # the wait is for what a use of this process keeps: details.cycle, the uses and waits in it
+    code = "would_deadlock"
 
 
 class UnknownGpu(CallerError):
@@ -156,7 +161,7 @@ class JournalUnavailable(OperatorError):
     code = "journal_unavailable"
 
 
-# -- the daemon --------------------------------------------------------------------------------------------------
+# -- the daemon
 class ArbiterUnreachable(TransientError):
     code = "arbiter_unreachable"
 
@@ -183,7 +188,7 @@ class ProbeFailed(TransientError):
     code = "probe_failed"
 
 
-# -- sidecars ----------------------------------------------------------------------------------------------------
+# -- sidecars
 class Evicted(TransientError):
     code = "evicted"  # never to be read as "object not found"
 
@@ -208,7 +213,7 @@ class SidecarUnavailable(TransientError):
     code = "sidecar_unavailable"  # cannot be started or reached; details.exit_code, log
 
 
-# -- runner and reasoner -----------------------------------------------------------------------------------------
+# -- runner and reasoner
 class RunnerUnreachable(TransientError):
     code = "runner_unreachable"  # it does not answer: not running, or hanging
 
@@ -222,15 +227,18 @@ class GoalRejected(CallerError):
 
 
 class EstopRequested(OperatorError):
-    code = "estop_requested"  # the emergency stop is latched: a person looks, then starts the runner again
+    # the emergency stop is latched: a person looks, then starts the runner again
+    code = "estop_requested"
 
 
 class RobotFault(OperatorError):
-    code = "robot_fault"  # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
+    # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
+    code = "robot_fault"
 
 
 class EnvironmentFailed(OperatorError):
-    code = "environment_failed"  # a simulated world raised, or told what cannot be: its own code, or its packages
+    # a simulated world raised, or told what cannot be: its own code, or its packages
+    code = "environment_failed"
 
 
 class FrameStale(TransientError):
@@ -265,7 +273,8 @@ CODES: dict[str, type[VramError]] = {cls.code: cls for cls in _leaves(VramError)
 
 
 def from_wire(error: Mapping[str, Any]) -> VramError:
-    """Rebuild the typed error of a reply; an unknown code (a newer server) becomes InternalError with the code kept."""
+    """Rebuild the typed error of a reply; an unknown code (a newer server) becomes InternalError
+    with the code kept."""
     cls = CODES.get(str(error.get("code")), InternalError)
     details = dict(error.get("details") or {})
     if cls is InternalError:

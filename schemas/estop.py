@@ -77,7 +77,8 @@ def request(reason: str) -> bytes:
 
 
 def reason_in(packet: bytes) -> str | None:
-    """Reason of a request, possibly empty; None where the packet is not a request. Any version stops."""
+    """Reason of a request, possibly empty; None where the packet is not a request. Any version
+    stops."""
     if not packet.startswith(PREFIX):
         return None
     return one_line(packet.partition(b" ")[2].decode(errors="replace"))

@@ -1,7 +1,9 @@
-"""JSON Schemas of everything that crosses a process border or lies in a file, made from the models themselves.
+"""JSON Schemas of everything that crosses a process border or lies in a file, made from the models
+themselves.
 
-One document a subject: `rskill.json` and the like have a root for editors, the documents of the wires list every message under
-`$defs`. Makes texts only; `python -m vram_arbiter.schemas export` writes them.
+One document a subject: `rskill.json` and the like have a root for editors, the documents of the
+wires list every message under `$defs`. Makes texts only; `python -m vram_arbiter.schemas export`
+writes them.
 """
 
 import importlib
@@ -61,7 +63,8 @@ def modules() -> list[str]:
 
 
 def public_models(module: ModuleType) -> list[type]:
-    """The models, typed dicts and messages that a module defines and does not hide behind an underscore, by name."""
+    """The models, typed dicts and messages that a module defines and does not hide behind an
+    underscore, by name."""
     return [
         value
         for name, value in sorted(vars(module).items())
@@ -93,7 +96,8 @@ def _of_module(module: ModuleType) -> dict[str, Any]:
 
 
 def _as_sent(model: Any, schema: dict[str, Any]) -> None:
-    """Describe what `schemas.codec` makes of a dataclass: a list of its fields, or a map with its kind."""
+    """Describe what `schemas.codec` makes of a dataclass: a list of its fields, or a map with its
+    kind."""
     if getattr(model, "COMPACT", False):
         schema.clear()
         schema.update(

@@ -1,19 +1,25 @@
-"""The simulated card: the format of its folder and every change that can happen to it, as pure functions. No I/O, no clock.
+"""The simulated card: the format of its folder and every change that can happen to it, as pure
+functions. No I/O, no clock.
 
 One folder per card:
-    gpu.json          what the card is, how it lags, which faults are on (`CardConfig`); people may edit it while it is in use
-    PID-START.json    one file per process with bytes on the card (`ProcessFile`); any `*.json` beside gpu.json counts, so a
+    gpu.json          what the card is, how it lags, which faults are on (`CardConfig`); people may
+    edit it while it is in use
+    PID-START.json    one file per process with bytes on the card (`ProcessFile`); any `*.json`
+    beside gpu.json counts, so a
                       stowaway is a file with the pid of some living process
-    log.jsonl         append-only, one line per change (`LogLine`), for timelines and for the independent checker
+    log.jsonl         append-only, one line per change (`LogLine`), for timelines and for the
+    independent checker
     lock              flock'ed exclusively around every reading and every change
 
-Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions, perform their `Edit`s in order.
-A step first replaces one process file (temporary file + rename), then appends that file's `last` to the log. So a kill at any
-instant leaves a readable card, and at most one line unwritten, which `read_card` orders the next process to append.
+Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions,
+perform their `Edit`s in order. A step first replaces one process file (temporary file + rename),
+then appends that file's `last` to the log. So a kill at any instant leaves a readable card, and at
+most one line unwritten, which `read_card` orders the next process to append.
 
-It behaves as a card under a caching framework does: a context on first touch stays until the process ends; a freed block goes to
-the process's cache and only `empty_cache` gives it back; memory comes back `release_lag_s` late, also that of a dead process;
-what does not fit raises `SimulatedOutOfMemory` in the process that asked.
+It behaves as a card under a caching framework does: a context on first touch stays until the
+process ends; a freed block goes to the process's cache and only `empty_cache` gives it back; memory
+comes back `release_lag_s` late, also that of a dead process; what does not fit raises
+`SimulatedOutOfMemory` in the process that asked.
 """
 
 import json
@@ -40,7 +46,8 @@ Alive = Callable[[ProcessKey], bool]
 
 
 class SimulatedOutOfMemory(OutOfMemory):
-    """The simulated card is full; stands for `torch.OutOfMemoryError`. details: requested_bytes, free_bytes, capacity_bytes."""
+    """The simulated card is full; stands for `torch.OutOfMemoryError`. details: requested_bytes,
+    free_bytes, capacity_bytes."""
 
 
 class _Frozen(BaseModel):
@@ -48,7 +55,8 @@ class _Frozen(BaseModel):
 
 
 class Faults(_Frozen):
-    """What goes wrong on purpose. `leak_bytes` of every process's emptied cache stay with it until it exits."""
+    """What goes wrong on purpose. `leak_bytes` of every process's emptied cache stay with it until
+    it exits."""
 
     probe: Literal["ok", "fail", "hang"] = "ok"
     leak_bytes: ByteSize = 0
@@ -56,7 +64,8 @@ class Faults(_Frozen):
 
 
 class CardConfig(_Frozen):
-    """`gpu.json`. `throttle_bytes_per_s` is how fast a simulated load fills the card (None: at once)."""
+    """`gpu.json`. `throttle_bytes_per_s` is how fast a simulated load fills the card (None: at
+    once)."""
 
     uuid: Annotated[str, Field(min_length=1, max_length=64)]
     name: Annotated[str, Field(max_length=NAME_MAX_CHARS)] = "Simulated GPU"
@@ -76,10 +85,12 @@ class Returning(_Frozen):
 
 
 class LogLine(TypedDict):
-    """One line of the log. `delta` is what it changed on the card; the sum of all deltas is `used_after`.
+    """One line of the log. `delta` is what it changed on the card; the sum of all deltas is
+    `used_after`.
 
-    ops: context, alloc, cache (freed into the process's cache), free (let go of: still on the card), leak, returned (free again),
-    oom (refused: delta 0), died (noticed: delta 0), edited (pid 0: process files were written or removed by hand).
+    ops: context, alloc, cache (freed into the process's cache), free (let go of: still on the
+    card), leak, returned (free again), oom (refused: delta 0), died (noticed: delta 0), edited (pid
+    0: process files were written or removed by hand).
     """
 
     seq: int
@@ -127,7 +138,8 @@ class ProcessFile(_Frozen):
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """One atomic piece of I/O: replace (or, without `text`, remove) the file `name`, then append `line` to the log."""
+    """One atomic piece of I/O: replace (or, without `text`, remove) the file `name`, then append
+    `line` to the log."""
 
     name: str
     text: str | None
@@ -159,7 +171,8 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a transition did: the next card, the steps that make it so on disk, and the refusal, if it was one."""
+    """What a transition did: the next card, the steps that make it so on disk, and the refusal, if
+    it was one."""
 
     card: Card
     steps: tuple[Edit, ...] = ()
@@ -183,7 +196,7 @@ def is_process_file(name: str) -> bool:
     return name.endswith(".json") and name != CARD_FILE
 
 
-# -- texts -----------------------------------------------------------------------------------------------------------
+# -- texts
 def parse_config(text: str | bytes) -> CardConfig:
     """Read `gpu.json`. Raises ConfigError."""
     try:
@@ -200,7 +213,8 @@ def dump_config(config: CardConfig) -> str:
 
 
 def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
-    """A card from the texts of its files and the end of its log. The steps mend what a killed process left unfinished.
+    """A card from the texts of its files and the end of its log. The steps mend what a killed
+    process left unfinished.
 
     Raises ConfigError for a file that is not what it should be.
     """
@@ -262,9 +276,10 @@ def _first(error: ValidationError) -> str:
     return f"{'.'.join(str(part) for part in problem['loc']) or 'the text'}: {problem['msg']}"
 
 
-# -- transitions -----------------------------------------------------------------------------------------------------
+# -- transitions
 def settle(card: Card, now: float, alive: Alive) -> Change:
-    """Let time pass: notice edits by hand and deaths, and let what is due come back. Comes before every other transition."""
+    """Let time pass: notice edits by hand and deaths, and let what is due come back. Comes before
+    every other transition."""
     change = _notice_edits(card, now)
     for name, process in card.processes.items():
         if process.died_at_s is None and not alive(process.key):
@@ -272,7 +287,8 @@ def settle(card: Card, now: float, alive: Alive) -> Change:
             change = change.then(_step(name, process, now, "died", process.on_card_bytes, 0))
         if process.died_at_s is not None and now >= process.died_at_s + card.config.release_lag_s:
             change = change.then(_return(name, process, now, process.on_card_bytes, {
-                "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0, "returning": (),
+                "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0,
+                "returning": (),
             })).then(_remove(name))  # fmt: skip
             continue
         due = sum(part.bytes for part in process.returning if part.due_s <= now)
@@ -287,7 +303,8 @@ def _notice_edits(card: Card, now: float) -> Change:
     if not delta:
         return Change(card)
     line: LogLine = {
-        "seq": card.seq + 1, "t": now, "pid": 0, "start": 0, "name": "edited by hand", "op": "edited", "label": "",
+        "seq": card.seq + 1, "t": now, "pid": 0, "start": 0, "name": "edited by hand",
+        "op": "edited", "label": "",
         "bytes": abs(delta), "delta": delta, "process_bytes": 0, "used_after": card.used_bytes,
         "capacity": card.config.capacity_bytes,
     }  # fmt: skip
@@ -305,7 +322,8 @@ def touch(card: Card, key: ProcessKey, name: str, context_bytes: int, now: float
 
 
 def allocate(card: Card, key: ProcessKey, name: str, label: str, size: int, now: float) -> Change:
-    """Put `size` bytes on the card for a process, from its own cache first. Refused with `error` if they do not fit."""
+    """Put `size` bytes on the card for a process, from its own cache first. Refused with `error` if
+    they do not fit."""
     process = card.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
     cached = min(process.cached_bytes, size)
     grown = process.model_copy(
@@ -318,7 +336,8 @@ def allocate(card: Card, key: ProcessKey, name: str, label: str, size: int, now:
 
 
 def free(card: Card, key: ProcessKey, label: str, size: int, now: float) -> Change:
-    """A block goes back to its process's cache; no other process gets it. Raises ValueError for more than is allocated."""
+    """A block goes back to its process's cache; no other process gets it. Raises ValueError for
+    more than is allocated."""
     process = card.process(key)
     if process is None or process.allocated_bytes < size:
         raise ValueError(f"process {key} frees {size} bytes that it has not")
@@ -332,7 +351,8 @@ def free(card: Card, key: ProcessKey, label: str, size: int, now: float) -> Chan
 
 
 def empty_cache(card: Card, key: ProcessKey, now: float) -> Change:
-    """A process gives its cache back to the card, where it is free `release_lag_s` later, less what leaks."""
+    """A process gives its cache back to the card, where it is free `release_lag_s` later, less what
+    leaks."""
     process = card.process(key)
     if process is None or not process.cached_bytes:
         return Change(card)
@@ -388,13 +408,15 @@ def _grow(
 
 def _out_of_memory(card: Card, process: ProcessFile, size: int) -> SimulatedOutOfMemory:
     others = "".join(
-        f" Process {other.pid} ({other.name or '?'}) has {format_bytes(other.on_card_bytes)} in use."
+        f" Process {other.pid} ({other.name or '?'}) has {format_bytes(other.on_card_bytes)} in "
+        "use."
         for other in card.processes.values()
         if other.key != process.key and other.on_card_bytes
     )
     config = card.config
     return SimulatedOutOfMemory(
-        f"CUDA out of memory (simulated). Tried to allocate {format_bytes(size)}. GPU {config.index} has a total capacity of "
+        f"CUDA out of memory (simulated). Tried to allocate {format_bytes(size)}. GPU "
+        f"{config.index} has a total capacity of "
         f"{format_bytes(config.capacity_bytes)} of which {format_bytes(card.free_bytes)} is free. "
         f"This process has {format_bytes(process.own_bytes)} in use.{others}",
         details={
@@ -411,7 +433,8 @@ def _step(
 ) -> Callable[[Card], Change]:
     def transition(card: Card) -> Change:
         line: LogLine = {
-            "seq": card.seq + 1, "t": now, "pid": process.pid, "start": process.start_ticks, "name": process.name, "op": op,
+            "seq": card.seq + 1, "t": now, "pid": process.pid, "start": process.start_ticks,
+            "name": process.name, "op": op,
             "label": label, "bytes": size, "delta": delta, "process_bytes": process.on_card_bytes,
             "used_after": card.logged_bytes + delta, "capacity": card.config.capacity_bytes,
         }  # fmt: skip
@@ -440,10 +463,11 @@ def _remove(name: str) -> Callable[[Card], Change]:
     return transition
 
 
-# -- making one ------------------------------------------------------------------------------------------------------
+# -- making one
 @dataclass(frozen=True, slots=True)
 class FolderPlan:
-    """How to bring a folder to hold a card: files to write (by name), process files to remove, whether the log starts anew."""
+    """How to bring a folder to hold a card: files to write (by name), process files to remove,
+    whether the log starts anew."""
 
     write: Mapping[str, str] = field(default_factory=dict)
     remove: tuple[str, ...] = ()
@@ -453,9 +477,11 @@ class FolderPlan:
 def plan_folder(
     wanted: CardConfig, existing: str | None, process_files: Iterable[str]
 ) -> FolderPlan:
-    """Make a card, or keep the one that is there: a restarted daemon must find what living processes still hold.
+    """Make a card, or keep the one that is there: a restarted daemon must find what living
+    processes still hold.
 
-    Process files of an earlier boot are void. Raises ConfigError if the card is in use with another capacity.
+    Process files of an earlier boot are void. Raises ConfigError if the card is in use with another
+    capacity.
     """
     processes = tuple(process_files)
     if existing is None:
@@ -471,7 +497,8 @@ def plan_folder(
         return FolderPlan()
     if processes:
         raise ConfigError(
-            f"a simulated card of {format_bytes(current.capacity_bytes)} is in use here, not one of "
+            f"a simulated card of {format_bytes(current.capacity_bytes)} is in use here, not one "
+            "of "
             f"{format_bytes(wanted.capacity_bytes)}",
             hint="stop the processes that use it, or choose another runtime folder",
         )

@@ -1,8 +1,9 @@
 """The runner's wire: goals, frames and state, on one ZeroMQ ROUTER socket.
 
-Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error": {…}}.
-A goal's progress comes as pushes to its sender: {"push": "feedback", …} and exactly one {"push": "result", …} per accepted goal.
-The emergency stop has a socket of its own: `schemas.estop`.
+Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error":
+{…}}. A goal's progress comes as pushes to its sender: {"push": "feedback", …} and exactly one
+{"push": "result", …} per accepted goal. The emergency stop has a socket of its own:
+`schemas.estop`.
 """
 
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
@@ -20,7 +21,8 @@ class _Call(BaseModel):
 
 
 class SendGoal(_Call):
-    """Execute a skill. One goal at a time; a second is refused with `goal_rejected`. `deadline_s` 0 takes the manifest's."""
+    """Execute a skill. One goal at a time; a second is refused with `goal_rejected`. `deadline_s` 0
+    takes the manifest's."""
 
     op: Literal["goal"]
     goal_id: Name
@@ -47,7 +49,8 @@ class GetResult(_Call):
 
 
 class GetFrame(_Call):
-    """Latest frame of a camera, no older than `max_age_ms`, else `frame_stale`. "" takes the runner's first camera."""
+    """Latest frame of a camera, no older than `max_age_ms`, else `frame_stale`. "" takes the
+    runner's first camera."""
 
     op: Literal["frame"]
     camera: str = ""

@@ -1,6 +1,7 @@
 """Identifiers that the whole product shares.
 
-Standard library only: this is the one schema module that the sans-IO core may import besides `schemas.defaults`.
+Standard library only: this is the one schema module that the sans-IO core may import besides
+`schemas.defaults`.
 """
 
 from dataclasses import dataclass

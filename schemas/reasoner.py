@@ -1,7 +1,7 @@
 """The reasoner's wire: what a person says to a running episode, on one ZeroMQ ROUTER socket.
 
-Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error": {…}}. Nothing here moves anything: words
-reach the planner, a cancel ends the episode and its goal.
+Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error":
+{…}}. Nothing here moves anything: words reach the planner, a cancel ends the episode and its goal.
 """
 
 from typing import Annotated, Literal

@@ -1,17 +1,23 @@
-"""The sidecars' wires: two families that the field already speaks, on one ZeroMQ ROUTER socket (ipc or loopback).
+"""The sidecars' wires: two families that the field already speaks, on one ZeroMQ ROUTER socket (ipc
+or loopback).
 
-Op family (detector, scene VLM, reward)   {"op": "ping" | "load" | "detect" | "query" | "score" | "unload" | "shutdown", …}
-                                     → {"ok": true, …} | {"ok": false, "error": "Type: message", "code": …, "hint": …, "details": …}
-Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "get_action" | "unload" | "shutdown", "data": …}
+Op family (detector, scene VLM, reward)   {"op": "ping" | "load" | "detect" | "query" | "score" |
+"unload" | "shutdown", …}
+                                     → {"ok": true, …} | {"ok": false, "error": "Type: message",
+                                     "code": …, "hint": …, "details": …}
+Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "get_action" |
+"unload" | "shutdown", "data": …}
                                      → the result | {"error": "Type: message", "code": …, …}
 
-`detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the card, a load, another request) are not looked at.
-Every request may carry "id" (echoed as "re": a DEALER may have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with
-`evicted` unless it is the sidecar's current one) and "traceparent". Images are PNG bytes of RGB. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}`
-(numpy's .npy format, pickle never allowed).
+`detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the card, a
+load, another request) are not looked at. Every request may carry "id" (echoed as "re": a DEALER may
+have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
+unless it is the sidecar's current one) and "traceparent". Images are PNG bytes of RGB. Arrays are
+`{"__ndarray_class__": true, "as_npy": bytes}` (numpy's .npy format, pickle never allowed).
 
-`load` makes the model resident (acquiring the lease) and answers with the lease id and token, so that a caller can mark a use of its own on it at
-the arbiter: a goal that spans many `get_action` calls is one use.
+`load` makes the model resident (acquiring the lease) and answers with the lease id and token, so
+that a caller can mark a use of its own on it at the arbiter: a goal that spans many `get_action`
+calls is one use.
 """
 
 from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
@@ -56,10 +62,12 @@ class ShutdownOp(_Call):
 
 
 class _Look(_Call):
-    """About pictures. Without `fresh_s` it does not matter how long they wait, as for the field's clients."""
+    """About pictures. Without `fresh_s` it does not matter how long they wait, as for the field's
+    clients."""
 
     fresh_s: Seconds | None = None
-    """From the request's arrival on, the model has to begin to look within so long; else `frame_stale`, and nothing was looked at."""
+    """From the request's arrival on, the model has to begin to look within so long; else
+    `frame_stale`, and nothing was looked at."""
 
 
 class DetectOp(_Look):
@@ -86,7 +94,8 @@ class QueryOp(_Look):
 class ScoreOp(_Look):
     """How far along `task` the robot is at each of one camera's pictures, oldest first.
 
-    Either `images` (PNG or JPEG bytes), or as the field writes it: `frames`, `n` raw pictures of `height` × `width` × 3 bytes, BGR, one after another.
+    Either `images` (PNG or JPEG bytes), or as the field writes it: `frames`, `n` raw pictures of
+    `height` × `width` × 3 bytes, BGR, one after another.
     """
 
     op: Literal["score"]
@@ -163,7 +172,8 @@ class DetectionResult(TypedDict):
 
 class DetectResult(TypedDict):
     ok: bool
-    answer: str  # `<ref>label</ref><box><x1><y1><x2><y2></box>…` in [0, norm], the field's grounding format
+    # `<ref>label</ref><box><x1><y1><x2><y2></box>…` in [0, norm], the field's grounding format
+    answer: str
     norm: int
     detections: list[DetectionResult]
 
@@ -174,7 +184,8 @@ class QueryResult(TypedDict):
 
 
 class ScoreResult(TypedDict):
-    """A value a picture, oldest first; models that judge a window as a whole give one, the newest's. All in 0..1."""
+    """A value a picture, oldest first; models that judge a window as a whole give one, the
+    newest's. All in 0..1."""
 
     ok: bool
     progress: list[float]

@@ -1,17 +1,21 @@
-"""Reading and writing byte sizes, free of pydantic so that a command line that only prints starts fast."""
+"""Reading and writing byte sizes, free of pydantic so that a command line that only prints starts
+fast."""
 
 import re
 
 _UNITS = {
     "": 1, "b": 1,
-    "k": 10**3, "kb": 10**3, "m": 10**6, "mb": 10**6, "g": 10**9, "gb": 10**9, "t": 10**12, "tb": 10**12,
-    "ki": 2**10, "kib": 2**10, "mi": 2**20, "mib": 2**20, "gi": 2**30, "gib": 2**30, "ti": 2**40, "tib": 2**40,
+    "k": 10**3, "kb": 10**3, "m": 10**6, "mb": 10**6, "g": 10**9, "gb": 10**9, "t": 10**12,
+    "tb": 10**12,
+    "ki": 2**10, "kib": 2**10, "mi": 2**20, "mib": 2**20, "gi": 2**30, "gib": 2**30, "ti": 2**40,
+    "tib": 2**40,
 }  # fmt: skip
 _SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([A-Za-z]*)\s*")
 
 
 def parse_bytes(text: str | int) -> int:
-    """Read `8GiB`, `5.3GB`, `450MiB` or a plain count of bytes. Raises ValueError with the accepted forms."""
+    """Read `8GiB`, `5.3GB`, `450MiB` or a plain count of bytes. Raises ValueError with the accepted
+    forms."""
     if isinstance(text, bool):
         raise ValueError("a size is a number of bytes or a text such as 8GiB")
     if isinstance(text, int):

@@ -1,7 +1,9 @@
-"""JSON from outside, read strictly: what Python's parser lets through and no robot should act on is an error.
+"""JSON from outside, read strictly: what Python's parser lets through and no robot should act on is
+an error.
 
-Refused: NaN and infinities (also `1e999`), whole numbers beyond 64 bits and halves of surrogate pairs (no wire could carry them on), an object that
-names a key twice, nesting deeper than `DEPTH_MAX`, text beyond `max_chars`. Pure; knows no message.
+Refused: NaN and infinities (also `1e999`), whole numbers beyond 64 bits and halves of surrogate
+pairs (no wire could carry them on), an object that names a key twice, nesting deeper than
+`DEPTH_MAX`, text beyond `max_chars`. Pure; knows no message.
 """
 
 import json

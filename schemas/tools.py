@@ -1,10 +1,12 @@
 """The tools that a reasoner may call, as frozen values discriminated by `tool`.
 
-Only the shapes: what a call does, whether it is allowed and what serves it are the reasoner's business. The same classes give
-the function schemas that are offered to a language model, so that what is offered and what is accepted cannot drift apart.
+Only the shapes: what a call does, whether it is allowed and what serves it are the reasoner's
+business. The same classes give the function schemas that are offered to a language model, so that
+what is offered and what is accepted cannot drift apart.
 
-A skill may also be offered as a function of its own, `execute_rskill__OWNER__REPO`, with the parameters its manifest describes:
-`skill_tool_name` names it, `skill_function` describes it, `parse_skill_call` reads it back as an `ExecuteRskill`.
+A skill may also be offered as a function of its own, `execute_rskill__OWNER__REPO`, with the
+parameters its manifest describes: `skill_tool_name` names it, `skill_function` describes it,
+`parse_skill_call` reads it back as an `ExecuteRskill`.
 """
 
 import copy
@@ -46,7 +48,8 @@ class _Tool(BaseModel):
 
 
 class ExecuteRskill(_Tool):
-    """Run an installed skill on the robot and wait for its result. The only tool that moves anything."""
+    """Run an installed skill on the robot and wait for its result. The only tool that moves
+    anything."""
 
     tool: Literal["execute_rskill"] = "execute_rskill"
     rskill_id: Annotated[
@@ -130,7 +133,8 @@ class QueryScene(_Tool):
 
 
 class QueryTaskProgress(_Tool):
-    """Ask the reward model how far along a task the newest pictures show the robot to be. Moves nothing; its word is an opinion, never a proof."""
+    """Ask the reward model how far along a task the newest pictures show the robot to be. Moves
+    nothing; its word is an opinion, never a proof."""
 
     tool: Literal["query_task_progress"] = "query_task_progress"
     window_s: Annotated[
@@ -148,7 +152,8 @@ class QueryTaskProgress(_Tool):
 
 
 class LifecycleTransition(_Tool):
-    """Configure, activate, deactivate or clean up a component that the reasoner is allowed to manage."""
+    """Configure, activate, deactivate or clean up a component that the reasoner is allowed to
+    manage."""
 
     tool: Literal["lifecycle_transition"] = "lifecycle_transition"
     node: Annotated[str, Field(min_length=1, max_length=256, description="Name of the component.")]
@@ -204,7 +209,8 @@ TOOL_CALL: TypeAdapter[ToolCall] = TypeAdapter(Annotated[ToolCall, Field(discrim
 
 
 def read_arguments(name: str, arguments: str | Mapping[str, Any]) -> dict[str, Any]:
-    """A call's arguments, a JSON text (empty: none) or a mapping, as a dict. Raises BadRequest, see `schemas.strictjson`."""
+    """A call's arguments, a JSON text (empty: none) or a mapping, as a dict. Raises BadRequest, see
+    `schemas.strictjson`."""
     try:
         value = strictjson.loads(arguments or "{}") if isinstance(arguments, str) else arguments
         strictjson.check(value)
@@ -216,9 +222,11 @@ def read_arguments(name: str, arguments: str | Mapping[str, Any]) -> dict[str, A
 
 
 def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
-    """Read a call as language models make it: the function's name and its arguments, a JSON text or a mapping.
+    """Read a call as language models make it: the function's name and its arguments, a JSON text or
+    a mapping.
 
-    Raises UnknownOp for a tool that does not exist and BadRequest, field by field, for wrong arguments.
+    Raises UnknownOp for a tool that does not exist and BadRequest, field by field, for wrong
+    arguments.
     """
     if name not in TOOLS:
         raise UnknownOp(
@@ -239,10 +247,11 @@ def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
 
 
 def skill_tool_name(rskill_id: str) -> str:
-    """`execute_rskill__OWNER__REPO`, letters, digits, `_` and `-`, at most 64. Different skills never share a name.
+    """`execute_rskill__OWNER__REPO`, letters, digits, `_` and `-`, at most 64. Different skills
+    never share a name.
 
-    A name that would be too long, or that cannot be read back because letters were replaced or underscores run together, ends in
-    `_` and eight digits of the id's SHA-1.
+    A name that would be too long, or that cannot be read back because letters were replaced or
+    underscores run together, ends in `_` and eight digits of the id's SHA-1.
     """
     name = "execute_rskill__" + "__".join(
         re.sub(r"[^A-Za-z0-9_-]", "_", part) for part in rskill_id.split("/")
@@ -261,9 +270,11 @@ _PLAIN = "[A-Za-z0-9-]+(?:_[A-Za-z0-9-]+)*"
 def skill_function(
     rskill_id: str, description: str, goal_params_schema: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """The function description of one skill: `execute_rskill` without `rskill_id`, its parameters as the manifest describes them.
+    """The function description of one skill: `execute_rskill` without `rskill_id`, its parameters
+    as the manifest describes them.
 
-    `goal_params` takes the place of `goal_params_json` where the manifest has a schema; a skill without one takes none.
+    `goal_params` takes the place of `goal_params_json` where the manifest has a schema; a skill
+    without one takes none.
     """
     function = function_schema(ExecuteRskill)
     body = function["function"]
@@ -280,7 +291,8 @@ def skill_function(
 
 
 def parse_skill_call(rskill_id: str, arguments: str | Mapping[str, Any]) -> ExecuteRskill:
-    """Read a call of a skill's own function. Raises BadRequest; whether the parameters fit the skill is the palette's to say."""
+    """Read a call of a skill's own function. Raises BadRequest; whether the parameters fit the
+    skill is the palette's to say."""
     name = skill_tool_name(rskill_id)
     fields = read_arguments(name, arguments)
     if stray := [key for key in ("rskill_id", "goal_params_json", "tool") if key in fields]:
@@ -296,7 +308,8 @@ def parse_skill_call(rskill_id: str, arguments: str | Mapping[str, Any]) -> Exec
 
 
 def function_schema(tool: type[ToolCall]) -> dict[str, Any]:
-    """The OpenAI-style function description of a tool: `{"type": "function", "function": {name, description, parameters}}`."""
+    """The OpenAI-style function description of a tool: `{"type": "function", "function": {name,
+    description, parameters}}`."""
     parameters = tool.model_json_schema(by_alias=False)
     name = parameters["properties"].pop("tool")["const"]
     description = " ".join(parameters.pop("description").split())
@@ -310,5 +323,6 @@ def function_schema(tool: type[ToolCall]) -> dict[str, Any]:
 
 
 def function_schemas(names: Iterable[str] | None = None) -> list[dict[str, Any]]:
-    """Function descriptions of the named tools, or of all. Raises KeyError for a name that is no tool."""
+    """Function descriptions of the named tools, or of all. Raises KeyError for a name that is no
+    tool."""
     return [function_schema(TOOLS[name]) for name in (TOOLS if names is None else names)]

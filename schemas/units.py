@@ -1,4 +1,5 @@
-"""Byte sizes as people write them and as we print them. Inside the product a size is always an int of bytes."""
+"""Byte sizes as people write them and as we print them. Inside the product a size is always an int
+of bytes."""
 
 from typing import Annotated
 

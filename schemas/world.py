@@ -1,8 +1,8 @@
 """What a robot sees, is and does: frames, joint states, world states, actions, ticks, detections.
 
-Plain values that cross process borders. No robot, camera or model is known here, and nothing is ever filled in: a missing or
-misshapen value is refused, because a fabricated one moves an arm. Lengths in metres, angles in radians, stamps in
-nanoseconds, pixels from the upper left corner.
+Plain values that cross process borders. No robot, camera or model is known here, and nothing is
+ever filled in: a missing or misshapen value is refused, because a fabricated one moves an arm.
+Lengths in metres, angles in radians, stamps in nanoseconds, pixels from the upper left corner.
 """
 
 import base64
@@ -44,7 +44,7 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-# -- cameras ------------------------------------------------------------------------------------------------------
+# -- cameras
 class FrameEncoding(StrEnum):
     """How the bytes of a frame are to be read."""
 
@@ -69,8 +69,9 @@ _BYTES_PER_PIXEL = {
 class SensorFrame(_Frozen):
     """One picture of one camera: its bytes, or where they are (a topic, or a handle on the device).
 
-    Exactly one of `data`, `topic` and `handle` is set; empty bytes and empty texts count as unset. `data` is bytes in Python and
-    msgpack, standard base64 in JSON. Uncompressed data must have exactly the bytes that width, height and encoding ask for.
+    Exactly one of `data`, `topic` and `handle` is set; empty bytes and empty texts count as unset.
+    `data` is bytes in Python and msgpack, standard base64 in JSON. Uncompressed data must have
+    exactly the bytes that width, height and encoding ask for.
     """
 
     sensor_id: Annotated[str, Field(min_length=1)]
@@ -111,14 +112,16 @@ class SensorFrame(_Frozen):
         given = [name for name in ("data", "topic", "handle") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(
-                f"exactly one of data, topic and handle must be set, not {', '.join(given) or 'none'}"
+                "exactly one of data, topic and handle must be set, not "
+                f"{', '.join(given) or 'none'}"
             )
         per_pixel = _BYTES_PER_PIXEL.get(self.encoding)
         if self.data is not None and per_pixel is not None:
             needed = self.width * self.height * per_pixel
             if len(self.data) != needed:
                 raise ValueError(
-                    f"{self.encoding} of {self.width} × {self.height} needs {needed} bytes of data, not {len(self.data)}"
+                    f"{self.encoding} of {self.width} × {self.height} needs {needed} bytes of "
+                    f"data, not {len(self.data)}"
                 )
         return self
 
@@ -130,10 +133,10 @@ class SensorFrame(_Frozen):
 class CameraModel(_Frozen):
     """Pinhole camera and where it stands: enough to put a pixel on the support plane.
 
-    `K` is the 3 × 3 intrinsic matrix in pixels, `T_base_camera` the 4 × 4 pose of the camera (x right, y down, z forward) in the
-    robot's base frame, `support_plane_z` the height of the table or floor in that frame, in metres.
-    `base_pose` is where the base stood by its own odometry when the picture was taken: x, y (metres) and yaw (rad); None: it cannot drive, or
-    does not know.
+    `K` is the 3 × 3 intrinsic matrix in pixels, `T_base_camera` the 4 × 4 pose of the camera (x
+    right, y down, z forward) in the robot's base frame, `support_plane_z` the height of the table
+    or floor in that frame, in metres. `base_pose` is where the base stood by its own odometry when
+    the picture was taken: x, y (metres) and yaw (rad); None: it cannot drive, or does not know.
     """
 
     K: Matrix3
@@ -150,7 +153,8 @@ class CameraModel(_Frozen):
         return self
 
     def ground_point(self, u: float, v: float) -> Vector3 | None:
-        """Where the ray through pixel (u, v) meets the support plane, in the base frame; None if it never does."""
+        """Where the ray through pixel (u, v) meets the support plane, in the base frame; None if it
+        never does."""
         ray = ((u - self.K[0][2]) / self.K[0][0], (v - self.K[1][2]) / self.K[1][1], 1.0)
         direction = [sum(row[i] * ray[i] for i in range(3)) for row in self.T_base_camera[:3]]
         origin = [row[3] for row in self.T_base_camera[:3]]
@@ -166,7 +170,7 @@ class CameraModel(_Frozen):
         )
 
 
-# -- detections ---------------------------------------------------------------------------------------------------
+# -- detections
 class Detection(_Frozen):
     """One box that a detector found in one picture."""
 
@@ -227,9 +231,10 @@ class DetectedObject(_Frozen):
     stamp_ns: Nanoseconds = 0
 
 
-# -- the robot's state --------------------------------------------------------------------------------------------
+# -- the robot's state
 class JointState(_Frozen):
-    """Positions (rad or m), velocities and efforts by joint name. The latter two are empty or as long as `name`."""
+    """Positions (rad or m), velocities and efforts by joint name. The latter two are empty or as
+    long as `name`."""
 
     name: tuple[str, ...]
     position: tuple[Finite, ...]
@@ -252,7 +257,8 @@ Diagnostic = Literal["ok", "warn", "error", "stale"]
 
 
 class WorldState(_Frozen):
-    """One snapshot of everything that a skill may look at. `diagnostics` says which component is not to be trusted."""
+    """One snapshot of everything that a skill may look at. `diagnostics` says which component is
+    not to be trusted."""
 
     stamp_ns: Nanoseconds
     joint_state: JointState
@@ -278,7 +284,7 @@ class WorldState(_Frozen):
         )
 
 
-# -- actions ------------------------------------------------------------------------------------------------------
+# -- actions
 Rows = tuple[tuple[Finite, ...], ...]
 
 PAYLOAD_OF_MODE: dict[ControlMode, str] = {
@@ -302,8 +308,9 @@ PAYLOAD_OF_MODE: dict[ControlMode, str] = {
 class Action(_Frozen):
     """One step (`horizon` 1) or a chunk of steps for one control mode.
 
-    Exactly the field of `PAYLOAD_OF_MODE` is set, with `horizon` rows; rows are equally long. `gripper` runs from 0 (closed) to
-    1 (open). `joint_names` says which joints the columns move; without it they are all joints in the robot's order.
+    Exactly the field of `PAYLOAD_OF_MODE` is set, with `horizon` rows; rows are equally long.
+    `gripper` runs from 0 (closed) to 1 (open). `joint_names` says which joints the columns move;
+    without it they are all joints in the robot's order.
     """
 
     control_mode: ControlMode
@@ -336,7 +343,8 @@ class Action(_Frozen):
         ]
         if given != [wanted]:
             raise ValueError(
-                f"control_mode {self.control_mode} is carried by {wanted} alone, not by {', '.join(given) or 'nothing'}"
+                f"control_mode {self.control_mode} is carried by {wanted} alone, not by "
+                f"{', '.join(given) or 'nothing'}"
             )
         rows = self.rows
         if len(rows) != self.horizon:
@@ -357,7 +365,7 @@ class Action(_Frozen):
         return payload
 
 
-# -- what a runner reports ----------------------------------------------------------------------------------------
+# -- what a runner reports
 class TickResult(_Frozen):
     """One turn of a runner's loop: where the time went and what became of the action.
 

@@ -1,8 +1,10 @@
-"""The product's only YAML loader: text or path → plain data and the line of each key, or a ConfigError with every place.
+"""The product's only YAML loader: text or path → plain data and the line of each key, or a
+ConfigError with every place.
 
-Only YAML's plain types are read: maps with single values as keys, lists, strings, numbers, booleans, null, dates. Size of the
-file, nesting, number of values (aliases expanded) and length of a number are bounded, so that no file ends in a traceback, a
-full memory or a hang. A key given twice is an error instead of the last one winning.
+Only YAML's plain types are read: maps with single values as keys, lists, strings, numbers,
+booleans, null, dates. Size of the file, nesting, number of values (aliases expanded) and length of
+a number are bounded, so that no file ends in a traceback, a full memory or a hang. A key given
+twice is an error instead of the last one winning.
 """
 
 import difflib
@@ -21,10 +23,12 @@ Path = tuple[str | int, ...]
 
 TEXT_MAX_BYTES = 1 << 20
 NODES_MAX = 100_000
-"""More values than any file that a person writes; aliases that multiply (`billion laughs`) end here."""
+"""More values than any file that a person writes; aliases that multiply (`billion laughs`) end
+here."""
 DEPTH_MAX = 64
 NUMBER_MAX_CHARACTERS = 100
-"""Longest text of a value that is not a string: converting a number costs the square of its length."""
+"""Longest text of a value that is not a string: converting a number costs the square of
+its length."""
 
 _TAG = "tag:yaml.org,2002:"
 _TAGS = {
@@ -35,7 +39,8 @@ _TAGS = {
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One mistake in one file. `line` and `column` count from 1; 0 means the file, or the line, as a whole."""
+    """One mistake in one file. `line` and `column` count from 1; 0 means the file, or the line, as
+    a whole."""
 
     line: int
     field: str
@@ -60,7 +65,8 @@ class YamlText:
     lines: Mapping[Path, int]
 
     def line(self, path: Path) -> int:
-        """Line of a path, or of its nearest parent that is in the text (a missing key has no line of its own)."""
+        """Line of a path, or of its nearest parent that is in the text (a missing key has no line
+        of its own)."""
         for end in range(len(path), -1, -1):
             if (found := self.lines.get(path[:end])) is not None:
                 return found
@@ -68,7 +74,8 @@ class YamlText:
 
 
 def read_text(path: FilePath, *, hint: str = "") -> str:
-    """Return the text of a file of at most TEXT_MAX_BYTES. Raises ConfigError that names the path."""
+    """Return the text of a file of at most TEXT_MAX_BYTES. Raises ConfigError that names
+    the path."""
     try:
         with path.open("rb") as file:
             content = file.read(TEXT_MAX_BYTES + 1)
@@ -79,15 +86,17 @@ def read_text(path: FilePath, *, hint: str = "") -> str:
 
 
 def read_yaml(path: FilePath, *, hint: str = "") -> YamlText:
-    """Parse the file at `path`. Raises ConfigError: it cannot be read, or every mistake with its line."""
+    """Parse the file at `path`. Raises ConfigError: it cannot be read, or every mistake with its
+    line."""
     return parse_yaml(read_text(path, hint=hint), str(path))
 
 
 def parse_yaml(content: str | bytes, name: str) -> YamlText:
     """Parse one document. `name` is how errors call it. An empty text is an empty map.
 
-    Raises ConfigError (details.fields: line, column, field, problem) on broken YAML, tags beyond YAML's plain types, keys given
-    twice, values that contain themselves, and more than the limits above allow.
+    Raises ConfigError (details.fields: line, column, field, problem) on broken YAML, tags beyond
+    YAML's plain types, keys given twice, values that contain themselves, and more than the limits
+    above allow.
     """
     text = _text_of(content, name)
     loader = None
@@ -122,7 +131,8 @@ def parse_yaml(content: str | bytes, name: str) -> YamlText:
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses deep nesting and a crowd of values while it composes, and gives wrong values their place."""
+    """SafeLoader that refuses deep nesting and a crowd of values while it composes, and gives wrong
+    values their place."""
 
     def __init__(self, text: str) -> None:
         self._depth = self._nodes = 0
@@ -155,7 +165,8 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Survey:
-    """Look at composed nodes before anything is made of them: tags, keys, texts, and what aliases multiply."""
+    """Look at composed nodes before anything is made of them: tags, keys, texts, and what aliases
+    multiply."""
 
     def __init__(self) -> None:
         self.problems: list[Problem] = []
@@ -261,7 +272,8 @@ def did_you_mean(word: str, known: Collection[str]) -> str:
 
 
 def config_error(name: str, problems: list[Problem]) -> ConfigError:
-    """All mistakes of a file as one typed error: a line of text for each, and the fields for programs."""
+    """All mistakes of a file as one typed error: a line of text for each, and the fields for
+    programs."""
     return ConfigError(
         "\n".join(problem.text(name) for problem in problems),
         details={
@@ -288,7 +300,8 @@ def validated[M: BaseModel](
 def problems_of(
     error: ValidationError, source: YamlText, known: Mapping[Path, Collection[str]]
 ) -> list[Problem]:
-    """Pydantic's findings with the lines of the text. `known` lists the keys of each section, for suggestions."""
+    """Pydantic's findings with the lines of the text. `known` lists the keys of each section, for
+    suggestions."""
     problems = []
     for finding in error.errors(include_url=False):
         if only_counts_wrong_entries(finding):

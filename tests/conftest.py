@@ -1,4 +1,5 @@
-"""For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's profiles."""
+"""For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's
+profiles."""
 
 import logging
 import os
@@ -23,7 +24,8 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 # MuJoCo reads it when it is first imported, by whichever test of this process that is.
 os.environ.setdefault("MUJOCO_GL", "egl")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A shell starts what runs in its background deaf to SIGINT, and so would be every program that a test interrupts.
+    # A shell starts what runs in its background deaf to SIGINT, and so would be every program that
+    # a test interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -44,7 +46,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def own_log() -> Iterator[None]:
-    """A program that a test runs in this process sets up the log of the whole process: no test is to see more or less for it."""
+    """A program that a test runs in this process sets up the log of the whole process: no test is
+    to see more or less for it."""
     root = logging.getLogger()
     level, handlers = root.level, list(root.handlers)
     yield
@@ -55,7 +58,8 @@ def own_log() -> Iterator[None]:
 
 @pytest.fixture
 def make_arbiter() -> Iterator[Callable[..., ArbiterProcess]]:
-    """`make_arbiter(gpu="fake:8GiB", arguments=(), config=None)` prepares a daemon; call `.start()` on it. Ended at teardown."""
+    """`make_arbiter(gpu="fake:8GiB", arguments=(), config=None)` prepares a daemon; call `.start()`
+    on it. Ended at teardown."""
     made: list[ArbiterProcess] = []
 
     def make(

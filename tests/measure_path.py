@@ -79,7 +79,7 @@ def _product_file(name: str) -> str | None:
     return file if file.split("/")[0] in PACKAGES else None
 
 
-# -- the three programs ------------------------------------------------------------------------------
+# -- the three programs
 def daemon(tracer: Tracer, arguments: list[str]) -> None:
     """The daemon itself; the measuring process turns its tracer on and off by signals."""
     from vram_arbiter.arbiter.__main__ import main
@@ -139,7 +139,7 @@ def _spec(consumer: str) -> Any:
     )
 
 
-# -- measuring ---------------------------------------------------------------------------------------
+# -- measuring
 def record(folder: Path) -> dict[str, list[Step]]:
     """Run the scene once. Returns the steps of each side."""
     arbiter = ArbiterProcess()

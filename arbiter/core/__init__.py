@@ -1,1 +1,2 @@
-"""The lease engine: synchronous, deterministic, no I/O. Events in, effects out; time comes in as `now`."""
+"""The lease engine: synchronous, deterministic, no I/O. Events in, effects out; time comes in as
+`now`."""

@@ -1,13 +1,17 @@
-"""The engine: events in, effects out. No clock, no sockets, no threads: the same events give the same effects.
+"""The engine: events in, effects out. No clock, no sockets, no threads: the same events give the
+same effects.
 
 `handle` is one decision tree:
   1. what happened
      1.1 connections: hello, bye, death of a process
-     1.2 requests: acquire, reacquire and cancel · ready, uses, renew, oom · revoke_ack, unloading, release · reattach · operators
-     1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the restart, a resume from suspend
+     1.2 requests: acquire, reacquire and cancel · ready, uses, renew, oom · revoke_ack, unloading,
+     release · reattach · operators
+     1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the
+     restart, a resume from suspend
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
-  3. waits that could never end are denied; who gets a card next (its own numbered tree: `grants`), and the answer to an acquire that has to wait
+  3. waits that could never end are denied; who gets a card next (its own numbered tree: `grants`),
+     and the answer to an acquire that has to wait
   4. background readings
   5. invariants
 It must not know how effects are performed, nor that a wire exists.
@@ -73,8 +77,8 @@ from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
 
 DUE_MAX = 64
-"""Timers that one Tick serves. What is due beyond them is served by the next one, at once, so that thousands of waits that end together do
-not hold the loop."""
+"""Timers that one Tick serves. What is due beyond them is served by the next one, at once, so that
+thousands of waits that end together do not hold the loop."""
 
 
 def _on_reading(core: Core, sample: MemorySampled) -> None:
@@ -138,7 +142,8 @@ class Arbiter:
             self._core.timers.set(("probe", gpu_id), now)  # the first reading
 
     def handle(self, event: Event, now: float) -> list[Effect]:
-        """What is to be done, in order. Raises InvariantViolation or IllegalTransition on a defect of the engine: stop then."""
+        """What is to be done, in order. Raises InvariantViolation or IllegalTransition on a defect
+        of the engine: stop then."""
         core = self._core
         core.now = max(core.now, now)
         self._happened(event)  # 1
@@ -154,7 +159,8 @@ class Arbiter:
         return turn.effects
 
     def check_all(self) -> None:
-        """Every invariant over everything, and the tables that the check of each event stands on. For tests' drivers: O(leases)."""
+        """Every invariant over everything, and the tables that the check of each event stands on.
+        For tests' drivers: O(leases)."""
         invariants.check_all(self._core)
 
     def inspect(self) -> Inspection:
@@ -172,7 +178,8 @@ class Arbiter:
         after: explain.PageKey | None = None,
         limit: int | None = None,
     ) -> StatusReply:
-        """Return a page of the status. `reader`: the process that asks; None: an operator, for all tokens."""
+        """Return a page of the status. `reader`: the process that asks; None: an operator, for all
+        tokens."""
         self._core.now = max(self._core.now, now)
         return explain.status(self._core, self._standby.host.status(), reader, after, limit)
 
@@ -199,7 +206,8 @@ class Arbiter:
         return self._core.footprints.kept()
 
     def owners(self, gpu: GpuId) -> Set[ProcessKey]:
-        """Processes with an account on a card: they hold a lease there, one of theirs is measured away, or they keep a residue.
+        """Processes with an account on a card: they hold a lease there, one of theirs is measured
+        away, or they keep a residue.
 
         Empty for an unknown card. As it is at that moment: it changes with the next event.
         """

@@ -1,4 +1,5 @@
-"""Everything that the core can ask of the world, as imperatives. Performed in order by `host.executor`. Plain values only."""
+"""Everything that the core can ask of the world, as imperatives. Performed in order by
+`host.executor`. Plain values only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +31,8 @@ class Refuse:
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """Send a push. A client that is away gets nothing: the lease's TTL and reattachment cover that."""
+    """Send a push. A client that is away gets nothing: the lease's TTL and reattachment
+    cover that."""
 
     client: ClientId
     body: AnyPush
@@ -38,8 +40,10 @@ class Push:
 
 @dataclass(frozen=True, slots=True)
 class JournalPut:
-    """Write a record durably *before* any later effect of the same batch. Failure posts JournalFailed(key); where the record `gates`
-    what follows (a grant), the rest of the batch that names the same key's lease is dropped."""
+    """Write a record durably *before* any later effect of the same batch. Failure posts
+    JournalFailed(key); where the record `gates` what follows (a grant), the rest of the batch that
+    names the same key's lease is dropped.
+    """
 
     key: str  # "lease:L3-17" or "residue:PID@START:GPU"
     record: Mapping[str, Any]
@@ -53,14 +57,16 @@ class JournalDelete:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Read a card now; posts MemorySampled or ProbeFailed. A second Sample while one is under way is merged into a fresh one after it."""
+    """Read a card now; posts MemorySampled or ProbeFailed. A second Sample while one is under way
+    is merged into a fresh one after it."""
 
     gpu: GpuId
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A fact for history, subscribers, telemetry and the log. `kind` is one of `core.explain.NOTE_KINDS`."""
+    """A fact for history, subscribers, telemetry and the log. `kind` is one of
+    `core.explain.NOTE_KINDS`."""
 
     kind: str
     data: Mapping[str, Any]
@@ -68,8 +74,8 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """Send a signal to a process that agreed to it (`on_overstay`), by the descriptor that its start was checked with. One that is gone
-    already is fine: its death is told as an event."""
+    """Send a signal to a process that agreed to it (`on_overstay`), by the descriptor that its
+    start was checked with. One that is gone already is fine: its death is told as an event."""
 
     process: ProcessKey
     kind: Literal["term", "kill"]

@@ -1,5 +1,5 @@
-"""Everything that can happen to the core, as past-tense facts. Made by `rpc.session` (requests), `host` (probes, deaths, journal)
-and `inbox` (time). Frozen; plain values only."""
+"""Everything that can happen to the core, as past-tense facts. Made by `rpc.session` (requests),
+`host` (probes, deaths, journal) and `inbox` (time). Frozen; plain values only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,13 +17,14 @@ from vram_arbiter.schemas.ids import (
 )
 
 DOUBT_KEY: Final = "doubt"
-"""Key of a journal record that says why leases may be missing among the others. It outlives restarts until the core deletes it, once
-each holder had its time to reattach."""
+"""Key of a journal record that says why leases may be missing among the others. It outlives
+restarts until the core deletes it, once each holder had its time to reattach."""
 BYE: Final = "bye"
-"""`ClientLeft.reason` of a connection that took its leave: only then are its resident leases released."""
+"""`ClientLeft.reason` of a connection that took its leave: only then are its resident leases
+released."""
 
 
-# -- clients -------------------------------------------------------------------------------------------------------
+# -- clients
 @dataclass(frozen=True, slots=True)
 class ClientConnected:
     """A connection said hello. The pid and uid come from the kernel, never from the message."""
@@ -50,7 +51,7 @@ class ProcessDied:
     process: ProcessKey
 
 
-# -- requests ------------------------------------------------------------------------------------------------------
+# -- requests
 @dataclass(frozen=True, slots=True)
 class Spec:
     """A lease as asked for (validated; mirrors `schemas.wire.LeaseSpec`)."""
@@ -223,7 +224,8 @@ class OomReported:
 
 @dataclass(frozen=True, slots=True)
 class OperatorAsked:
-    """Somebody whose role allows it wants something done by hand. `target` is a lease or a consumer ("" for drain and resume)."""
+    """Somebody whose role allows it wants something done by hand. `target` is a lease or a consumer
+    ("" for drain and resume)."""
 
     client: ClientId
     request: RequestId
@@ -233,10 +235,11 @@ class OperatorAsked:
     reason: str
 
 
-# -- the machine ---------------------------------------------------------------------------------------------------
+# -- the machine
 @dataclass(frozen=True, slots=True)
 class ProcessUse:
-    """Bytes of one process on one GPU: evidence, not authority. Where only a pid is known, `start_ticks` is 0."""
+    """Bytes of one process on one GPU: evidence, not authority. Where only a pid is known,
+    `start_ticks` is 0."""
 
     process: ProcessKey
     name: str
@@ -285,7 +288,8 @@ class MemorySampled:
     def bytes_of(self, process: ProcessKey) -> int | None:
         """Return the bytes of a process: 0 if the list omits it, None if the reading cannot tell.
 
-        An omitted process may hold bytes: it may live in a container that the driver cannot name, or be dying.
+        An omitted process may hold bytes: it may live in a container that the driver cannot name,
+        or be dying.
         """
         if self.processes is None:
             return None
@@ -319,7 +323,8 @@ class ProbeFailed:
 
 @dataclass(frozen=True, slots=True)
 class JournalFailed:
-    """A record could not be written. `gates`: it was that of a grant, which has not been sent and is withdrawn."""
+    """A record could not be written. `gates`: it was that of a grant, which has not been sent and
+    is withdrawn."""
 
     key: str
     reason: str
@@ -328,14 +333,16 @@ class JournalFailed:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """First event after a restart on the same boot: the journal's records, by key. Empty journal: no such event."""
+    """First event after a restart on the same boot: the journal's records, by key. Empty journal:
+    no such event."""
 
     records: Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """The machine was suspended for `slept_s` in which the monotonic clock stood still. Comes before any other event of the new day."""
+    """The machine was suspended for `slept_s` in which the monotonic clock stood still. Comes
+    before any other event of the new day."""
 
     slept_s: float
 
@@ -346,7 +353,28 @@ class Tick:
 
 
 Event = (
-    ClientConnected | ClientLeft | ProcessDied | AcquireRequested | ReadyReported | UseBegan | UseEnded | UseYielded
-    | Renewed | RevokeAcknowledged | UnloadStarted | ReleaseReported | CancelRequested | Reacquired | ResizeAsked | Reattached | OomReported
-    | OperatorAsked | MemorySampled | ProbeFailed | JournalFailed | Recovered | Resumed | Tick
-)  # fmt: skip
+    ClientConnected
+    | ClientLeft
+    | ProcessDied
+    | AcquireRequested
+    | ReadyReported
+    | UseBegan
+    | UseEnded
+    | UseYielded
+    | Renewed
+    | RevokeAcknowledged
+    | UnloadStarted
+    | ReleaseReported
+    | CancelRequested
+    | Reacquired
+    | ResizeAsked
+    | Reattached
+    | OomReported
+    | OperatorAsked
+    | MemorySampled
+    | ProbeFailed
+    | JournalFailed
+    | Recovered
+    | Resumed
+    | Tick
+)

@@ -52,7 +52,7 @@ class Feature:
         if not any(feature is self for feature in lease.features):
             lease.features = (*lease.features, self)
 
-    # -- requests ----------------------------------------------------------------------------------
+    # -- requests
     def on_acquire(self, core: "Core", event: AcquireRequested, known: Lease | None) -> bool:
         """A lease is acquired. Return whether this feature answers. May raise Refused.
 
@@ -87,7 +87,7 @@ class Feature:
     def on_dismissed(self, core: "Core", lease: Lease, order: Order) -> None:
         """An operator evicted a lease."""
 
-    # -- scheduling --------------------------------------------------------------------------------
+    # -- scheduling
     def blocks(self, gpu: "Gpu") -> str:
         """Return the name of the group that this feature keeps a GPU for (`Gpu.keeper`)."""
         return ""
@@ -104,7 +104,8 @@ class Feature:
         return False
 
     def protects(self, lease: Lease) -> str:
-        """Return the name of the group that keeps a holder from being revoked for others; "" if none does."""
+        """Return the name of the group that keeps a holder from being revoked for others; "" if
+        none does."""
         return ""
 
     def unclaimed(self, lease: Lease) -> bool:
@@ -115,7 +116,7 @@ class Feature:
         """Return whether a revoked holder may keep its weights in host RAM."""
         return False
 
-    # -- the life of a lease -----------------------------------------------------------------------
+    # -- the life of a lease
     def on_moved(self, core: "Core", lease: Lease, before: LeaseState) -> None:
         """A lease came to another state."""
 
@@ -130,7 +131,7 @@ class Feature:
         """Return whether readings cannot be compared with the declared size of a resident now."""
         return False
 
-    # -- readings and time -------------------------------------------------------------------------
+    # -- readings and time
     def settle(self, core: "Core") -> None:
         """An event was handled; the GPUs are scheduled next."""
 
@@ -140,7 +141,7 @@ class Feature:
     def on_timer(self, core: "Core", kind: str, subject: str) -> None:
         """A timer of one of `timers` is due."""
 
-    # -- across a restart --------------------------------------------------------------------------
+    # -- across a restart
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
         """Return what the journal's record of a lease keeps of this feature."""
         return {}
@@ -151,7 +152,7 @@ class Feature:
     def on_reattached(self, core: "Core", lease: Lease, item: ReattachedLease) -> None:
         """A holder reattached, and says how it knows its lease. The journal may not know it."""
 
-    # -- reports and invariants --------------------------------------------------------------------
+    # -- reports and invariants
     def view(self, core: "Core", lease: Lease) -> Mapping[str, object]:
         """Return the fields of `schemas.wire.LeaseView` that this feature adds."""
         return {}

@@ -15,7 +15,8 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, UseId
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """The live tables of the engine: they change with the next event, and cannot be changed here."""
+    """The live tables of the engine: they change with the next event, and cannot be
+    changed here."""
 
     gpus: Mapping[GpuId, Gpu]
     leases: Mapping[LeaseId, Lease]

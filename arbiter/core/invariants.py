@@ -7,7 +7,8 @@ relies on. The drivers of the tests and the simulation run it after every event.
 
 Public: `check`, `check_all`, `InvariantViolation`. By number:
   1. approved bytes never exceed capacity − reserve; a grant fits beside stowaways at its moment
-  2. an exclusive lease has no other resident beside it, none is granted before its bytes are measured
+  2. an exclusive lease has no other resident beside it, none is granted before its bytes are
+     measured
      gone; one lease at a time loads on a GPU
   3. a lease in use is not unloaded
   4. bytes stay charged until a verdict: a resident is charged, a charged lease is resident, under
@@ -100,7 +101,8 @@ def _residents(gpu: Gpu, *, granted: bool) -> None:
         if debts:
             raise InvariantViolation(
                 2,
-                f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet a lease came",
+                f"{debts[0]} was exclusive on {gpu.info.id} and is not measured gone, yet a lease "
+                "came",
             )
         loading = [lease.id for lease in residents.in_state(LeaseState.LOADING)]
         if len(loading) > 1:

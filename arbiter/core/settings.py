@@ -9,7 +9,8 @@ from vram_arbiter.schemas.ids import GpuId
 
 @dataclass(frozen=True, slots=True)
 class GpuInfo:
-    """One card. `capacity_bytes` is the budget: what the card has, or less where the operator caps it."""
+    """One card. `capacity_bytes` is the budget: what the card has, or less where the operator caps
+    it."""
 
     id: GpuId
     index: int
@@ -51,13 +52,15 @@ class Settings:
     user_share: float = d.USER_SHARE
     priority_reserve: float = d.PRIORITY_RESERVE
     token_secret: str = ""
-    """Secret hexadecimal digits that keep tokens from being guessed. "": the next number each time."""
+    """Secret hexadecimal digits that keep tokens from being guessed. "": the next number
+    each time."""
     host_ram_budget_bytes: int = 0
     """Host RAM for the weights of parked leases; 0: nobody parks."""
     policy: str = DEFAULT
     """A name of `core.scheduling.SCHEDULING`."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Durations learnt by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s", "load_s"}; basis of ETAs."""
+    """Durations learnt by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s",
+    "load_s"}; basis of ETAs."""
     footprints: dict[str, dict[str, list[int]]] = field(default_factory=dict)
     """Footprints measured by earlier runs, as `core.footprints.Footprints.kept` gave them."""
 

@@ -1,8 +1,9 @@
-"""Frozen dataclasses ⇄ plain JSON, by their type hints alone: a new event, or a new field with a default, needs no code here.
+"""Frozen dataclasses ⇄ plain JSON, by their type hints alone: a new event, or a new field with a
+default, needs no code here.
 
-Encoding goes by value (what JSON cannot say is a dataclass or a mapping), decoding by hint. Numbers come back as they were: nothing
-is converted, so that a replay sees the very same values. The digest of effects is over all their bytes, in order.
-Knows nothing of files.
+Encoding goes by value (what JSON cannot say is a dataclass or a mapping), decoding by hint. Numbers
+come back as they were: nothing is converted, so that a replay sees the very same values. The digest
+of effects is over all their bytes, in order. Knows nothing of files.
 """
 
 import json
@@ -26,10 +27,11 @@ _PLAIN = (str, int, float, bool, NoneType)
 
 
 class CodecError(ValueError):
-    """A value that was written by another version, or by nobody of us; the message says which field."""
+    """A value that was written by another version, or by nobody of us; the message says which
+    field."""
 
 
-# -- values → JSON ---------------------------------------------------------------------------------------------------
+# -- values → JSON
 @cache
 def _names(cls: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields(cls))
@@ -53,7 +55,7 @@ def to_json(value: Any) -> str:
     return _JSON.encode(value)
 
 
-# -- JSON → values ---------------------------------------------------------------------------------------------------
+# -- JSON → values
 @cache
 def event_types() -> Mapping[str, type]:
     """Every event of the core by its name."""
@@ -134,7 +136,8 @@ def _mapped(data: Any) -> Mapping[str, Any]:
 
 
 def _union_decoder(arguments: Sequence[Any]) -> _Decode:
-    """None and plain values stand for themselves; of several dataclasses the one with these fields is meant."""
+    """None and plain values stand for themselves; of several dataclasses the one with these fields
+    is meant."""
     classes = [hint for hint in arguments if isinstance(hint, type) and is_dataclass(hint)]
     rest = [hint for hint in arguments if hint not in classes and hint is not NoneType]
     other = _decoder(rest[0]) if rest else _same
@@ -173,7 +176,7 @@ def _dataclass_decoder(cls: type) -> _Decode:
     return make
 
 
-# -- effects ---------------------------------------------------------------------------------------------------------
+# -- effects
 @cache
 def _getter(cls: type) -> Callable[[Any], tuple[Any, ...]]:
     names = _names(cls)
@@ -190,13 +193,15 @@ def _packable(value: Any) -> Any:
 
 
 def digest(effects: Sequence[Effect]) -> str:
-    """16 hex digits over every byte of the effects, in their order. The same decisions give the same digest, on any machine."""
+    """16 hex digits over every byte of the effects, in their order. The same decisions give the
+    same digest, on any machine."""
     packed = msgpack.packb([_packable(effect) for effect in effects], default=_packable)
     return blake2b(packed, digest_size=8).hexdigest()
 
 
 def summary(effects: Sequence[Effect]) -> str:
-    """The effects by kind, e.g. `Reply Note:queued Push:revoke`: what to look at where digests differ."""
+    """The effects by kind, e.g. `Reply Note:queued Push:revoke`: what to look at where digests
+    differ."""
     return " ".join(
         f"Note:{effect.kind}"
         if isinstance(effect, Note)

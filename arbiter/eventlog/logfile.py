@@ -1,11 +1,15 @@
 """The files of an event log: names, first line, lines, and how they are read again.
 
-    record/20261121T144512-000003-0000.jsonl      start of the daemon, epoch, number of the file within this start
-    {"log": 1, "version": …, "engine": …, "epoch": …, "segment": …, "cause": …, "at_wall_s": …, "now": …, "settings": …, "state": …}
-    {"t": 812.25, "event": "UseBegan", "data": {…}, "effects": "Reply Note:use_began", "digest": "77c0…"}
+    record/20261121T144512-000003-0000.jsonl      start of the daemon, epoch, number of the file
+    within this start
+    {"log": 1, "version": …, "engine": …, "epoch": …, "segment": …, "cause": …, "at_wall_s": …,
+    "now": …, "settings": …, "state": …}
+    {"t": 812.25, "event": "UseBegan", "data": {…}, "effects": "Reply Note:use_began", "digest":
+    "77c0…"}
 
-`state` is null in the first file of a start: the engine begins empty. Every later file begins with the whole state, so the oldest files
-may go. `digest` is null where the engine raised. Reads files and nothing else.
+`state` is null in the first file of a start: the engine begins empty. Every later file begins with
+the whole state, so the oldest files may go. `digest` is null where the engine raised. Reads files
+and nothing else.
 """
 
 import json
@@ -73,7 +77,8 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class LogFile:
-    """One file, read as far as it can be. `torn`: its last line was cut off by a crash or a full disk."""
+    """One file, read as far as it can be. `torn`: its last line was cut off by a crash or a full
+    disk."""
 
     path: Path
     header: Header
@@ -83,7 +88,8 @@ class LogFile:
 
 @cache
 def engine_id() -> str:
-    """Names the engine's source: two logs with the same id were made by the same decisions' code."""
+    """Names the engine's source: two logs with the same id were made by the same
+    decisions' code."""
     seen = blake2b(digest_size=6)
     modules = [Path(str(ids.__file__)), Path(str(defaults.__file__))]
     for path in [*sorted(Path(core.__path__[0]).rglob("*.py")), *modules]:
@@ -113,9 +119,10 @@ def entry_line(now: float, event: Event, effects: Sequence[Effect] | None) -> st
     return to_json(facts) + "\n"
 
 
-# -- reading -----------------------------------------------------------------------------------------------------------
+# -- reading
 def find_files(place: Path) -> list[Path]:
-    """The files of a log: the one file, or those of the newest start in a folder (the state folder or its `record`). Raises LogError."""
+    """The files of a log: the one file, or those of the newest start in a folder (the state folder
+    or its `record`). Raises LogError."""
     try:
         if place.is_file():
             return [place]
@@ -136,7 +143,8 @@ def find_files(place: Path) -> list[Path]:
 
 
 def read_file(path: Path) -> LogFile:
-    """Raises LogError for a file that is no log, is of another format, or is broken before its last line."""
+    """Raises LogError for a file that is no log, is of another format, or is broken before its last
+    line."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -178,14 +186,18 @@ def _entries(path: Path, lines: Sequence[str]) -> Iterator[Entry]:
         except CodecError as error:
             raise _foreign(path, number, error, "") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            whole = f"it is damaged; its first {number - 1} lines can be replayed: `head -n {number - 1}`"
+            whole = (
+                f"it is damaged; its first {number - 1} lines can be replayed: `head -n "
+                f"{number - 1}`"
+            )
             raise LogError(
                 f"{path}:{number}: not a line of an event log: {error}", hint=whole
             ) from error
 
 
 def _entry(data: Any, number: int) -> Entry:
-    """Raises CodecError for an event of another version, and what `_entries` expects of a line that is none."""
+    """Raises CodecError for an event of another version, and what `_entries` expects of a line that
+    is none."""
     event = decode_event(data["event"], data["data"])
     now, effects, made = data["t"], data["effects"], data["digest"]
     if (

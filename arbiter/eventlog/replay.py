@@ -1,6 +1,7 @@
 """A log through the engine once more: the same decisions, or the first one that is another.
 
-Feeds every event with its own time to an engine made as the log says, and compares digests of effects. Reads logs, writes nothing.
+Feeds every event with its own time to an engine made as the log says, and compares digests of
+effects. Reads logs, writes nothing.
 """
 
 from collections import deque
@@ -68,7 +69,8 @@ class Replayed:
 
 
 def load(place: Path) -> list[LogFile]:
-    """The files of one start, oldest first, each whole or with a torn last line. Raises LogError."""
+    """The files of one start, oldest first, each whole or with a torn last line. Raises
+    LogError."""
     files: list[LogFile] = []
     for path in find_files(place):
         file = read_file(path)
@@ -83,7 +85,8 @@ def load(place: Path) -> list[LogFile]:
 
 
 def engine_of(header: Header) -> Arbiter:
-    """The engine as it was at the beginning of a file. Raises LogError if this version cannot hold that state."""
+    """The engine as it was at the beginning of a file. Raises LogError if this version cannot hold
+    that state."""
     if header.state is None:
         return Arbiter(header.settings, header.now)
     try:
@@ -97,7 +100,8 @@ def engine_of(header: Header) -> Arbiter:
 def replay(
     files: Sequence[LogFile], seen: Seen | None = None, *, to_the_end: bool = False
 ) -> Replayed:
-    """Run the log again. Stops at the first divergence, or goes on with this version's decisions (`to_the_end`). Raises LogError."""
+    """Run the log again. Stops at the first divergence, or goes on with this version's decisions
+    (`to_the_end`). Raises LogError."""
     found = Replayed(files[0].header, [file.path for file in files])
     found.torn = [file.path for file in files if file.torn]
     found.began_at = found.ended_at = found.header.now
@@ -126,7 +130,8 @@ def replay(
 
 
 def _engines(files: Sequence[LogFile], found: Replayed) -> Iterator[tuple[LogFile, Arbiter]]:
-    """Each file with the engine for it: one for all, but a new beginning where the recording was interrupted."""
+    """Each file with the engine for it: one for all, but a new beginning where the recording was
+    interrupted."""
     arbiter: Arbiter | None = None
     for index, file in enumerate(files):
         follows = index > 0 and file.header.segment == files[index - 1].header.segment + 1
@@ -150,7 +155,7 @@ def _handle(arbiter: Arbiter, entry: Entry) -> tuple[Sequence[Effect], str]:
         return (), f"{type(error).__name__}: {error}"
 
 
-# -- for programs ------------------------------------------------------------------------------------------------------
+# -- for programs
 def report(found: Replayed) -> dict[str, Any]:
     """What `--json` prints."""
     shown: dict[str, Any] = {

@@ -1,8 +1,10 @@
-"""The engine's whole state as plain JSON and back: where a log begins that is not the daemon's whole life.
+"""The engine's whole state as plain JSON and back: where a log begins that is not the daemon's
+whole life.
 
-A graph of objects: every container and instance once, by number, so that what was shared stays shared. Only classes of the core
-and its ids are ever made, without running any of their code. `freeze` is the part that must be quick: a copy at one moment, on the
-decision path; everything else can happen on another thread.
+A graph of objects: every container and instance once, by number, so that what was shared stays
+shared. Only classes of the core and its ids are ever made, without running any of their code.
+`freeze` is the part that must be quick: a copy at one moment, on the decision path; everything else
+can happen on another thread.
 """
 
 import importlib
@@ -24,9 +26,12 @@ _HOMES = ("vram_arbiter.arbiter.core.", "vram_arbiter.schemas.ids", "vram_arbite
 type Ref = list[int]
 
 
-# -- a copy at one moment ----------------------------------------------------------------------------------------------
+# -- a copy at one moment --------------------------------------------------------------------------
 def freeze(arbiter: Arbiter) -> bytes:
-    """The state as it is now, in a form for `thaw` in this very process. Some microseconds per lease."""
+    """The state as it is now, in a form for `thaw` in this very process.
+
+    Some microseconds per lease.
+    """
     sink = io.BytesIO()
     pickler = pickle.Pickler(sink, protocol=pickle.HIGHEST_PROTOCOL)
     pickler.dispatch_table = _reducers()
@@ -45,8 +50,10 @@ _known_reducers: dict[type, _Reduce] = {}
 
 
 def _reducers() -> dict[type, _Reduce]:
-    """Frozen dataclasses with slots pickle themselves slowly; their constructor and values do it in a third of the time. Maps with
-    bookkeeping of their own are copied as they are, not built up again."""
+    """Frozen dataclasses with slots pickle themselves slowly; their constructor and values do it in
+    a third of the time. Maps with bookkeeping of their own are copied as they are, not built up
+    again.
+    """
     if not _known_reducers:
         for name, module in list(sys.modules.items()):
             if name.startswith(_HOMES):
@@ -88,9 +95,12 @@ def _reducer(cls: type) -> _Reduce:
     return lambda value: (cls, values(value))
 
 
-# -- state → JSON ------------------------------------------------------------------------------------------------------
+# -- state → JSON ----------------------------------------------------------------------------------
 def to_plain(arbiter: Arbiter) -> dict[str, Any]:
-    """`{"objects": […], "root": n}`. Raises CodecError for a state that holds what is no data (a function, a file)."""
+    """`{"objects": […], "root": n}`.
+
+    Raises CodecError for a state that holds what is no data (a function, a file).
+    """
     graph = _Graph()
     root = graph.value(arbiter)
     return {"root": root[0], "objects": graph.objects}
@@ -147,9 +157,12 @@ def _attributes(value: Any) -> Iterable[tuple[str, Any]]:
     return ((name, getattr(value, name)) for name in names if hasattr(value, name))
 
 
-# -- JSON → state ------------------------------------------------------------------------------------------------------
+# -- JSON → state ----------------------------------------------------------------------------------
 def from_plain(data: Mapping[str, Any]) -> Arbiter:
-    """The engine as it was. Raises CodecError if this version's classes are others, or the data is nothing of ours."""
+    """The engine as it was.
+
+    Raises CodecError if this version's classes are others, or the data is nothing of ours.
+    """
     try:
         found = _Builder(data["objects"]).build(data["root"])
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
@@ -164,7 +177,9 @@ def from_plain(data: Mapping[str, Any]) -> Arbiter:
 
 
 class _Builder:
-    """Mutable things first as empty shells, so that circles close; what can be a key is whole before it is used as one."""
+    """Mutable things first as empty shells, so that circles close; what can be a key is whole
+    before it is used as one.
+    """
 
     def __init__(self, objects: list[Any]) -> None:
         self._objects = objects

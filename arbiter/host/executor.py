@@ -1,7 +1,9 @@
-"""Performs effects, in order: one match over all of them. Slow ones (samples) end by posting an event.
+"""Performs effects, in order: one match over all of them. Slow ones (samples) end by posting an
+event.
 
-Runs on the thread of the event loop and never blocks, except for journal writes (a local SQLite commit without fsync, tens of
-microseconds). Must not decide anything; sockets, files and threads are behind the protocols below.
+Runs on the thread of the event loop and never blocks, except for journal writes (a local SQLite
+commit without fsync, tens of microseconds). Must not decide anything; sockets, files and threads
+are behind the protocols below.
 """
 
 import logging
@@ -90,14 +92,16 @@ class Executor:
         self._words = words
         self._traces = traces
         self.owed: dict[str, None] = {}
-        """Records still to be deleted: the disk was full when they ended. The next write does it."""
+        """Records still to be deleted: the disk was full when they ended. The next write
+        does it."""
 
     def perform(self, effects: Sequence[fx.Effect]) -> None:
-        """One batch. Its records are written first, all in one transaction, so a grant is on disk before its holder hears of it. If that
-        fails, what the batch says about a lease after it was granted is not said (the waiting request is refused instead).
+        """One batch. Its records are written first, all in one transaction, so a grant is on disk
+        before its holder hears of it. If that fails, what the batch says about a lease after it was
+        granted is not said (the waiting request is refused instead).
 
-        Answers go out first: facts are written down after all answers, and readings are begun last of all, since
-        their thread takes the interpreter from this one.
+        Answers go out first: facts are written down after all answers, and readings are begun last
+        of all, since their thread takes the interpreter from this one.
         """
         if self._traces is not None:
             self._traces.outgoing(effects)
@@ -151,7 +155,8 @@ class Executor:
     def _write(
         self, records: Sequence[fx.JournalPut | fx.JournalDelete]
     ) -> Mapping[str, JournalUnavailable]:
-        """Write records, and delete what is owed. Keys of grants that could not be written, with the reason."""
+        """Write records, and delete what is owed. Keys of grants that could not be written, with
+        the reason."""
         changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in records]
         owed: list[tuple[str, Mapping[str, Any] | None]] = []
         if self.owed:

@@ -1,10 +1,12 @@
 """What must survive the daemon: one record per lease and residue, in SQLite.
 
-Records are written before a grant is sent. WAL with `synchronous=NORMAL` does not fsync each commit: a commit survives the death of the
-daemon (it is in the kernel's page cache) but perhaps not a power cut, and that is enough, since a power cut empties the GPU too: a new
-boot id voids every record. SQLite does not tell a lost or damaged log from one that was never written, so each row carries a digest and
-`host.seal` names the digest of all of them. What they do not confirm is doubted: a record of the doubt itself says so, until the core
-deletes it, and nothing is granted before. Damage is put aside and reported, never repaired by guessing. Must not know what the other
+Records are written before a grant is sent. WAL with `synchronous=NORMAL` does not fsync each
+commit: a commit survives the death of the daemon (it is in the kernel's page cache) but perhaps not
+a power cut, and that is enough, since a power cut empties the GPU too: a new boot id voids every
+record. SQLite does not tell a lost or damaged log from one that was never written, so each row
+carries a digest and `host.seal` names the digest of all of them. What they do not confirm is
+doubted: a record of the doubt itself says so, until the core deletes it, and nothing is granted
+before. Damage is put aside and reported, never repaired by guessing. Must not know what the other
 records mean: `check` tells whether one can be read.
 """
 
@@ -60,10 +62,12 @@ Change = tuple[str, Mapping[str, Any] | None]
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """What a start found. `put_aside` names the file that damage was moved to; `voided` counts records of an earlier boot.
-    `witness` is for the next start. `doubt` says why the records may not be all; its own record is among them then.
-    `problems` is for people, a line for each file and for the records put aside. `learnt` is what `keep` wrote last under that name,
-    whatever the boot, and so are `footprints`."""
+    """What a start found. `put_aside` names the file that damage was moved to; `voided` counts
+    records of an earlier boot. `witness` is for the next start. `doubt` says why the records may
+    not be all; its own record is among them then. `problems` is for people, a line for each file
+    and for the records put aside. `learnt` is what `keep` wrote last under that name, whatever the
+    boot, and so are `footprints`.
+    """
 
     epoch: int
     records: Mapping[str, Mapping[str, Any]]
@@ -78,8 +82,8 @@ class Opened:
 
 
 class Journal:
-    """One connection, used by one thread. `open` makes it; the database stays locked against a second daemon's writes by the
-    daemon's own lock file, not here."""
+    """One connection, used by one thread. `open` makes it; the database stays locked against a
+    second daemon's writes by the daemon's own lock file, not here."""
 
     def __init__(
         self,
@@ -111,12 +115,14 @@ class Journal:
         witness: str = "",
         seals: type[Seal] = Seal,
     ) -> Self:
-        """Open or make the journal in `folder`, and count a new epoch, `at_least` that (else `fresh_epoch`). Raises ConfigError if the
-        folder cannot be used, JournalUnavailable if its disk is full, failing or read-only: without a durable epoch tokens could be
-        given out twice.
+        """Open or make the journal in `folder`, and count a new epoch, `at_least` that (else
+        `fresh_epoch`). Raises ConfigError if the folder cannot be used, JournalUnavailable if its
+        disk is full, failing or read-only: without a durable epoch tokens could be given out twice.
 
-        1. Read everything; damage is put aside. 2. Records of another boot are dropped. 3. What no seal confirms is doubted.
-        4. Epoch: more than every known one. 5. Seal before the database, so that a kill between them causes no doubt; in doubt the
+        1. Read everything; damage is put aside. 2. Records of another boot are dropped. 3. What no
+           seal confirms is doubted.
+        4. Epoch: more than every known one. 5. Seal before the database, so that a kill between
+           them causes no doubt; in doubt the
         other way round, so that it stays one. 6. The epoch file.
 
         `witness` is what `Opened.witness` said at the last start, kept outside of the folder.
@@ -168,15 +174,20 @@ class Journal:
 
     @property
     def problems(self) -> list[str]:
-        """What an operator should know, a line each. A doubt, of this start or of one before it, counts until the core deletes it."""
+        """What an operator should know, a line each. A doubt, of this start or of one before it,
+        counts until the core deletes it."""
         doubt = ""
         if DOUBT_KEY in self._digests and DOUBT_KEY in self.opened.records:
             why = self.opened.records[DOUBT_KEY].get("why")
-            doubt = f"the journal may not name every lease ({why}): grants wait until each holder had time to reattach"
+            doubt = (
+                f"the journal may not name every lease ({why}): grants wait until each holder had "
+                "time to reattach"
+            )
         return [problem for problem in (*self.opened.problems, doubt, self.problem) if problem]
 
     def put_aside(self, problem: str) -> None:
-        """The database is sound but its records cannot be used: start with an empty one, in the same epoch and in doubt."""
+        """The database is sound but its records cannot be used: start with an empty one, in the
+        same epoch and in doubt."""
         self._connection.close()
         aside = put_aside(self._path)
         log.error("journal not understood (%s): put aside as %s", problem, aside)
@@ -198,7 +209,8 @@ class Journal:
         )
 
     def apply(self, changes: Sequence[Change]) -> None:
-        """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is written then)."""
+        """Write all changes in one transaction; None deletes. Raises JournalUnavailable (nothing is
+        written then)."""
         rows: list[tuple[str, str | None, bytes]] = []
         known, soon = self._digests, self._total
         fresh: dict[str, int] = {}
@@ -239,7 +251,8 @@ class Journal:
                 known.pop(key, None)
         try:
             self._seal.write(soon, soon)
-        except OSError as error:  # it is written, and accepted: the next change finds the seal unwritable before it is made
+        # it is written, and accepted: the next change finds the seal unwritable before it is made
+        except OSError as error:
             self._failed(error)
         else:
             if (
@@ -253,7 +266,8 @@ class Journal:
         )
 
     def settle(self) -> None:
-        """After a failure: can it be written again? Asked now and then, so that room on the disk is noticed without a request."""
+        """After a failure: can it be written again? Asked now and then, so that room on the disk is
+        noticed without a request."""
         if self.problem:
             try:
                 self._connection.execute(
@@ -266,7 +280,8 @@ class Journal:
                 self.problem = ""
 
     def _change_at_once(self, rows: Sequence[tuple[str, str | None, bytes]]) -> None:
-        """All puts or all deletions, in one statement: a statement alone is a transaction, and half the price of one around it."""
+        """All puts or all deletions, in one statement: a statement alone is a transaction, and half
+        the price of one around it."""
         if rows[0][1] is None:
             self._connection.execute(_DELETE[len(rows)], [key for key, _, _ in rows])
         else:
@@ -275,7 +290,8 @@ class Journal:
     def keep(
         self, name: Literal["learnt", "footprints"], learnt: Mapping[str, Mapping[str, Any]]
     ) -> None:
-        """Keep what was learnt for the next start. Losing it costs estimates only: a failure is logged."""
+        """Keep what was learnt for the next start. Losing it costs estimates only: a failure is
+        logged."""
         text = json.dumps(learnt, separators=(",", ":"))
         if text == self._kept.get(name):
             return
@@ -352,7 +368,8 @@ def _footprints(meta: Mapping[str, str]) -> dict[str, dict[str, list[int]]]:
 
 
 def may_pass(error: BaseException) -> bool:
-    """Is it the disk's trouble, or its permissions', which may be over at the next try, unlike a wrong folder?"""
+    """Is it the disk's trouble, or its permissions', which may be over at the next try, unlike a
+    wrong folder?"""
     if isinstance(error, OSError):
         return error.errno in _PASSING
     codes = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY)

@@ -1,7 +1,9 @@
-"""What lies in the state folder when the daemon starts: the journal's database, its seal and the epoch file, read and judged.
+"""What lies in the state folder when the daemon starts: the journal's database, its seal and the
+epoch file, read and judged.
 
-Damage is put aside under a name of its own and reported; `doubt` says why leases of this boot may be missing among what is left.
-Decides nothing that outlives the start, and must not know what records mean.
+Damage is put aside under a name of its own and reported; `doubt` says why leases of this boot may
+be missing among what is left. Decides nothing that outlives the start, and must not know what
+records mean.
 """
 
 import contextlib
@@ -41,7 +43,8 @@ Check = Callable[[str, str], None]
 
 @dataclass(slots=True)
 class Found:
-    """What lies in the state folder, before anything is decided. `epoch` is the greatest one that any file names."""
+    """What lies in the state folder, before anything is decided. `epoch` is the greatest one that
+    any file names."""
 
     connection: sqlite3.Connection
     meta: dict[str, str] = field(default_factory=dict)
@@ -61,7 +64,8 @@ class Found:
     epoch: int = 0
 
     def void(self, boot_id: str) -> int | None:
-        """Drop the records if they are of another boot. Returns how many there were; None: they are of this boot."""
+        """Drop the records if they are of another boot. Returns how many there were; None: they are
+        of this boot."""
         if self.meta.get("boot_id") in (None, boot_id):
             return None
         count = len(self.records) + len(self.damaged)
@@ -70,7 +74,8 @@ class Found:
 
 
 def look(folder: Path, check: Check | None, witness: str) -> Found:
-    """Read all files, and `witness`: a text of `LastStart` from outside of the folder, or anything else. A database, an epoch file or rows that cannot be read are put aside."""
+    """Read all files, and `witness`: a text of `LastStart` from outside of the folder, or anything
+    else. A database, an epoch file or rows that cannot be read are put aside."""
     path = folder / "journal.sqlite"
     try:
         found = _read(Found(connect(path)), check)
@@ -105,14 +110,16 @@ def look(folder: Path, check: Check | None, witness: str) -> Found:
 
 
 def doubt_of(found: Found, boot_id: str) -> str:
-    """Why leases of this boot may be missing among the records; "" if what is there is what was written last."""
+    """Why leases of this boot may be missing among the records; "" if what is there is what was
+    written last."""
     if found.forgotten is not None and found.forgotten.boot == boot_id:
         return "the state folder is older than the last start at this socket"
     seal, last, meta_boot = found.seal, found.last, found.meta.get("boot_id")
     sealed_here = seal is not None and seal.is_of(boot_id)
     if not sealed_here and meta_boot != boot_id and (last is None or last.boot != boot_id):
-        # No file is of this boot. One that names another boot shows that nothing was granted since, whatever a power cut left in
-        # the others: the epoch file is fsynced, the seal is not. A folder without any file is new.
+        # No file is of this boot. One that names another boot shows that nothing was granted since,
+        # whatever a power cut left in the others: the epoch file is fsynced, the seal is not. A
+        # folder without any file is new.
         sound = not found.seal_problem and not found.unread
         new = sound and last is None and meta_boot is None and not found.total
         if (last is not None and last.boot) or seal is not None or (sound and meta_boot) or new:
@@ -133,7 +140,8 @@ def doubt_of(found: Found, boot_id: str) -> str:
 
 
 def _read(found: Found, check: Check | None) -> Found:
-    """Fill in meta, records and damaged rows. Raises sqlite3.DatabaseError or ValueError for a file that cannot be trusted."""
+    """Fill in meta, records and damaged rows. Raises sqlite3.DatabaseError or ValueError for a file
+    that cannot be trusted."""
     connection = found.connection
     try:
         state = connection.execute("PRAGMA quick_check").fetchone()[0]
@@ -145,7 +153,8 @@ def _read(found: Found, check: Check | None) -> Found:
         if schema not in (None, "1", str(SCHEMA_VERSION)):
             raise sqlite3.DatabaseError(f"schema {schema}, this daemon knows {SCHEMA_VERSION}")
         rows = connection.execute(
-            "SELECT CAST(key AS BLOB), CASE WHEN length(json) <= ? THEN json END, digest FROM records ORDER BY key",
+            "SELECT CAST(key AS BLOB), CASE WHEN length(json) <= ? THEN json END, digest FROM "
+            "records ORDER BY key",
             (RECORD_MAX_CHARS,),
         )
         for key, content, told in rows:
@@ -224,7 +233,8 @@ def _free_name(path: Path, kind: str = "") -> Path:
 
 
 def put_aside(path: Path) -> Path:
-    """Move a file, and the WAL of a database, away under the first free name, so that it can be looked at."""
+    """Move a file, and the WAL of a database, away under the first free name, so that it can be
+    looked at."""
     aside = _free_name(path)
     path.rename(aside)
     for suffix in ("-wal", "-shm"):
@@ -235,7 +245,8 @@ def put_aside(path: Path) -> Path:
 
 
 def put_rows_aside(folder: Path, found: Found) -> None:
-    """Write damaged rows to a file of their own, a line each. They leave the database with the doubt that they raise."""
+    """Write damaged rows to a file of their own, a line each. They leave the database with the
+    doubt that they raise."""
     aside = _free_name(folder / "journal", ".records")
     lines = []
     for key, problem in found.damaged.items():

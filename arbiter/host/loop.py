@@ -1,7 +1,8 @@
 """The daemon's event loop: asyncio's own, with timers that keep their microseconds.
 
-epoll counts in whole milliseconds and Python rounds up, so each wait of 2 ms between two readings of a card took up to 3. `select` on
-the epoll descriptor itself waits to the microsecond. Must not know what the timers are for.
+epoll counts in whole milliseconds and Python rounds up, so each wait of 2 ms between two readings
+of a card took up to 3. `select` on the epoll descriptor itself waits to the microsecond. Must not
+know what the timers are for.
 """
 
 import asyncio

@@ -11,11 +11,13 @@ _THRESHOLD_BYTES = 128 * 1024
 
 
 def give_back_freed_memory() -> None:
-    """Let malloc return large buffers to the kernel when they are freed, for the rest of this process.
+    """Let malloc return large buffers to the kernel when they are freed, for the rest of this
+    process.
 
-    glibc raises its threshold for mmap (mallopt(3), M_MMAP_THRESHOLD) with every large buffer that is
-    freed, up to 32 MiB, and keeps what lies below it: after one attack with incomplete messages the daemon
-    stayed at 136 MiB; with fixed thresholds it is back at 29. Without effect on another C library.
+    glibc raises its threshold for mmap (mallopt(3), M_MMAP_THRESHOLD) with every large buffer that
+    is freed, up to 32 MiB, and keeps what lies below it: after one attack with incomplete messages
+    the daemon stayed at 136 MiB; with fixed thresholds it is back at 29. Without effect on another
+    C library.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -24,7 +26,8 @@ def give_back_freed_memory() -> None:
 
 
 def available_bytes(meminfo: Path = MEMINFO) -> int:
-    """What a program could have now without swapping. Raises OSError, or ValueError where the kernel does not say."""
+    """What a program could have now without swapping. Raises OSError, or ValueError where the
+    kernel does not say."""
     for line in meminfo.read_text().splitlines():
         name, _, rest = line.partition(":")
         if name == "MemAvailable":
@@ -33,7 +36,8 @@ def available_bytes(meminfo: Path = MEMINFO) -> int:
 
 
 def park_budget_bytes(configured: int | None, meminfo: Path = MEMINFO) -> int:
-    """The budget for parked weights: what the operator says, else half of what is available; where that is unknown, nothing."""
+    """The budget for parked weights: what the operator says, else half of what is available; where
+    that is unknown, nothing."""
     if configured is not None:
         return configured
     try:

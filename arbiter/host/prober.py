@@ -1,8 +1,10 @@
-"""Readings of the cards without ever blocking the loop: one thread per card, each reading with a deadline.
+"""Readings of the cards without ever blocking the loop: one thread per card, each reading with a
+deadline.
 
-A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the card stays unknown and no further reading is
-started until it returns. Requests are merged, except that one that comes after a reading began is answered by a fresh one: a
-verification must never be fed with a reading from before its question. Bytes of children are booked on the ancestor that holds the lease
+A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the card stays
+unknown and no further reading is started until it returns. Requests are merged, except that one
+that comes after a reading began is answered by a fresh one: a verification must never be fed with a
+reading from before its question. Bytes of children are booked on the ancestor that holds the lease
 (`tree`): ancestors are read in the thread, holders are looked up when the reading is handed on.
 """
 
@@ -26,7 +28,8 @@ CLOSE_S = 1.0
 
 
 class Prober:
-    """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or for several merged ones.
+    """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or
+    for several merged ones.
 
     `known(gpu)` is called on the loop's thread.
     """
@@ -47,7 +50,8 @@ class Prober:
         self._readers[gpu].request()
 
     def close(self) -> None:
-        """Ends the threads. A call that hangs in its driver is not waited for: it dies with the process (daemon threads)."""
+        """Ends the threads. A call that hangs in its driver is not waited for: it dies with the
+        process (daemon threads)."""
         for reader in self._readers.values():
             reader.close()
         closing = threading.Thread(target=self._probe.close, name="probe-close", daemon=True)
@@ -56,7 +60,8 @@ class Prober:
 
 
 class _Reader:
-    """One card: idle → reading → idle, or reading → stuck → idle when the hung call returns at last."""
+    """One card: idle → reading → idle, or reading → stuck → idle when the hung call returns at
+    last."""
 
     def __init__(
         self,
@@ -131,7 +136,8 @@ class _Reader:
     def _done(
         self, taken_at: float, outcome: Reading | str, lineages: Mapping[ProcessKey, Lineage]
     ) -> None:
-        """Back on the loop's thread. A late answer is not used: it is as old as its question, and a fresh one costs nothing."""
+        """Back on the loop's thread. A late answer is not used: it is as old as its question, and a
+        fresh one costs nothing."""
         if self._state == "closed":
             return
         was_stuck = self._state == "stuck"
@@ -157,9 +163,10 @@ class _Reader:
         else:
             self._fail(outcome)
         if self._again and self._state == "idle":
-            self._begin()  # else the handler of this answer asked again, and that reading serves all
+            # else the handler of this answer asked again, and that reading serves all
+            self._begin()
 
-    # -- the thread ----------------------------------------------------------------------------------------------
+    # -- the thread
     def _run(self) -> None:
         while self._work.get():
             taken_at = time.monotonic()
@@ -180,7 +187,8 @@ class _Reader:
 
 
 async def within[T](deadline_s: float, call: Callable[[], T], what: str) -> T:
-    """Run a blocking call in a thread of its own. Raises what it raises, or ProbeFailed after `deadline_s`."""
+    """Run a blocking call in a thread of its own. Raises what it raises, or ProbeFailed after
+    `deadline_s`."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
 

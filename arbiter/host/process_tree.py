@@ -1,7 +1,9 @@
-"""Attribution of bytes in a process *tree*: a child's bytes are charged to the ancestor that holds the lease.
+"""Attribution of bytes in a process *tree*: a child's bytes are charged to the ancestor that holds
+the lease.
 
-In two halves: `Lineages` reads ancestors from /proc and may block (a probe's thread); `on_owners` attributes by the holders of that very
-moment (the loop's thread). Must not decide anything about leases: it only says which process a reading's bytes belong to.
+In two halves: `Lineages` reads ancestors from /proc and may block (a probe's thread); `on_owners`
+attributes by the holders of that very moment (the loop's thread). Must not decide anything about
+leases: it only says which process a reading's bytes belong to.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Set
@@ -55,7 +57,8 @@ def read_kin(pid: int) -> Kin | None:
 
 
 class Lineages:
-    """Ancestors of the processes of one card's readings. Remembers the last reading's, for a process that dies before it is traced."""
+    """Ancestors of the processes of one card's readings. Remembers the last reading's, for a
+    process that dies before it is traced."""
 
     def __init__(self, read: Reader = read_kin) -> None:
         self._read = read
@@ -79,7 +82,8 @@ class Lineages:
         return found
 
     def _ancestors(self, process: ProcessKey) -> Lineage | None:
-        """None if that process is gone. A parent that is younger than its child is another process with a reused pid: the line ends."""
+        """None if that process is gone. A parent that is younger than its child is another process
+        with a reused pid: the line ends."""
         kin = self._read(process.pid)
         if kin is None or kin.process != process:
             return None
@@ -96,10 +100,11 @@ class Lineages:
 def on_owners(
     processes: Iterable[ProcessUse], lineages: Mapping[ProcessKey, Lineage], known: Known
 ) -> tuple[ProcessUse, ...]:
-    """The reading's processes with the bytes of children booked on their nearest ancestor that has an account.
+    """The reading's processes with the bytes of children booked on their nearest ancestor that has
+    an account.
 
-    A process with an account or a connection of its own keeps its own bytes; one without such an ancestor stays a stowaway.
-    Bytes that the driver does not say (None) make the sum unknown.
+    A process with an account or a connection of its own keeps its own bytes; one without such an
+    ancestor stays a stowaway. Bytes that the driver does not say (None) make the sum unknown.
     """
     booked: dict[ProcessKey, ProcessUse] = {}
     children: dict[ProcessKey, list[str]] = {}

@@ -1,7 +1,9 @@
-"""Deaths of processes, told by the kernel: one pidfd per process, readable the moment it ends (0.2 ms here).
+"""Deaths of processes, told by the kernel: one pidfd per process, readable the moment it ends (0.2
+ms here).
 
-The process of a connection comes with the pidfd of its accept (`take`). One that is known by its pid alone, from the journal, may have
-died and its pid been reused, so the start time is compared after the pidfd is opened (`add`). Must not know clients or leases.
+The process of a connection comes with the pidfd of its accept (`take`). One that is known by its
+pid alone, from the journal, may have died and its pid been reused, so the start time is compared
+after the pidfd is opened (`add`). Must not know clients or leases.
 """
 
 import asyncio
@@ -32,7 +34,8 @@ class ProcessWatch:
         self._fds: dict[ProcessKey, int | None] = {}  # None: dead already, the call is under way
 
     def add(self, process: ProcessKey) -> None:
-        """Watch a process; a second time changes nothing. Dead already: `died` is called in the loop's next turn.
+        """Watch a process; a second time changes nothing. Dead already: `died` is called in the
+        loop's next turn.
 
         Raises OSError where no descriptor is left (EMFILE, ENFILE).
         """
@@ -50,7 +53,8 @@ class ProcessWatch:
         self._watch(process, fd)
 
     def take(self, process: ProcessKey, pidfd: int) -> bool:
-        """Watch the process of a connection by a copy of the pidfd that was opened when it was accepted: its pid may have been reused.
+        """Watch the process of a connection by a copy of the pidfd that was opened when it was
+        accepted: its pid may have been reused.
 
         Return False if it was watched before. Raises OSError where no descriptor is left.
         """
@@ -67,8 +71,10 @@ class ProcessWatch:
             os.close(fd)
 
     def signal(self, process: ProcessKey, kind: str) -> None:
-        """Send SIGTERM ("term") or SIGKILL ("kill") through the pidfd, which names the process whose start time was compared. One that is
-        not watched (it died) gets nothing, nor does one whose start time was never known. Must not raise: a refusal is logged."""
+        """Send SIGTERM ("term") or SIGKILL ("kill") through the pidfd, which names the process
+        whose start time was compared. One that is not watched (it died) gets nothing, nor does one
+        whose start time was never known. Must not raise: a refusal is logged.
+        """
         fd = self._fds.get(process)
         if fd is None or process.start_ticks == 0:
             log.warning("no %s for %s: it is gone or not known by its start time", kind, process)

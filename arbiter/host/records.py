@@ -1,7 +1,9 @@
-"""What a record of the journal may say: types and ranges of what `Core.record_lease` and its neighbors write.
+"""What a record of the journal may say: types and ranges of what `Core.record_lease` and its
+neighbors write.
 
-A record outside of them would end every start in a traceback, or every answer of the daemon: a pid that no kernel gives, a token
-that no wire carries. Unknown fields pass, within the limits of `schemas.strictjson`: an engine may write more than is read here.
+A record outside of them would end every start in a traceback, or every answer of the daemon: a pid
+that no kernel gives, a token that no wire carries. Unknown fields pass, within the limits of
+`schemas.strictjson`: an engine may write more than is read here.
 """
 
 from typing import Annotated, Any, Literal

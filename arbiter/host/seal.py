@@ -1,10 +1,13 @@
-"""Two small files beside the journal that say what its last commit was, so that a lost or changed one is noticed at the next start.
+"""Two small files beside the journal that say what its last commit was, so that a lost or changed
+one is noticed at the next start.
 
-`journal.seal` is rewritten around each commit, without fsync: it names the digest of all records. Like the commit itself it
-survives the death of the daemon, and after a power cut nothing of it matters. Before a commit it names the old and the new digest,
-after it the new one alone: a kill at any instant leaves a journal that its seal accepts, a lost commit leaves one that it does not.
-`epoch` is replaced once per start, with fsync: it names the epoch and the boot of the last start. A copy of it in the
-socket's lock file (the witness) knows of a start that the state folder as a whole has forgotten. Must not know what records are.
+`journal.seal` is rewritten around each commit, without fsync: it names the digest of all records.
+Like the commit itself it survives the death of the daemon, and after a power cut nothing of it
+matters. Before a commit it names the old and the new digest, after it the new one alone: a kill at
+any instant leaves a journal that its seal accepts, a lost commit leaves one that it does not.
+`epoch` is replaced once per start, with fsync: it names the epoch and the boot of the last start. A
+copy of it in the socket's lock file (the witness) knows of a start that the state folder as a whole
+has forgotten. Must not know what records are.
 """
 
 import os
@@ -26,15 +29,17 @@ _EPOCH_FILE_MAX = 256
 
 
 def digest(key: str, text: str) -> bytes:
-    """Digest of one record. All records together have the exclusive or of theirs, so that one change costs one digest."""
+    """Digest of one record. All records together have the exclusive or of theirs, so that one
+    change costs one digest."""
     return sha256(f"{key}\0{text}".encode()).digest()[:16]
 
 
 def fresh_epoch() -> int:
     """An epoch for a start that knows of no earlier one: seconds since 2026 and 16 random bits.
 
-    The seconds let it grow, so that what was granted before a lost state folder counts as earlier. The random bits keep two
-    starts apart that read the same second, as after a step of the clock. A clock that was never set counts from the boot.
+    The seconds let it grow, so that what was granted before a lost state folder counts as earlier.
+    The random bits keep two starts apart that read the same second, as after a step of the clock. A
+    clock that was never set counts from the boot.
     """
     seconds = max(time.time() - _BEGINNING_S, time.clock_gettime(time.CLOCK_BOOTTIME))
     return (int(seconds) << 16) | secrets.randbits(16)
@@ -74,7 +79,8 @@ class Seal:
 
     @staticmethod
     def read(folder: Path) -> Sealed | None:
-        """What the last daemon wrote; None where there is no file. Raises ValueError for one that says nothing."""
+        """What the last daemon wrote; None where there is no file. Raises ValueError for one that
+        says nothing."""
         try:
             with (folder / "journal.seal").open("rb") as file:
                 content = file.read(_BODY.size + 1)
@@ -118,7 +124,8 @@ def last_start(text: str) -> LastStart:
 
 
 def read_last_start(folder: Path) -> LastStart | None:
-    """What the last start wrote; None where there is no file. Raises ValueError for one that cannot be true."""
+    """What the last start wrote; None where there is no file. Raises ValueError for one that cannot
+    be true."""
     try:
         with (folder / "epoch").open("rb") as file:
             content = file.read(_EPOCH_FILE_MAX + 1)

@@ -1,7 +1,8 @@
-"""Was the machine suspended? CLOCK_BOOTTIME runs on while it sleeps, CLOCK_MONOTONIC does not: their difference is the sleep.
+"""Was the machine suspended? CLOCK_BOOTTIME runs on while it sleeps, CLOCK_MONOTONIC does not:
+their difference is the sleep.
 
-Timers, deadlines and readings all use the monotonic clock, so nothing expires over night, and the daemon has to notice
-that the night was there. Must not know what is done about it.
+Timers, deadlines and readings all use the monotonic clock, so nothing expires over night, and the
+daemon has to notice that the night was there. Must not know what is done about it.
 """
 
 import time
@@ -16,7 +17,8 @@ _boottime = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
 
 
 class SuspendWatch:
-    """`slept_s()` gives the seconds slept since it was last asked, each sleep once; 0.0 if there was none."""
+    """`slept_s()` gives the seconds slept since it was last asked, each sleep once; 0.0 if there
+    was none."""
 
     def __init__(
         self,
@@ -36,6 +38,7 @@ class SuspendWatch:
         return slept_s
 
     def _lead_s(self) -> float:
-        """Boottime's lead. A thread that is held up between the two readings sees less of it, never more: no sleep is made up."""
+        """Boottime's lead. A thread that is held up between the two readings sees less of it, never
+        more: no sleep is made up."""
         boottime = self._boottime()
         return boottime - self._monotonic()

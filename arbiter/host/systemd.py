@@ -1,4 +1,5 @@
-"""sd_notify in thirty lines: tells the service manager READY, STATUS, WATCHDOG and STOPPING over its datagram socket.
+"""sd_notify in thirty lines: tells the service manager READY, STATUS, WATCHDOG and STOPPING over
+its datagram socket.
 
 No socket (not started by systemd): every call does nothing. Must not know what the daemon does.
 """
@@ -8,7 +9,8 @@ import socket
 from collections.abc import Mapping
 
 READY_S = 1.0
-"""READY is worth a wait if the manager's queue is full; everything else is dropped then, to never hold up the loop."""
+"""READY is worth a wait if the manager's queue is full; everything else is dropped then, to never
+hold up the loop."""
 
 
 class Notifier:

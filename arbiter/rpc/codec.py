@@ -1,8 +1,9 @@
-"""Bytes ↔ requests. Nothing that a peer sends makes this raise anything but a typed error, at a bounded cost.
+"""Bytes ↔ requests. Nothing that a peer sends makes this raise anything but a typed error, at a
+bounded cost.
 
-A message is counted before it is built (`msgpack_codec`), and validation stops at the first wrong item of a list, so the worst
-message of 1 MiB costs a few milliseconds. Must not know sockets, sessions or the core. Requests are validated by `schemas.wire`;
-replies and pushes are plain maps.
+A message is counted before it is built (`msgpack_codec`), and validation stops at the first wrong
+item of a list, so the worst message of 1 MiB costs a few milliseconds. Must not know sockets,
+sessions or the core. Requests are validated by `schemas.wire`; replies and pushes are plain maps.
 """
 
 from collections.abc import Mapping
@@ -23,7 +24,8 @@ from vram_arbiter.schemas.wire.requests import OPS, REQUEST, Request
 
 FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
 KEYS_MAX = 64
-"""Keys of one map: every unknown key makes validation build one more error. The largest map of the wire has 20."""
+"""Keys of one map: every unknown key makes validation build one more error. The largest map of the
+wire has 20."""
 _OPS = frozenset(OPS)
 _validate = (
     REQUEST.validator.validate_python
@@ -31,7 +33,8 @@ _validate = (
 
 
 class Undecodable(Exception):
-    """A frame that is no request: the typed error to answer with, and the id to answer to if one could be read."""
+    """A frame that is no request: the typed error to answer with, and the id to answer to if one
+    could be read."""
 
     def __init__(self, error: VramError, request_id: int | None) -> None:
         super().__init__(error.message)
@@ -40,7 +43,8 @@ class Undecodable(Exception):
 
 
 def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
-    """One frame to one request. Raises Undecodable with BadFrame, MessageTooLarge, UnknownOp or BadRequest."""
+    """One frame to one request. Raises Undecodable with BadFrame, MessageTooLarge, UnknownOp or
+    BadRequest."""
     try:
         message = unpack_map(payload, _limits(size_max))
     except VramError as error:
@@ -65,7 +69,8 @@ def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
 
 
 def id_of(payload: bytes | bytearray | memoryview, size_max: int) -> int | None:
-    """The id that a request is answered to, without looking at the rest of it; None where none can be read."""
+    """The id that a request is answered to, without looking at the rest of it; None where none can
+    be read."""
     try:
         return _id(unpack_map(payload, _limits(size_max)))
     except VramError:
@@ -112,7 +117,8 @@ def reply(request_id: int, epoch: int, body: AnyReply) -> bytes:
 
 
 def refusal(request_id: int | None, epoch: int, error: ErrorView) -> bytes:
-    """`{"re", "epoch", "ok": false, "error"}`; `re` is null where the request had no readable id."""
+    """`{"re", "epoch", "ok": false, "error"}`; `re` is null where the request had no
+    readable id."""
     return encode({"re": request_id, "epoch": epoch, "ok": False, "error": to_map(error)})
 
 

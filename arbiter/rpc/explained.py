@@ -71,13 +71,16 @@ def wait_for(why: BlockView | None) -> str:
     return "waits for its turn" if why is None else f"waits: {block(why)}"
 
 
-# -- waiters -----------------------------------------------------------------------------------------------------------
+# -- waiters
 def _needs(told: Explanation) -> str:
     together = ""
     if told.gang is not None and told.condition is Situation.GANG_WAITS:
         together = f" with gang {told.gang.id}"
     kept = " or kept for it" if told.kept else ""
-    head = f"{told.consumer}{together} needs {gib(told.needed_bytes)}, {gib(told.free_bytes)} are free{kept}"
+    head = (
+        f"{told.consumer}{together} needs {gib(told.needed_bytes)}, {gib(told.free_bytes)} are "
+        f"free{kept}"
+    )
     head += f", {gib(told.deficit_bytes)} are missing" if told.deficit_bytes else ""
     if told.expected_bytes is not None:
         declared = told.footprint.declared_bytes["load_peak"]
@@ -123,7 +126,10 @@ def _in_gang(told: Explanation, gang: GangView) -> str:
         Wait.MAKING_ROOM: "room is being made for the whole gang",
         Wait.NO_VICTIM: "no holder that could make room for the whole gang may be asked now",
     }
-    return f"waits as one of gang {gang.id}: {'behind others' if told.wait is None else why.get(told.wait) or WAIT[told.wait]}"
+    return (
+        f"waits as one of gang {gang.id}: "
+        f"{'behind others' if told.wait is None else why.get(told.wait) or WAIT[told.wait]}"
+    )
 
 
 def _leaving(one: Blocker) -> str:
@@ -131,7 +137,10 @@ def _leaving(one: Blocker) -> str:
     match one.condition:
         case Condition.REVOKED if one.uses:
             uses = f"{one.uses} use{'' if one.uses == 1 else 's'}"
-            return f"waits for {one.consumer} to finish {uses} ({ago}), then it unloads and {charge} are verified"
+            return (
+                f"waits for {one.consumer} to finish {uses} ({ago}), then it unloads and {charge} "
+                "are verified"
+            )
         case Condition.REVOKED:
             return f"waits for {one.consumer} to unload ({ago}), then {charge} are verified"
         case Condition.UNLOADING:
@@ -149,20 +158,24 @@ def condition(one: Blocker) -> str:
         Condition.LOADING: _loading(one),
         Condition.REVOKED: f"was asked to leave {seconds:.1f} s ago, {_uses(one)}",
         Condition.UNLOADING: "is unloading",
-        Condition.HANGING: f"is unloading for {seconds:.0f} s and may hang: end its process (pid {one.pid})",
+        Condition.HANGING: f"is unloading for {seconds:.0f} s and may hang: end its process (pid "
+        f"{one.pid})",
         Condition.MEASURED: "let go, its bytes are being measured",
         Condition.NOT_BACK: f"has not come back since the restart, is given up in {seconds:.1f} s",
         Condition.GANG: f"belongs to gang {one.by}, which is not complete",
         Condition.PINNED: f"is pinned by {one.by}" if one.by else "is pinned",
         Condition.RESIDENCY: f"may stay {seconds:.1f} s more (minimum residency)",
         Condition.THRASHING: f"may stay {seconds:.1f} s more (they keep throwing each other out)",
-        Condition.PRIORITY: f"is in use and has priority {one.priority}, the waiter {one.waiter_priority}",
+        Condition.PRIORITY: f"is in use and has priority {one.priority}, the waiter "
+        f"{one.waiter_priority}",
         Condition.IN_USE: "is in use",
         Condition.IDLE: "is idle and may be asked",
         Condition.CONTEXT: "keeps its context until it exits",
-        Condition.RETAINED: f"keeps more than its context until its process (pid {one.pid}) gives it back or ends",
+        Condition.RETAINED: f"keeps more than its context until its process (pid {one.pid}) gives "
+        "it back or ends",
         Condition.DEBT: "is over, its bytes are being measured",
-        Condition.DEBT_KEPT: f"is over, and its process (pid {one.pid}) keeps its bytes until it frees them or ends",
+        Condition.DEBT_KEPT: f"is over, and its process (pid {one.pid}) keeps its bytes until it "
+        "frees them or ends",
         Condition.STOWAWAY: "holds bytes without a lease",
         Condition.TURN: f"has its bytes kept for its turn in gang {one.by}",
     }[one.condition]
@@ -181,7 +194,7 @@ def _uses(one: Blocker) -> str:
     return running + paused
 
 
-# -- leases that are granted -------------------------------------------------------------------------------------------
+# -- leases that are granted
 def _resident(told: Explanation) -> str:
     says = _away(told) if told.holder is None else _holder(told, told.holder)
     if told.gang is not None:
@@ -237,7 +250,7 @@ def _away(told: Explanation) -> str:
             return f"{where}: comes back with the next reading of the GPU, or after those before it"
 
 
-# -- steps -------------------------------------------------------------------------------------------------------------
+# -- steps
 def _step(step: Step) -> str:
     when = ""
     if step.in_s is not None:

@@ -1,4 +1,5 @@
-"""What a peer may be: visible, and perhaps an operator. Which process it is says the kernel (`schemas.runtime.peercred`).
+"""What a peer may be: visible, and perhaps an operator. Which process it is says the kernel
+(`schemas.runtime.peercred`).
 
 Must not know sessions or requests.
 """
@@ -18,13 +19,16 @@ def check_visible(peer: Peer) -> None:
     """Raises NotPermitted for a process of another pid namespace: its death could not be seen."""
     if peer.process.pid == 0:
         raise NotPermitted(
-            "the process at the other end cannot be seen from here: it runs in another pid namespace, not below the arbiter's",
-            hint="run the arbiter in the host's pid namespace (docker: --pid=host); clients may be in containers",
+            "the process at the other end cannot be seen from here: it runs in another pid "
+            "namespace, not below the arbiter's",
+            hint="run the arbiter in the host's pid namespace (docker: --pid=host); clients may be "
+            "in containers",
         )
 
 
 def is_operator(peer: Peer, operators_gid: int | None) -> bool:
-    """Root, the daemon's own user, or a member (primary or supplementary) of the operators' group."""
+    """Root, the daemon's own user, or a member (primary or supplementary) of the
+    operators' group."""
     if peer.uid in (0, os.getuid()):
         return True
     if operators_gid is None:
@@ -41,12 +45,18 @@ def is_operator(peer: Peer, operators_gid: int | None) -> bool:
 def how_to_operate(operators_gid: int | None) -> str:
     """What a peer that may not act by hand can do, with the group's name."""
     if operators_gid is None:
-        return "use its user or root, or let the daemon name a group (wire.operators_group); looking is open to observers"
+        return (
+            "use its user or root, or let the daemon name a group (wire.operators_group); looking "
+            "is open to observers"
+        )
     try:
         name = grp.getgrgid(operators_gid).gr_name
     except KeyError:
         name = str(operators_gid)
-    return f"use its user or root, or join the group {name} (wire.operators_group, then log in again); looking is open to observers"
+    return (
+        f"use its user or root, or join the group {name} (wire.operators_group, then log in "
+        "again); looking is open to observers"
+    )
 
 
 def group_id(name: str) -> int | None:

@@ -1,4 +1,5 @@
-"""Requests that can change the engine, turned into its events. Pure: no sessions, no sockets, no answers."""
+"""Requests that can change the engine, turned into its events. Pure: no sessions, no sockets, no
+answers."""
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, RequestId, Token, UseId
@@ -11,7 +12,8 @@ BY_HAND = frozenset(("evict", "pin", "unpin", "release_dead", "drain", "resume")
 
 
 def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event | None:
-    """Return the event of a request; None for a request that only reads. `operator` names the peer of an action by hand."""
+    """Return the event of a request; None for a request that only reads. `operator` names the peer
+    of an action by hand."""
     re = RequestId(request.id)
     match request:
         case w.Acquire():

@@ -1,8 +1,9 @@
 """Connections: their processes, what they may do, and requests turned into events of the engine.
 
-One `SessionTable` is the router's handler. It runs on the thread of the event loop, never blocks, and knows neither sockets (it is given
-`Connection`) nor how the engine decides (it is given `Decisions`). Rules: nothing but `hello` before a hello; a connection belongs to the
-process that the kernel named when it was accepted; every limit's breach is a typed reply; no input raises.
+One `SessionTable` is the router's handler. It runs on the thread of the event loop, never blocks,
+and knows neither sockets (it is given `Connection`) nor how the engine decides (it is given
+`Decisions`). Rules: nothing but `hello` before a hello; a connection belongs to the process that
+the kernel named when it was accepted; every limit's breach is a typed reply; no input raises.
 """
 
 import difflib
@@ -54,7 +55,8 @@ from vram_arbiter.schemas.wire.replies import (
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
 SILENT_S = 10.0
-"""At a limit of sessions a connection that never held anything and has been silent for so long makes room."""
+"""At a limit of sessions a connection that never held anything and has been silent for so long
+makes room."""
 REFUSED_MAX_BYTES = 64 * KIB
 """Of a message over the rate the id is read, if it is no larger than this."""
 
@@ -105,7 +107,8 @@ class Watch(Protocol):
     """Deaths of processes (`arbiter.host.process_watch.ProcessWatch`), as sessions need them."""
 
     def take(self, process: ProcessKey, pidfd: int) -> bool:
-        """Watch a process by a copy of `pidfd`. False: it was watched before. Raises OSError where no descriptor is left."""
+        """Watch a process by a copy of `pidfd`. False: it was watched before. Raises OSError where
+        no descriptor is left."""
         ...
 
     def drop(self, process: ProcessKey) -> None:
@@ -114,7 +117,8 @@ class Watch(Protocol):
 
 
 HistoryReader = Callable[[int, int, tuple[str, ...], Callable[[HistoryReply], None]], None]
-"""`read(after, limit, kinds, done)`: `done` is called on the loop's thread, at once or later, with the body of the reply."""
+"""`read(after, limit, kinds, done)`: `done` is called on the loop's thread, at once or later, with
+the body of the reply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +155,8 @@ class Session:
     heard_at: float
     seq: int = 0
     leased: bool = False
-    """It asked for a lease or a use at least once: the engine is asked before the session ends without a `bye`."""
+    """It asked for a lease or a use at least once: the engine is asked before the session ends
+    without a `bye`."""
     lost: bool = False
     """Its connection is gone; the client may come back on another one."""
 
@@ -166,7 +171,8 @@ class _Entry:
 
 
 class SessionTable:
-    """All connections; also the way out for the executor (`reply`, `refuse`, `push`, `broadcast`)."""
+    """All connections; also the way out for the executor (`reply`, `refuse`, `push`,
+    `broadcast`)."""
 
     def __init__(
         self,
@@ -198,7 +204,8 @@ class SessionTable:
         )  # watched since a hello, and never had a lease or a use
         self._budgets = ProcessBudgets(settings.process_rate_per_s)
         self._too_fast = LimitExceeded(
-            f"more than {settings.rate_per_s} requests a second of one connection, or {settings.process_rate_per_s} of one process; "
+            f"more than {settings.rate_per_s} requests a second of one connection, or "
+            f"{settings.process_rate_per_s} of one process; "
             "each KiB of a message counts as one more",
             hint="send less often",
             details={
@@ -208,7 +215,7 @@ class SessionTable:
             },
         ).view()
 
-    # -- in ----------------------------------------------------------------------------------------------------
+    # -- in
     def connected(self, connection: Connection) -> None:
         """A peer has finished the handshake; it is a stranger until its hello."""
         now, rate = self._clock(), float(self._settings.rate_per_s)
@@ -217,9 +224,11 @@ class SessionTable:
         self._entries[connection.serial] = _Entry(Budget(rate, rate, now), shared)
 
     def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
-        """One message. Never raises for anything that a peer can send. False: its sender is over its rate.
+        """One message. Never raises for anything that a peer can send. False: its sender is over
+        its rate.
 
-        1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and validate. 3. No session: hello or
+        1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and
+           validate. 3. No session: hello or
         UnknownSession. 4. Role. 5. Dispatch.
         """
         entry, now = self._entries[connection.serial], self._clock()
@@ -264,8 +273,10 @@ class SessionTable:
         return True
 
     def disconnected(self, connection: Connection, reason: str) -> None:
-        """A connection has ended. Its session ends with it, unless the engine knows the client: a holder keeps its lease and its uses
-        until it reattaches, its ttl is over or its process dies."""
+        """A connection has ended. Its session ends with it, unless the engine knows the client: a
+        holder keeps its lease and its uses until it reattaches, its ttl is over or its process
+        dies.
+        """
         session = self._entries.pop(connection.serial).session
         if session is None or self._sessions.get(session.client) is not session:
             return
@@ -274,7 +285,8 @@ class SessionTable:
         self._end_if_forgotten(session)
 
     def sweep(self) -> None:
-        """End the sessions of lost connections whose clients have nothing left. Called now and then."""
+        """End the sessions of lost connections whose clients have nothing left. Called now and
+        then."""
         for session in [session for session in self._sessions.values() if session.lost]:
             self._end_if_forgotten(session)
 
@@ -288,7 +300,7 @@ class SessionTable:
     def __len__(self) -> int:
         return len(self._sessions)
 
-    # -- out ---------------------------------------------------------------------------------------------------
+    # -- out
     def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None:
         if session := self._sessions.get(self._moved.get(client, client)):
             session.connection.send(codec.reply(request, self._settings.epoch, body))
@@ -304,13 +316,18 @@ class SessionTable:
             session.connection.send(codec.push(session.seq, self._settings.epoch, body))
 
     def broadcast(self, event: Mapping[str, Any]) -> None:
-        """One history event to every subscriber. One that does not read loses events and can fetch them by `history`."""
+        """One history event to every subscriber. One that does not read loses events and can fetch
+        them by `history`."""
         for client in list(self._subscribers):
             self.push(client, EventPush(event))
 
-    # -- steps -------------------------------------------------------------------------------------------------
+    # -- steps
     def _hello(self, connection: Connection, entry: _Entry, hello: w.Hello, now: float) -> None:
-        """1. Version. 2. A process that can be seen. 3. Role. 4. Room. 5. Watch it, tell the engine, welcome it."""
+        """1.
+
+        Version. 2. A process that can be seen. 3. Role. 4. Room. 5. Watch it, tell the engine,
+        welcome it.
+        """
         self._check_version(hello)  # 1
         peer = connection.peer
         check_visible(peer)  # 2
@@ -341,7 +358,8 @@ class SessionTable:
         self._welcome(session, hello)
 
     def _begin_watch(self, session: Session) -> None:
-        """A process that has held something is watched until it dies, also after its last connection: such processes have shares too."""
+        """A process that has held something is watched until it dies, also after its last
+        connection: such processes have shares too."""
         peer = session.peer
         if peer.process not in self._watched:
             count, of_user = len(self._watched), self._watched.of_user(peer.uid)
@@ -350,7 +368,8 @@ class SessionTable:
             ):
                 raise LimitExceeded(
                     f"{count} processes are watched, {of_user} of them of uid {peer.uid}",
-                    hint="end processes that use the arbiter no longer, or raise limits.connections_max and LimitNOFILE of the daemon",
+                    hint="end processes that use the arbiter no longer, or raise "
+                    "limits.connections_max and LimitNOFILE of the daemon",
                     details={"limit": "connections_max", "value": self._watched.most},
                 )
         try:
@@ -366,8 +385,10 @@ class SessionTable:
             self._casual.add(peer.process)
 
     def _replace_earlier(self, session: Session) -> None:
-        """A client object that comes back on a new connection: the old one ends. The engine moves what was its own to the new one;
-        answers under way to the old one, and to no older one, go there too."""
+        """A client object that comes back on a new connection: the old one ends. The engine moves
+        what was its own to the new one; answers under way to the old one, and to no older one, go
+        there too.
+        """
         key = (session.peer.process, session.instance)
         earlier = self._instances.get(key)
         if earlier is not None and earlier in self._sessions:
@@ -390,8 +411,10 @@ class SessionTable:
     def _check_version(self, hello: w.Hello) -> None:
         if hello.version != WIRE_VERSION:
             raise VersionMismatch(
-                f"the arbiter speaks version {WIRE_VERSION} of the wire, the client speaks {hello.version}",
-                hint=f"upgrade the {'client' if hello.version < WIRE_VERSION else 'arbiter'}: both must speak the same version",
+                f"the arbiter speaks version {WIRE_VERSION} of the wire, the client speaks "
+                f"{hello.version}",
+                hint=f"upgrade the {'client' if hello.version < WIRE_VERSION else 'arbiter'}: both "
+                "must speak the same version",
                 details={"server": WIRE_VERSION, "client": hello.version},
             )
 
@@ -408,7 +431,8 @@ class SessionTable:
         self.reply(session.client, RequestId(hello.id), welcome)
 
     def _hello_again(self, session: Session, hello: w.Hello) -> None:
-        """A repeated hello is answered again; under another name it is another client's, which needs its own connection."""
+        """A repeated hello is answered again; under another name it is another client's, which
+        needs its own connection."""
         self._check_version(hello)
         if (hello.name, hello.instance, hello.role) != (
             session.name,
@@ -422,19 +446,23 @@ class SessionTable:
         self._welcome(session, hello)
 
     def _make_room(self, session: Session, now: float) -> None:
-        """A place within the shares of the process and the user, and beside the operators' reserve. A session whose connection is
-        lost, or that is silent and never held anything, leaves for it."""
+        """A place within the shares of the process and the user, and beside the operators' reserve.
+        A session whose connection is lost, or that is silent and never held anything, leaves for
+        it.
+        """
         settings, peer = self._settings, session.peer
         operator = session.role == "operator"
         every = settings.sessions_max
         allowed = every if operator else every - min(settings.operator_reserve, every - 1)
         self._need(
-            len(self._of_process.get(peer.process, ())), share_of(every, settings.process_share), "process_share",
+            len(self._of_process.get(peer.process, ())), share_of(every, settings.process_share),
+            "process_share",
             f"process {peer.process.pid}", lambda other: other.peer.process == peer.process, now,
         )  # fmt: skip
         if not operator:
             self._need(
-                self._sessions_of_user.get(peer.uid, 0), share_of(every, settings.user_share), "user_share",
+                self._sessions_of_user.get(peer.uid, 0), share_of(every, settings.user_share),
+                "user_share",
                 f"uid {peer.uid}", lambda other: other.peer.uid == peer.uid, now,
             )  # fmt: skip
         self._need(
@@ -450,7 +478,8 @@ class SessionTable:
         among: Callable[[Session], bool],
         now: float,
     ) -> None:
-        """Raises LimitExceeded where `count` sessions are as many as may be, and none of those `among` can leave."""
+        """Raises LimitExceeded where `count` sessions are as many as may be, and none of those
+        `among` can leave."""
         if count < most:
             return
         leaving = [
@@ -463,7 +492,8 @@ class SessionTable:
         if not leaving:
             raise LimitExceeded(
                 f"{whose}: {count} connections are open, the limit is {most}",
-                hint=f"close connections that are not used, or raise limits.sessions_max or limits.{limit}",
+                hint="close connections that are not used, or raise limits.sessions_max or "
+                f"limits.{limit}",
                 details={"limit": limit, "value": most},
             )
         oldest = min(leaving, key=lambda other: (not other.lost, other.heard_at))
@@ -522,7 +552,8 @@ class SessionTable:
         )
 
     def _dispatch(self, session: Session, request: w.Request) -> None:
-        """Reads are answered here; everything that can change the engine becomes an event, whose effects answer."""
+        """Reads are answered here; everything that can change the engine becomes an event, whose
+        effects answer."""
         client, re = session.client, RequestId(request.id)
         match request:
             case w.Hello():
@@ -576,7 +607,8 @@ class SessionTable:
             others = [other.peer for other in self._subscribers.values()]
             for count, allowed, limit in (
                 (len(others), most, "subscribers_max"),
-                (sum(other.uid == peer.uid for other in others), share_of(most, self._settings.user_share), "user_share"),
+                (sum(other.uid == peer.uid for other in others),
+                share_of(most, self._settings.user_share), "user_share"),
                 (sum(other.process == peer.process for other in others),
                  share_of(most, self._settings.process_share), "process_share"),
             ):  # fmt: skip

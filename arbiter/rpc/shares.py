@@ -1,7 +1,9 @@
-"""Shares of the server: requests by connection and process, sessions by process and user. Pure: time is passed in.
+"""Shares of the server: requests by connection and process, sessions by process and user. Pure:
+time is passed in.
 
-A request is charged by its size, because its cost grows with it. Processor time of different users is not divided here but by the
-router, which handles messages in turns over users and processes: a budget of a user would let some of its processes refuse another.
+A request is charged by its size, because its cost grows with it. Processor time of different users
+is not divided here but by the router, which handles messages in turns over users and processes: a
+budget of a user would let some of its processes refuse another.
 """
 
 from dataclasses import dataclass
@@ -32,7 +34,8 @@ class Budget:
 
 
 class ProcessBudgets:
-    """One budget for all connections of a process. It outlives them: connecting again does not refill it."""
+    """One budget for all connections of a process. It outlives them: connecting again does not
+    refill it."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -54,7 +57,8 @@ class ProcessBudgets:
 
 
 class WatchedProcesses:
-    """Processes that are watched since a hello: each costs a descriptor until it dies, with or without a connection."""
+    """Processes that are watched since a hello: each costs a descriptor until it dies, with or
+    without a connection."""
 
     def __init__(self, most: int, user_share: float) -> None:
         self.most = most
@@ -84,9 +88,11 @@ class WatchedProcesses:
 
 
 def spend(cost: int, own: Budget, process: Budget, now: float) -> bool:
-    """Charge a request to a connection and its process. False: one of them has nothing left, and nothing is charged.
+    """Charge a request to a connection and its process. False: one of them has nothing left, and
+    nothing is charged.
 
-    A request that costs more than what is left goes through, and the next ones wait until that is paid.
+    A request that costs more than what is left goes through, and the next ones wait until that is
+    paid.
     """
     if not (own.has_some(now) and process.has_some(now)):
         return False

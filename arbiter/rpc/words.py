@@ -1,7 +1,8 @@
 """English for plain wire clients, history and logs: the engine's codes and values in words.
 
-The engine holds no prose, so that rewording a message changes no decision and no replay. Each error says what is wrong,
-with values, then what to do. `arbiter.rpc.explained` does the same for answers to `why`.
+The engine holds no prose, so that rewording a message changes no decision and no replay. Each error
+says what is wrong, with values, then what to do. `arbiter.rpc.explained` does the same for answers
+to `why`.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,7 +45,7 @@ _UNPIN = "unpin it first"
 _PINNED = "end its program: a pinned holder is never made to leave"
 
 
-# -- errors ------------------------------------------------------------------------------------------------------------
+# -- errors
 def error_view(refusal: Refusal) -> ErrorView:
     """Return the error of a refusal with its words: what is wrong, then what to do."""
     if isinstance(refusal, r.TimedOut):
@@ -71,14 +72,18 @@ def _too_large(no: r.TooLarge) -> tuple[str, str]:
 
 
 def _growth_too_large(no: r.GrowthTooLarge) -> tuple[str, str]:
-    told = f"{no.consumer} would need {no.needed_bytes} bytes; alone on its GPU it can have {no.room_bytes}"
+    told = (
+        f"{no.consumer} would need {no.needed_bytes} bytes; alone on its GPU it can have "
+        f"{no.room_bytes}"
+    )
     return told, "stay smaller"
 
 
 def _bad_lease_state(no: r.BadLeaseState) -> tuple[str, str]:
     told = {
         r.Misfit.STILL_QUEUED: "it is still queued",
-        r.Misfit.NOT_AWAY: "only a lease that is away, or being measured on its way there, is called back",
+        r.Misfit.NOT_AWAY: "only a lease that is away, or being measured on its way there, is "
+        "called back",
         r.Misfit.GRANTED: "it is granted already, release it",
         r.Misfit.NOT_LOADING: "only a loading lease becomes ready",
         r.Misfit.NOT_HELD: "only a held lease can be used",
@@ -170,7 +175,8 @@ def _ambiguous(no: r.Ambiguous) -> tuple[str, str]:
 
 def _no_host_ram(no: r.NoHostRam) -> tuple[str, str]:
     return (
-        f"{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} {no.booked_bytes} are booked",
+        f"{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} "
+        f"{no.booked_bytes} are booked",
         "release without parking, or raise host.park_budget_bytes",
     )
 
@@ -223,7 +229,8 @@ def _broken_gang(no: r.BrokenGang) -> tuple[str, str]:
         r.GangEnd.FALLEN: f"{no.consumer} ({no.lease_id}) is {no.state}{because}",
         r.GangEnd.INCOMPLETE: "not all of it came back after the restart",
         r.GangEnd.MEMBER_TOO_LARGE: "a member holds more than it declared, the rest no longer fits",
-        r.GangEnd.OTHERS_TOO_LARGE: "others hold more than they were granted, the rest no longer fits",
+        r.GangEnd.OTHERS_TOO_LARGE: "others hold more than they were granted, the rest no longer "
+        "fits",
         r.GangEnd.NOT_FREED: "measured memory did not come back, the rest no longer fits",
     }[no.why]
     return f"gang {no.gang}: {told}", "ask for all of it again"
@@ -244,8 +251,10 @@ def _deadlock(no: r.Deadlock) -> tuple[str, str]:
 
 _ERRORS: Final[Mapping[type[Refusal], Callable[[Any], tuple[str, str]]]] = {
     r.NoSession: lambda no: ("this connection has not said hello", "say hello, then re-attach"),
-    r.NoLease: lambda no: (f"there is no lease {no.lease_id}", "acquire one; after a restart: re-attach"),
-    r.WrongToken: lambda no: (f"{no.token} is not the token of {no.lease_id}", "use the token that came with the grant"),
+    r.NoLease: lambda no: (f"there is no lease {no.lease_id}",
+    "acquire one; after a restart: re-attach"),
+    r.WrongToken: lambda no: (f"{no.token} is not the token of {no.lease_id}",
+    "use the token that came with the grant"),
     r.NotHolder: lambda no: (f"{no.lease_id} belongs to process {no.pid}", "ask as its holder"),
     r.BadLeaseState: _bad_lease_state,
     r.BadTargetState: _bad_target_state,
@@ -262,12 +271,14 @@ _ERRORS: Final[Mapping[type[Refusal], Callable[[Any], tuple[str, str]]]] = {
     r.CancelledRequest: lambda no: (f"{no.lease_id}: {_why(no.why, no.by)}", "acquire again"),
     r.TimedOut: _timed_out,
     r.HolderOutstays: lambda no: (
-        f"{no.consumer} did not leave within {no.deadline_s:g} s", "try again later, or wait: on_deadline=wait"
+        f"{no.consumer} did not leave within {no.deadline_s:g} s",
+        "try again later, or wait: on_deadline=wait"
     ),
     r.Expired: _expired,
     r.Lost: _lost,
     r.NotJournaled: lambda no: (
-        f"the grant of {no.lease_id} could not be written: {no.problem}", "look at the daemon's log and its disk"
+        f"the grant of {no.lease_id} could not be written: {no.problem}",
+        "look at the daemon's log and its disk"
     ),
     r.GangMismatch: _mismatch,
     r.GangTooLarge: _gang_too_large,
@@ -280,7 +291,7 @@ def _worded(error: ErrorView) -> ErrorView:
     return error_view(error.details) if isinstance(error.details, Refusal) else error
 
 
-# -- replies and pushes ------------------------------------------------------------------------------------------------
+# -- replies and pushes
 def reply(body: AnyReply) -> AnyReply:
     """Return a reply with its words."""
     match body:
@@ -332,7 +343,7 @@ def _why(code: str, by: str = "") -> str:
     return f"{words}: {by}" if by else str(words)
 
 
-# -- events ------------------------------------------------------------------------------------------------------------
+# -- events
 def event(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the facts of a note as history keeps them: plain values, and `reason` in words."""
     plain = {key: _plain(value) for key, value in data.items() if key != "refusal"}
@@ -401,7 +412,10 @@ def _drift(data: Mapping[str, Any]) -> str:
 
 
 def _signalled(data: Mapping[str, Any]) -> str:
-    return f"asked {data['asked_s']:.1f} s ago, idle, and its lease says on_overstay={data['on_overstay']}"
+    return (
+        f"asked {data['asked_s']:.1f} s ago, idle, and its lease says "
+        f"on_overstay={data['on_overstay']}"
+    )
 
 
 def _expired_note(data: Mapping[str, Any]) -> str:

@@ -50,7 +50,8 @@ DESCRIPTIONS = {
 SEED_MAX = 2**31 - 1
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
 BUDGET = "8GiB"
-LOAD_BYTES_PER_S = 2_500_000_000  # of the simulated card: about what safetensors' load_file reaches from the page cache
+# of the simulated card: about what safetensors' load_file reaches from the page cache
+LOAD_BYTES_PER_S = 2_500_000_000
 BOOT_S = 240.0
 LOOP_S = (
     400.0  # it takes one or two minutes; a machine with other work on its cores has time as well
@@ -105,7 +106,8 @@ def run(args: argparse.Namespace) -> int:
     arbiter = args.arbiter == "on"
     if args.gpu == "nvml" and not arbiter:
         args.parser.error(
-            "without the arbiter no program reads a real GPU; use --gpu fake:8GiB with --arbiter off"
+            "without the arbiter no program reads a real GPU; use --gpu fake:8GiB with --arbiter "
+            "off"
         )
     packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
     need("the demo", *packages, extra="all")
@@ -168,13 +170,18 @@ async def _episode(
     )
     capacity = watch.capacity_bytes or parse_bytes(gpu.removeprefix("fake:"))
     summary = summarise(
-        seed=seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity, events=watch.events, reasoner=outcome, truth=truth,
+        seed=seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
+        events=watch.events, reasoner=outcome, truth=truth,
         target=target, seconds=seconds,
     )  # fmt: skip
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    title = f"{task}: {'completed' if summary['completed'] else 'not completed'}, {summary['oom_events']} out-of-memory"
+    title = (
+        f"{task}: {'completed' if summary['completed'] else 'not completed'}, "
+        f"{summary['oom_events']} out-of-memory"
+    )
     draw_timeline(
-        out / "timeline.png", story, capacity, watch.events, start_s=watch.start_s, wall_offset_s=watch.wall_offset_s,
+        out / "timeline.png", story, capacity, watch.events, start_s=watch.start_s,
+        wall_offset_s=watch.wall_offset_s,
         title=title + ("" if arbiter else " (no arbiter)"),
     )  # fmt: skip
     return summary
@@ -204,9 +211,11 @@ async def _boot(
     gpu: str,
     out: Path,
 ) -> AsyncClient | None:
-    """Start everything and wait until each answers. The arbiter's client, if there is an arbiter."""
+    """Start everything and wait until each answers. The arbiter's client, if there is an
+    arbiter."""
     print(
-        f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take a while) …"
+        f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take "
+        "a while) …"
     )
     without = [] if arbiter else ["--no-arbiter"]
     client = None

@@ -1,6 +1,8 @@
-"""The demo's live display: the card as a bar, the leases as a table, the last switches, and where the robot is.
+"""The demo's live display: the card as a bar, the leases as a table, the last switches, and where
+the robot is.
 
-On a terminal it redraws in place; into a file or a CI log it prints one line per event. It sends no requests.
+On a terminal it redraws in place; into a file or a CI log it prints one line per event. It sends no
+requests.
 """
 
 import sys
@@ -33,7 +35,10 @@ def describe(event: Mapping[str, Any]) -> str:
         case "revoke_asked":
             return f"{who}: asked to leave ({event.get('reason', '')})"
         case "verified":
-            return f"{who}: memory measured back, verdict {event.get('verdict')} after {event.get('verify_ms', event.get('ms', 0)):.0f} ms"
+            return (
+                f"{who}: memory measured back, verdict {event.get('verdict')} after "
+                f"{event.get('verify_ms', event.get('ms', 0)):.0f} ms"
+            )
         case "switch" if event["switched"]:
             gone = ", ".join(victim["consumer"] for victim in event["evicted"])
             return f"{who} took over from {gone} in {event['total_ms']:.0f} ms"
@@ -119,7 +124,8 @@ def _bar(gpu: Mapping[str, Any], leases: list[Mapping[str, Any]]) -> Text:
     bar.append("░" * max(0, BAR_CELLS - cells))
     used = gpu["measured_used_bytes"]
     bar.append(
-        f"  measured {'unknown' if used is None else format_bytes(used)} of {format_bytes(capacity)}"
+        f"  measured {'unknown' if used is None else format_bytes(used)} of "
+        f"{format_bytes(capacity)}"
     )
     return bar
 
@@ -128,7 +134,8 @@ def _table(leases: list[Mapping[str, Any]]) -> Table:
     table = Table("consumer", "state", "charged", "uses", "since", expand=False)
     for lease in leases:
         table.add_row(
-            Text(printable(lease["consumer"]), style=COLOURS.get(lease["consumer"], "white")), Text(printable(lease["state"])),
+            Text(printable(lease["consumer"]), style=COLOURS.get(lease["consumer"], "white")),
+            Text(printable(lease["state"])),
             format_bytes(lease["charge_bytes"]), str(lease["uses"]), f"{lease['since_s']:.0f} s",
         )  # fmt: skip
     return table

@@ -1,4 +1,5 @@
-"""The demo's programs: started by `python -m`, watched, and ended again. Only processes started here are ever signalled."""
+"""The demo's programs: started by `python -m`, watched, and ended again. Only processes started
+here are ever signalled."""
 
 import asyncio
 import os
@@ -38,12 +39,14 @@ class Programs:
     running: dict[str, Program] = field(default_factory=dict)
 
     async def start(self, name: str, package: str, *arguments: str) -> Program:
-        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`; its output goes to `<log_dir>/<name>.log`."""
+        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`; its output goes to
+        `<log_dir>/<name>.log`."""
         log = self.log_dir / f"{name}.log"
         with log.open("wb") as sink:
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", f"vram_arbiter.{package}", *arguments,
-                stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink, env=dict(os.environ) | traces.environ() | dict(self.environ),
+                stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink,
+                env=dict(os.environ) | traces.environ() | dict(self.environ),
             )  # fmt: skip
         program = self.running[name] = Program(name, process, log)
         return program
@@ -57,7 +60,8 @@ class Programs:
         for program in self.running.values():
             if program.process.returncode is not None:
                 raise SidecarUnavailable(
-                    f"{program.name} ended with exit code {program.process.returncode}:\n{program.tail()}",
+                    f"{program.name} ended with exit code "
+                    f"{program.process.returncode}:\n{program.tail()}",
                     hint=f"its whole output is in {program.log}",
                 )
 
@@ -74,6 +78,7 @@ class Programs:
             await program.process.wait()
 
     async def stop_all(self) -> None:
-        """End everything that still runs, last started first: clients leave before the arbiter does."""
+        """End everything that still runs, last started first: clients leave before the arbiter
+        does."""
         for name in reversed(list(self.running)):
             await self.stop(name)

@@ -1,4 +1,5 @@
-"""What a demo leaves behind: `summary.json` and `timeline.png`, from the card's own allocation log and the arbiter's history.
+"""What a demo leaves behind: `summary.json` and `timeline.png`, from the card's own allocation log
+and the arbiter's history.
 
 Pure but for writing those two files. It must not know how the programs were started.
 """
@@ -28,7 +29,8 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class CardStory:
-    """What happened on the card: every change of every program, the peak, and how often an allocation was refused."""
+    """What happened on the card: every change of every program, the peak, and how often an
+    allocation was refused."""
 
     points: tuple[Point, ...]
     peak_bytes: int
@@ -36,7 +38,8 @@ class CardStory:
 
 
 def read_log(text: str, names: Mapping[int, str]) -> CardStory:
-    """Story of a simulated card from its allocation log; `names` says which pid is which program. Torn lines are skipped."""
+    """Story of a simulated card from its allocation log; `names` says which pid is which program.
+    Torn lines are skipped."""
     points: list[Point] = []
     refused: list[float] = []
     peak = 0
@@ -62,7 +65,8 @@ def read_samples(
     events: Iterable[Mapping[str, Any]],
     wall_offset_s: float,
 ) -> CardStory:
-    """The same for a real card, from `status` readings of the arbiter: (monotonic seconds, GpuView)."""
+    """The same for a real card, from `status` readings of the arbiter: (monotonic seconds,
+    GpuView)."""
     points: list[Point] = []
     peak = 0
     for at_s, gpu in samples:
@@ -80,10 +84,12 @@ def read_samples(
 
 
 def summarise(
-    *, seed: int, arbiter: bool, task: str, story: CardStory, capacity_bytes: int, events: Sequence[Mapping[str, Any]],
+    *, seed: int, arbiter: bool, task: str, story: CardStory, capacity_bytes: int,
+    events: Sequence[Mapping[str, Any]],
     reasoner: Mapping[str, Any], truth: Mapping[str, Any], target: str, seconds: float,
 ) -> dict[str, Any]:  # fmt: skip
-    """The demo's outcome. `completed` needs three witnesses: the simulator, the scene VLM and the reasoner."""
+    """The demo's outcome. `completed` needs three witnesses: the simulator, the scene VLM and the
+    reasoner."""
     switches = [event for event in events if event["kind"] == "switch"]
     held = bool(truth.get("held_above_table", {}).get(target))
     confirmed = bool(reasoner.get("vlm_confirmed"))
@@ -128,7 +134,8 @@ def draw_timeline(
     wall_offset_s: float,
     title: str,
 ) -> None:
-    """Stacked bytes per program over seconds since the start; capacity as a line; evictions and refusals marked."""
+    """Stacked bytes per program over seconds since the start; capacity as a line; evictions and
+    refusals marked."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -142,7 +149,8 @@ def draw_timeline(
         colours = [COLOURS.get(name, OTHER_COLOUR) for name in names]
         axes.stackplot(times, stacks, step="post", labels=names, colors=colours, alpha=0.85)
     axes.axhline(capacity_bytes / GIB, color="black", linewidth=1.2)
-    axes.annotate(f"capacity {format_bytes(capacity_bytes)}", (0.005, capacity_bytes / GIB), xycoords=("axes fraction", "data"),
+    axes.annotate(f"capacity {format_bytes(capacity_bytes)}", (0.005, capacity_bytes / GIB),
+    xycoords=("axes fraction", "data"),
                   xytext=(0, 3), textcoords="offset points", fontsize=8)  # fmt: skip
     for event in events:
         at_s = event["at_wall_s"] - wall_offset_s - start_s

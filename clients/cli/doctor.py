@@ -42,7 +42,8 @@ class Finding:
 
 
 def doctor(*, as_json: bool, endpoint: str | None) -> int:
-    """Return 0 if all is well, 1 for a finding (an unhealthy daemon too), 3 if the arbiter cannot be reached."""
+    """Return 0 if all is well, 1 for a finding (an unhealthy daemon too), 3 if the arbiter cannot
+    be reached."""
     where = endpoint or arbiter_endpoint(os.environ, os.getuid())
     findings = [_origin(), _driver(), Finding("endpoint", None, where)]
     reachable, about = _arbiter(where)
@@ -82,7 +83,8 @@ def _driver() -> Finding:
 
 
 def _memory_of(nvml: Any, card: Any) -> str:
-    """Jetson and GB10 have no memory of their own: the arbiter's source `auto` reads the machine's there."""
+    """Jetson and GB10 have no memory of their own: the arbiter's source `auto` reads the machine's
+    there."""
     if card is None:
         return ""
     try:
@@ -126,7 +128,8 @@ def _card(gpu: dict[str, Any]) -> Finding:
         return Finding(
             what,
             False,
-            f"{gpu['name']}: the probe does not answer, nothing is granted ({(gpu['blocked'] or {}).get('text', '')})",
+            f"{gpu['name']}: the probe does not answer, nothing is granted "
+            f"({(gpu['blocked'] or {}).get('text', '')})",
         )
     if gpu["pressure_bytes"]:
         over = format_bytes(gpu["pressure_bytes"])

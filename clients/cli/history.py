@@ -81,7 +81,8 @@ _UNITS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 
 def parse_since(written: str, now_wall_s: float) -> float:
-    """`90s`, `10m`, `2h`, `1d` ago; `14:30` or `14:30:05`, the last time it was so late; or a date, `2026-11-21 14:30`. Wall seconds.
+    """`90s`, `10m`, `2h`, `1d` ago; `14:30` or `14:30:05`, the last time it was so late; or a date,
+    `2026-11-21 14:30`. Wall seconds.
 
     Raises ValueError that says what may be written.
     """
@@ -140,7 +141,8 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 
 
 def collect(wanted: Wanted, endpoint: str | None) -> Message:
-    """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises `Unreachable`."""
+    """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises
+    `Unreachable`."""
     reply = _page(NEVER, 1, (), endpoint)
     if not reply.get("ok"):
         return reply
@@ -199,7 +201,8 @@ def _before(wall_s: float, last_seq: int, endpoint: str | None) -> int:
 
 
 async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = None) -> int:
-    """The newest events, then every further one as it happens, until Ctrl-C; also across restarts of the arbiter.
+    """The newest events, then every further one as it happens, until Ctrl-C; also across restarts
+    of the arbiter.
 
     Raises ArbiterUnreachable if no arbiter answers at first.
     """

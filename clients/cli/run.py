@@ -1,9 +1,12 @@
-"""`vramctl run`: a lease for a program that knows nothing of the arbiter. Acquire, start it, pass signals on, release when it ends.
+"""`vramctl run`: a lease for a program that knows nothing of the arbiter. Acquire, start it, pass
+signals on, release when it ends.
 
-The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the arbiter charges a child's bytes to its
-nearest ancestor with a lease. A program that leaves the tree (it daemonizes) or leases for itself is not covered.
+The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the
+arbiter charges a child's bytes to its nearest ancestor with a lease. A program that leaves the tree
+(it daemonizes) or leases for itself is not covered.
 
-A program cannot unload, it can only end. So it counts as one long use, and what a revoke does is decided here (`ON_REVOKE`).
+A program cannot unload, it can only end. So it counts as one long use, and what a revoke does is
+decided here (`ON_REVOKE`).
 """
 
 import argparse
@@ -36,11 +39,12 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 log = logging.getLogger(__name__)
 
 PRIORITY = 40
-"""Below that of other leases: programs make room for a robot's models, and queue among themselves."""
+"""Below that of other leases: programs make room for a robot's models, and queue among
+themselves."""
 OnRevoke = Literal["priority", "term", "pin"]
 ON_REVOKE: tuple[OnRevoke, ...] = ("priority", "term", "pin")
-"""priority: end the program for a request of a higher priority, or for an operator; others wait until it ends. term: end it for any
-request, and when the arbiter stays away. pin: never."""
+"""priority: end the program for a request of a higher priority, or for an operator; others wait
+until it ends. term: end it for any request, and when the arbiter stays away. pin: never."""
 
 DESCRIPTIONS = {
     "run": "Run a program that knows nothing of the arbiter under a lease: vramctl run --vram 5GiB "
@@ -57,7 +61,8 @@ NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
 
 @dataclass(frozen=True, slots=True)
 class RunSpec:
-    """What to run and what it needs. `grace_s`: from SIGTERM to SIGKILL; None waits for as long as the program takes."""
+    """What to run and what it needs. `grace_s`: from SIGTERM to SIGKILL; None waits for as long as
+    the program takes."""
 
     command: list[str]
     name: str | None
@@ -83,7 +88,8 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--priority",
         type=arguments.count(0, 100),
         default=PRIORITY,
-        help="below the 50 of other leases, so that a robot's models go first (default: %(default)s)",
+        help="below the 50 of other leases, so that a robot's models go first (default: "
+        "%(default)s)",
     )
     parser.add_argument(
         "--wait",
@@ -147,7 +153,8 @@ def _bytes(written: str) -> int:
 
 
 def lease_spec(spec: RunSpec) -> LeaseSpec:
-    """The program's whole need for its whole life: nothing is known of phases inside it. It leaves no residue: it exits."""
+    """The program's whole need for its whole life: nothing is known of phases inside it. It leaves
+    no residue: it exits."""
     return LeaseSpec(
         consumer=spec.consumer,
         model_id=spec.consumer,
@@ -162,7 +169,8 @@ def lease_spec(spec: RunSpec) -> LeaseSpec:
 
 
 async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
-    """The program's exit code. Raises the typed error of a lease that was not granted, ArbiterUnreachable."""
+    """The program's exit code. Raises the typed error of a lease that was not granted,
+    ArbiterUnreachable."""
     program = shutil.which(spec.command[0])
     if program is None:
         code, problem = _why_not(spec.command[0])
@@ -225,7 +233,8 @@ class _Run:
             asked = self._spec.vram_bytes
             more = ", more than was asked for" if self.peak_bytes > asked else ""
             _say(
-                f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} asked{more}"
+                f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} "
+                f"asked{more}"
             )
         else:
             _say("peak not measured: no reading showed bytes of the program")
@@ -262,7 +271,7 @@ class _Run:
         )
         self.peak_bytes = max(self.peak_bytes, used)
 
-    # -- revoke ------------------------------------------------------------------------------------------------------
+    # -- revoke
     async def revoke_asked(self, lease: AsyncLease, eviction: Eviction) -> None:
         self._reason = eviction.reason
         self._wake.set()
@@ -271,7 +280,8 @@ class _Run:
         _say(f"{lease.lease_id} was lost: {error}")
 
     def _decide(self, lease: AsyncLease, status: StatusReply | None) -> None:
-        """End the program where a revoke is for a higher priority. A request that came after the revoke is seen in `status`."""
+        """End the program where a revoke is for a higher priority. A request that came after the
+        revoke is seen in `status`."""
         eviction = lease.evicted
         if eviction is None or self._ending or self._spec.on_revoke != "priority":
             return
@@ -291,7 +301,8 @@ class _Run:
         elif consumer not in self._told:
             self._told.add(consumer)
             _say(
-                f"{consumer} waits for its room (priority {priority}): it gets it when the program ends"
+                f"{consumer} waits for its room (priority {priority}): it gets it when the program "
+                "ends"
             )
 
     async def ended(self) -> None:

@@ -1,5 +1,5 @@
-"""Signals that `vramctl run` passes on to its program: from before it starts, so that none ends `vramctl`
-while it runs."""
+"""Signals that `vramctl run` passes on to its program: from before it starts, so that none ends
+`vramctl` while it runs."""
 
 import asyncio
 import signal
@@ -15,7 +15,8 @@ FORWARDED = (
     signal.SIGWINCH,
 )
 TYPED = frozenset({signal.SIGINT, signal.SIGQUIT})
-"""A terminal sends these to the program as well (Ctrl-C, Ctrl-\\): they are passed on only when a process sent them."""
+r"""A terminal sends these to the program as well (Ctrl-C, Ctrl-\): they are passed on only when a
+process sent them."""
 SI_KERNEL = 128
 
 
@@ -27,7 +28,8 @@ class Forwarding:
         self._early: list[signal.Signals] = []
         self._over = False
         self._loop = asyncio.get_running_loop()
-        # Only sigwaitinfo says where a signal is from, and only in a thread does it not block the loop.
+        # Only sigwaitinfo says where a signal is from, and only in a thread does it not block the
+        # loop.
         self._listener = threading.Thread(target=self._listen, name="signals", daemon=True)
 
     def __enter__(self) -> Self:

@@ -1,6 +1,8 @@
-"""How `vramctl` says things: replies of the arbiter as lines of text. Pure; sizes in GiB/MiB, times in seconds.
+"""How `vramctl` says things: replies of the arbiter as lines of text. Pure; sizes in GiB/MiB, times
+in seconds.
 
-It stands on the fast path: no pydantic, no rich here. Whatever a reply quotes is escaped (`schemas.runtime.printable`).
+It stands on the fast path: no pydantic, no rich here. Whatever a reply quotes is escaped
+(`schemas.runtime.printable`).
 """
 
 import time
@@ -47,13 +49,14 @@ def plural(count: int, word: str) -> str:
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
-# -- status ------------------------------------------------------------------------------------------------------------
+# -- status
 @makes_printable
 def status_lines(status: Message) -> list[str]:
-    """Return the arbiter, each GPU with its other processes, and all leases: residents, then the queue."""
+    """Return the arbiter, each GPU with its other processes, and all leases: residents, then the
+    queue."""
     lines = [
-        f"arbiter {status['phase']} · epoch {status['epoch']} · up {duration(status['uptime_s'])} · "
-        + plural(status["clients"], "client")
+        f"arbiter {status['phase']} · epoch {status['epoch']} · up {duration(status['uptime_s'])} "
+        "· " + plural(status["clients"], "client")
     ]
     if status["phase"] == "recovering":
         lines.append("  after a restart nothing is granted until every lease is accounted for")
@@ -85,7 +88,8 @@ def _gpu_lines(gpu: Message) -> list[str]:
     )
     lines = [
         f"GPU {gpu['index']} {gpu['name']} ({gpu['gpu']})",
-        f"  capacity {size(gpu['capacity_bytes'])}{' =' if known else ':'} reserve {size(gpu['reserve_bytes'])} + charged {size(gpu['charged_bytes'])}"
+        f"  capacity {size(gpu['capacity_bytes'])}{' =' if known else ':'} reserve "
+        f"{size(gpu['reserve_bytes'])} + charged {size(gpu['charged_bytes'])}"
         + (f" + stowaways {size(gpu['stowaway_bytes'])}" if gpu["stowaway_bytes"] else "")
         + (f" + free {size(max(0, room))}" if known else ""),
     ]
@@ -93,7 +97,8 @@ def _gpu_lines(gpu: Message) -> list[str]:
         lines.append("  measured: unknown (the probe fails), so nothing is granted")
     else:
         lines.append(
-            f"  measured {size(gpu['measured_used_bytes'])} in use, {duration(gpu['sample_age_s'] or 0.0)} ago"
+            f"  measured {size(gpu['measured_used_bytes'])} in use, "
+            f"{duration(gpu['sample_age_s'] or 0.0)} ago"
         )
     if gpu["pressure_bytes"]:
         lines.append(f"  pressure: {size(gpu['pressure_bytes'])} more than was granted")
@@ -133,7 +138,8 @@ def _lease_row(lease: Message, indices: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _since_s(lease: Message) -> float:
-    """Since the grant of a lease with bytes on a GPU; otherwise since it waits, or since it left."""
+    """Since the grant of a lease with bytes on a GPU; otherwise since it waits, or since
+    it left."""
     if lease["state"] in ("queued", "standby", "parked"):
         return float(lease["since_s"])
     return float(lease.get("granted_s", lease["since_s"]))
@@ -159,14 +165,15 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [line(columns), *(line(row) for row in shown)]
 
 
-# -- why ---------------------------------------------------------------------------------------------------------------
+# -- why
 @makes_printable
 def why_lines(why: Message) -> list[str]:
     """Return what blocks a consumer: leases, bytes, conditions, what happens next and when."""
     if not why["leases"]:
         name = why["consumer"]
         return [
-            f"{name} has no lease and waits for none (all leases: `vramctl status`; what became of it: `vramctl history -c {name}`)"
+            f"{name} has no lease and waits for none (all leases: `vramctl status`; what became of "
+            f"it: `vramctl history -c {name}`)"
         ]
     lines: list[str] = []
     for lease in why["leases"]:
@@ -188,19 +195,21 @@ def _why_details(lease: Message) -> list[str]:
     )
     for blocker in lease["blockers"]:
         lines.append(
-            f"  blocked   by {blocker['consumer']} ({blocker['lease_id']}): {size(blocker['bytes'])}, "
+            f"  blocked   by {blocker['consumer']} ({blocker['lease_id']}): "
+            f"{size(blocker['bytes'])}, "
             f"{blocker['state']}, {blocker['text']}"
         )
     lines.append(f"  next      {lease['next']}")
     lines += [f"  then      {step['text']}" for step in lease.get("plan", ())]
     eta = lease["eta_s"]
     lines.append(
-        f"  expected  {'unknown, never seen before' if eta is None else f'in {duration(eta)} ({lease["eta_source"]})'}"
+        "  expected  "
+        f"{'unknown, never seen before' if eta is None else f'in {duration(eta)} ({lease["eta_source"]})'}"
     )
     return lines
 
 
-# -- by hand -----------------------------------------------------------------------------------------------------------
+# -- by hand
 @makes_printable
 def by_hand_lines(action: str, reply: Message) -> list[str]:
     """What an operator's action did, and what happens next."""
@@ -238,9 +247,10 @@ def _footprint_lines(footprint: Message | None) -> list[str]:
     return [f"  footprint {', '.join(parts)}"]
 
 
-# -- events ------------------------------------------------------------------------------------------------------------
+# -- events
 def event_line(event: Message) -> str:
-    """One history event: local date and time, kind, consumer and lease, reason, and its other plain fields."""
+    """One history event: local date and time, kind, consumer and lease, reason, and its other plain
+    fields."""
     at = event["at_wall_s"]
     clock = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at)) + f".{int(at * 1000) % 1000:03d}"
     who = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
@@ -258,7 +268,8 @@ def _plain(value: object) -> bool:
 
 
 def _field(key: str, value: Any) -> str:
-    """`charge=1GiB`, `waited=12.3ms`, `eta=3.5s`, `uses=2`: the unit stands behind the number, not in the name."""
+    """`charge=1GiB`, `waited=12.3ms`, `eta=3.5s`, `uses=2`: the unit stands behind the number, not
+    in the name."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if key.endswith("_bytes") and isinstance(value, int):
         return f"{key.removesuffix('_bytes')}={format_bytes(value).replace(' ', '')}"

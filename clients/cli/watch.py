@@ -1,4 +1,5 @@
-"""`vramctl watch`: the status, live, with the newest events below; plain event lines where the output is no terminal."""
+"""`vramctl watch`: the status, live, with the newest events below; plain event lines where the
+output is no terminal."""
 
 import argparse
 import asyncio
@@ -38,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def watch(endpoint: str | None, events_shown: int) -> int:
-    """Show until Ctrl-C. Raises ArbiterUnreachable if no arbiter answers at first; later it waits for one."""
+    """Show until Ctrl-C. Raises ArbiterUnreachable if no arbiter answers at first; later it waits
+    for one."""
     client = AsyncClient(
         "vramctl watch", endpoint=endpoint, role="observer", connect_timeout_s=TIMEOUT_S
     )

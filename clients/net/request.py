@@ -22,15 +22,20 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 3.0
 DOUBT_S = 0.2
-"""An arbiter answers within milliseconds; after so long the kernel is asked whether there is one."""
+"""An arbiter answers within milliseconds; after so long the kernel is asked whether there
+is one."""
 RETRY_S = 0.02
-HANGS = "something holds the socket and is silent: look at the arbiter's log, or set VRAM_ARBITER_ENDPOINT"
+HANGS = (
+    "something holds the socket and is silent: look at the arbiter's log, or set "
+    "VRAM_ARBITER_ENDPOINT"
+)
 
 Message = dict[str, Any]
 
 
 class Unreachable(Exception):
-    """No arbiter answers that may be believed; the text says where, `hint` what to do, `code` is that of the typed error."""
+    """No arbiter answers that may be believed; the text says where, `hint` what to do, `code` is
+    that of the typed error."""
 
     def __init__(self, message: str, hint: str, code: str = "arbiter_unreachable") -> None:
         super().__init__(message)
@@ -77,7 +82,8 @@ def ask(
 def _link(
     context: "zmq.Context[zmq.Socket[bytes]]", where: str, deadline: float, silent: Unreachable
 ) -> "Link":
-    """A link to an arbiter that may be believed. Raises Unreachable, UntrustedServer, ConfigError."""
+    """A link to an arbiter that may be believed. Raises Unreachable, UntrustedServer,
+    ConfigError."""
     from vram_arbiter.clients.net.link import Link
 
     while True:
@@ -96,7 +102,8 @@ def _link(
 
 
 def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Message:
-    """The reply to the request, or the refusal of the hello. Raises Unreachable, UntrustedServer."""
+    """The reply to the request, or the refusal of the hello. Raises Unreachable,
+    UntrustedServer."""
     import msgpack
     import zmq
 

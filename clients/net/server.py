@@ -142,7 +142,8 @@ class RouterServer:
         self._waiting_max_bytes = several_bytes
         limits = Limits(
             message_max_bytes=message_max_bytes,
-            stranger_message_max_bytes=message_max_bytes,  # these wires have no hello: the first request may be a picture
+            # these wires have no hello: the first request may be a picture
+            stranger_message_max_bytes=message_max_bytes,
             skip_max_bytes=several_bytes,
             hello_s=SILENT_S,
             connections_max=CONNECTIONS_MAX,
@@ -192,12 +193,13 @@ class RouterServer:
             self._router.stop_receiving()
 
     async def send(self, peer: Peer, message: Message) -> None:
-        """Answer or push. A peer that is gone gets nothing; one that does not read is hung up on."""
+        """Answer or push. A peer that is gone gets nothing; one that does not read is hung
+        up on."""
         client = self._clients.get(peer.identity)
         if client is not None and not client.connection.send(pack(message)):
             client.connection.close("it does not read its answers")
 
-    # -- for the router --------------------------------------------------------------------------------------------------
+    # -- for the router
     def connected(self, connection: Connection) -> None:
         peer = Peer(connection.serial, connection.peer.process.pid, connection.peer.uid)
         self._clients[connection.serial] = _Client(connection, peer)
@@ -237,7 +239,8 @@ class RouterServer:
         return unpack_map(payload, self._unpack), len(payload)
 
     def _waiting_of(self, uid: int, size: int) -> _Waiting:
-        """Raises LimitExceeded where a user has all the requests, or bytes of them, that may wait."""
+        """Raises LimitExceeded where a user has all the requests, or bytes of them, that
+        may wait."""
         waiting = self._waiting.setdefault(uid, _Waiting())
         full = "requests" if waiting.count >= WAITING_MAX else "bytes of requests"
         if waiting.count >= WAITING_MAX or waiting.size_bytes + size > self._waiting_max_bytes:

@@ -1,8 +1,10 @@
-"""Talk to one sidecar: lazy connection, replies matched by id, typed errors, a child of its own where no sidecar serves.
+"""Talk to one sidecar: lazy connection, replies matched by id, typed errors, a child of its own
+where no sidecar serves.
 
-Rules. The first call connects; a socket that timed out or was hung up on is replaced before the next call; a child of ours that
-died is started again by the next call; a sidecar that another program started is used and left running. No failure here reads
-as an answer: *evicted* or *unavailable* is never "not found". It knows nothing of images or actions.
+Rules. The first call connects; a socket that timed out or was hung up on is replaced before the
+next call; a child of ours that died is started again by the next call; a sidecar that another
+program started is used and left running. No failure here reads as an answer: *evicted* or
+*unavailable* is never "not found". It knows nothing of images or actions.
 """
 
 import asyncio
@@ -28,9 +30,11 @@ SHUTDOWN_S = 5.0  # from the op's answer to the exit
 
 
 class SidecarClient:
-    """Base of the sidecars' clients. `family` says how requests are tagged: `op` (perception) or `endpoint` (policy).
+    """Base of the sidecars' clients. `family` says how requests are tagged: `op` (perception) or
+    `endpoint` (policy).
 
-    `spawn` starts the sidecar when none answers at `endpoint`. Several calls may be under way. One loop, one process.
+    `spawn` starts the sidecar when none answers at `endpoint`. Several calls may be under way. One
+    loop, one process.
     """
 
     family = "op"
@@ -60,7 +64,7 @@ class SidecarClient:
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
-    # -- ops of both families ------------------------------------------------------------------------------------------
+    # -- ops of both families
     async def ping(self, *, timeout_s: float = PROBE_S) -> PingResult:
         """Identity and state. Does not start anything. Raises SidecarUnavailable."""
         answer = cast(PingResult, await self._exchange("ping", {}, timeout_s))
@@ -68,7 +72,8 @@ class SidecarClient:
         return answer
 
     async def load(self, timeout_s: float | None = None) -> LoadResult:
-        """Make the model resident (the sidecar acquires its lease). `timeout_s` bounds the wait for the lease: WaitTimeout, OutOfMemory …"""
+        """Make the model resident (the sidecar acquires its lease). `timeout_s` bounds the wait for
+        the lease: WaitTimeout, OutOfMemory …"""
         fields = (
             {"timeout_s": timeout_s} if self.family == "op" else {"data": {"timeout_s": timeout_s}}
         )
@@ -92,10 +97,12 @@ class SidecarClient:
         timeout_s: float | None = None,
         fresh_s: float | None = None,
     ) -> Any:
-        """One request, connecting and starting the sidecar first where needed. It carries the present span, if there is one.
+        """One request, connecting and starting the sidecar first where needed. It carries the
+        present span, if there is one.
 
         `fresh_s`: from now on, what was sent has to be looked at within so long; else FrameStale.
-        Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError, …) SidecarUnavailable or UntrustedServer.
+        Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError,
+        …) SidecarUnavailable or UntrustedServer.
         """
         began_s = monotonic()
         await self._ensure()
@@ -109,7 +116,8 @@ class SidecarClient:
         )
 
     async def close(self) -> None:
-        """End the child that we started (shutdown, SIGTERM, SIGKILL); leave an adopted one alone. Idempotent."""
+        """End the child that we started (shutdown, SIGTERM, SIGKILL); leave an adopted one alone.
+        Idempotent."""
         async with self._connecting:
             child, self.child = self.child, None
             try:
@@ -122,9 +130,10 @@ class SidecarClient:
             finally:
                 self._drop("the client was closed")
 
-    # -- steps: connection ---------------------------------------------------------------------------------------------
+    # -- steps: connection
     async def _ensure(self) -> None:
-        """1. Proven already, child alive. 2. A sidecar answers: adopt it. 3. Start a child, or wait for another program's start."""
+        """1. Proven already, child alive. 2. A sidecar answers: adopt it. 3. Start a child, or wait
+        for another program's start."""
         async with self._connecting:
             if self.child is not None and not self._rpc.proven:
                 await self.child.wait(REBIRTH_S)  # it may have hung up because it is dying
@@ -166,8 +175,10 @@ class SidecarClient:
         return True
 
     async def _boot(self, spec: SpawnSpec) -> None:
-        """Start it and wait for its first answer or its end, whichever comes first. A child of ours that lives and is silent is waited for:
-        it still boots, or is dying, and then it is replaced."""
+        """Start it and wait for its first answer or its end, whichever comes first. A child of ours
+        that lives and is silent is waited for: it still boots, or is dying, and then it is
+        replaced.
+        """
         started = self.child is None or not self.child.alive
         child = self.child = Child(spec) if self.child is None or started else self.child
         exited = asyncio.create_task(child.exited.wait())
@@ -202,7 +213,8 @@ class SidecarClient:
                 answered.cancel()
 
     async def _bury_or_raise(self) -> None:
-        """Our child ended at once: if another process serves the endpoint by now, that is why, and good enough."""
+        """Our child ended at once: if another process serves the endpoint by now, that is why, and
+        good enough."""
         assert self.child is not None
         failure = self.child.failure()
         await self._bury()
@@ -217,7 +229,7 @@ class SidecarClient:
         if child is not None:
             await child.end(0.0)
 
-    # -- steps: one exchange -------------------------------------------------------------------------------------------
+    # -- steps: one exchange
     async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Any:
         try:
             reply = await self._rpc.exchange({self.family: op, **fields}, timeout_s)
@@ -241,7 +253,8 @@ class SidecarClient:
 
 
 def _result(reply: Message) -> Any:
-    """The result without the envelope. Raises the typed error of a failure; one without a code is a foreign server's ModelError."""
+    """The result without the envelope. Raises the typed error of a failure; one without a code is a
+    foreign server's ModelError."""
     if reply.get("ok") is False or ("error" in reply and "ok" not in reply):
         error = reply.get("error", "")
         wire = {**error} if isinstance(error, dict) else {"message": str(error)}

@@ -1,4 +1,5 @@
-"""Arrays on the sidecar wire: `{"__ndarray_class__": true, "as_npy": <bytes of numpy's .npy format>}`, never pickle.
+"""Arrays on the sidecar wire: `{"__ndarray_class__": true, "as_npy": <bytes of numpy's .npy
+format>}`, never pickle.
 
 Of that format only arrays of numbers are taken, and nothing is allocated before the header agrees
 with the bytes behind it. numpy is imported inside the functions: the base install has none.

@@ -1,4 +1,5 @@
-"""Clients of the perception sidecars: open-vocabulary detector, scene VLM, reward model. They know images as PNG bytes only."""
+"""Clients of the perception sidecars: open-vocabulary detector, scene VLM, reward model. They know
+images as PNG bytes only."""
 
 import math
 from collections.abc import Sequence
@@ -38,10 +39,11 @@ class DetectorClient(SidecarClient):
         timeout_s: float | None = None,
         fresh_s: float | None = None,
     ) -> list[Detection]:
-        """Everything that matches, best first. An empty list means: the detector looked and found nothing.
+        """Everything that matches, best first. An empty list means: the detector looked and found
+        nothing.
 
-        Raises Evicted, NotResident, WaitTimeout, OutOfMemory, ModelError, SidecarUnavailable, and FrameStale when it could not look within
-        `fresh_s` (seconds from now): it did not look.
+        Raises Evicted, NotResident, WaitTimeout, OutOfMemory, ModelError, SidecarUnavailable, and
+        FrameStale when it could not look within `fresh_s` (seconds from now): it did not look.
         """
         fields = {
             "image": image_png,
@@ -87,7 +89,8 @@ class SceneVlmClient(SidecarClient):
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Of each picture, oldest first, or of the newest alone: `progress` 0..1, `success` (probability; empty: not said). Advice, no proof."""
+    """Of each picture, oldest first, or of the newest alone: `progress` 0..1, `success`
+    (probability; empty: not said). Advice, no proof."""
 
     progress: tuple[float, ...]
     success: tuple[float, ...]
@@ -106,7 +109,8 @@ class RewardClient(SidecarClient):
         timeout_s: float | None = None,
         fresh_s: float | None = None,
     ) -> Judgement:
-        """How far along the task one camera's pictures show the robot to be; the newest `PICTURES_MAX` are sent. Raises as `DetectorClient.detect`."""
+        """How far along the task one camera's pictures show the robot to be; the newest
+        `PICTURES_MAX` are sent. Raises as `DetectorClient.detect`."""
         fields = {"images": list(images_png)[-PICTURES_MAX:], "task": task}
         sent = len(fields["images"])
         reply = await self.call("score", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
@@ -126,7 +130,8 @@ class RewardClient(SidecarClient):
             len(found.progress),
         ):
             raise ModelError(
-                f"the reward model judged {len(found.progress)} and {len(found.success)} of {sent} pictures"
+                f"the reward model judged {len(found.progress)} and {len(found.success)} of {sent} "
+                "pictures"
             )
         return found
 

@@ -1,4 +1,5 @@
-"""Client of a policy sidecar (endpoint family): load, reset, get_action. Arrays travel as .npy (`clients.sidecar.npy`)."""
+"""Client of a policy sidecar (endpoint family): load, reset, get_action. Arrays travel as .npy
+(`clients.sidecar.npy`)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +10,8 @@ from vram_arbiter.schemas.errors import ModelError
 
 
 class PolicyClient(SidecarClient):
-    """`load` gives lease id and token; a goal marks a use with them at the arbiter and sends the token with every call."""
+    """`load` gives lease id and token; a goal marks a use with them at the arbiter and sends the
+    token with every call."""
 
     family = "endpoint"
 
@@ -35,7 +37,8 @@ class PolicyClient(SidecarClient):
     ) -> dict[str, Any]:
         """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`.
 
-        Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory, SidecarUnavailable.
+        Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory,
+        SidecarUnavailable.
         """
         data = {
             "observation": npy.pack(dict(observation)),

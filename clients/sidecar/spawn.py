@@ -1,4 +1,5 @@
-"""Start a sidecar as a child process, watch it through its pidfd, and end it: only ever the child that we started.
+"""Start a sidecar as a child process, watch it through its pidfd, and end it: only ever the child
+that we started.
 
 It knows no sockets: whether the child *serves* is for `base` to find out by `ping`.
 """
@@ -23,9 +24,11 @@ LOG_TAIL_BYTES = 4000
 
 @dataclass(frozen=True, slots=True)
 class SpawnSpec:
-    """How to start a sidecar, e.g. `[sys.executable, "-m", "vram_arbiter.sidecars", "--name", "grab", …]`.
+    """How to start a sidecar, e.g. `[sys.executable, "-m", "vram_arbiter.sidecars", "--name",
+    "grab", …]`.
 
-    `env` is added to this process' environment. `log` receives its output (None: a temporary file, for the error's details).
+    `env` is added to this process' environment. `log` receives its output (None: a temporary file,
+    for the error's details).
     """
 
     argv: Sequence[str]
@@ -128,8 +131,8 @@ class Child:
         return True
 
     async def end(self, polite_s: float) -> None:
-        """Wait `polite_s` for it to end by itself (after a `shutdown` op), then SIGTERM, then SIGKILL. Through the pidfd: the pid
-        may belong to another process by then."""
+        """Wait `polite_s` for it to end by itself (after a `shutdown` op), then SIGTERM, then
+        SIGKILL. Through the pidfd: the pid may belong to another process by then."""
         for timeout_s, number in (
             (polite_s, signal.SIGTERM),
             (TERM_TIMEOUT_S, signal.SIGKILL),

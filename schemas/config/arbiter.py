@@ -1,7 +1,8 @@
 """The arbiter's configuration: one model, one YAML file, every key with purpose, default and range.
 
-Pure: `load_config(text, name)` takes the text of a file; the daemon reads the file. `configs/arbiter.yaml` states the same
-keys with the same defaults, and a test holds both together. No key is required: an empty file is the default configuration.
+Pure: `load_config(text, name)` takes the text of a file; the daemon reads the file.
+`configs/arbiter.yaml` states the same keys with the same defaults, and a test holds both together.
+No key is required: an empty file is the default configuration.
 """
 
 from collections.abc import Collection, Mapping
@@ -28,17 +29,23 @@ class GpuConfig(_Section):
     """Which cards are leased and how much of each."""
 
     source: str = "auto"
-    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA cards. `unified`: the memory that CPU and GPU share on a
-    Jetson or a GB10. `fake:8GiB`: one simulated card. `fake:FOLDER`: the card in that folder."""
+    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA cards. `unified`:
+    the memory that CPU and GPU share on a Jetson or a GB10. `fake:8GiB`: one simulated card.
+    `fake:FOLDER`: the card in that folder.
+    """
     reserve_bytes: ByteSize = d.RESERVE_BYTES
-    """Bytes of every card that are never leased: driver, display, allocator slack. At least 15 % of a memory shared with the CPU."""
+    """Bytes of every card that are never leased: driver, display, allocator slack. At least 15 % of
+    a memory shared with the CPU."""
     capacity_bytes: dict[str, ByteSize] = Field(default_factory=dict)
-    """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not named has no cap."""
+    """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not
+    named has no cap."""
 
     pids: Literal["auto", "own", "host"] = "auto"
-    """Pid namespace in which the driver counts. `auto`: this one on a host, the host's in a container."""
+    """Pid namespace in which the driver counts. `auto`: this one on a host, the host's in a
+    container."""
     host_proc: Annotated[str, Field(pattern="^/")] | None = None
-    """In a container: where the host's /proc is mounted, so that the driver's pids can be told apart. Null: lists are no evidence there."""
+    """In a container: where the host's /proc is mounted, so that the driver's pids can be told
+    apart. Null: lists are no evidence there."""
 
     @field_validator("source")
     @classmethod
@@ -47,7 +54,8 @@ class GpuConfig(_Section):
             value.startswith("fake:") and len(value) > 5
         ):
             raise ValueError(
-                f"{value!r} is no source of cards; write auto, nvml, unified, fake:8GiB or fake:FOLDER"
+                f"{value!r} is no source of cards; write auto, nvml, unified, fake:8GiB or "
+                "fake:FOLDER"
             )
         sizes = (
             value.removeprefix("fake:") if value.startswith("fake:") and "/" not in value else ""
@@ -67,7 +75,8 @@ class SchedulingConfig(_Section):
     thrash_hold_max_s: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = (
         d.THRASH_HOLD_MAX_S
     )
-    """Of two consumers that thrash, the resident one stays for the cost of a switch, at most this long. 0: never."""
+    """Of two consumers that thrash, the resident one stays for the cost of a switch, at most this
+    long. 0: never."""
     policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
     """Order of the queue and choice of victims; docs/policies.md compares the policies."""
 
@@ -80,9 +89,11 @@ class RevokeConfig(_Section):
     remind_s: Seconds = d.REVOKE_REMIND_S
     """After this long without a safe point the history says so."""
     deadline_s: Seconds = d.REVOKE_DEADLINE_S
-    """After this long the waiter's own policy applies: keep waiting (`wait`) or a typed error (`deny`)."""
+    """After this long the waiter's own policy applies: keep waiting (`wait`) or a typed error
+    (`deny`)."""
     terminate_grace_s: Seconds = d.TERMINATE_GRACE_S
-    """A holder whose lease says `on_overstay: kill` is killed so long after it was told to terminate."""
+    """A holder whose lease says `on_overstay: kill` is killed so long after it was told to
+    terminate."""
 
 
 class VerifyConfig(_Section):
@@ -94,9 +105,11 @@ class VerifyConfig(_Section):
         tuple[Annotated[float, Field(ge=0.001, le=10, allow_inf_nan=False)], ...],
         Field(min_length=1, max_length=16),
     ] = d.VERIFY_POLL_S
-    """Pauses between samples, the first one while memory usually comes back; the last one repeats."""
+    """Pauses between samples, the first one while memory usually comes back; the last one
+    repeats."""
     poll_until_s: Annotated[tuple[Seconds, ...], Field(max_length=15)] = d.VERIFY_POLL_UNTIL_S
-    """Until when after the release each pause but the last is kept. A consumer known to take longer is looked at for longer."""
+    """Until when after the release each pause but the last is kept. A consumer known to take longer
+    is looked at for longer."""
     confirm_s: Annotated[float, Field(ge=0.001, le=1, allow_inf_nan=False)] = d.VERIFY_CONFIRM_S
     """After a sample that is on target: when the second one is taken, which has to agree."""
     slow_poll_s: Seconds = d.VERIFY_SLOW_POLL_S
@@ -110,7 +123,8 @@ class VerifyConfig(_Section):
             self.poll_until_s
         ):
             raise ValueError(
-                f"poll_until_s needs {len(self.poll_s) - 1} rising times, one for each of poll_s but the last"
+                f"poll_until_s needs {len(self.poll_s) - 1} rising times, one for each of poll_s "
+                "but the last"
             )
         return self
 
@@ -123,7 +137,8 @@ class ProbeConfig(_Section):
     period_s: Seconds = d.PROBE_PERIOD_S
     """Period of background readings while there are leases or waiters."""
     load_s: Annotated[float, Field(ge=0.005, le=60, allow_inf_nan=False)] = d.LOAD_PROBE_S
-    """Period of readings while a lease loads: its load peak is learned from them, and a peak between two is not seen."""
+    """Period of readings while a lease loads: its load peak is learned from them, and a peak
+    between two is not seen."""
     sample_max_age_s: Seconds = d.SAMPLE_MAX_AGE_S
     """An older reading does not gate a grant; a fresh one is taken first."""
 
@@ -139,7 +154,8 @@ class HostConfig(_Section):
     """Memory of the machine itself."""
 
     park_budget_bytes: ByteSize | None = None
-    """Host RAM that parked models may keep together; 0: no parking. Null: half of what is available when the daemon starts."""
+    """Host RAM that parked models may keep together; 0: no parking. Null: half of what is available
+    when the daemon starts."""
 
 
 class LimitsConfig(_Section):
@@ -148,7 +164,8 @@ class LimitsConfig(_Section):
     message_max_bytes: Annotated[ByteSize, Field(ge=4096, le=64 * d.MIB)] = d.MESSAGE_MAX_BYTES
     """Largest request."""
     connections_max: Annotated[int, Field(ge=4, le=65_536)] = d.CONNECTIONS_MAX
-    """Connections at a time, with those that have not said hello. Less where the daemon may open fewer files (three per connection)."""
+    """Connections at a time, with those that have not said hello. Less where the daemon may open
+    fewer files (three per connection)."""
     sessions_max: Annotated[int, Field(ge=1, le=65_536)] = d.SESSIONS_MAX
     """Clients at a time: connections that have said hello."""
     operator_reserve: Annotated[int, Field(ge=0, le=1024)] = d.OPERATOR_RESERVE
@@ -156,10 +173,11 @@ class LimitsConfig(_Section):
     waiters_max: Annotated[int, Field(ge=1, le=1_000_000)] = d.WAITERS_MAX
     """Queued leases at a time."""
     process_share: Share = d.PROCESS_SHARE
-    """Part of the connections, clients, subscribers and places of `waiters_max`, and of the uses of another process's lease, that one
-    process may take."""
+    """Part of the connections, clients, subscribers and places of `waiters_max`, and of the uses of
+    another process's lease, that one process may take."""
     user_share: Share = d.USER_SHARE
-    """The same for all processes of one user together, but that operators always find room as clients."""
+    """The same for all processes of one user together, but that operators always find room as
+    clients."""
     priority_reserve: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = (
         d.PRIORITY_RESERVE
     )
@@ -169,7 +187,8 @@ class LimitsConfig(_Section):
     uses_per_lease_max: Annotated[int, Field(ge=1, le=65_536)] = d.USES_PER_LEASE_MAX
     """Uses of one lease at a time: its holder's own, and as many of others."""
     rate_per_client_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_CLIENT_PER_S
-    """Requests a second of one connection; a burst of one second's worth is allowed. Each KiB of a request counts as one more."""
+    """Requests a second of one connection; a burst of one second's worth is allowed. Each KiB of a
+    request counts as one more."""
     rate_per_process_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_PROCESS_PER_S
     """The same for all connections of one process together."""
     subscribers_max: Annotated[int, Field(ge=0, le=65_536)] = d.SUBSCRIBERS_MAX
@@ -200,14 +219,16 @@ class WireConfig(_Section):
     """The socket."""
 
     endpoint: str | None = None
-    """`ipc:///run/vram-arbiter/arbiter.sock`. Null: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in the runtime folder."""
+    """`ipc:///run/vram-arbiter/arbiter.sock`. Null: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in
+    the runtime folder."""
     heartbeat_s: Annotated[float, Field(ge=0.1, le=60, allow_inf_nan=False)] = d.HEARTBEAT_S
     """How often clients are asked to say that they are there."""
     group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
-    """Unix group that may connect and hold leases, beside the daemon's own user and root. Null: that of `operators_group`."""
+    """Unix group that may connect and hold leases, beside the daemon's own user and root. Null:
+    that of `operators_group`."""
     operators_group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
-    """Unix group that may act by hand (evict, pin, drain), beside the daemon's own user and root. Where `group` is set, operators are
-    members of both. Null: no group may."""
+    """Unix group that may act by hand (evict, pin, drain), beside the daemon's own user and root.
+    Where `group` is set, operators are members of both. Null: no group may."""
 
     @field_validator("endpoint")
     @classmethod
@@ -219,8 +240,8 @@ class StateConfig(_Section):
     """Files that outlive the daemon."""
 
     dir: Annotated[str, Field(min_length=1)] | None = None
-    """Folder of journal and history. Null: `$STATE_DIRECTORY` under systemd, else `~/.local/state/vram-arbiter`; with a
-    simulated card `state` in the runtime folder."""
+    """Folder of journal and history. Null: `$STATE_DIRECTORY` under systemd, else
+    `~/.local/state/vram-arbiter`; with a simulated card `state` in the runtime folder."""
 
 
 class LogConfig(_Section):
@@ -233,14 +254,18 @@ class LogConfig(_Section):
 
 
 class TelemetryConfig(_Section):
-    """Traces and metrics, with the extra `telemetry`. What is set here wins over the OTEL_* variables; nothing set anywhere: off."""
+    """Traces and metrics, with the extra `telemetry`. What is set here wins over the OTEL_*
+    variables; nothing set anywhere: off."""
 
     endpoint: str | None = None
-    """OTLP collector (HTTP, protobuf) for spans and metrics. Null: `OTEL_EXPORTER_OTLP_ENDPOINT`, else none."""
+    """OTLP collector (HTTP, protobuf) for spans and metrics. Null: `OTEL_EXPORTER_OTLP_ENDPOINT`,
+    else none."""
     prometheus_port: Annotated[int, Field(ge=0, le=65_535)] | None = None
-    """Port of a Prometheus endpoint on 127.0.0.1; 0: any free one, said in the log. Null: none, unless `OTEL_METRICS_EXPORTER` says so."""
+    """Port of a Prometheus endpoint on 127.0.0.1; 0: any free one, said in the log. Null: none,
+    unless `OTEL_METRICS_EXPORTER` says so."""
     sample_ratio: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None = None
-    """Share of the traces that begin in the daemon; the others are kept where their beginning was. Null: `OTEL_TRACES_SAMPLER_ARG`, else 1."""
+    """Share of the traces that begin in the daemon; the others are kept where their beginning was.
+    Null: `OTEL_TRACES_SAMPLER_ARG`, else 1."""
 
     @field_validator("endpoint")
     @classmethod
@@ -249,7 +274,8 @@ class TelemetryConfig(_Section):
 
 
 class ArbiterConfig(_Section):
-    """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in bytes."""
+    """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in
+    bytes."""
 
     gpu: GpuConfig = GpuConfig()
     scheduling: SchedulingConfig = SchedulingConfig()
@@ -280,8 +306,8 @@ def known_keys() -> Mapping[Path, Collection[str]]:
 def load_config(text: str, name: str) -> ArbiterConfig:
     """Read the text of a configuration file; `name` is how errors call the file.
 
-    Raises ConfigError with every mistake, each with its line: `arbiter.yaml:12: verify.tiemout_s: unknown key; did you mean
-    timeout_s?`
+    Raises ConfigError with every mistake, each with its line: `arbiter.yaml:12: verify.tiemout_s:
+    unknown key; did you mean timeout_s?`
     """
     source = parse_yaml(text, name)
     data = source.data

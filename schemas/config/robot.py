@@ -1,8 +1,10 @@
-"""A deployment: which robot, which cameras, which skill, at which rate. The YAML file that `vram-runner deploy` reads.
+"""A deployment: which robot, which cameras, which skill, at which rate. The YAML file that
+`vram-runner deploy` reads.
 
-Pure: `load_robot(text, name)` takes the text of a file. Field names are those of the field's `RobotEnvironment` files, so that they load
-unchanged. Nothing is guessed: what an adapter or a reader needs beyond these fields stands in `transport`, `params` and `backend_params`
-and is checked by that adapter, before anything moves.
+Pure: `load_robot(text, name)` takes the text of a file. Field names are those of the field's
+`RobotEnvironment` files, so that they load unchanged. Nothing is guessed: what an adapter or a
+reader needs beyond these fields stands in `transport`, `params` and `backend_params` and is checked
+by that adapter, before anything moves.
 """
 
 from collections.abc import Collection, Mapping
@@ -119,7 +121,8 @@ class RobotEnvironment(_Section):
     """What the robot is, e.g. `so101_follower`; empty: what its adapter is known to be. Skills made
     for other robots are refused. A tag that no manifest can name is a warning."""
     capabilities: dict[str, Capability] = {}
-    """Facts that manifests ask for by name: `has_vision: true`, `can_lift_kg: 0.5`. Cameras and grippers are seen without being named here."""
+    """Facts that manifests ask for by name: `has_vision: true`, `can_lift_kg: 0.5`. Cameras and
+    grippers are seen without being named here."""
     hal: HalConfig
     sensors: tuple[SensorReaderConfig, ...] = ()
     task: TaskSpec | None = None
@@ -166,11 +169,13 @@ def known_keys() -> Mapping[Path, Collection[str]]:
 def load_robot(text: str, name: str) -> RobotEnvironment:
     """Read the text of a deployment file; `name` is how errors call it.
 
-    Raises ConfigError with every mistake and its line: `robot.yaml:7: sensors[0].bakend: unknown key; did you mean backend?`
+    Raises ConfigError with every mistake and its line: `robot.yaml:7: sensors[0].bakend: unknown
+    key; did you mean backend?`
     """
     return robot_of(parse_yaml(text, name))
 
 
 def robot_of(source: YamlText) -> RobotEnvironment:
-    """Return a parsed deployment file as its model. Raises ConfigError with every mistake and its line."""
+    """Return a parsed deployment file as its model. Raises ConfigError with every mistake and its
+    line."""
     return validated(RobotEnvironment, source, known_keys())

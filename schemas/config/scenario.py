@@ -1,6 +1,8 @@
-"""Scenarios for `vramctl simulate`: cards, consumers with their footprints, arrivals and times. One model, one YAML file each.
+"""Scenarios for `vramctl simulate`: cards, consumers with their footprints, arrivals and times. One
+model, one YAML file each.
 
-Pure: `load_scenario(text, name)` takes the text of a file. configs/scenarios holds examples with every key explained.
+Pure: `load_scenario(text, name)` takes the text of a file. configs/scenarios holds examples with
+every key explained.
 """
 
 from collections.abc import Collection, Mapping
@@ -55,9 +57,11 @@ class Arrivals(_Part):
     per_minute: Annotated[float, Field(gt=0, le=60_000)] | None = None
     """At random, so many a minute on average (Poisson)."""
     after: Name | None = None
-    """When a job of that consumer is over; `start_s` gives the first one where they wait for each other in a circle."""
+    """When a job of that consumer is over; `start_s` gives the first one where they wait for each
+    other in a circle."""
     start_s: Seconds | None = None
-    """First arrival of `every_s` and `per_minute` (default 0), or a first one before any `after`."""
+    """First arrival of `every_s` and `per_minute` (default 0), or a first one before any
+    `after`."""
     think_s: Span = (0.0, 0.0)
     """Pause between the other's job and this one (`after`)."""
     jitter_s: Seconds = 0.0
@@ -74,7 +78,8 @@ class Arrivals(_Part):
         ]
         if len(given) != 1:
             raise ValueError(
-                f"give exactly one of at_s, every_s, per_minute and after, not {', '.join(given) or 'none'}"
+                "give exactly one of at_s, every_s, per_minute and after, not "
+                f"{', '.join(given) or 'none'}"
             )
         return self
 
@@ -151,7 +156,8 @@ class Scenario(_Part):
                 consumer.gpu.isdecimal() and int(consumer.gpu) < len(self.cards)
             ):
                 raise ValueError(
-                    f"consumers.{name}.gpu: {consumer.gpu!r} is no card; write 0 to {len(self.cards) - 1} or any"
+                    f"consumers.{name}.gpu: {consumer.gpu!r} is no card; write 0 to "
+                    f"{len(self.cards) - 1} or any"
                 )
             if (consumer.steady or 0) > consumer.load_peak:
                 raise ValueError(f"consumers.{name}.steady is larger than its load_peak")
@@ -190,7 +196,8 @@ class _Keys(Mapping[Path, Collection[str]]):
 def load_scenario(text: str, name: str) -> Scenario:
     """Read the text of a scenario; `name` is how errors call the file.
 
-    Raises ConfigError with every mistake, each with its line: `robot.yaml:12: consumers.grab.lod_s: unknown key; did you mean load_s?`
+    Raises ConfigError with every mistake, each with its line: `robot.yaml:12: consumers.grab.lod_s:
+    unknown key; did you mean load_s?`
     """
     source = parse_yaml(text, name)
     return validated(Scenario, source, _Keys(source.data))

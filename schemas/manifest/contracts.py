@@ -1,6 +1,8 @@
-"""The blocks of a manifest that say what a skill needs, runs on and is: sensors, actuators, weights, budgets, kinds' own blocks.
+"""The blocks of a manifest that say what a skill needs, runs on and is: sensors, actuators,
+weights, budgets, kinds' own blocks.
 
-What goes into and comes out of a policy is in `io_contracts`. No block looks at another: rules across blocks are the manifest's.
+What goes into and comes out of a policy is in `io_contracts`. No block looks at another: rules
+across blocks are the manifest's.
 """
 
 import json
@@ -33,9 +35,10 @@ class Block(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-# -- what the skill needs of the robot ----------------------------------------------------------------------------
+# -- what the skill needs of the robot
 class SensorRequirement(Block):
-    """One sensor, by the policy's feature key, or `count` sensors of a modality. Sizes in pixels."""
+    """One sensor, by the policy's feature key, or `count` sensors of a modality. Sizes in
+    pixels."""
 
     modality: Modality
     vla_feature_key: str | None = None
@@ -54,7 +57,8 @@ class ControlModeSemantics(Block):
 
 
 class ActuatorRequirement(Block):
-    """One actuator that the skill commands. Grippers state their convention, cartesian ones their frame, others neither."""
+    """One actuator that the skill commands. Grippers state their convention, cartesian ones their
+    frame, others neither."""
 
     kind: ControlMode
     n_dof: PositiveInt | None = None
@@ -111,7 +115,7 @@ class SafetyEnvelope(Block):
     self_collision_margin_m: float = 0.0
 
 
-# -- what it runs on ----------------------------------------------------------------------------------------------
+# -- what it runs on
 class Quantization(Block):
     """Number format of the weights and what makes it; `extra` belongs to the adapter."""
 
@@ -131,7 +135,7 @@ class LatencyBudget(Block):
     max_execution_s: Positive | None = None
 
 
-# -- the kinds' own blocks ----------------------------------------------------------------------------------------
+# -- the kinds' own blocks
 class RosIntegration(Block):
     """The ROS 2 action or service that a `ros_action` or `ros_service` skill wraps."""
 
@@ -159,7 +163,8 @@ class RosIntegration(Block):
 
 
 class DetectorContract(Block):
-    """Vocabulary and input of a detector. `input_size` is width × height, `max_side` the longest edge, in pixels."""
+    """Vocabulary and input of a detector. `input_size` is width × height, `max_side` the longest
+    edge, in pixels."""
 
     labels: Annotated[tuple[str, ...], Field(min_length=1)]
     input_size: tuple[PositiveInt, PositiveInt] = (640, 640)
@@ -208,7 +213,8 @@ class RewardContract(Block):
             problems.append(
                 Problem(
                     ("check_floor",),
-                    f"must not exceed success_threshold ({self.success_threshold}), not {self.check_floor}",
+                    f"must not exceed success_threshold ({self.success_threshold}), not "
+                    f"{self.check_floor}",
                 )
             )
         raise_if(problems)

@@ -1,4 +1,5 @@
-"""What goes into and comes out of a policy: its processors, pictures, state vector and action vector."""
+"""What goes into and comes out of a policy: its processors, pictures, state vector and action
+vector."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -45,7 +46,8 @@ class Processors(Block):
 
 
 class ImagePreprocessing(Block):
-    """What was done to the pictures in training. `aliases` maps the robot's camera names to the policy's."""
+    """What was done to the pictures in training. `aliases` maps the robot's camera names to the
+    policy's."""
 
     flip_180: bool = False
     flip_vertical: bool = False
@@ -75,7 +77,8 @@ class StateBindings(Block):
 
 
 class StateContract(Block):
-    """The proprioception that the checkpoint was trained on: a named layout, a width, and bindings for task-space layouts."""
+    """The proprioception that the checkpoint was trained on: a named layout, a width, and bindings
+    for task-space layouts."""
 
     layout: (
         Annotated[
@@ -119,7 +122,8 @@ class StateContract(Block):
 
 
 _SLOT_RULES: tuple[tuple[frozenset[ControlMode], str, str, str], ...] = (
-    # modes                                     ee   frame joint_names     R required, F forbidden, - free
+    # modes                                     ee   frame joint_names     R required, F forbidden,
+    # - free
     (JOINT_MODES, "F", "F", "-"),
     (CARTESIAN_MODES, "R", "R", "F"),
     (GRIPPER_MODES, "R", "F", "F"),
@@ -182,7 +186,8 @@ class ActionSlot(Block):
             problems.append(
                 Problem(
                     ("joint_names",),
-                    f"has {len(self.joint_names)} names for {self.width} values of the action vector",
+                    f"has {len(self.joint_names)} names for {self.width} values of the action "
+                    "vector",
                 )
             )
         if mode is ControlMode.COMPOSITE_MODE and self.width != 1:
@@ -202,7 +207,8 @@ _DELTA_WIDTH = {
 
 
 class ActionContract(Block):
-    """The action vector of the checkpoint. With `slots`, each of its `dim` values lies in exactly one slot."""
+    """The action vector of the checkpoint. With `slots`, each of its `dim` values lies in exactly
+    one slot."""
 
     dim: Annotated[int, Field(gt=0, le=_DIM_MAX)]
     representation: ActionRepresentation | None = None
@@ -244,7 +250,8 @@ class ActionContract(Block):
             problems.append(
                 Problem(
                     ("slots",),
-                    f"must cover every value of dim; not covered: {missing}. Discard what is unused",
+                    f"must cover every value of dim; not covered: {missing}. Discard what is "
+                    "unused",
                 )
             )
         return problems

@@ -43,7 +43,8 @@ def _read(table: str) -> dict[str, dict[Kind, str]]:
 
 
 RULES: dict[str, dict[Kind, str]] = _read(_TABLE)
-"""field → kind → `R` required, `F` forbidden, `-` free, `=v` must be v, `+v` must contain v. An empty list counts as not given."""
+"""field → kind → `R` required, `F` forbidden, `-` free, `=v` must be v, `+v` must contain v. An
+empty list counts as not given."""
 
 _WHY = {
     "chunk_size": "every row must pass the safety check by itself",
@@ -53,7 +54,8 @@ _WHY = {
 
 
 def check_kind(kind: Kind, values: Mapping[str, object]) -> list[Problem]:
-    """Findings of the table, and of the families that need processors; `values` maps field names to raw or validated values."""
+    """Findings of the table, and of the families that need processors; `values` maps field names to
+    raw or validated values."""
     problems = []
     for field, row in RULES.items():
         rule, value = row[kind], values.get(field)

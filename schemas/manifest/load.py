@@ -29,7 +29,8 @@ def load_manifest(path: str | FilePath) -> RSkillManifest:
 
 
 def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillManifest:
-    """Check the text of a manifest. Raises ManifestError with every finding; `source` names the text in messages."""
+    """Check the text of a manifest. Raises ManifestError with every finding; `source` names the
+    text in messages."""
     document = _read_yaml(content, source)
     data = document.data
     try:
@@ -43,7 +44,8 @@ def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillM
 
 
 def _with_kind_rules(problems: list[Problem], data: Mapping[str, Any]) -> list[Problem]:
-    """Add what the kind demands: pydantic stops before that rule as soon as any single field is wrong."""
+    """Add what the kind demands: pydantic stops before that rule as soon as any single field is
+    wrong."""
     kind = data.get("kind")
     if kind not in KINDS:
         return problems

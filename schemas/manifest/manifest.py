@@ -1,7 +1,7 @@
 """`RSkillManifest`: the whole of one `rskill.yaml`, checked.
 
-Fields and their blocks here; words in `vocabulary`, what a kind demands in `kinds`. It reads no files (`load` does) and knows
-nothing of how a skill is run.
+Fields and their blocks here; words in `vocabulary`, what a kind demands in `kinds`. It reads no
+files (`load` does) and knows nothing of how a skill is run.
 """
 
 from collections.abc import Callable
@@ -71,8 +71,9 @@ _TEMPLATE_WORDS = ("TEMPLATE_ORG", "TEMPLATE_ID")
 class RSkillManifest(Block):
     """The package description of one robot skill.
 
-    `min_vram_gb` is what its authors declare per number format, in the field's loose GB: good for a first guess, never for a
-    grant. `policy_extras` and `quantization.extra` belong to the adapter that runs the skill.
+    `min_vram_gb` is what its authors declare per number format, in the field's loose GB: good for a
+    first guess, never for a grant. `policy_extras` and `quantization.extra` belong to the adapter
+    that runs the skill.
     """
 
     schema_version: Literal["0.1"] = "0.1"
@@ -168,7 +169,7 @@ class RSkillManifest(Block):
             return [Problem(("fallback_skill_id",), "must be another skill than this one")]
         return []
 
-    # -- what others ask ----------------------------------------------------------------------------------------
+    # -- what others ask
     @property
     def is_commercial_use_allowed(self) -> bool:
         """Whether the licence of the weights allows commercial use; unknown ones do not."""
@@ -176,13 +177,15 @@ class RSkillManifest(Block):
 
     @property
     def is_scaffold_placeholder(self) -> bool:
-        """Whether the file is still the template of a new skill: valid, but nothing that could be run."""
+        """Whether the file is still the template of a new skill: valid, but nothing that could be
+        run."""
         texts = (self.name, self.weights_uri or "", self.source_repo or "")
         return any(word in text for word in _TEMPLATE_WORDS for text in texts)
 
     @property
     def declared_vram_gb(self) -> float | None:
-        """What the authors declare for the active number format, in the field's GB; None if they do not."""
+        """What the authors declare for the active number format, in the field's GB; None if they do
+        not."""
         return (self.min_vram_gb or {}).get(self.quantization.dtype)
 
     @property
@@ -198,7 +201,8 @@ class RSkillManifest(Block):
 _WARNINGS: tuple[tuple[tuple[str, ...], str, Callable[[RSkillManifest], bool]], ...] = (
     (
         ("role",),
-        "a vlm answers the slow reasoner: 's2' is meant, with 's1' it may be offered as a motion skill",
+        "a vlm answers the slow reasoner: 's2' is meant, with 's1' it may be offered as a motion "
+        "skill",
         lambda m: m.kind is Kind.VLM and m.role is not Role.S2,
     ),
     (
@@ -208,7 +212,8 @@ _WARNINGS: tuple[tuple[tuple[str, ...], str, Callable[[RSkillManifest], bool]], 
     ),
     (
         ("min_vram_gb",),
-        "does not declare the active quantization.dtype; the footprint has to be configured or learnt",
+        "does not declare the active quantization.dtype; the footprint has to be configured or "
+        "learnt",
         lambda m: m.weights_uri is not None and m.declared_vram_gb is None,
     ),
     (

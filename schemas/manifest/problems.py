@@ -1,6 +1,7 @@
 """What is wrong with a manifest, field by field, in words that say what to write instead.
 
-Turns pydantic's findings and our own rules into one list of `Problem`s. Knows nothing of YAML; lines are added by the loader.
+Turns pydantic's findings and our own rules into one list of `Problem`s. Knows nothing of YAML;
+lines are added by the loader.
 """
 
 import difflib
@@ -20,7 +21,8 @@ Path = tuple[str | int, ...]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One finding: where, what is wrong and what would be right, and the line of the file if known."""
+    """One finding: where, what is wrong and what would be right, and the line of the file
+    if known."""
 
     path: Path
     message: str
@@ -29,7 +31,8 @@ class Problem:
 
     @property
     def field(self) -> str:
-        """The path as people write it, e.g. `actuators_required[0].kind`; empty for the file as a whole."""
+        """The path as people write it, e.g. `actuators_required[0].kind`; empty for the file as a
+        whole."""
         text = ""
         for part in self.path:
             text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
@@ -49,7 +52,8 @@ class Problem:
 
 
 class RuleError(ValueError):
-    """Raised inside validators to report several findings at once, with paths relative to the value being validated."""
+    """Raised inside validators to report several findings at once, with paths relative to the value
+    being validated."""
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
@@ -57,7 +61,8 @@ class RuleError(ValueError):
 
 
 class ManifestError(ManifestInvalid):
-    """A manifest that cannot be used. `problems` lists every finding, `details["fields"]` the same as plain data."""
+    """A manifest that cannot be used. `problems` lists every finding, `details["fields"]` the same
+    as plain data."""
 
     def __init__(self, source: str, problems: Sequence[Problem]) -> None:
         self.source = source
@@ -95,7 +100,8 @@ def _nearest(value: object, words: Sequence[str]) -> str:
 def from_validation_error(
     error: ValidationError, model: type[BaseModel], data: object
 ) -> list[Problem]:
-    """All findings of a ValidationError of `model` over `data`, in the order of the fields, one per place and message."""
+    """All findings of a ValidationError of `model` over `data`, in the order of the fields, one per
+    place and message."""
     problems: dict[Problem, None] = {}
     for item in error.errors(include_url=False):
         if only_counts_wrong_entries(item):
@@ -111,7 +117,8 @@ def from_validation_error(
 
 
 def _path_in(data: object, loc: tuple[str | int, ...], *, missing: bool) -> Path:
-    """Pydantic's `loc` without the parts that name a union's member or a dict's key instead of a place in the data."""
+    """Pydantic's `loc` without the parts that name a union's member or a dict's key instead of a
+    place in the data."""
     path: list[str | int] = []
     value = data
     for index, part in enumerate(loc):
@@ -154,7 +161,10 @@ def _message(item: Any, path: Path, model: type[BaseModel]) -> str:
         case "too_short" | "string_too_short":
             return f"must have at least {_count(ctx['min_length'], kind)}"
         case "too_long" | "string_too_long":
-            return f"must have at most {_count(ctx['max_length'], kind)}, not {ctx.get('actual_length', len(value))}"
+            return (
+                f"must have at most {_count(ctx['max_length'], kind)}, not "
+                f"{ctx.get('actual_length', len(value))}"
+            )
         case "model_type" | "model_attributes_type" | "dict_type" | "mapping_type":
             return f"must be a mapping of fields, not {value!r}"
         case "tuple_type" | "list_type":
@@ -201,7 +211,8 @@ def _annotation_at(model: type[BaseModel], path: Path) -> object:
         elif owner is not None:
             field = owner.model_fields.get(part)
             annotation = field.annotation if field else None
-        else:  # a dict: a wrong key is judged by the type of keys, a wrong value by the type of values
+        # a dict: a wrong key is judged by the type of keys, a wrong value by the type of values
+        else:
             arguments = _arguments(annotation, (dict,))
             annotation = arguments[0] if arguments else None
     return annotation

@@ -1,7 +1,7 @@
 """The words that an rSkill manifest may use: its closed sets, as the field writes them.
 
-Sets that grew over time are the union of what was ever published, so that older and newer files load alike. A robot that is
-not listed here says `custom` and describes itself (`embodiment_extra`).
+Sets that grew over time are the union of what was ever published, so that older and newer files
+load alike. A robot that is not listed here says `custom` and describes itself (`embodiment_extra`).
 """
 
 from enum import StrEnum
@@ -9,7 +9,8 @@ from typing import Literal
 
 
 class Kind(StrEnum):
-    """What an rSkill is; decides which other fields it must and must not have (`schemas.manifest.kinds`)."""
+    """What an rSkill is; decides which other fields it must and must not have
+    (`schemas.manifest.kinds`)."""
 
     VLA = "vla"
     WAM = "wam"
@@ -128,7 +129,8 @@ class Runtime(StrEnum):
 
 
 class Dtype(StrEnum):
-    """Number format of the weights. `int4` is bitsandbytes' NF4 in every file of the field so far."""
+    """Number format of the weights. `int4` is bitsandbytes' NF4 in every file of the field
+    so far."""
 
     FP32 = "fp32"
     FP16 = "fp16"
@@ -235,7 +237,8 @@ EmbodimentTag = Literal[
     "ur5e",
     "widowx",
 ]
-"""Robots that a skill is made for; `any` for all, `mobile_base` for a class of them, `custom` for one described in the file."""
+"""Robots that a skill is made for; `any` for all, `mobile_base` for a class of them, `custom` for
+one described in the file."""
 
 BenchmarkId = Literal[
     "aloha",

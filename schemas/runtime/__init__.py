@@ -1,1 +1,2 @@
-"""Plumbing that every program shares: servers, framing, decoding. Contracts and the core never import it."""
+"""Plumbing that every program shares: servers, framing, decoding. Contracts and the core never
+import it."""

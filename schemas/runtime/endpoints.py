@@ -1,4 +1,5 @@
-"""Where the sockets are, and what may be an endpoint. Callers pass their environment in; nothing is made here."""
+"""Where the sockets are, and what may be an endpoint. Callers pass their environment in; nothing is
+made here."""
 
 import os
 import stat
@@ -15,10 +16,11 @@ EXAMPLE = f"{IPC}{SYSTEM_RUNTIME}/arbiter.sock"
 
 
 def runtime_dir(environ: Mapping[str, str], uid: int, sessions: str = "/run/user") -> str:
-    """Folder of all sockets: explicit, under systemd, of the login session, or for root the system's.
+    """Folder of all sockets: explicit, under systemd, of the login session, or for root the
+    system's.
 
-    Never a folder below /tmp: any user could make one of a name that can be foreseen, and serve there.
-    Raises ConfigError where none of them exists.
+    Never a folder below /tmp: any user could make one of a name that can be foreseen, and serve
+    there. Raises ConfigError where none of them exists.
     """
     if explicit := environ.get(RUNTIME_VARIABLE):
         return explicit
@@ -32,7 +34,8 @@ def runtime_dir(environ: Mapping[str, str], uid: int, sessions: str = "/run/user
         return SYSTEM_RUNTIME
     raise ConfigError(
         f"no folder for sockets: XDG_RUNTIME_DIR is not set and there is no {sessions}/{uid}",
-        hint=f"log in with a session, or set {RUNTIME_VARIABLE} to a folder of your own, such as ~/.vram-arbiter",
+        hint=f"log in with a session, or set {RUNTIME_VARIABLE} to a folder of your own, such as "
+        "~/.vram-arbiter",
     )
 
 
@@ -45,28 +48,33 @@ def _is_folder_of(path: str, uid: int) -> bool:
 
 
 def arbiter_endpoint(environ: Mapping[str, str], uid: int) -> str:
-    """Endpoint of the arbiter: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in the runtime folder. Raises ConfigError."""
+    """Endpoint of the arbiter: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in the runtime folder.
+    Raises ConfigError."""
     return environ.get(ENDPOINT_VARIABLE) or program_endpoint("arbiter", environ, uid)
 
 
 def program_endpoint(name: str, environ: Mapping[str, str], uid: int) -> str:
-    """Endpoint of a sidecar or of the runner, by its name: `ipc://<runtime>/<name>.sock`. Raises ConfigError."""
+    """Endpoint of a sidecar or of the runner, by its name: `ipc://<runtime>/<name>.sock`. Raises
+    ConfigError."""
     return f"{IPC}{runtime_dir(environ, uid)}/{name}.sock"
 
 
 def check_endpoint(endpoint: str) -> str:
-    """The endpoint itself if it may be served and connected to. Raises ValueError that says what to write instead."""
+    """The endpoint itself if it may be served and connected to. Raises ValueError that says what to
+    write instead."""
     scheme, separator, path = endpoint.partition("://")
     if not separator or scheme not in ("ipc", "tcp"):
         raise ValueError(f"{endpoint!r} is not an endpoint; write {EXAMPLE}")
     if scheme == "tcp":
         raise ValueError(
-            "tcp:// is refused: without CURVE keys any user of the machine could connect, take leases, drive a robot and stop it; "
+            "tcp:// is refused: without CURVE keys any user of the machine could connect, take "
+            "leases, drive a robot and stop it; "
             "write ipc://PATH"
         )
     if path.startswith("@"):
         raise ValueError(
-            f"{endpoint} is refused: abstract sockets have no permissions, any user could connect or serve there; "
+            f"{endpoint} is refused: abstract sockets have no permissions, any user could connect "
+            "or serve there; "
             "write ipc://PATH"
         )
     if not path.startswith("/"):
@@ -78,13 +86,15 @@ def check_endpoint(endpoint: str) -> str:
     size = len(os.fsencode(path))
     if size > PATH_MAX_BYTES:
         raise ValueError(
-            f"the socket path has {size} bytes, Linux allows {PATH_MAX_BYTES}; choose a shorter folder"
+            f"the socket path has {size} bytes, Linux allows {PATH_MAX_BYTES}; choose a shorter "
+            "folder"
         )
     return endpoint
 
 
 def socket_path(endpoint: str) -> str:
-    """The path of an endpoint. Raises ConfigError for one that may neither be served nor connected to."""
+    """The path of an endpoint. Raises ConfigError for one that may neither be served nor connected
+    to."""
     try:
         return check_endpoint(endpoint).removeprefix(IPC)
     except ValueError as error:

@@ -1,4 +1,5 @@
-"""Packages that only some installations have, and the extra of `vram-arbiter` that brings each of them. Imports none of them."""
+"""Packages that only some installations have, and the extra of `vram-arbiter` that brings each of
+them. Imports none of them."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -44,7 +45,8 @@ def not_installed(what: str, missing: list[str], extra: str) -> ConfigError:
 
 
 def explained(what: str, error: ModuleNotFoundError) -> ConfigError | None:
-    """The operator's error behind an import that failed; None for a module that no extra brings: that is a defect."""
+    """The operator's error behind an import that failed; None for a module that no extra brings:
+    that is a defect."""
     root = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(root)
     return None if extra is None else not_installed(what, [root], extra)

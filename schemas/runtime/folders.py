@@ -1,7 +1,8 @@
-"""Private folders and lock files of the servers: made or checked through descriptors, without following links.
+"""Private folders and lock files of the servers: made or checked through descriptors, without
+following links.
 
-A server binds and writes only in a folder that no other user can exchange under it; a lock file is never a link to another file.
-Clients make no folders. It must not know what the folders hold.
+A server binds and writes only in a folder that no other user can exchange under it; a lock file is
+never a link to another file. Clients make no folders. It must not know what the folders hold.
 """
 
 import contextlib
@@ -25,7 +26,8 @@ _FOLDER: Final = os.O_DIRECTORY | os.O_CLOEXEC
 def socket_folder(
     folder: Path, environ: Mapping[str, str], group: int | None = None, *, shared: bool = False
 ) -> None:
-    """Make or check the folder of a socket, as `private_folder` does. Only the runtime folder is made: a mistyped endpoint leaves no trace."""
+    """Make or check the folder of a socket, as `private_folder` does. Only the runtime folder is
+    made: a mistyped endpoint leaves no trace."""
     try:
         default = Path(runtime_dir(environ, os.getuid()))
     except ConfigError:
@@ -40,8 +42,9 @@ def private_folder(
 ) -> None:
     """Make the last component of `folder`, 0700, or 0750 with `group`; check a folder that exists.
 
-    A folder that exists must belong to this user or root, if it is `shared` also to the arbiter's service user, and must not be writable
-    by others (by a group only with the sticky bit, as the shared folder of the units). Raises ConfigError.
+    A folder that exists must belong to this user or root, if it is `shared` also to the arbiter's
+    service user, and must not be writable by others (by a group only with the sticky bit, as the
+    shared folder of the units). Raises ConfigError.
     """
     try:
         parent = os.open(folder.parent, _FOLDER | os.O_PATH)
@@ -71,7 +74,8 @@ def _made(folder: Path, parent: int) -> bool:
 
 
 def _open_folder(folder: Path, parent: int | None = None, *, shared: bool = True) -> int:
-    """A descriptor of a folder that passed the checks of `private_folder`. Raises ConfigError, OSError."""
+    """A descriptor of a folder that passed the checks of `private_folder`. Raises ConfigError,
+    OSError."""
     path = folder if parent is None else Path(folder.name or ".")
     try:
         opened = os.open(path, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
@@ -102,8 +106,8 @@ def _problem(found: os.stat_result, shared: bool) -> str:
 
 
 def _remove_foreign(name: str, folder: int) -> None:
-    """Remove another user's file of this name from a folder of this user's own, where members of its group may add files: one of them
-    must not keep the server from starting."""
+    """Remove another user's file of this name from a folder of this user's own, where members of
+    its group may add files: one of them must not keep the server from starting."""
     try:
         found = os.stat(name, dir_fd=folder, follow_symlinks=False)
     except FileNotFoundError:
@@ -115,8 +119,9 @@ def _remove_foreign(name: str, folder: int) -> None:
 class LockFile:
     """One server per socket and per state folder: a lock file, held as long as the process lives.
 
-    `acquire` once, `release` at the end (or by dying). The socket needs it because a bind would take an existing path over. The
-    file stays: removing it would let two servers lock two files of one name. A dead server's lock is gone with it.
+    `acquire` once, `release` at the end (or by dying). The socket needs it because a bind would
+    take an existing path over. The file stays: removing it would let two servers lock two files of
+    one name. A dead server's lock is gone with it.
     """
 
     def __init__(self, path: Path, protects: str, holder: str = "an arbiter") -> None:
@@ -128,7 +133,8 @@ class LockFile:
         """What the last holder left for the next one (`leave`)."""
 
     def acquire(self) -> None:
-        """Raises AlreadyRunning with the pid of the holder, ConfigError where the file cannot be made or must not be used."""
+        """Raises AlreadyRunning with the pid of the holder, ConfigError where the file cannot be
+        made or must not be used."""
         fd = self._open(os.O_CREAT)
         assert fd is not None
         self._lock(fd)
@@ -147,7 +153,8 @@ class LockFile:
             os.ftruncate(self._fd, len(content))
 
     def check_free(self) -> None:
-        """Raise what `acquire` would raise because of another holder, without making the file or keeping the lock."""
+        """Raise what `acquire` would raise because of another holder, without making the file or
+        keeping the lock."""
         fd = self._open(0)
         if fd is not None:
             self._lock(fd)
@@ -186,7 +193,8 @@ class LockFile:
             return fd
         os.close(fd)
         raise ConfigError(
-            f"{self._path}: not a file of this user's own (uid {found.st_uid}, {found.st_nlink} names)",
+            f"{self._path}: not a file of this user's own (uid {found.st_uid}, {found.st_nlink} "
+            "names)",
             hint="remove it if its program does not run",
         )
 

@@ -1,7 +1,8 @@
 """Bounded msgpack decoding, shared by every server: bytes of a peer → one map, at a bounded cost.
 
-`unpack_map` counts the values of a message before it builds any of them: a message of 1 MiB can hold a million lists, and building,
-validating and freeing those holds an event loop for seconds. Pure: no sockets, no clock. Must not know what a message means.
+`unpack_map` counts the values of a message before it builds any of them: a message of 1 MiB can
+hold a million lists, and building, validating and freeing those holds an event loop for seconds.
+Pure: no sockets, no clock. Must not know what a message means.
 """
 
 from dataclasses import dataclass
@@ -19,21 +20,25 @@ class UnpackLimits:
 
     message_max_bytes: int = MESSAGE_MAX_BYTES
     values_max: int = VALUES_MAX
-    """All values of a message together, at every depth; their cost is what bounds the time of `unpack_map`."""
+    """All values of a message together, at every depth; their cost is what bounds the time of
+    `unpack_map`."""
     keys_max: int = LISTED_MAX
     """Keys of one map."""
     items_max: int = LISTED_MAX
     """Items of one list."""
     beside_binary_max_bytes: int = MESSAGE_MAX_BYTES
-    """All but the content of binary values, which costs a copy only; UTF-8 text is checked letter by letter, 2 ms a MiB."""
+    """All but the content of binary values, which costs a copy only; UTF-8 text is checked letter
+    by letter, 2 ms a MiB."""
 
 
 def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) -> dict[str, Any]:
     """Decode one message to a map with text keys.
 
     Raises:
-        MessageTooLarge: more bytes or values than `limits` allows; only the headers of the values were read.
-        BadFrame: not one msgpack map, a map or list that is too long, text that is not UTF-8, or an extension type.
+        MessageTooLarge: more bytes or values than `limits` allows; only the headers of the values
+        were read.
+        BadFrame: not one msgpack map, a map or list that is too long, text that is not UTF-8, or an
+        extension type.
     """
     size = len(payload)
     if size > limits.message_max_bytes:
@@ -47,13 +52,15 @@ def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) ->
         values, binary_bytes = _walk(payload, limits.values_max)
         if values > limits.values_max:
             raise MessageTooLarge(
-                f"the message has more than {limits.values_max} values (keys, list items and what they hold)",
+                f"the message has more than {limits.values_max} values (keys, list items and what "
+                "they hold)",
                 hint="send less in one message",
                 details={"size_bytes": size, "limit_values": limits.values_max},
             )
         if size - binary_bytes > limits.beside_binary_max_bytes:
             raise MessageTooLarge(
-                f"the message has {size - binary_bytes} bytes beside its binary values, the limit is {limits.beside_binary_max_bytes}",
+                f"the message has {size - binary_bytes} bytes beside its binary values, the limit "
+                f"is {limits.beside_binary_max_bytes}",
                 hint="send pictures and arrays as binary values, and less text",
                 details={"size_bytes": size, "limit_bytes": limits.beside_binary_max_bytes},
             )
@@ -82,8 +89,9 @@ def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) ->
 def count_values(payload: bytes | bytearray | memoryview, values_max: int) -> int:
     """Number of msgpack values in `payload`, those inside maps and lists included.
 
-    Only headers are read, at most `values_max` of them: the count ends, at more than `values_max`, with the header that announces too
-    much. Torn or invalid bytes end it early; the decoder says what is wrong with them.
+    Only headers are read, at most `values_max` of them: the count ends, at more than `values_max`,
+    with the header that announces too much. Torn or invalid bytes end it early; the decoder says
+    what is wrong with them.
     """
     return _walk(payload, values_max)[0]
 
@@ -129,7 +137,8 @@ def _sizes() -> bytes:
 _SIZES = _sizes()
 _BINARY = (0xC4, 0xC5, 0xC6)
 _HEADERS: dict[int, tuple[int, int, int]] = {
-    # first byte: (bytes of the length, bytes beside the content, values per unit of length; 0: the length counts bytes)
+    # first byte: (bytes of the length, bytes beside the content, values per unit of length; 0: the
+    # length counts bytes)
     **dict.fromkeys(range(128, 144), (0, 0, 2)),  # fixmap
     **dict.fromkeys(range(144, 160), (0, 0, 1)),  # fixarray
     0xC4: (1, 0, 0), 0xC5: (2, 0, 0), 0xC6: (4, 0, 0),  # bin

@@ -31,7 +31,8 @@ log = logging.getLogger(__name__)
 
 LISTEN_BACKLOG = 512
 ACCEPT_MAX = 4
-"""Connections accepted in one turn of the loop: each costs some 0.3 ms until it is read or cut, and others wait so long."""
+"""Connections accepted in one turn of the loop: each costs some 0.3 ms until it is read or cut, and
+others wait so long."""
 ACCEPT_PAUSE_S = 0.1
 """After a failed accept (EMFILE, ENFILE, ENOMEM); the backlog keeps new connections meanwhile."""
 SWEEP_S = 0.5
@@ -97,7 +98,7 @@ class Router:
         """Number of open connections."""
         return len(self._connections)
 
-    # -- life ------------------------------------------------------------------------------------
+    # -- life
     def bind(self) -> None:
         """Bind with mode 0660 from the first instant. Raises ConfigError."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -180,7 +181,7 @@ class Router:
             return False
         return (found.st_dev, found.st_ino) == self._inode
 
-    # -- accepting ---------------------------------------------------------------------------------
+    # -- accepting
     def _accept(self) -> None:
         """1. Take a few from the backlog. 2. Ask the kernel for the peer. 3. Room within the
         shares. 4. Open the transport. Where more may wait: 5. Rest.
@@ -322,7 +323,7 @@ class Router:
         if self._empty is not None and not self._connections and not self._empty.done():
             self._empty.set_result(None)
 
-    # -- handling ----------------------------------------------------------------------------------
+    # -- handling
     def readable(self, connection: Connection) -> None:
         """Handle what has come at once while the loop has time for it, else when it is the
         connection's turn.
@@ -384,7 +385,7 @@ class Router:
         if self._complaints == 1:
             log.warning("refused %s", what)
 
-    # -- watching ----------------------------------------------------------------------------------
+    # -- watching
     def _sweep_once(self) -> None:
         loop = self._loop_or_fail
         now = loop.time()

@@ -1,7 +1,8 @@
-"""How a program of the command line ends where its surroundings end it: Ctrl-C, a reader that left (`| head`), a full output device, and
-a package that this installation does not have.
+"""How a program of the command line ends where its surroundings end it: Ctrl-C, a reader that left
+(`| head`), a full output device, and a package that this installation does not have.
 
-None of them is a defect, so there is no traceback but one line at most. The first two have the shell's exit codes, 128 + the signal.
+None of them is a defect, so there is no traceback but one line at most. The first two have the
+shell's exit codes, 128 + the signal.
 """
 
 import errno
@@ -24,7 +25,8 @@ _NO_ROOM = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.
 
 
 def program[**P](main: Callable[P, int]) -> Callable[P, int]:
-    """Let `main`, which returns the exit code, end quietly. A pipe of its own that breaks is its error as before."""
+    """Let `main`, which returns the exit code, end quietly. A pipe of its own that breaks is its
+    error as before."""
 
     @wraps(main)
     def ended(*arguments: P.args, **named: P.kwargs) -> int:
@@ -55,7 +57,8 @@ def complain(name: str, error: BaseException) -> None:
 
 
 def no_room(name: str, error: OSError) -> int:
-    """Say that an output cannot be written and return the exit code. Raises the error if it is any other."""
+    """Say that an output cannot be written and return the exit code. Raises the error if it is any
+    other."""
     if error.errno not in _NO_ROOM:
         raise error
     silence()
@@ -81,7 +84,8 @@ def silence() -> None:
 
 
 def program_name() -> str:
-    """What the program was started as: `vram-runner`, or `runner` for `python -m vram_arbiter.runner`."""
+    """What the program was started as: `vram-runner`, or `runner` for `python -m
+    vram_arbiter.runner`."""
     path = sys.argv[0] if sys.argv else ""
     folder, name = os.path.split(path)
     return os.path.basename(folder) if name == "__main__.py" else name or "python"

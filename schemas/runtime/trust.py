@@ -1,8 +1,9 @@
 """Which user serves a socket, by the kernel's word, and whether a client may believe it.
 
-A client trusts root, its own user, the unit's user for the program it asks (`SERVICE_USERS`) and the users named in
-`VRAM_ARBITER_SERVER_USERS`. A folder that others may write, or a socket left by another user, is then no danger: the check is
-about the process that listens, not about files. It must not know what is said on the socket.
+A client trusts root, its own user, the unit's user for the program it asks (`SERVICE_USERS`) and
+the users named in `VRAM_ARBITER_SERVER_USERS`. A folder that others may write, or a socket left by
+another user, is then no danger: the check is about the process that listens, not about files. It
+must not know what is said on the socket.
 """
 
 import os
@@ -30,16 +31,18 @@ _UCRED = struct.Struct("iII")  # pid, uid, gid
 
 
 def check_server(connected: socket.socket, program: Program, where: str) -> None:
-    """Check the process that listens at the other end of a connected unix socket, before anything is sent or believed.
+    """Check the process that listens at the other end of a connected unix socket, before anything
+    is sent or believed.
 
-    `where` names the endpoint in the error. Raises UntrustedServer, ConfigError for a `VRAM_ARBITER_SERVER_USERS` that names
-    unknown users.
+    `where` names the endpoint in the error. Raises UntrustedServer, ConfigError for a
+    `VRAM_ARBITER_SERVER_USERS` that names unknown users.
     """
     check_uid(server_uid(connected), program, where)
 
 
 def server_uid(connected: socket.socket) -> int:
-    """The uid of the process that called listen() on the other end of a connected unix socket (SO_PEERCRED)."""
+    """The uid of the process that called listen() on the other end of a connected unix socket
+    (SO_PEERCRED)."""
     _, uid, _ = _UCRED.unpack(
         connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size)
     )
@@ -47,7 +50,8 @@ def server_uid(connected: socket.socket) -> int:
 
 
 def frame_uid(peer_address: object) -> int | None:
-    """The uid in libzmq's `Peer-Address` of a frame (`localhost:UID:GID:PID` on ipc), None where it names none."""
+    """The uid in libzmq's `Peer-Address` of a frame (`localhost:UID:GID:PID` on ipc), None where it
+    names none."""
     parts = peer_address.rsplit(":", 3) if isinstance(peer_address, str) else []
     return (
         int(parts[1]) if len(parts) == 4 and all(part.isdecimal() for part in parts[1:]) else None
@@ -62,14 +66,17 @@ def check_uid(
         return
     user = _name_of(uid)
     raise UntrustedServer(
-        f"{where} is served by uid {uid}{f' ({user})' if user else ''}, not by a user that may serve the {program}",
-        hint=f"nothing was asked of it and nothing it says is believed; if it may serve, set {USERS_VARIABLE}={uid}",
+        f"{where} is served by uid {uid}{f' ({user})' if user else ''}, not by a user that may "
+        f"serve the {program}",
+        hint="nothing was asked of it and nothing it says is believed; if it may serve, set "
+        f"{USERS_VARIABLE}={uid}",
         details={"endpoint": where, "uid": uid, "user": user, "program": program},
     )
 
 
 def trusts(uid: int, program: Program, environ: Mapping[str, str] | None = None) -> bool:
-    """Whether a `program` that `uid` serves may be believed. Raises ConfigError as `check_server` does."""
+    """Whether a `program` that `uid` serves may be believed. Raises ConfigError as `check_server`
+    does."""
     if uid in (ROOT, os.geteuid()):
         return True
     if _name_of(uid) == SERVICE_USERS[program]:

@@ -9,9 +9,8 @@ class Turns[T: Hashable]:
     """Items that wait for a turn, each under a path of keys such as (user, process).
 
     Every key of a level has its turn before the first has its second: a user with a thousand busy
-    connections delays
-    another user's only one by one item, not by a thousand. `add`, `pop` and `discard` take time in
-    the path's length.
+    connections delays another user's only one by one item, not by a thousand. `add`, `pop` and
+    `discard` take time in the path's length.
     """
 
     def __init__(self) -> None:

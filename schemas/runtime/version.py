@@ -1,4 +1,5 @@
-"""The version of this installation, and `--version` for programs on argparse. Reads it only when it is asked for."""
+"""The version of this installation, and `--version` for programs on argparse. Reads it only when it
+is asked for."""
 
 import argparse
 from collections.abc import Sequence

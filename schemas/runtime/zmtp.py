@@ -1,12 +1,9 @@
 """ZMTP 3.1 for a ROUTER, without I/O: bytes in, events and bytes out.
 
 Implements the server side of https://rfc.zeromq.org/spec/37/ with the NULL mechanism, for DEALER
-and REQ peers of any
-ZeroMQ library from version 4.0 on. Every length is checked before a byte of it is kept: memory is
-bounded by
-`WireLimits.message_max_bytes` and one read of the caller, whatever a peer sends. Must not know sockets,
-loops or what a
-message means.
+and REQ peers of any ZeroMQ library from version 4.0 on. Every length is checked before a byte of it
+is kept: memory is bounded by `WireLimits.message_max_bytes` and one read of the caller, whatever a
+peer sends. Must not know sockets, loops or what a message means.
 """
 
 import struct
@@ -97,8 +94,7 @@ class ServerConnection:
     """One connection as a ROUTER sees it.
 
     `feed` bytes, call `next_event` until it returns None, and send what `outgoing` returns. After a
-    ZmtpError nothing
-    may be called any more but `outgoing`.
+    ZmtpError nothing may be called any more but `outgoing`.
     """
 
     def __init__(self, limits: WireLimits) -> None:
@@ -154,7 +150,7 @@ class ServerConnection:
             if event is not None:
                 return event
 
-    # -- greeting ------------------------------------------------------------------------------
+    # -- greeting
     def _read_greeting(self) -> bool:
         have = self._data[self._at : self._at + GREETING_BYTES]
         # what is wrong is said as soon as it is there: a client of another protocol may never send
@@ -172,7 +168,7 @@ class ServerConnection:
         self._outgoing += READY
         return True
 
-    # -- frames --------------------------------------------------------------------------------
+    # -- frames
     def _read_header(self) -> bool:
         """Read flags and size of the next frame; check both before a byte of its body is kept."""
         data, at = self._data, self._at
@@ -210,7 +206,8 @@ class ServerConnection:
             raise ZmtpError(f"a message of more than {FRAMES_MAX} frames")
         if self._size > self.limits.skip_max_bytes:
             raise ZmtpError(
-                f"a message of {self._size} bytes or more, at most {self.limits.skip_max_bytes} are read"
+                f"a message of {self._size} bytes or more, at most {self.limits.skip_max_bytes} "
+                "are read"
             )
         if self._size > self.limits.message_max_bytes:
             self._skipping = True
@@ -254,7 +251,7 @@ class ServerConnection:
         self._payload = b""
         return event
 
-    # -- commands ------------------------------------------------------------------------------
+    # -- commands
     def _command(self, body: bytes) -> Event:
         if not body or len(body) < 1 + body[0]:
             raise ZmtpError("a command without a name")

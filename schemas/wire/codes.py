@@ -1,4 +1,5 @@
-"""Codes for why things happen, as history, errors and views carry them. Standard library only; words are made elsewhere."""
+"""Codes for why things happen, as history, errors and views carry them. Standard library only;
+words are made elsewhere."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -17,12 +18,14 @@ class Order:
 
 
 type Cause = Literal["waiter", "pressure", "operator"]
-"""Why a holder is revoked: for a request, because the GPU holds more than its budget, or by hand."""
+"""Why a holder is revoked: for a request, because the GPU holds more than its budget, or
+by hand."""
 
 
 @dataclass(frozen=True, slots=True)
 class RevokeCause:
-    """Why a holder is revoked. `wanted_by`: the consumer of the waiter; `gang`: the waiter's, if it has one."""
+    """Why a holder is revoked. `wanted_by`: the consumer of the waiter; `gang`: the waiter's, if it
+    has one."""
 
     cause: Cause
     wanted_by: str = ""

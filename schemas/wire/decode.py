@@ -55,7 +55,8 @@ PUSHES: Final[Mapping[str, type[Any]]] = MappingProxyType(
 
 
 def decode_reply(op: str, message: Mapping[str, Any]) -> AnyReply:
-    """Return the typed reply to `op`; the envelope's fields are ignored. Raises CodecError, and KeyError for an unknown op."""
+    """Return the typed reply to `op`; the envelope's fields are ignored. Raises CodecError, and
+    KeyError for an unknown op."""
     reply: AnyReply = from_map(REPLIES[op], message)
     return reply
 

@@ -6,9 +6,11 @@ from typing import Any, ClassVar
 
 
 class Refusal:
-    """Base of the values of one kind of refusal, as the engine makes them: typed fields and no words.
+    """Base of the values of one kind of refusal, as the engine makes them: typed fields and no
+    words.
 
-    `code` is the wire code. `arbiter.rpc.words` makes an `ErrorView` of it, with the fields as `details`.
+    `code` is the wire code. `arbiter.rpc.words` makes an `ErrorView` of it, with the fields as
+    `details`.
     """
 
     __slots__ = ()
@@ -26,7 +28,8 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class ErrorView:
-    """A typed error: `code` is one of `schemas.errors.CODES`, `details` its values, and words for people."""
+    """A typed error: `code` is one of `schemas.errors.CODES`, `details` its values, and words for
+    people."""
 
     WHOLE: ClassVar = True
 

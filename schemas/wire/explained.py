@@ -1,6 +1,7 @@
 """Answers to *why is this consumer not running*: codes and values. Standard library only.
 
-The fields `text` and `next` say the same in words. The engine leaves them empty; `arbiter.rpc.words` fills them.
+The fields `text` and `next` say the same in words. The engine leaves them empty;
+`arbiter.rpc.words` fills them.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,5 @@
-"""What the arbiter sends unasked: `{"push": kind, "seq": n, "epoch": e, …}`. Standard library only."""
+"""What the arbiter sends unasked: `{"push": kind, "seq": n, "epoch": e, …}`. Standard
+library only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ from vram_arbiter.schemas.wire.views import LeaseView
 
 @dataclass(frozen=True, slots=True)
 class RevokePush:
-    """The arbiter asks the holder to leave. Repeated every `REVOKE_RESEND_S` until acknowledged; idempotent."""
+    """The arbiter asks the holder to leave. Repeated every `REVOKE_RESEND_S` until acknowledged;
+    idempotent."""
 
     TAG: ClassVar = ("push", "revoke")
 
@@ -51,7 +53,8 @@ class DeniedPush:
 
 @dataclass(frozen=True, slots=True)
 class ResizedPush:
-    """The lease has this size now: it has grown or shrunk, or it was not measured smaller in time."""
+    """The lease has this size now: it has grown or shrunk, or it was not measured smaller
+    in time."""
 
     TAG: ClassVar = ("push", "resized")
 
@@ -62,7 +65,8 @@ class ResizedPush:
 
 @dataclass(frozen=True, slots=True)
 class LostPush:
-    """The lease is over and its holder did not end it (expired, fenced): unload and acquire again."""
+    """The lease is over and its holder did not end it (expired, fenced): unload and
+    acquire again."""
 
     TAG: ClassVar = ("push", "lost")
 

@@ -1,4 +1,5 @@
-"""Answers to requests: `{"re": n, "epoch": e, "ok": true, …}`, one class per shape. Standard library only."""
+"""Answers to requests: `{"re": n, "epoch": e, "ok": true, …}`, one class per shape. Standard
+library only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,7 +34,8 @@ class PingReply:
 
 @dataclass(frozen=True, slots=True)
 class AcquireReply:
-    """Answer to `acquire` and `reacquire` (`loading`, `queued`), and to `resize` (`held`, `shrinking`, `growing`)."""
+    """Answer to `acquire` and `reacquire` (`loading`, `queued`), and to `resize` (`held`,
+    `shrinking`, `growing`)."""
 
     state: str
     lease: LeaseView
@@ -61,7 +63,8 @@ class StateReply:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseReply:
-    """`next`: what the lease becomes once its bytes are measured gone: `released`, `standby` or `parked`."""
+    """`next`: what the lease becomes once its bytes are measured gone: `released`, `standby` or
+    `parked`."""
 
     state: str
     next: str
@@ -103,7 +106,8 @@ class OomReply:
 
 @dataclass(frozen=True, slots=True)
 class StatusReply:
-    """The state of everything. `leases` is a page of the live ones: held, loading, …, then the queue in order."""
+    """The state of everything. `leases` is a page of the live ones: held, loading, …, then the
+    queue in order."""
 
     epoch: int
     phase: Literal["recovering", "serving"]
@@ -137,12 +141,27 @@ class OperatorReply:
 
 @dataclass(frozen=True, slots=True)
 class DrainReply:
-    """Answer to `drain` and `resume`: the operator that drained the arbiter, and why; "" while it grants."""
+    """Answer to `drain` and `resume`: the operator that drained the arbiter, and why; "" while it
+    grants."""
 
     drained: str
 
 
 type AnyReply = (
-    DoneReply | WelcomeReply | PingReply | AcquireReply | ReadyReply | UsesReply | StateReply | ReleaseReply | RenewReply
-    | ReattachReply | OomReply | StatusReply | HistoryReply | OperatorReply | DrainReply | WhyReply
-)  # fmt: skip
+    DoneReply
+    | WelcomeReply
+    | PingReply
+    | AcquireReply
+    | ReadyReply
+    | UsesReply
+    | StateReply
+    | ReleaseReply
+    | RenewReply
+    | ReattachReply
+    | OomReply
+    | StatusReply
+    | HistoryReply
+    | OperatorReply
+    | DrainReply
+    | WhyReply
+)

@@ -1,8 +1,9 @@
 """Requests of the arbiter's wire, validated: frozen models that refuse unknown keys.
 
-The life of a lease on the wire: `acquire` → reply `loading` (granted at once) or `queued`, then push `granted` → `ready` →
-`use_begin`/`use_end`… → push `revoke` → `revoke_ack` → `unloading` → `release`. `renew` keeps all leases of a connection alive.
-A revoked lease with `standby` continues after its `release`: push `granted` (with a new token) when it is back, or `reacquire`.
+The life of a lease on the wire: `acquire` → reply `loading` (granted at once) or `queued`, then
+push `granted` → `ready` → `use_begin`/`use_end`… → push `revoke` → `revoke_ack` → `unloading` →
+`release`. `renew` keeps all leases of a connection alive. A revoked lease with `standby` continues
+after its `release`: push `granted` (with a new token) when it is back, or `reacquire`.
 """
 
 from typing import Annotated, Literal
@@ -22,7 +23,8 @@ Seconds = Annotated[float, Field(ge=0, le=86_400 * 365, allow_inf_nan=False)]
 Reason = Annotated[str, Field(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Bytes = Annotated[int, Field(ge=0, le=1 << 50)]
 UseIds = Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX, fail_fast=True)]
-"""Lists end at their first wrong item: a message with thousands of wrong ones must not cost an error for each."""
+"""Lists end at their first wrong item: a message with thousands of wrong ones must not cost an
+error for each."""
 
 
 class _Frozen(BaseModel):
@@ -30,7 +32,8 @@ class _Frozen(BaseModel):
 
 
 class Footprint(_Frozen):
-    """Bytes that a model puts on a GPU: at the worst moment of loading, when resident, and after unloading while its process lives."""
+    """Bytes that a model puts on a GPU: at the worst moment of loading, when resident, and after
+    unloading while its process lives."""
 
     load_peak_bytes: Bytes
     steady_bytes: Bytes
@@ -43,7 +46,8 @@ class LeaseRef(_Frozen):
 
 
 class Gang(_Frozen):
-    """Several leases, of whatever processes, that are granted together or not at all. One id for each time."""
+    """Several leases, of whatever processes, that are granted together or not at all. One id for
+    each time."""
 
     id: Name
     size: Annotated[int, Field(ge=2, le=16)]
@@ -73,7 +77,8 @@ class LeaseSpec(_Frozen):
         0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
     )
     gang: Gang | None = None
-    independent: bool = False  # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
+    # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
+    independent: bool = False
 
 
 class _Request(_Frozen):
@@ -82,7 +87,8 @@ class _Request(_Frozen):
 
 
 class Hello(_Request):
-    """First message of a connection. `instance` names the client object, to find its leases again after a reconnect."""
+    """First message of a connection. `instance` names the client object, to find its leases again
+    after a reconnect."""
 
     op: Literal["hello"]
     version: int = d.WIRE_VERSION
@@ -92,7 +98,8 @@ class Hello(_Request):
 
 
 class Acquire(_Request):
-    """Ask for a lease. The same `nonce` from the same process is the same request: a repeat never makes a second lease."""
+    """Ask for a lease. The same `nonce` from the same process is the same request: a repeat never
+    makes a second lease."""
 
     op: Literal["acquire"]
     nonce: Name
@@ -106,14 +113,16 @@ class _OnLease(_Request):
 
 
 class Ready(_OnLease):
-    """The model is loaded; `measured_bytes` is what the holder sees of its own allocation (None: it cannot tell)."""
+    """The model is loaded; `measured_bytes` is what the holder sees of its own allocation (None: it
+    cannot tell)."""
 
     op: Literal["ready"]
     measured_bytes: Bytes | None = None
 
 
 class UseBegin(_OnLease):
-    """Begin a use. Any client that knows the token may; the use ends with that client's process at the latest."""
+    """Begin a use. Any client that knows the token may; the use ends with that client's process at
+    the latest."""
 
     op: Literal["use_begin"]
     use_id: Name
@@ -126,7 +135,8 @@ class UseEnd(_OnLease):
 
 
 class Yield(_OnLease):
-    """The use pauses: it no longer keeps the lease from being evicted. `use_begin` with the same id resumes it, if it may."""
+    """The use pauses: it no longer keeps the lease from being evicted. `use_begin` with the same id
+    resumes it, if it may."""
 
     op: Literal["yield"]
     use_id: Name
@@ -140,7 +150,8 @@ class Renew(_Request):
 
 
 class RevokeAck(_OnLease):
-    """The holder heard `revoke`; `safe_point_eta_s` is its guess of when it will be between uses."""
+    """The holder heard `revoke`; `safe_point_eta_s` is its guess of when it will be
+    between uses."""
 
     op: Literal["revoke_ack"]
     safe_point_eta_s: Seconds | None = None
@@ -151,9 +162,11 @@ class Unloading(_OnLease):
 
 
 class Release(_OnLease):
-    """The holder has let go of the bytes (its process lives on: residue) or is about to exit (`exiting`).
+    """The holder has let go of the bytes (its process lives on: residue) or is about to exit
+    (`exiting`).
 
-    The reply's `next` says where the lease goes once the bytes are measured gone: `released`, `standby` or `parked`.
+    The reply's `next` says where the lease goes once the bytes are measured gone: `released`,
+    `standby` or `parked`.
     """
 
     op: Literal["release"]
@@ -169,14 +182,16 @@ class Cancel(_Request):
 
 
 class Reacquire(_OnLease):
-    """A lease that is away is wanted now: it waits like any other. `token` is the last one, so a late repeat asks for nothing."""
+    """A lease that is away is wanted now: it waits like any other. `token` is the last one, so a
+    late repeat asks for nothing."""
 
     op: Literal["reacquire"]
     wait_timeout_s: Seconds | None = None
 
 
 class Resize(_OnLease):
-    """The holder freed bytes, or needs more. Reply state `held`, `shrinking` or `growing`; then push `resized`, or `denied` for a growth."""
+    """The holder freed bytes, or needs more. Reply state `held`, `shrinking` or `growing`; then
+    push `resized`, or `denied` for a growth."""
 
     op: Literal["resize"]
     footprint: Footprint
@@ -195,7 +210,8 @@ class ReattachLease(_Frozen):
 
 
 class Reattach(_Request):
-    """After a reconnect: what this client still holds. The reply says per lease `kept` or why not."""
+    """After a reconnect: what this client still holds. The reply says per lease `kept` or
+    why not."""
 
     op: Literal["reattach"]
     leases: Annotated[
@@ -239,7 +255,8 @@ class Subscribe(_Request):
 
 
 class _ByHand(_Request):
-    """An operator's action. `reason` is kept with the operator's name in history and, for pins and drains, in the journal."""
+    """An operator's action. `reason` is kept with the operator's name in history and, for pins and
+    drains, in the journal."""
 
     reason: Reason
 
@@ -265,7 +282,8 @@ class Unpin(_ByHandOn):
 
 
 class ReleaseDead(_ByHandOn):
-    """Give up the lease of a holder that is not heard of, before its ttl is over. Refused in use, and for a holder that lives."""
+    """Give up the lease of a holder that is not heard of, before its ttl is over. Refused in use,
+    and for a holder that lives."""
 
     op: Literal["release_dead"]
 
@@ -285,19 +303,47 @@ class Ping(_Request):
 
 
 class Bye(_Request):
-    """The client closes its socket. Its leases are released; a process that lives on keeps its residue."""
+    """The client closes its socket. Its leases are released; a process that lives on keeps its
+    residue."""
 
     op: Literal["bye"]
 
 
 Request = Annotated[
-    Hello | Acquire | Ready | UseBegin | UseEnd | Yield | Renew | RevokeAck | Unloading | Release | Cancel | Reacquire | Resize | Reattach | Oom
-    | Status | Why | History | Subscribe | Evict | Pin | Unpin | ReleaseDead | Drain | Resume | Ping | Bye,
+    Hello
+    | Acquire
+    | Ready
+    | UseBegin
+    | UseEnd
+    | Yield
+    | Renew
+    | RevokeAck
+    | Unloading
+    | Release
+    | Cancel
+    | Reacquire
+    | Resize
+    | Reattach
+    | Oom
+    | Status
+    | Why
+    | History
+    | Subscribe
+    | Evict
+    | Pin
+    | Unpin
+    | ReleaseDead
+    | Drain
+    | Resume
+    | Ping
+    | Bye,
     Field(discriminator="op"),
-]  # fmt: skip
+]
 REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
 OPS: tuple[str, ...] = (
-    "hello", "acquire", "ready", "use_begin", "use_end", "yield", "renew", "revoke_ack", "unloading", "release", "cancel",
-    "reacquire", "resize", "reattach", "oom", "status", "why", "history", "subscribe", "evict", "pin", "unpin", "release_dead", "drain", "resume",
+    "hello", "acquire", "ready", "use_begin", "use_end", "yield", "renew", "revoke_ack",
+    "unloading", "release", "cancel",
+    "reacquire", "resize", "reattach", "oom", "status", "why", "history", "subscribe", "evict",
+    "pin", "unpin", "release_dead", "drain", "resume",
     "ping", "bye",
 )  # fmt: skip

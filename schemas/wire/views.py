@@ -20,8 +20,8 @@ class GangView:
 class BlockView:
     """Why nothing is granted on a GPU.
 
-    `names`: holders that have not reattached, the consumer that loads, or the gang; `more` of them are not named.
-    `text`: the same in words; the engine leaves it empty.
+    `names`: holders that have not reattached, the consumer that loads, or the gang; `more` of them
+    are not named. `text`: the same in words; the engine leaves it empty.
     """
 
     code: Block
@@ -34,7 +34,8 @@ class BlockView:
 
 @dataclass(frozen=True, slots=True)
 class LeaseView:
-    """A lease. `token` is None while it is queued, and for readers that are neither its holder's process nor an operator."""
+    """A lease. `token` is None while it is queued, and for readers that are neither its holder's
+    process nor an operator."""
 
     lease_id: str
     token: Token | None

@@ -1,4 +1,5 @@
-"""The daemon as an operator meets it: flags, exit codes, start, stop, notifications. Real processes."""
+"""The daemon as an operator meets it: flags, exit codes, start, stop, notifications. Real
+processes."""
 
 import contextlib
 import json

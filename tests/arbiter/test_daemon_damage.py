@@ -1,7 +1,8 @@
-"""The journal is damaged while the daemon is down: nothing may be granted beside a holder that it no longer names.
+"""The journal is damaged while the daemon is down: nothing may be granted beside a holder that it
+no longer names.
 
-Regression: SQLite drops a write-ahead log from its first bad frame on without a word. In each of these cases the next start
-granted another client's lease beside a living exclusive holder in use.
+Regression: SQLite drops a write-ahead log from its first bad frame on without a word. In each of
+these cases the next start granted another client's lease beside a living exclusive holder in use.
 """
 
 import contextlib
@@ -54,7 +55,8 @@ asyncio.run(main())
 
 @contextlib.contextmanager
 def holder_in_use(arbiter: ArbiterProcess) -> Iterator[subprocess.Popen[str]]:
-    """A process by the product's own client: an exclusive lease, bytes on the GPU, a use under way."""
+    """A process by the product's own client: an exclusive lease, bytes on the GPU, a use
+    under way."""
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(arbiter.card)],
         env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -94,9 +96,12 @@ def put_back(database: Path) -> None:
 DAMAGES: dict[str, Callable[[Path], Any]] = {
     "log deleted": lambda database: wal(database).unlink(),
     "log emptied": lambda database: os.truncate(wal(database), 0),
-    "log cut in the middle": lambda database: os.truncate(wal(database), wal(database).stat().st_size // 2),
-    "last page zeroed": lambda database: change(wal(database), -PAGE, lambda old: bytes(len(old)), PAGE),
-    "one bit flipped": lambda database: change(wal(database), 32 + 24 + 100, lambda old: bytes([old[0] ^ 1])),
+    "log cut in the middle": lambda database: os.truncate(wal(database),
+    wal(database).stat().st_size // 2),
+    "last page zeroed": lambda database: change(wal(database), -PAGE, lambda old: bytes(len(old)),
+    PAGE),
+    "one bit flipped": lambda database: change(wal(database), 32 + 24 + 100,
+    lambda old: bytes([old[0] ^ 1])),
     "older copy put back": put_back,
     "state folder deleted": lambda database: shutil.rmtree(database.parent),
 }  # fmt: skip

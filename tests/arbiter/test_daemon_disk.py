@@ -1,6 +1,8 @@
-"""The disk of the state folder fills up, under a running daemon and before one starts. A real disk, or a real limit of the kernel's.
+"""The disk of the state folder fills up, under a running daemon and before one starts. A real disk,
+or a real limit of the kernel's.
 
-What is held stays held, nothing is granted that could not be recovered, it is said, and it ends with the trouble.
+What is held stays held, nothing is granted that could not be recovered, it is said, and it ends
+with the trouble.
 """
 
 import contextlib
@@ -142,7 +144,8 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
         on_small_disk.wait_for("journal cannot be written", PATIENCE_S)
         doctor = subprocess.run(
             [sys.executable, "-m", "vram_arbiter.clients", "doctor"],
-            env=on_small_disk.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+            env=on_small_disk.environ, capture_output=True, text=True, timeout=PATIENCE_S,
+            check=False,
         )  # fmt: skip
         assert doctor.returncode == 1, "a daemon that can grant nothing is not healthy"
         assert "BAD  files" in doctor.stdout
@@ -193,7 +196,8 @@ def test_a_start_on_a_full_disk_says_so_and_is_worth_another_try(
 def test_a_start_on_a_read_only_disk_is_worth_another_try_and_loses_no_lease(
     on_small_disk: ArbiterProcess, tmpfs: Tmpfs
 ) -> None:
-    """Regression: it ended with 2, the code that systemd takes for a person's mistake, and stayed down for ever."""
+    """Regression: it ended with 2, the code that systemd takes for a person's mistake, and stayed
+    down for ever."""
     on_small_disk.start()
     with WireClient(on_small_disk.endpoint) as client:
         client.hello().granted("holder", GIB, ttl_s=600.0)

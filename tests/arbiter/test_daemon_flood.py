@@ -1,4 +1,5 @@
-"""A client that sends without end, and everybody else: what they release is still measured, so they never run out of leases."""
+"""A client that sends without end, and everybody else: what they release is still measured, so they
+never run out of leases."""
 
 import subprocess
 import sys
@@ -41,7 +42,8 @@ def flooded(arbiter_daemon: ArbiterProcess) -> Iterator[ArbiterProcess]:
 
 
 def test_releases_are_measured_under_a_flood(flooded: ArbiterProcess) -> None:
-    """Readings starved: their thread got the interpreter once in 5 ms and needs it twenty times a reading."""
+    """Readings starved: their thread got the interpreter once in 5 ms and needs it twenty times a
+    reading."""
     with WireClient(flooded.endpoint).hello("calm") as calm:
         for number in range(3 * d.LEASES_PER_CLIENT_MAX):
             lease = calm.granted("calm", 4096, nonce=f"n{number}", mode="shared")

@@ -55,7 +55,8 @@ def speak(arbiter: ArbiterProcess, role: str, primary: str, other: str) -> dict[
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root to act as other users")
 def test_a_member_of_the_group_may_lease_and_only_operators_act_by_hand(make_arbiter: Make) -> None:
-    """Every member of the socket's group could evict and drain: to hold a lease was to be an operator."""
+    """Every member of the socket's group could evict and drain: to hold a lease was to be an
+    operator."""
     members, operators = groups()
     arbiter = make_arbiter(arguments=("--group", members, "--operators-group", operators))
     arbiter.runtime.chmod(0o755)

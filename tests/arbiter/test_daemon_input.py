@@ -98,7 +98,8 @@ def test_another_process_cannot_speak_for_a_lease(
         "import sys; from tests.support.wire import WireClient\n"
         "with WireClient(sys.argv[1]) as c:\n"
         "    c.hello('thief')\n"
-        "    reply = c.ask('release', lease_id=sys.argv[2], token=[int(n) for n in sys.argv[3:5]])\n"
+        "    reply = c.ask('release', lease_id=sys.argv[2], token=[int(n) for n in "
+        "sys.argv[3:5]])\n"
         "    print(reply['error']['code'])\n"
     )
     token = [str(number) for number in lease["token"]]

@@ -1,4 +1,5 @@
-"""Pid namespaces: below the arbiter's a client is known by the pid that the arbiter sees, beside or above it cannot be known and is refused."""
+"""Pid namespaces: below the arbiter's a client is known by the pid that the arbiter sees, beside or
+above it cannot be known and is refused."""
 
 import os
 import shutil

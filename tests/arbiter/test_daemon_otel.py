@@ -1,4 +1,5 @@
-"""Telemetry of a real daemon: one trace through a handover, numbers on loopback, lines that name their span, and nothing at all when off."""
+"""Telemetry of a real daemon: one trace through a handover, numbers on loopback, lines that name
+their span, and nothing at all when off."""
 
 import http.client
 import json
@@ -35,7 +36,8 @@ def on(lease: dict[str, Any]) -> dict[str, Any]:
 
 
 def hand_over(arbiter: ArbiterProcess) -> dict[str, Any]:
-    """A detector leaves for a policy that was asked for within a trace. Returns the `revoke` that it heard."""
+    """A detector leaves for a policy that was asked for within a trace. Returns the `revoke` that
+    it heard."""
     client = WireClient(arbiter.endpoint).hello()
     try:
         detector = client.granted("detector", 5 * GIB)
@@ -138,7 +140,8 @@ def test_prometheus_reads_the_cards_on_loopback(make_arbiter: Make) -> None:
 
 
 def scraped(port: int, wanted: str) -> None:
-    """Until it is there: an event is answered before it is counted, and a loop that was held up shows no picture of the cards."""
+    """Until it is there: an event is answered before it is counted, and a loop that was held up
+    shows no picture of the cards."""
     deadline = time.monotonic() + 60.0
     while not re.search(wanted, text := scrape(port), re.MULTILINE):
         assert time.monotonic() < deadline, f"no {wanted} in {text}"

@@ -1,4 +1,5 @@
-"""Crashes of the daemon, corrupt and unwritable journals, hanging probes: leases survive, and nothing is granted on a guess."""
+"""Crashes of the daemon, corrupt and unwritable journals, hanging probes: leases survive, and
+nothing is granted on a guess."""
 
 import contextlib
 import json
@@ -53,7 +54,8 @@ def hold(client: WireClient, arbiter: ArbiterProcess, name: str, size: int) -> d
 
 def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> dict[str, Any]:
     spec = {"consumer": name, "model_id": name, "ttl_s": TTL_S,
-            "footprint": {"load_peak_bytes": size, "steady_bytes": size, "residue_bytes": 0}}  # fmt: skip
+            "footprint": {"load_peak_bytes": size, "steady_bytes": size,
+            "residue_bytes": 0}}  # fmt: skip
     reply = client.ask(
         "reattach", leases=[{**on, "spec": spec, "state": "held", "measured_bytes": size}]
     )
@@ -75,7 +77,8 @@ with Client(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]),
 
 @contextlib.contextmanager
 def runner_on(arbiter: ArbiterProcess, on: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
-    """Another process, by the product's own client, uses the lease whose token it was told. It ends its use with a line of input."""
+    """Another process, by the product's own client, uses the lease whose token it was told. It ends
+    its use with a line of input."""
     words = [on["lease_id"], *map(str, on["token"])]
     runner = subprocess.Popen(
         [sys.executable, "-c", RUNNER, *words],
@@ -97,7 +100,8 @@ def runner_on(arbiter: ArbiterProcess, on: dict[str, Any]) -> Iterator[subproces
 def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
     make_arbiter: Make, end: str
 ) -> None:
-    """Regression: nothing but its own client knew of the use, and the holder was sent away in the middle of a grab."""
+    """Regression: nothing but its own client knew of the use, and the holder was sent away in the
+    middle of a grab."""
     arbiter = make_arbiter().start()
     with WireClient(arbiter.endpoint) as client:
         on = hold(client.hello(), arbiter, "sidecar", 5 * GIB)
@@ -334,7 +338,8 @@ def test_a_hanging_driver_does_not_hold_up_the_stop(make_arbiter: Make) -> None:
 
 
 def test_status_of_an_idle_daemon_reads_the_gpu_before_it_answers(make_arbiter: Make) -> None:
-    """After idleness `status` showed 5.4 GiB of a process without a lease as free memory, for up to 11 minutes."""
+    """After idleness `status` showed 5.4 GiB of a process without a lease as free memory, for up to
+    11 minutes."""
     config = "probe:\n  period_s: 3600\n  sample_max_age_s: 0.05\n"
     arbiter = make_arbiter(config=config).start()
     with contextlib.closing(WireClient(arbiter.endpoint)) as client:

@@ -1,4 +1,5 @@
-"""Several users at one daemon: what all processes of one user take leaves room and time for another. Real users, so it needs root."""
+"""Several users at one daemon: what all processes of one user take leaves room and time for
+another. Real users, so it needs root."""
 
 import grp
 import json

@@ -1,4 +1,5 @@
-"""A lease owns a process tree: a real daemon, the real `vramctl run`, and a child that puts its bytes on the simulated card."""
+"""A lease owns a process tree: a real daemon, the real `vramctl run`, and a child that puts its
+bytes on the simulated card."""
 
 import contextlib
 import signal
@@ -32,7 +33,8 @@ sys.stdin.readline()
 def quick_reader(
     make_arbiter: Callable[..., ArbiterProcess], request: pytest.FixtureRequest
 ) -> ArbiterProcess:
-    """Reads its card ten times a second, and waits for bytes for a minute, or as long as `indirect` parametrization says."""
+    """Reads its card ten times a second, and waits for bytes for a minute, or as long as `indirect`
+    parametrization says."""
     timeout_s = getattr(request, "param", 60)
     return make_arbiter(
         config=f"probe: {{period_s: 0.1}}\nverify: {{timeout_s: {timeout_s}}}\n"
@@ -50,9 +52,11 @@ def observer(quick_reader: ArbiterProcess) -> Iterator[WireClient]:
 def job(
     quick_reader: ArbiterProcess, size: int, *extra: str
 ) -> Iterator[tuple["subprocess.Popen[str]", int]]:
-    """`vramctl run` of a child that holds `size` until its stdin closes: (vramctl, the child's pid)."""
+    """`vramctl run` of a child that holds `size` until its stdin closes: (vramctl, the child's
+    pid)."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "5GiB", "--name", "job", "--",
+        [sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "5GiB", "--name", "job",
+        "--",
          *extra, sys.executable, "-c", CHILD, str(quick_reader.card), str(size)],
         env=quick_reader.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -67,7 +71,8 @@ def job(
 
 
 def seen(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """The card's view as soon as it is like that. Every answer of the daemon paces the questions; raises TimeoutError."""
+    """The card's view as soon as it is like that. Every answer of the daemon paces the questions;
+    raises TimeoutError."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         gpu: dict[str, Any] = observer.ask("status")["gpus"][0]

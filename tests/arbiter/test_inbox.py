@@ -1,4 +1,5 @@
-"""The inbox: one event after the other, one timer, and an end when the core fails. The core is scripted, the loop is real."""
+"""The inbox: one event after the other, one timer, and an end when the core fails. The core is
+scripted, the loop is real."""
 
 import asyncio
 import time
@@ -132,7 +133,8 @@ def test_an_earlier_deadline_replaces_a_later_one() -> None:
 
 
 def test_the_same_deadline_twice_in_a_row_still_ticks() -> None:
-    """After a tick the core may name the deadline again that has just come: it must not be taken for armed."""
+    """After a tick the core may name the deadline again that has just come: it must not be taken
+    for armed."""
 
     async def test(inbox: Inbox, core: ScriptedCore, done: list[Any]) -> None:
         deadline = time.monotonic() + 0.01
@@ -161,7 +163,8 @@ def test_the_core_hears_of_a_suspend_before_anything_else() -> None:
 
 
 def test_a_daemon_that_did_not_run_says_so_before_it_judges_anybody() -> None:
-    """SIGSTOP, swapping, a paused virtual machine: the renewals lie in the socket, and the timer that would expire everybody is due."""
+    """SIGSTOP, swapping, a paused virtual machine: the renewals lie in the socket, and the timer
+    that would expire everybody is due."""
 
     async def run() -> None:
         core, now = ScriptedCore(), [100.0]
@@ -265,7 +268,8 @@ def test_everything_that_is_handled_is_recorded_before_it_is_performed() -> None
 
 
 def test_a_question_waits_for_a_fresh_reading_of_every_gpu() -> None:
-    """An idle daemon answered `status` from a reading of minutes ago: a stowaway of 5.4 GiB was shown as free memory."""
+    """An idle daemon answered `status` from a reading of minutes ago: a stowaway of 5.4 GiB was
+    shown as free memory."""
 
     async def run() -> None:
         core, asked, answered = ScriptedCore(), list[GpuId](), list[str]()
@@ -315,7 +319,8 @@ def test_questions_that_wait_are_bounded() -> None:
 
 
 def test_questions_that_waited_together_are_answered_a_few_at_a_time() -> None:
-    """Each answer costs a page of the status: a thousand in one turn of the loop held everybody else for a second."""
+    """Each answer costs a page of the status: a thousand in one turn of the loop held everybody
+    else for a second."""
 
     async def run() -> None:
         core, answered = ScriptedCore(), list[int]()

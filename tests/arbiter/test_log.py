@@ -79,7 +79,8 @@ def test_a_flood_of_refusals_does_not_flood_the_log(caplog: pytest.LogCaptureFix
     now += 1.0
     refusals.say(7, 1, "chat", "bad_state", "later")
     assert caplog.records[-1].getMessage() == (
-        f"refused chat (pid 1, uid 7): bad_state: later ({1000 - REFUSALS_BURST} more before it are not shown)"
+        f"refused chat (pid 1, uid 7): bad_state: later ({1000 - REFUSALS_BURST} more before it "
+        "are not shown)"
     )
     for uid in range(REFUSED_USERS_MAX + 10):
         refusals.say(uid, 1, "", "bad_state", "x")

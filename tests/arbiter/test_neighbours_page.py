@@ -1,4 +1,5 @@
-"""docs/neighbours.md names tests: each of them exists, every complaint has one, and every test that carries a complaint's number is there or has a sibling."""
+"""docs/neighbours.md names tests: each of them exists, every complaint has one, and every test that
+carries a complaint's number is there or has a sibling."""
 
 import ast
 import re

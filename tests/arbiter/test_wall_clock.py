@@ -1,6 +1,8 @@
-"""The wall clock jumps: a battery is missing, the network sets it, somebody types a date. So nothing may be decided by it.
+"""The wall clock jumps: a battery is missing, the network sets it, somebody types a date. So
+nothing may be decided by it.
 
-Whoever reads it in the arbiter is listed here with what it is good for; everything else runs on the monotonic clock.
+Whoever reads it in the arbiter is listed here with what it is good for; everything else runs on the
+monotonic clock.
 """
 
 import ast
@@ -53,5 +55,8 @@ def test_only_those_read_it_who_date_things() -> None:
 
 
 def test_the_search_finds_what_it_is_for() -> None:
-    text = "import time, datetime\nfrom time import time as now\nx = time.time()\ny = time.monotonic()\n"
+    text = (
+        "import time, datetime\nfrom time import time as now\nx = time.time()\ny = "
+        "time.monotonic()\n"
+    )
     assert wall_clocks(ast.parse(text)) == ["datetime", "from time import time", "time.time"]

@@ -1,6 +1,8 @@
-"""The service manager's watchdog is fed by the decision loop itself: whatever is stuck in it starves the watchdog. Real processes.
+"""The service manager's watchdog is fed by the decision loop itself: whatever is stuck in it
+starves the watchdog. Real processes.
 
-The defect is planted from outside: a script runs the real daemon around a part that reads from a pipe into which nobody writes.
+The defect is planted from outside: a script runs the real daemon around a part that reads from a
+pipe into which nobody writes.
 """
 
 import os
@@ -20,7 +22,8 @@ PATIENCE_S = 60
 WATCHDOG_S = 0.6
 GIB = 1 << 30
 SMALL = 200 << 20
-"""No bytes are on the card here: a larger lease would be void at the restart, because the card is read as empty."""
+"""No bytes are on the card here: a larger lease would be void at the restart, because the card is
+read as empty."""
 
 Make = Callable[..., ArbiterProcess]
 

@@ -1,4 +1,5 @@
-"""Other clients' requests while one process attacks the daemon, and the messages that cost its loop the most. Limits as shipped."""
+"""Other clients' requests while one process attacks the daemon, and the messages that cost its loop
+the most. Limits as shipped."""
 
 import time
 

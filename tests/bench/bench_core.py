@@ -1,4 +1,5 @@
-"""One decision of the core alone, in this process: 100 leases and 1,000 waiters, and how its cost grows with ten times as many."""
+"""One decision of the core alone, in this process: 100 leases and 1,000 waiters, and how its cost
+grows with ten times as many."""
 
 import math
 import random
@@ -85,7 +86,8 @@ class Bench:
     def acquire(self, client: ClientId, size: int) -> LeaseId:
         spec = ev.Spec(
             consumer="bench", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=size,
-            steady_bytes=size, residue_bytes=0, priority=50, evictable=True, ttl_s=1e9, min_residency_s=0.0,
+            steady_bytes=size, residue_bytes=0, priority=50, evictable=True, ttl_s=1e9,
+            min_residency_s=0.0,
             deny_on_deadline=False,
         )  # fmt: skip
         event = ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)

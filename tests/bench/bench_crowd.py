@@ -1,4 +1,5 @@
-"""Many at once: ten thousand live leases, ten thousand waiters' memory, ten thousand connections that vanish in one moment, a flood."""
+"""Many at once: ten thousand live leases, ten thousand waiters' memory, ten thousand connections
+that vanish in one moment, a flood."""
 
 import os
 import signal
@@ -83,7 +84,8 @@ def waiters_memory(suite: Suite) -> None:
 
 
 def fill_history(peer: Peer) -> None:
-    """The newest facts and the newest ended leases are kept in memory whoever waits; they are no cost of a waiter."""
+    """The newest facts and the newest ended leases are kept in memory whoever waits; they are no
+    cost of a waiter."""
     for _ in range(1200):
         lease = peer.reply(peer.want())["lease"]
         peer.ask("cancel", lease_id=lease["lease_id"])
@@ -141,7 +143,8 @@ def all_forgotten(witness: Peer) -> bool:
 
 
 def flood(suite: Suite) -> None:
-    """A client's acquire + release while another sends as fast as its socket takes it. Limits as shipped."""
+    """A client's acquire + release while another sends as fast as its socket takes it. Limits as
+    shipped."""
     rounds = suite.size(1500, 150)
     with arbiter(SHIPPED) as daemon:
         peer = Peer(daemon.endpoint, "calm").hello()

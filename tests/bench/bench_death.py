@@ -1,6 +1,7 @@
 """SIGKILL of a holder: how long after its parent could reap it the next one is granted.
 
-The victim holds the card's loading slot with nothing on the card yet, so the kernel's and the driver's part is as small as it gets.
+The victim holds the card's loading slot with nothing on the card yet, so the kernel's and the
+driver's part is as small as it gets.
 """
 
 import os

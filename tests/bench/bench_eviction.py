@@ -1,7 +1,9 @@
-"""An eviction split into what the arbiter adds, what the holder takes and what the driver takes to give memory back.
+"""An eviction split into what the arbiter adds, what the holder takes and what the driver takes to
+give memory back.
 
-Two clients of 5 GiB on a simulated card of 8 GiB. The holder's bytes lie on the card as a process file; when it unloads it writes when
-they come back. The arbiter's part is from the waiter's acquire to the holder's `revoke`, plus from the memory's return to the grant.
+Two clients of 5 GiB on a simulated card of 8 GiB. The holder's bytes lie on the card as a process
+file; when it unloads it writes when they come back. The arbiter's part is from the waiter's acquire
+to the holder's `revoke`, plus from the memory's return to the grant.
 """
 
 import os
@@ -19,7 +21,8 @@ from vram_arbiter.schemas.runtime.fakegpu_folder import locked
 
 LAG_S = 0.15
 NO_HOLD = "scheduling:\n  thrash_hold_max_s: 0\n"
-"""Two that throw each other out without pause are what the arbiter slows down on purpose; it is asked not to, as with `min_residency_s`."""
+"""Two that throw each other out without pause are what the arbiter slows down on purpose; it is
+asked not to, as with `min_residency_s`."""
 
 
 def run(suite: Suite) -> None:
@@ -42,7 +45,8 @@ def run(suite: Suite) -> None:
 
 
 def evict(daemon: ArbiterProcess, peers: list[Peer], lag_s: float) -> tuple[float, float, float]:
-    """(acquire → revoke, revoke → release, release or memory back → grant) in microseconds. The peers change places."""
+    """(acquire → revoke, revoke → release, release or memory back → grant) in microseconds. The
+    peers change places."""
     holder, waiter = peers
     held = holder.acquire(5 * GIB)
     put(daemon.card, 5 * GIB)

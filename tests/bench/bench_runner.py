@@ -1,14 +1,17 @@
-"""How well `vram-runner sim` holds its 30 Hz, alone and while sidecars switch beside it. Writes `out/bench/runner.json`.
+"""How well `vram-runner sim` holds its 30 Hz, alone and while sidecars switch beside it. Writes
+`out/bench/runner.json`.
 
-Real processes: arbiter, simulator with physics, cameras and video as in the demo, and two sidecars with the shipped checkpoints that do not fit
-the card together, so that each load throws the other out. One run has stretches with nothing beside and stretches with one switch after the
-other; the runner itself notes when each tick began (`--timings`), and ticks are told apart by the stretch in which they began.
+Real processes: arbiter, simulator with physics, cameras and video as in the demo, and two sidecars
+with the shipped checkpoints that do not fit the card together, so that each load throws the other
+out. One run has stretches with nothing beside and stretches with one switch after the other; the
+runner itself notes when each tick began (`--timings`), and ticks are told apart by the stretch in
+which they began.
 
-No goal runs in the stretches: ticks step the physics and observe, pictures are rendered for the detector, and the video repeats its last one, as
-it does while nothing moves.
+No goal runs in the stretches: ticks step the physics and observe, pictures are rendered for the
+detector, and the video repeats its last one, as it does while nothing moves.
 
-*Jitter* is how far behind its slot a tick began. A slot that a long tick ate is no tick, and not in it; the row *from one start to the next*
-has such gaps, as a whole period each.
+*Jitter* is how far behind its slot a tick began. A slot that a long tick ate is no tick, and not in
+it; the row *from one start to the next* has such gaps, as a whole period each.
 """
 
 import asyncio
@@ -48,7 +51,9 @@ STOP_PAUSE_S = 0.01
 NO_HOLD = (
     "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
 )
-FOOTPRINT = "5GB,5GB,450MiB"  # of each, on 8 GiB; without the simulated bandwidth of a real load there are more switches in a second
+# of each, on 8 GiB; without the simulated bandwidth of a real load there are more switches in a
+# second
+FOOTPRINT = "5GB,5GB,450MiB"
 BOOT_S = 240.0
 SETTLE_S = 3.0  # after the start: imports, first pictures, page cache
 POLL_S = 0.1
@@ -60,7 +65,8 @@ Stretch = tuple[float, float]  # monotonic seconds
 
 @dataclass(slots=True)
 class RunnerRow:
-    """One row of the file. `idle_p99_us` is the same with nothing beside, `ratio` p99 over that; `target` in words."""
+    """One row of the file. `idle_p99_us` is the same with nothing beside, `ratio` p99 over that;
+    `target` in words."""
 
     name: str
     p50_us: float | None = None
@@ -136,7 +142,8 @@ class Measured:
             jitter,
             attacked,
             stops,
-            RunnerRow("state, asked by another client under attack", p50(self.attacked_state_us), p99(self.attacked_state_us)),
+            RunnerRow("state, asked by another client under attack", p50(self.attacked_state_us),
+            p99(self.attacked_state_us)),
             _compare(
                 "tick_jitter while it drives and is filmed",
                 _us(_all(driven_beside), "late_ms"),
@@ -147,14 +154,20 @@ class Measured:
                 _us(starting, "late_ms"),
                 _us(idle, "late_ms"),
             ),
-            _compare("tick: time from one start to the next, off by", _uneven(beside), _uneven(alone)),
+            _compare("tick: time from one start to the next, off by", _uneven(beside),
+            _uneven(alone)),
             _compare("... while it drives and is filmed", _uneven(driven_beside), _uneven(driven)),
-            _compare("tick: decide (world state, no skill; others' pictures)", _decide_us(busy), _decide_us(idle)),
-            _compare("tick: apply (physics, a video that stands still)", _us(busy, "hal_ms"), _us(idle, "hal_ms")),
-            _compare("... while it drives and is filmed", _us(_all(driven_beside), "hal_ms"), _us(_all(driven), "hal_ms")),
-            RunnerRow("switch: one sidecar out, the other in, asked", p50(self.switches_us), p99(self.switches_us)),
+            _compare("tick: decide (world state, no skill; others' pictures)", _decide_us(busy),
+            _decide_us(idle)),
+            _compare("tick: apply (physics, a video that stands still)", _us(busy, "hal_ms"),
+            _us(idle, "hal_ms")),
+            _compare("... while it drives and is filmed", _us(_all(driven_beside), "hal_ms"),
+            _us(_all(driven), "hal_ms")),
+            RunnerRow("switch: one sidecar out, the other in, asked", p50(self.switches_us),
+            p99(self.switches_us)),
             RunnerRow("goal of one tick, policy resident", p50(self.goals_us), p99(self.goals_us)),
-            RunnerRow("goal of one tick, policy to be loaded", p50(self.cold_goals_us), p99(self.cold_goals_us)),
+            RunnerRow("goal of one tick, policy to be loaded", p50(self.cold_goals_us),
+            p99(self.cold_goals_us)),
         ]  # fmt: skip
 
     def _within(self, stretches: Sequence[Stretch]) -> list[list[Tick]]:
@@ -178,8 +191,8 @@ def _decide_us(ticks: Sequence[Tick]) -> list[float]:
 
 
 def _uneven(stretches: Sequence[Sequence[Tick]]) -> list[float]:
-    """How much more or less than a period lies between the starts of neighbours in a stretch, however long the loop stood still. A slot that a
-    long tick ate counts as a whole period."""
+    """How much more or less than a period lies between the starts of neighbours in a stretch,
+    however long the loop stood still. A slot that a long tick ate counts as a whole period."""
     gaps = [
         b["started_s"] - a["started_s"] for ticks in stretches for a, b in itertools.pairwise(ticks)
     ]
@@ -190,7 +203,7 @@ def _compare(name: str, busy: Sequence[float], idle: Sequence[float]) -> RunnerR
     return RunnerRow(name, p50(busy), p99(busy), p99(idle), p99(busy) / max(p99(idle), 1e-3))
 
 
-# -- the run ------------------------------------------------------------------------------------------------------------
+# -- the run
 async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Measured:
     found = Measured([], [], [], [], [], [], [], [], [], [], [], [], [])
     timings = daemon.runtime / "ticks.jsonl"
@@ -241,7 +254,8 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
 async def _switch(
     runner: RunnerClient, detector: DetectorClient, grab: PolicyClient
 ) -> list[float]:
-    """Detector in and policy out, with a picture of the runner's as a reasoner would send; then the other way. Microseconds of each."""
+    """Detector in and policy out, with a picture of the runner's as a reasoner would send; then the
+    other way. Microseconds of each."""
     began = time.perf_counter()
     frame = await runner.frame("front", encoding="png")
     await detector.detect(frame["data"], "red cube", timeout_s=BOOT_S)
@@ -257,7 +271,8 @@ async def _drive(
     grab: PolicyClient,
     stretch_s: float,
 ) -> None:
-    """The robot turns on the spot, to and fro, and every third tick renders a picture for the video: first with nothing beside, then with switches."""
+    """The robot turns on the spot, to and fro, and every third tick renders a picture for the
+    video: first with nothing beside, then with switches."""
 
     async def turn() -> None:
         for way in itertools.cycle((TURN_RAD, -TURN_RAD)):
@@ -292,7 +307,8 @@ async def _until_idle(runner: RunnerClient) -> None:
 async def _goals(
     found: Measured, runner: RunnerClient, detector: DetectorClient, grab: PolicyClient, count: int
 ) -> None:
-    """From asking to the result of a goal that may move for one tick: acceptance, residency, use, reset, arm and back."""
+    """From asking to the result of a goal that may move for one tick: acceptance, residency, use,
+    reset, arm and back."""
     for _ in range(count):
         await grab.load(timeout_s=BOOT_S)
         found.goals_us.append(await _goal(runner))
@@ -302,7 +318,8 @@ async def _goals(
 
 
 async def _attacked(found: Measured, runner: RunnerClient, attack: str, stretch_s: float) -> None:
-    """Another process of the same user attacks the goal socket; a client that was there before asks for the state."""
+    """Another process of the same user attacks the goal socket; a client that was there before asks
+    for the state."""
     with _attackers(runner, [attack]):
         began = time.monotonic()
         while time.monotonic() - began < stretch_s:
@@ -314,7 +331,8 @@ async def _attacked(found: Measured, runner: RunnerClient, attack: str, stretch_
 
 
 async def _stops(found: Measured, runner: RunnerClient) -> None:
-    """The last that is measured: the robot stays stopped. First nothing beside, then all attacks at once."""
+    """The last that is measured: the robot stays stopped. First nothing beside, then all attacks at
+    once."""
     for stops_us, attacks in ((found.stops_us, ()), (found.attacked_stops_us, ATTACKS)):
         with _attackers(runner, attacks):
             for _ in range(STOPS):
@@ -374,7 +392,7 @@ async def _start_another(
         return began, time.monotonic()
 
 
-# -- programs ---------------------------------------------------------------------------------------------------------
+# -- programs
 async def _until_up(ping: Callable[[], Any], programs: Sequence["subprocess.Popen[bytes]"]) -> None:
     async with asyncio.timeout(BOOT_S):
         while True:
@@ -412,7 +430,8 @@ def _sidecar(
 def _program(
     daemon: ArbiterProcess, name: str, words: Sequence[str]
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """`python -m WORDS` in the daemon's runtime folder. What it said is shown when anything goes wrong."""
+    """`python -m WORDS` in the daemon's runtime folder. What it said is shown when anything goes
+    wrong."""
     log = daemon.runtime / f"{name}.log"
     environ = daemon.environ | {
         "HF_HUB_OFFLINE": "1",

@@ -1,4 +1,5 @@
-"""Cycles a second of 16 clients that all want the same, and how evenly 128 of them are served. The same load on a Redis lock."""
+"""Cycles a second of 16 clients that all want the same, and how evenly 128 of them are served. The
+same load on a Redis lock."""
 
 import json
 from contextlib import ExitStack
@@ -37,7 +38,8 @@ def fairness(counts: list[int]) -> float:
 
 
 def load(kind: str, address: str, clients: int, seconds: float) -> list[int]:
-    """Cycles of every client within so many seconds: several processes with several connections each."""
+    """Cycles of every client within so many seconds: several processes with several connections
+    each."""
     workers = [
         spawn("contender.py", kind, address, str(clients // PROCESSES)) for _ in range(PROCESSES)
     ]

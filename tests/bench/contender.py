@@ -1,6 +1,8 @@
-"""Some of the clients that fight for one lock: each takes it, gives it back, and queues up again, until a line says stop.
+"""Some of the clients that fight for one lock: each takes it, gives it back, and queues up again,
+until a line says stop.
 
-Says a line when connected, waits for a line to begin, and prints how many cycles each of its clients made.
+Says a line when connected, waits for a line to begin, and prints how many cycles each of its
+clients made.
 """
 
 import json
@@ -29,7 +31,8 @@ class Contender:
         self.peer.want()
 
     def go_on(self) -> None:
-        """What has come: a grant is given back at once, a release that is confirmed is followed by the next acquire."""
+        """What has come: a grant is given back at once, a release that is confirmed is followed by
+        the next acquire."""
         while self.peer.socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:
             message: dict[str, Any] = msgpack.unpackb(self.peer.socket.recv())
             if message.get("push") == "granted" or message.get("state") == "loading":

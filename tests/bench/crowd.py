@@ -1,4 +1,5 @@
-"""Thousands of connections of one process, each with a lease that waits; says a line when all wait, then sits until it is killed."""
+"""Thousands of connections of one process, each with a lease that waits; says a line when all wait,
+then sits until it is killed."""
 
 import sys
 

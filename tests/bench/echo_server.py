@@ -1,4 +1,5 @@
-"""The floor of the wire: a blocking ZeroMQ ROUTER that validates each request and answers. Ends with its standard input."""
+"""The floor of the wire: a blocking ZeroMQ ROUTER that validates each request and answers. Ends
+with its standard input."""
 
 import sys
 import threading

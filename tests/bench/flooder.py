@@ -1,4 +1,5 @@
-"""A client that sends pings as fast as its socket takes them and reads what comes back. Ends with its standard input."""
+"""A client that sends pings as fast as its socket takes them and reads what comes back. Ends with
+its standard input."""
 
 import sys
 import threading

@@ -1,7 +1,9 @@
-"""What every benchmark shares: rows and their table, samples, a connection that speaks the wire by hand, servers of the run's own.
+"""What every benchmark shares: rows and their table, samples, a connection that speaks the wire by
+hand, servers of the run's own.
 
-All clients here are blocking and bare: what is measured is the server, not a client library. Everything of one row, its floor too, is
-measured in turns within one run, because core placement and neighbours move every absolute figure two- to threefold.
+All clients here are blocking and bare: what is measured is the server, not a client library.
+Everything of one row, its floor too, is measured in turns within one run, because core placement
+and neighbours move every absolute figure two- to threefold.
 """
 
 import json
@@ -30,7 +32,8 @@ ANSWER_TIMEOUT_S = 30.0
 KIB = 1 << 10
 GIB = 1 << 30
 SLIVER = 4 * KIB
-"""The footprint of a lease where bytes are not the subject: many fit, none has to be measured gone before the next."""
+"""The footprint of a lease where bytes are not the subject: many fit, none has to be measured gone
+before the next."""
 FLOOR = "floor: ZeroMQ round trip (F)"
 
 WIDE = """
@@ -53,9 +56,10 @@ SHIPPED = "log:\n  level: error\n"
 class Row:
     """One line of the table and of the file.
 
-    Times: `p50_us` and `p99_us` of the row, `floor_us` of what it is compared with (named in `against`), `ratio` the row's over the
-    floor's. Other figures: `value` with `unit`; `ratio` is then the value over its target, where that means anything. `target` is in
-    words, `ok` None where the row is there to be read and has none.
+    Times: `p50_us` and `p99_us` of the row, `floor_us` of what it is compared with (named in
+    `against`), `ratio` the row's over the floor's. Other figures: `value` with `unit`; `ratio` is
+    then the value over its target, where that means anything. `target` is in words, `ok` None where
+    the row is there to be read and has none.
     """
 
     name: str
@@ -96,7 +100,8 @@ class Suite:
         of: Callable[[Sequence[float]], float] | None = None,
         note: str | None = None,
     ) -> None:
-        """A row that may be so many times its floor: by the median, or by what `of` takes of both."""
+        """A row that may be so many times its floor: by the median, or by what `of` takes
+        of both."""
         of = of or p50
         ratio = of(samples) / of(floor)
         target = None if at_most is None else f"<= {at_most:g} x {against}"
@@ -210,7 +215,8 @@ def elapsed_us(action: Callable[[], object]) -> float:
 def in_turns(
     rounds: int, calls: Mapping[str, Callable[[], float]], chunk: int = 25
 ) -> dict[str, list[float]]:
-    """Samples of several calls, taken in turns of a few, so that what the machine does to one it does to all."""
+    """Samples of several calls, taken in turns of a few, so that what the machine does to one it
+    does to all."""
     samples: dict[str, list[float]] = {name: [] for name in calls}
     for call in calls.values():  # warm
         for _ in range(10):
@@ -225,9 +231,10 @@ def pause(seconds: float) -> None:
     threading.Event().wait(seconds)
 
 
-# -- clients -----------------------------------------------------------------------------------------------------------
+# -- clients
 class Peer:
-    """One connection that speaks the wire by hand. Raises RuntimeError with the daemon's words for a refusal."""
+    """One connection that speaks the wire by hand. Raises RuntimeError with the daemon's words for
+    a refusal."""
 
     def __init__(
         self,
@@ -320,7 +327,8 @@ class Peer:
         self.reply(self.letting_go(lease))
 
     def settle(self) -> None:
-        """Until nobody has a lease and nothing is measured any more: the next acquire finds a quiet card, and cores awake."""
+        """Until nobody has a lease and nothing is measured any more: the next acquire finds a quiet
+        card, and cores awake."""
         while self.ask("status")["leases"]:
             pass
 
@@ -328,10 +336,11 @@ class Peer:
         self.socket.close()
 
 
-# -- servers -----------------------------------------------------------------------------------------------------------
+# -- servers
 @contextmanager
 def arbiter(config: str = WIDE, gpu: str = "fake:8GiB") -> Iterator[ArbiterProcess]:
-    """A daemon of the run's own with journal, identity checks and measurement as in production. It must outlive its use."""
+    """A daemon of the run's own with journal, identity checks and measurement as in production. It
+    must outlive its use."""
     daemon = ArbiterProcess(gpu, config=config)
     try:
         daemon.start()
@@ -383,7 +392,8 @@ def helper(script: str, *arguments: str) -> Iterator[None]:
 
 @contextmanager
 def floor() -> Iterator[Callable[[], float]]:
-    """A blocking ROUTER that validates and answers, and nothing else; yields a call that takes one round trip's microseconds."""
+    """A blocking ROUTER that validates and answers, and nothing else; yields a call that takes one
+    round trip's microseconds."""
     with (
         tempfile.TemporaryDirectory(prefix="vb") as folder,
         helper("echo_server.py", f"ipc://{folder}/e"),

@@ -1,8 +1,10 @@
-"""Redis locks to compare with: SET NX PX to take one, a Lua compare-and-delete that wakes the longest waiter to give it back.
+"""Redis locks to compare with: SET NX PX to take one, a Lua compare-and-delete that wakes the
+longest waiter to give it back.
 
-They are crash-safe by TTL. Waiters block in BLPOP, which is the fastest way that Redis has; redis-py's own lock polls. Redis appends to its
-log before it answers and leaves the disk's cache alone, as the arbiter's journal does. Two clients: redis-py, which the targets were set
-by and people use, and RESP spoken by hand, which shows what the server itself takes.
+They are crash-safe by TTL. Waiters block in BLPOP, which is the fastest way that Redis has;
+redis-py's own lock polls. Redis appends to its log before it answers and leaves the disk's cache
+alone, as the arbiter's journal does. Two clients: redis-py, which the targets were set by and
+people use, and RESP spoken by hand, which shows what the server itself takes.
 """
 
 import importlib.util

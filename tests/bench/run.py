@@ -1,8 +1,10 @@
-"""`make bench`: how fast the arbiter is, beside a bare ZeroMQ round trip and Redis locks, and how even a runner's ticks are beside a switch.
+"""`make bench`: how fast the arbiter is, beside a bare ZeroMQ round trip and Redis locks, and how
+even a runner's ticks are beside a switch.
 
-Prints tables and writes `out/bench/arbiter.json` (`harness.Row` says what the fields mean) and `runner.json` beside it (`bench_runner`).
-`--quick` (QUICK=1) takes less of everything, `--only grants` one subject. Only ratios within one run mean anything. Rows against etcd and nvshare are left out: neither is
-here to be measured.
+Prints tables and writes `out/bench/arbiter.json` (`harness.Row` says what the fields mean) and
+`runner.json` beside it (`bench_runner`). `--quick` (QUICK=1) takes less of everything, `--only
+grants` one subject. Only ratios within one run mean anything. Rows against etcd and nvshare are
+left out: neither is here to be measured.
 """
 
 import argparse

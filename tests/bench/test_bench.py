@@ -1,4 +1,5 @@
-"""The benchmarks run, and their file has the shape that is documented. What they measure is nobody's test."""
+"""The benchmarks run, and their file has the shape that is documented. What they measure is
+nobody's test."""
 
 import json
 import os
@@ -25,7 +26,8 @@ KEYS = {
 
 
 def run_bench(out: Path, *subjects: str) -> list[dict[str, object]]:
-    """A short run over a few subjects: the rows that it wrote to `out`, all of them in the table that it printed."""
+    """A short run over a few subjects: the rows that it wrote to `out`, all of them in the table
+    that it printed."""
     flags = [word for subject in subjects for word in ("--only", subject)]
     command = [
         sys.executable,

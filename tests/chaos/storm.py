@@ -1,9 +1,11 @@
-"""Fault injection on real processes: a daemon, consumers, a user of other processes' leases, stowaways and attackers of the
-daemon's socket on one simulated card, hit at every named step of a switch, for as long as is asked. An independent checker judges afterwards.
+"""Fault injection on real processes: a daemon, consumers, a user of other processes' leases,
+stowaways and attackers of the daemon's socket on one simulated card, hit at every named step of a
+switch, for as long as is asked. An independent checker judges afterwards.
 
-`make chaos SECONDS=300 SEED=0`, or `python tests/chaos/storm.py --seconds 300 --seed 0 --out out/chaos`. Ends with 1 if anything that
-must not happen happened. What to hit and when is drawn from the seed; when exactly it lands is the machine's doing, so a seed chooses
-the plan, not the outcome. Steps are followed through the arbiter's own event stream, never by time.
+`make chaos SECONDS=300 SEED=0`, or `python tests/chaos/storm.py --seconds 300 --seed 0 --out
+out/chaos`. Ends with 1 if anything that must not happen happened. What to hit and when is drawn
+from the seed; when exactly it lands is the machine's doing, so a seed chooses the plan, not the
+outcome. Steps are followed through the arbiter's own event stream, never by time.
 """
 
 import argparse
@@ -117,7 +119,7 @@ class Storm:
             tuple[str, str, str]
         ] = []  # what is still to be done of this turn: step, role, signal
 
-    # -- the run -------------------------------------------------------------------------------------------------------
+    # -- the run
     async def run(self) -> dict[str, Any]:
         began = time.monotonic()
         usage: dict[str, Any] = {}
@@ -154,7 +156,8 @@ class Storm:
         self._arbiter.close()
 
     def _keep_evidence(self) -> None:
-        """What a finding is looked into with: the last run's log, card log, traces and the workers' errors."""
+        """What a finding is looked into with: the last run's log, card log, traces and the workers'
+        errors."""
         kept = self._out / "evidence"
         shutil.rmtree(kept, ignore_errors=True)
         kept.mkdir(parents=True)
@@ -175,7 +178,7 @@ class Storm:
     def _finding(self, rule: str, text: str) -> None:
         self._findings.append(Finding(rule, time.monotonic(), text))
 
-    # -- processes -----------------------------------------------------------------------------------------------------
+    # -- processes
     def _spawn(self, kind: str, name: str, what: str) -> Child:
         child = self._forks.spawn(
             kind, name, what, str(self._arbiter.card), str(self._traces), name=name
@@ -191,7 +194,7 @@ class Storm:
         self._born += 1
         self._user = self._spawn("user", f"u-{self._born}", "-")
 
-    # -- following the arbiter -----------------------------------------------------------------------------------------
+    # -- following the arbiter
     async def _watch(self) -> None:
         async with AsyncClient(
             "watch", endpoint=self._arbiter.endpoint, role="operator", connect_timeout_s=60.0
@@ -239,9 +242,10 @@ class Storm:
         except TimeoutError:
             return None
 
-    # -- striking ------------------------------------------------------------------------------------------------------
+    # -- striking
     async def _strike_until(self, end: float) -> None:
-        """Every cell of step × role × signal in a shuffled order, again and again; faults of card and disk in between."""
+        """Every cell of step × role × signal in a shuffled order, again and again; faults of card
+        and disk in between."""
         while time.monotonic() < end or not self._enough():
             if not self._plan:
                 self._plan = [
@@ -260,7 +264,8 @@ class Storm:
             await asyncio.sleep(self._random.uniform(0.05, 0.4))
 
     def _enough(self) -> bool:
-        """Of faults as many as were wanted at least, and of grants half as many: a storm in which nobody loads shows nothing."""
+        """Of faults as many as were wanted at least, and of grants half as many: a storm in which
+        nobody loads shows nothing."""
         grants = sum(event["kind"] == "granted" for event in self._events.values())
         return sum(self._tally.by_kind.values()) >= self._faults and 2 * grants >= self._faults
 
@@ -305,7 +310,8 @@ class Storm:
                 return
 
     def _stop(self, target: Child) -> None:
-        """SIGSTOP now, SIGCONT later: mostly a hiccup, sometimes longer than its ttl, the grace and the verification."""
+        """SIGSTOP now, SIGCONT later: mostly a hiccup, sometimes longer than its ttl, the grace and
+        the verification."""
         since = time.monotonic()
         target.signal(signal.SIGSTOP)
 
@@ -342,9 +348,11 @@ class Storm:
         self._outages.append((since, time.monotonic()))
 
     async def _start_daemon(self) -> None:
-        """A full disk may forbid a start, and it says so; then it is emptied first, as an operator would.
+        """A full disk may forbid a start, and it says so; then it is emptied first, as an operator
+        would.
 
-        It may be empty again by the time that the start has failed: what counts is how the start found it.
+        It may be empty again by the time that the start has failed: what counts is how the start
+        found it.
         """
         found_full = self._disk_is_full
         try:
@@ -355,7 +363,7 @@ class Storm:
             self._empty_disk()
             await asyncio.to_thread(self._arbiter.start)
 
-    # -- faults of the machine -----------------------------------------------------------------------------------------
+    # -- faults of the machine
     async def _strike_machine(self, fault: str) -> None:
         pause_s = self._random.uniform(0.3, 2.5)
         match fault:
@@ -424,7 +432,8 @@ class Storm:
         self._start(asyncio.to_thread(self._set_card))
 
     def _set_card(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
-        """Not on the loop: whoever holds the card's lock may have been stopped, and the loop lets it go on."""
+        """Not on the loop: whoever holds the card's lock may have been stopped, and the loop lets
+        it go on."""
         path = self._arbiter.card / fakegpu.CARD_FILE
         with locked(self._arbiter.card):
             config = fakegpu.parse_config(path.read_text())
@@ -456,7 +465,7 @@ class Storm:
     def _later(self, delay_s: float, action: Callable[[], None]) -> None:
         asyncio.get_running_loop().call_later(delay_s, action)
 
-    # -- afterwards ----------------------------------------------------------------------------------------------------
+    # -- afterwards
     async def _calm_down(self) -> None:
         """Faults end, everybody goes on, finishes and leaves. Who does not is a finding."""
         for go_on in list(self._stopped.values()):
@@ -605,8 +614,10 @@ def main() -> int:
     for kind, count in faults["by_kind"].items():
         print(f"{count:6}  {kind}")
     print(
-        f"{faults['total']} faults at {len(faults['by_step'])} steps in {report['seconds']} s: {report['grants']} grants, "
-        f"{report['switches']} switches, {report['uses']} uses, wait p50 {report['wait_p50_s']} s, max {report['wait_max_s']} s"
+        f"{faults['total']} faults at {len(faults['by_step'])} steps in {report['seconds']} s: "
+        f"{report['grants']} grants, "
+        f"{report['switches']} switches, {report['uses']} uses, wait p50 {report['wait_p50_s']} s, "
+        f"max {report['wait_max_s']} s"
     )
     for finding in report["violations"]:
         print(f"VIOLATION {finding['rule']}: {finding['text']}")

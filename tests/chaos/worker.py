@@ -1,8 +1,10 @@
-"""What a process of the storm does: a consumer that leases and loads for ever, a stranger that takes bytes without asking, or a
-user that marks uses on other people's leases. Not a test module; run by `tests.support.forkserver`.
+"""What a process of the storm does: a consumer that leases and loads for ever, a stranger that
+takes bytes without asking, or a user that marks uses on other people's leases. Not a test module;
+run by `tests.support.forkserver`.
 
-A consumer writes down what it does, and when, in a trace of JSON lines: the checker's second witness beside the arbiter's history.
-It is honest but not careful: it loads after its grant without looking twice, as real programs do.
+A consumer writes down what it does, and when, in a trace of JSON lines: the checker's second
+witness beside the arbiter's history. It is honest but not careful: it loads after its grant without
+looking twice, as real programs do.
 """
 
 import asyncio
@@ -162,7 +164,8 @@ class Consumer:
         self._trace.say("ready", lease_id=lease.lease_id)
 
     async def _allocate(self, lease: AsyncLease, size: int) -> Block:
-        """Off the loop, as real loaders do: the card's lock may be held by a process that was stopped."""
+        """Off the loop, as real loaders do: the card's lock may be held by a process that was
+        stopped."""
         return await asyncio.to_thread(self._memory.allocate, lease.lease_id, size)
 
     async def _unless_stopping(self, work: Coroutine[Any, Any, AsyncLease]) -> AsyncLease | None:
@@ -201,7 +204,8 @@ class Consumer:
 
 
 async def take_bytes(card: Path, trace: Trace, size: int) -> None:
-    """A stowaway: allocates without a lease, and exits when it is told to or its standard input ends."""
+    """A stowaway: allocates without a lease, and exits when it is told to or its standard input
+    ends."""
     memory = FakeMemory(card, "stowaway", 64 * MIB)
     try:
         memory.allocate("stowaway", size)
@@ -215,7 +219,8 @@ async def take_bytes(card: Path, trace: Trace, size: int) -> None:
 
 
 async def mark_uses(trace: Trace) -> None:
-    """Like a runner: marks a use on the lease of whoever it is told of (`LEASE EPOCH SERIAL`), by its token."""
+    """Like a runner: marks a use on the lease of whoever it is told of (`LEASE EPOCH SERIAL`), by
+    its token."""
     reader = await lines()
     async with AsyncClient(name="user", connect_timeout_s=CONNECT_S) as client:
         while line := await reader.readline():
@@ -239,8 +244,8 @@ async def lines() -> asyncio.StreamReader:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`consumer NAME SEED CARD TRACES`, `stowaway NAME BYTES CARD TRACES`, `user NAME - CARD TRACES` or
-    `attacker NAME ATTACK:SECONDS CARD TRACES`."""
+    """`consumer NAME SEED CARD TRACES`, `stowaway NAME BYTES CARD TRACES`, `user NAME - CARD
+    TRACES` or `attacker NAME ATTACK:SECONDS CARD TRACES`."""
     kind, name, what, card, traces = arguments
     trace = Trace(Path(traces) / f"{name}.jsonl", name)
     trace.say("born", kind=kind)

@@ -1,7 +1,9 @@
-"""A real consumer for the kill tests: one process, one lease, bytes on the simulated card. Not a test module.
+"""A real consumer for the kill tests: one process, one lease, bytes on the simulated card. Not a
+test module.
 
-Usage: consumer.py NAME BYTES CARD_FOLDER RESIDUE_BYTES. Prints one JSON line per thing that happens; commands come on stdin: `use`, `end`.
-Steps at which it stops and waits to be killed are given by VRAM_TEST_PAUSE (comma-separated: `loading`, `unloading`).
+Usage: consumer.py NAME BYTES CARD_FOLDER RESIDUE_BYTES. Prints one JSON line per thing that
+happens; commands come on stdin: `use`, `end`. Steps at which it stops and waits to be killed are
+given by VRAM_TEST_PAUSE (comma-separated: `loading`, `unloading`).
 """
 
 import asyncio
@@ -17,7 +19,9 @@ from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
 
-TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
+# a daemon that is started again on a busy machine is away for seconds, and nobody is to fence
+# himself
+TTL_S = 120.0
 PAUSE = frozenset(os.environ.get("VRAM_TEST_PAUSE", "").split(","))
 
 

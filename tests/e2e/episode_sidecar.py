@@ -1,7 +1,9 @@
-"""A sidecar process for the episodes: a real host, lease and simulated card around a model that looks at nothing and holds the arm still.
+"""A sidecar process for the episodes: a real host, lease and simulated card around a model that
+looks at nothing and holds the arm still.
 
-`python episode_sidecar.py FOLDER [flags of vram-sidecar]`. While a file `hold` is in FOLDER, a call of the model does not come back
-(`holding` says that it is in one); a file `fail_load` or `fail` makes the load or a call fail, `slow_load` makes the load last.
+`python episode_sidecar.py FOLDER [flags of vram-sidecar]`. While a file `hold` is in FOLDER, a call
+of the model does not come back (`holding` says that it is in one); a file `fail_load` or `fail`
+makes the load or a call fail, `slow_load` makes the load last.
 """
 
 import sys

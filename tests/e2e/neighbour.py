@@ -1,8 +1,10 @@
-"""A consumer with the habits that users of the neighbours complain about. Not a test module; run by `tests.support.forkserver`.
+"""A consumer with the habits that users of the neighbours complain about. Not a test module; run by
+`tests.support.forkserver`.
 
-Arguments: NAME BYTES CARD_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`, `gone`. Habits: `slow` loads when it is told
-`go`, `stuck` never ends its unloading, `deaf` ignores SIGTERM, `again` asks for its lease again in the very moment it has lost it,
-`spec` goes into its lease.
+Arguments: NAME BYTES CARD_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`,
+`gone`. Habits: `slow` loads when it is told `go`, `stuck` never ends its unloading, `deaf` ignores
+SIGTERM, `again` asks for its lease again in the very moment it has lost it, `spec` goes into its
+lease.
 """
 
 import asyncio

@@ -1,7 +1,9 @@
-"""A consumer that stops at every step of its life and goes on when it is told `go`. Not a test module; run by `tests.support.forkserver`.
+"""A consumer that stops at every step of its life and goes on when it is told `go`. Not a test
+module; run by `tests.support.forkserver`.
 
-Arguments: NAME BYTES CARD_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`, `unloading`, `released`; it waits for `go`
-after `loading`, `in_use` and `unloading`. `use` begins a use, which the next `go` ends.
+Arguments: NAME BYTES CARD_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`,
+`unloading`, `released`; it waits for `go` after `loading`, `in_use` and `unloading`. `use` begins a
+use, which the next `go` ends.
 """
 
 import asyncio
@@ -14,7 +16,9 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
-TTL_S = 120.0  # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence himself
+# a daemon that is started again on a busy machine is away for seconds, and nobody is to fence
+# himself
+TTL_S = 120.0
 
 
 async def live(name: str, size: int, card: Path, residue: int) -> None:

@@ -1,7 +1,9 @@
-"""A daemon under attack by another process: it lives, serves an honest holder, and keeps nothing of the attack.
+"""A daemon under attack by another process: it lives, serves an honest holder, and keeps nothing of
+the attack.
 
-With libzmq's ROUTER (before `schemas.runtime.router`) the daemon aborted under `forged_identity` and `bare_connects`, and
-grew without bound under `more_for_ever` and `slow_reader`. `tests/bench` measures the times exactly.
+With libzmq's ROUTER (before `schemas.runtime.router`) the daemon aborted under `forged_identity`
+and `bare_connects`, and grew without bound under `more_for_ever` and `slow_reader`. `tests/bench`
+measures the times exactly.
 """
 
 import subprocess
@@ -21,7 +23,8 @@ ATTACK_S = 1.5
 P99_MAX_S = 1.0
 """20 times the target of 50 ms: other tests run beside this one."""
 MEMORY_MAX_KIB = 64 * 1024
-"""Growth during an attack: at most `Limits.user_in_max_bytes` of half messages, or as much of unread answers."""
+"""Growth during an attack: at most `Limits.user_in_max_bytes` of half messages, or as much of
+unread answers."""
 OPEN_FILES = 512
 ATTACKER = """
 import sys, time
@@ -72,7 +75,8 @@ def test_an_attack_costs_others_little_and_leaves_nothing(
 def test_a_slow_reader_of_a_long_history_holds_little_memory(
     make_arbiter: Callable[..., ArbiterProcess],
 ) -> None:
-    """One reader that asked and never read had 2.5 GiB queued: libzmq counts messages, not bytes."""
+    """One reader that asked and never read had 2.5 GiB queued: libzmq counts messages, not
+    bytes."""
     arbiter = make_arbiter(config="limits: {leases_per_client_max: 1024}\n").start()
     with WireClient(arbiter.endpoint) as client, WireClient(arbiter.endpoint) as writer:
         honest = Honest(arbiter, client)

@@ -1,7 +1,9 @@
-"""Episodes: after every goal's end, however it came, the detector is back on the card by itself, and never before.
+"""Episodes: after every goal's end, however it came, the detector is back on the card by itself,
+and never before.
 
-Real processes: arbiter, detector on standby, policy that lets go when idle, runner with the simulator, reasoner. Nobody sequences anything:
-each is a plain client. The witnesses are the arbiter's history and the card's own log, which an independent checker reads.
+Real processes: arbiter, detector on standby, policy that lets go when idle, runner with the
+simulator, reasoner. Nobody sequences anything: each is a plain client. The witnesses are the
+arbiter's history and the card's own log, which an independent checker reads.
 """
 
 import asyncio
@@ -86,7 +88,8 @@ policy_extras: {{rollout_steps: 12, stop_when_still: false}}
 
 
 class Programs:
-    """The processes of one robot; those that a test killed are started again by `up`. `tell` makes the policy's model behave."""
+    """The processes of one robot; those that a test killed are started again by `up`. `tell` makes
+    the policy's model behave."""
 
     def __init__(self) -> None:
         self.arbiter = ArbiterProcess(prepared=True).start()
@@ -107,8 +110,10 @@ class Programs:
     def sidecar(self, model: str, size: int, *flags: str, name: str = "") -> None:
         name, folder = name or model, self.runtime / model
         self.start(
-            name, str(HERE / "episode_sidecar.py"), str(folder), "--name", name, "--rskill", f"{folder}/rskill.yaml",
-            "--device", f"fake:{self.arbiter.card}", "--footprint", f"{size},{size},{CONTEXT_BYTES}", *flags,
+            name, str(HERE / "episode_sidecar.py"), str(folder), "--name", name, "--rskill",
+            f"{folder}/rskill.yaml",
+            "--device", f"fake:{self.arbiter.card}", "--footprint",
+            f"{size},{size},{CONTEXT_BYTES}", *flags,
         )  # fmt: skip
 
     def start(self, name: str, *words: str, **environ: str) -> None:
@@ -117,7 +122,8 @@ class Programs:
             return
         with (self.runtime / "programs.log").open("ab") as log:
             self.running[name] = subprocess.Popen(
-                [sys.executable, *words], cwd=ROOT, env=self.arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ,
+                [sys.executable, *words], cwd=ROOT,
+                env=self.arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )  # fmt: skip
 
@@ -159,7 +165,8 @@ class Programs:
 
 
 class Stage:
-    """One test's clients, and the history from its beginning on. It opens with the detector on the card and nobody else."""
+    """One test's clients, and the history from its beginning on. It opens with the detector on the
+    card and nobody else."""
 
     def __init__(self, episode_programs: Programs) -> None:
         self.programs = episode_programs
@@ -219,8 +226,10 @@ class Stage:
         )
 
     async def under_way(self) -> None:
-        """A goal has its policy in use and the detector is away. What was before its policy's last load is forgotten: on a slow machine
-        the policy may have been idle, and gone, between a load and the use that it was for."""
+        """A goal has its policy in use and the detector is away. What was before its policy's last
+        load is forgotten: on a slow machine the policy may have been idle, and gone, between a load
+        and the use that it was for.
+        """
         assert await self.leases() == {"policy": "held", "detector": "standby"}
         loads = [
             n
@@ -233,7 +242,8 @@ class Stage:
         return {view.consumer: view.state for view in (await self.arbiter.status()).leases}
 
     async def goal_under_way(self) -> AcceptedGoal:
-        """A goal that has its policy resident and in use, held inside a call of the model, and the detector away."""
+        """A goal that has its policy resident and in use, held inside a call of the model, and the
+        detector away."""
         self.programs.tell("hold", True)
         goal = await self.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
         await self.until("use_began", "policy", BOOT_S)
@@ -263,7 +273,8 @@ class Stage:
     async def detector_is_back(
         self, *, after: str = "use_ended", verdicts: tuple[str, ...] = ("verified", "residue")
     ) -> None:
-        """By itself, once: granted after the policy's `after` and after its bytes were measured gone, and loaded."""
+        """By itself, once: granted after the policy's `after` and after its bytes were measured
+        gone, and loaded."""
         ended = await self.until(after, "policy")
         gone = await self.until("verified", "policy")
         granted = await self.until("granted", "detector")
@@ -293,14 +304,15 @@ def episode_programs() -> Iterator[Programs]:
     started.close()
 
 
-# -- how a goal ends -----------------------------------------------------------------------------------------------------
+# -- how a goal ends
 async def done(stage: Stage) -> None:
     goal = await stage.goal_under_way()
     for _ in range(
         20
     ):  # an operator asks again where nobody answered in the seconds that he is made to wait
         shown = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "vram_arbiter.clients", "status", env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
+            sys.executable, "-m", "vram_arbiter.clients", "status",
+            env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
         )  # fmt: skip
         said = (await shown.communicate())[0].decode()
         if shown.returncode != UNREACHABLE:
@@ -333,7 +345,8 @@ async def canceled(stage: Stage) -> None:
 
 
 async def rejected(stage: Stage) -> None:
-    """A goal that is refused changes nothing: neither while the detector is there, nor while another goal has sent it away."""
+    """A goal that is refused changes nothing: neither while the detector is there, nor while
+    another goal has sent it away."""
     with pytest.raises(UnknownSkill):
         await stage.runner.send_goal("test/arm-nothing", prompt="x")
     assert await stage.leases() == {"detector": "held"}
@@ -347,7 +360,8 @@ async def rejected(stage: Stage) -> None:
 
 
 async def past_its_deadline(stage: Stage) -> None:
-    """The result is out, but a call of the model still runs: its bytes are on the card, so the detector stays away until they are measured gone."""
+    """The result is out, but a call of the model still runs: its bytes are on the card, so the
+    detector stays away until they are measured gone."""
     async with PolicyClient(
         f"ipc://{stage.programs.runtime}/policy.sock", connect_timeout_s=BOOT_S
     ) as policy:
@@ -379,7 +393,8 @@ async def policy_killed(stage: Stage) -> None:
 
 
 async def load_failed(stage: Stage) -> None:
-    """The policy never comes up: the detector was sent away for nothing, and nothing of the load stays behind."""
+    """The policy never comes up: the detector was sent away for nothing, and nothing of the load
+    stays behind."""
     stage.programs.tell("fail_load", True)
     goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
     result = await goal.result(WAIT_S)
@@ -388,7 +403,8 @@ async def load_failed(stage: Stage) -> None:
 
 
 async def out_of_memory(stage: Stage) -> None:
-    """Somebody without a lease fills the card while the policy loads: the goal hears of it by type, and the detector waits for the room."""
+    """Somebody without a lease fills the card while the policy loads: the goal hears of it by type,
+    and the detector waits for the room."""
     stage.programs.tell("slow_load", True)
     goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
     await stage.until("granted", "policy")
@@ -432,7 +448,8 @@ async def reasoner_killed(stage: Stage) -> None:
     with server:
         stage.programs.tell("hold", True)
         stage.programs.start(
-            "reasoner", "-m", "vram_arbiter.reasoner", "--task", "hold still", "--planner", "openai", "--detector", "none", "--scene-vlm", "none",
+            "reasoner", "-m", "vram_arbiter.reasoner", "--task", "hold still", "--planner",
+            "openai", "--detector", "none", "--scene-vlm", "none",
             VRAM_REASONER_LLM_BASE_URL=server.url, VRAM_REASONER_LLM_MODEL="m",
         )  # fmt: skip
         await stage.until("use_began", "policy", BOOT_S)
@@ -454,7 +471,8 @@ async def runner_killed(stage: Stage) -> None:
 
 @pytest.mark.parametrize(
     "end",
-    [done, failed, canceled, rejected, past_its_deadline, load_failed, out_of_memory, canceled_while_loading, policy_killed, reasoner_killed,
+    [done, failed, canceled, rejected, past_its_deadline, load_failed, out_of_memory,
+    canceled_while_loading, policy_killed, reasoner_killed,
      runner_killed],
     ids=lambda end: end.__name__,
 )  # fmt: skip
@@ -465,7 +483,8 @@ def test_after_a_goal_the_detector_is_back_by_itself(
 
 
 async def called_back(stage: Stage) -> None:
-    """Of a policy that is on standby itself: its lease waits to come back, behind a look, when its goal is over."""
+    """Of a policy that is on standby itself: its lease waits to come back, behind a look, when its
+    goal is over."""
     episode_programs, manifest = stage.programs, parse_manifest(MANIFESTS["policy"])
     episode_programs.sidecar(
         "policy", POLICY_BYTES, "--standby", "--min-residency-s", "0", name="spare"
@@ -508,7 +527,7 @@ def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
         episode_programs.kill("spare")
 
 
-# -- while it runs -------------------------------------------------------------------------------------------------------
+# -- while it runs
 async def wanted_meanwhile(stage: Stage) -> None:
     goal = await stage.goal_under_way()
     with pytest.raises(WaitTimeout):
@@ -525,7 +544,8 @@ async def wanted_meanwhile(stage: Stage) -> None:
 def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(
     episode_programs: Programs,
 ) -> None:
-    """Nobody is made to leave in the middle of a step; the look that was wanted comes with the goal's end."""
+    """Nobody is made to leave in the middle of a step; the look that was wanted comes with the
+    goal's end."""
     episode_programs.play(wanted_meanwhile)
 
 

@@ -1,5 +1,7 @@
-"""Hostile clients against a real daemon: whatever they do, the one honest holder keeps its lease and its answers, and when they are gone
-nothing of them is left: no session, no lease, no descriptor, no memory."""
+"""Hostile clients against a real daemon: whatever they do, the one honest holder keeps its lease
+and its answers, and when they are gone nothing of them is left: no session, no lease, no
+descriptor, no memory.
+"""
 
 import json
 import os
@@ -39,7 +41,8 @@ def honest(arbiter_daemon: ArbiterProcess, connect: Connect) -> Honest:
 
 
 def attack(arbiter: ArbiterProcess, script: str, **words: Any) -> "subprocess.Popen[str]":
-    """Another process that attacks; what it prints last are its findings. It is ended by the caller or by itself, and by us with its stdin."""
+    """Another process that attacks; what it prints last are its findings. It is ended by the caller
+    or by itself, and by us with its stdin."""
     return subprocess.Popen(
         [sys.executable, "-c", ATTACKER + script, arbiter.endpoint, json.dumps(words)],
         stdin=subprocess.PIPE,
@@ -55,7 +58,7 @@ def findings(attacker: "subprocess.Popen[str]") -> dict[str, Any]:
     return found
 
 
-# -- floods ----------------------------------------------------------------------------------------------------------------
+# -- floods
 def test_a_flood_from_another_process_does_not_silence_others(honest: Honest) -> None:
     flood = attack(
         honest.arbiter,
@@ -153,7 +156,7 @@ os._exit(0)
     honest.is_alone()
 
 
-# -- junk ------------------------------------------------------------------------------------------------------------------
+# -- junk
 def test_bombs_and_giants_are_answered_or_cut_off(honest: Honest, connect: Connect) -> None:
     bomber = connect().hello("bomber")
     for name, bomb in BOMBS.items():
@@ -195,9 +198,10 @@ def test_thousands_of_forged_frames_are_answered_one_by_one(
     honest.is_served()
 
 
-# -- somebody else's words ----------------------------------------------------------------------------------------------------
+# -- somebody else's words
 def test_a_stolen_token_lets_another_process_mark_a_use_and_nothing_else(honest: Honest) -> None:
-    """Handing a token over is how a runner marks a goal; its thief can keep the holder resident, but never make it leave."""
+    """Handing a token over is how a runner marks a goal; its thief can keep the holder resident,
+    but never make it leave."""
     thief = attack(
         honest.arbiter,
         """
@@ -221,7 +225,8 @@ done(**codes)
         on=honest.on,
     )
     found = findings(thief)
-    assert {found.pop(op) for op in ("ready", "revoke_ack", "unloading", "release", "oom", "cancel", "renew",
+    assert {found.pop(op) for op in ("ready", "revoke_ack", "unloading", "release", "oom", "cancel",
+    "renew",
                                      "reattach")} == {"not_permitted"}  # fmt: skip
     assert found == {"end": 1, "stale": "stale_token", "use": 2}, (
         "the honest one's own use is not the thief's to end"
@@ -230,7 +235,8 @@ done(**codes)
 
 
 def test_another_ones_routing_id_gives_nothing_of_it(honest: Honest, connect: Connect) -> None:
-    """A connection is the kernel's word for it; the identity that a peer gives itself is ignored."""
+    """A connection is the kernel's word for it; the identity that a peer gives itself is
+    ignored."""
     mine = connect(routing_id=b"mine").hello("mine")
     forger = attack(
         honest.arbiter,

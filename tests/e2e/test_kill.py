@@ -1,6 +1,8 @@
-"""`kill -9` of a holder, of a waiter and of the daemon in the middle of a switch: real processes, sockets and files.
+"""`kill -9` of a holder, of a waiter and of the daemon in the middle of a switch: real processes,
+sockets and files.
 
-Every test ends with the independent checker over the card's own allocation log: no instant with more bytes than the card has.
+Every test ends with the independent checker over the card's own allocation log: no instant with
+more bytes than the card has.
 """
 
 import asyncio

@@ -1,5 +1,6 @@
-"""What users of the neighbours complain about, where the complaint is about processes, cards and what an operator is shown: a real daemon, real
-programs, a simulated card. Numbers are those of the list of complaints; docs/neighbours.md is the table.
+"""What users of the neighbours complain about, where the complaint is about processes, cards and
+what an operator is shown: a real daemon, real programs, a simulated card. Numbers are those of the
+list of complaints; docs/neighbours.md is the table.
 """
 
 import json
@@ -81,11 +82,13 @@ class Stage:
         return child
 
     def vramctl(self, *arguments: str) -> str:
-        """What an operator sees, who asks again where nobody answered in the seconds that he is made to wait."""
+        """What an operator sees, who asks again where nobody answered in the seconds that he is
+        made to wait."""
         for _ in range(20):
             done = subprocess.run(
                 [sys.executable, "-m", "vram_arbiter.clients", *arguments],
-                env=self.arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+                env=self.arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S,
+                check=False,
             )  # fmt: skip
             if done.returncode != UNREACHABLE:
                 break
@@ -170,7 +173,8 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
 
 
 def test_1_while_the_card_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
-    """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print nothing."""
+    """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print
+    nothing."""
     asked_until(lambda: stage.vramctl("status"), "free 7.71 GiB")
     stage.configure(faults=fakegpu.Faults(probe="fail"))
     shown = asked_until(lambda: stage.vramctl("status"), "measured: unknown")
@@ -202,7 +206,8 @@ def test_2_an_unload_that_does_not_unload_is_named_until_its_process_ends(stage:
 def test_3_a_holder_that_is_stopping_for_ever_is_named_and_ended_only_where_it_agreed(
     stage: Stage,
 ) -> None:
-    """ollama#7606 and others "Stopping…"; llama-swap#125, #138: only SIGKILL helped, and children stayed behind."""
+    """ollama#7606 and others "Stopping…"; llama-swap#125, #138: only SIGKILL helped, and children
+    stayed behind."""
     patient = stage.spawn("patient", 5, stuck=True)
     patient.until("ready")
     first = stage.spawn("first-3", 5)
@@ -237,7 +242,8 @@ def test_8_of_two_that_come_at_once_one_loads_after_the_other(stage: Stage) -> N
 
 
 def test_11_a_game_that_starts_is_seen_named_and_makes_idle_models_leave(stage: Stage) -> None:
-    """gpu-arbiter's whole purpose; Berth's stowaways; Castwright#1976: what was missing was a name."""
+    """gpu-arbiter's whole purpose; Berth's stowaways; Castwright#1976: what was missing
+    was a name."""
     idle = stage.spawn("idle-11", 5)
     idle.until("ready")
     with subprocess.Popen(
@@ -257,7 +263,8 @@ def test_11_a_game_that_starts_is_seen_named_and_makes_idle_models_leave(stage: 
 
 
 def test_12_the_running_manager_has_no_bytes_on_the_card_and_no_cuda_in_it(stage: Stage) -> None:
-    """llama.cpp#20582, #21692: 120-550 MB of every card, for a router that only asked how much is free."""
+    """llama.cpp#20582, #21692: 120-550 MB of every card, for a router that only asked how much is
+    free."""
     stage.spawn("user-12", 1).until("ready")
     maps = Path(f"/proc/{stage.arbiter.pid}/maps").read_text()
     assert not [word for word in ("libcuda", "libcudart", "libtorch", "libnvrtc") if word in maps]
@@ -269,7 +276,8 @@ def test_12_the_running_manager_has_no_bytes_on_the_card_and_no_cuda_in_it(stage
 def test_13_a_second_authority_on_the_same_card_does_not_give_away_what_the_first_one_gave(
     stage: Stage,
 ) -> None:
-    """taOS#859: two VRAM authorities. Each arbiter sees the other's holders: bytes without a lease of its own."""
+    """taOS#859: two VRAM authorities. Each arbiter sees the other's holders: bytes without a lease
+    of its own."""
     holder = stage.spawn("holder-13", 5)
     holder.until("ready")
     other = ArbiterProcess(gpu=f"fake:{stage.arbiter.card}", config=CONFIG, prepared=True).start()
@@ -287,7 +295,8 @@ def test_13_a_second_authority_on_the_same_card_does_not_give_away_what_the_firs
 
 
 def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage) -> None:
-    """Berth 0.5.1-rc.1: an engine without a lease after the daemon's restart, and nobody says whether its wrapper is alive."""
+    """Berth 0.5.1-rc.1: an engine without a lease after the daemon's restart, and nobody says
+    whether its wrapper is alive."""
     silent, exits = stage.spawn("silent-14", 2), stage.spawn("exits-14", 2)
     silent.until("ready")
     exits.until("ready")
@@ -310,7 +319,8 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
 def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_start(
     stage: Stage,
 ) -> None:
-    """A supervisor starts it again at once, every time. The model that works stays, and the program is told the cause."""
+    """A supervisor starts it again at once, every time. The model that works stays, and the program
+    is told the cause."""
     for _ in range(
         8
     ):  # after that it is refused for a minute: however slowly the rest of this goes, it is
@@ -330,7 +340,8 @@ def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_
 def test_21_whoever_was_made_to_leave_and_starts_again_at_once_does_not_get_in_between(
     stage: Stage,
 ) -> None:
-    """OpenRAL ADR-0050: within 15 ms an autostarted node activates again and takes the memory that was made free."""
+    """OpenRAL ADR-0050: within 15 ms an autostarted node activates again and takes the memory that
+    was made free."""
     detector = stage.spawn("detector-21", 5, again=True)
     detector.until("ready")
     policy = stage.spawn("policy-21", 5)

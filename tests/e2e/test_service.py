@@ -1,5 +1,6 @@
-"""The daemon as systemd starts it: the unit's own command line, the folders and sockets that a manager hands over, a manager's stop and
-restart, and the unit's restrictions as far as they can be had without a manager. Real processes; no systemd is run.
+"""The daemon as systemd starts it: the unit's own command line, the folders and sockets that a
+manager hands over, a manager's stop and restart, and the unit's restrictions as far as they can be
+had without a manager. Real processes; no systemd is run.
 """
 
 import ctypes
@@ -33,7 +34,8 @@ CONSUMER = Path(__file__).with_name("consumer.py")
 
 
 class Service(ArbiterProcess):
-    """A daemon that gets its command line from the unit and everything else from the environment, as a service does."""
+    """A daemon that gets its command line from the unit and everything else from the environment,
+    as a service does."""
 
     def __init__(self, options: str, group: str) -> None:
         super().__init__()
@@ -108,19 +110,21 @@ def test_a_mistake_in_the_configuration_folder_ends_it_for_good(service: Service
     assert "arbiter.yaml:2: gpu.reserv_bytes: unknown key" in service.log
 
 
-# -- a manager stops, restarts and kills it ----------------------------------------------------------------------------------
+# -- a manager stops, restarts and kills it
 class Holder:
     """A real consumer process with a lease and bytes on the card."""
 
     def __init__(self, service: Service) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), str(service.card), str(GIB // 2)],
+            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), str(service.card),
+            str(GIB // 2)],
             env=service.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
         )  # fmt: skip
         self._said = b""
 
     def until(self, event: str) -> dict[str, Any]:
-        """Read its lines until an event comes. Not through a buffered file: what that holds back, `select` does not see."""
+        """Read its lines until an event comes. Not through a buffered file: what that holds back,
+        `select` does not see."""
         assert self.process.stdout is not None
         while True:
             line, newline, rest = self._said.partition(b"\n")
@@ -185,7 +189,7 @@ def test_a_holder_outlives_the_service_with_its_lease(
         holder.process.wait(PATIENCE_S)
 
 
-# -- what the unit forbids -----------------------------------------------------------------------------------------------------
+# -- what the unit forbids
 NOBODY = 65534
 PR_SET_MDWE, PR_GET_MDWE, PR_MDWE_REFUSE_EXEC_GAIN = 65, 66, 1
 NO_EXEC_GAIN = """
@@ -206,7 +210,8 @@ with WireClient(sys.argv[1]) as client:
 
 
 def restricted() -> list[str]:
-    """What the unit takes from the daemon and a test can take too: capabilities, new privileges, memory that is writable and executable."""
+    """What the unit takes from the daemon and a test can take too: capabilities, new privileges,
+    memory that is writable and executable."""
     setpriv = [
         "setpriv",
         "--no-new-privs",
@@ -224,7 +229,8 @@ def restricted() -> list[str]:
     reason="needs root and setpriv to drop privileges",
 )
 def test_without_any_capability_it_serves_and_watches_other_users() -> None:
-    """A holder of another user connects through the operators' group; its death is seen through /proc and a pidfd all the same."""
+    """A holder of another user connects through the operators' group; its death is seen through
+    /proc and a pidfd all the same."""
     service = Service("--gpu fake:8GiB", grp.getgrgid(NOBODY).gr_name)
     service.wrapper = restricted()
     service.runtime.chmod(0o755)

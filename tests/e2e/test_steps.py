@@ -1,8 +1,10 @@
-"""Each named step of a switch, hit by SIGKILL and by SIGSTOP then SIGCONT, in the holder, the waiter and the daemon: what the design promises
-comes true each time. Real processes; every wait is for an event.
+"""Each named step of a switch, hit by SIGKILL and by SIGSTOP then SIGCONT, in the holder, the
+waiter and the daemon: what the design promises comes true each time. Real processes; every wait is
+for an event.
 
-The promise: whoever lives is served in the end; the newcomer's first byte comes after the last of the holder's (but for a context that
-lives on); a use is never cut short; and afterwards nothing is left.
+The promise: whoever lives is served in the end; the newcomer's first byte comes after the last of
+the holder's (but for a context that lives on); a use is never cut short; and afterwards nothing is
+left.
 """
 
 import json

@@ -1,4 +1,5 @@
-"""The short storm: real processes killed, stopped and starved at every step of a switch, judged by the independent checker."""
+"""The short storm: real processes killed, stopped and starved at every step of a switch, judged by
+the independent checker."""
 
 import json
 import os
@@ -15,7 +16,8 @@ ROOT = Path(__file__).parents[2]
 def test_a_short_storm_leaves_every_promise_kept(tmp_path: Path) -> None:
     """`make chaos` is the same for five minutes."""
     storm = subprocess.run(
-        [sys.executable, str(ROOT / "tests/chaos/storm.py"), "--seconds", "15", "--faults", "10", "--seed", "7", "--out", str(tmp_path)],
+        [sys.executable, str(ROOT / "tests/chaos/storm.py"), "--seconds", "15", "--faults", "10",
+        "--seed", "7", "--out", str(tmp_path)],
         env={**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"},
         capture_output=True,
         text=True,

@@ -1,7 +1,9 @@
-"""One trace through all processes: from the reasoner's decision to the first action that reaches the robot.
+"""One trace through all processes: from the reasoner's decision to the first action that reaches
+the robot.
 
-Real programs (arbiter, two sidecars, the simulator's runner, reasoner) export by OTLP to a collector in the test. The language model decides
-twice: look for the cube, so that the detector has the card; then grab, so that it has to leave. Once the arm has moved, everything is ended by
+Real programs (arbiter, two sidecars, the simulator's runner, reasoner) export by OTLP to a
+collector in the test. The language model decides twice: look for the cube, so that the detector has
+the card; then grab, so that it has to leave. Once the arm has moved, everything is ended by
 SIGTERM, which has to lose nothing.
 """
 
@@ -202,7 +204,8 @@ def endless(folder: Path) -> Path:
 
 
 async def all_up(runtime: Path) -> None:
-    """Each serves: the clients of the programs themselves wait no longer for one that is just being started than for one that is gone."""
+    """Each serves: the clients of the programs themselves wait no longer for one that is just being
+    started than for one that is gone."""
     for name in ("detector", "grab"):
         async with SidecarClient(f"ipc://{runtime}/{name}.sock") as sidecar:
             await sidecar.ping(timeout_s=START_S)
@@ -223,7 +226,8 @@ class Trace:
         )
 
     def above(self, span: ReceivedSpan) -> list[ReceivedSpan]:
-        """Parent, its parent, and so on up to the root. Raises KeyError for a parent that never was exported."""
+        """Parent, its parent, and so on up to the root. Raises KeyError for a parent that never was
+        exported."""
         found: list[ReceivedSpan] = []
         while span.parent_id:
             span = self._by_id[span.parent_id]
@@ -236,7 +240,8 @@ class Trace:
 
 
 def judge(trace: Trace, collector: Collector) -> None:
-    """Follow the trace upwards from the first action, then down again to everything that had to happen before it."""
+    """Follow the trace upwards from the first action, then down again to everything that had to
+    happen before it."""
     first = trace.named(telemetry.SPAN_SEND)[0]
     above = trace.above(first)
     assert [(span.service, span.name) for span in above] == [

@@ -1,7 +1,9 @@
-"""Coverage-guided fuzzing of the codec with atheris: `python tests/fuzz/fuzz_codec.py -max_total_time=300 [CORPUS]`.
+"""Coverage-guided fuzzing of the codec with atheris: `python tests/fuzz/fuzz_codec.py
+-max_total_time=300 [CORPUS]`.
 
-atheris is no dependency of this project: `pip install atheris` into an environment of its own. Ends with libFuzzer's report; a crash
-is a frame that made `decode` raise anything but `Undecodable`, or an answer that cannot be sent or is long. `fuzz_msgpack.py` is the decoder below it.
+atheris is no dependency of this project: `pip install atheris` into an environment of its own. Ends
+with libFuzzer's report; a crash is a frame that made `decode` raise anything but `Undecodable`, or
+an answer that cannot be sent or is long. `fuzz_msgpack.py` is the decoder below it.
 """
 
 import random

@@ -1,7 +1,9 @@
-"""Coverage-guided fuzzing of the bounded msgpack decoder with atheris: `python tests/fuzz/fuzz_msgpack.py -runs=10000000 [CORPUS]`.
+"""Coverage-guided fuzzing of the bounded msgpack decoder with atheris: `python
+tests/fuzz/fuzz_msgpack.py -runs=10000000 [CORPUS]`.
 
-atheris is not a dependency of this project: `pip install atheris` into an environment of its own. Ends with libFuzzer's report; a finding
-is an input that raises anything but the typed errors, or of which more values are built than were counted or are allowed.
+atheris is not a dependency of this project: `pip install atheris` into an environment of its own.
+Ends with libFuzzer's report; a finding is an input that raises anything but the typed errors, or of
+which more values are built than were counted or are allowed.
 """
 
 import sys

@@ -1,8 +1,10 @@
-"""Coverage-guided fuzzing of the ZMTP framing with atheris: `python tests/fuzz/fuzz_zmtp.py -runs=10000000 [CORPUS]`.
+"""Coverage-guided fuzzing of the ZMTP framing with atheris: `python tests/fuzz/fuzz_zmtp.py
+-runs=10000000 [CORPUS]`.
 
-atheris is not a dependency of this project: `pip install atheris` into an environment of its own. The first byte of an
-input says into how many pieces the rest is cut. Ends with libFuzzer's report; a finding is an input that raises
-anything but `ZmtpError`, keeps more bytes than the limits allow, or reads differently in pieces than in one.
+atheris is not a dependency of this project: `pip install atheris` into an environment of its own.
+The first byte of an input says into how many pieces the rest is cut. Ends with libFuzzer's report;
+a finding is an input that raises anything but `ZmtpError`, keeps more bytes than the limits allow,
+or reads differently in pieces than in one.
 """
 
 import sys

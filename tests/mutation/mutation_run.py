@@ -1,12 +1,15 @@
-"""Mutation check of the engine: `python tests/mutation/mutation_run.py --sample 300 --out out/mutation/report.json`.
+"""Mutation check of the engine: `python tests/mutation/mutation_run.py --sample 300 --out
+out/mutation/report.json`.
 
-A mutant is one function of `arbiter/core` with one small change (mutmut's operators: comparisons, constants, `and`/`or`, arguments, …). It is
-killed if a test of `tests/arbiter/core` fails with it. What survives is either a missing test or a change that means the same: every
-survivor is looked at, and those that mean the same stand in `equivalent.json` beside this file, each with its reason.
+A mutant is one function of `arbiter/core` with one small change (mutmut's operators: comparisons,
+constants, `and`/`or`, arguments, …). It is killed if a test of `tests/arbiter/core` fails with it.
+What survives is either a missing test or a change that means the same: every survivor is looked at,
+and those that mean the same stand in `equivalent.json` beside this file, each with its reason.
 
-pytest collects once. Each mutant is tried in a fork of that process: the mutant's bytecode takes the place of the function's, so whoever
-imported the function has the mutant, and only the tests themselves cost time. The rule machines are left out: they are slow, and what only
-they kill deserves a test with a name.
+pytest collects once. Each mutant is tried in a fork of that process: the mutant's bytecode takes
+the place of the function's, so whoever imported the function has the mutant, and only the tests
+themselves cost time. The rule machines are left out: they are slow, and what only they kill
+deserves a test with a name.
 """
 
 import argparse
@@ -66,9 +69,10 @@ class Mutant:
         return ".".join(("vram_arbiter", *path.relative_to(CORE.parents[1]).with_suffix("").parts))
 
 
-# -- which there are -------------------------------------------------------------------------------------------------
+# -- which there are
 def enumerate_file(path: Path) -> Iterator[tuple[str, Any, Any]]:
-    """(name, the parsed module, the mutation) of each mutant of a file. Words for people (strings with a space) stay as they are."""
+    """(name, the parsed module, the mutation) of each mutant of a file. Words for people (strings
+    with a space) stay as they are."""
     import libcst as cst
     from mutmut.mutation.file_mutation import create_mutations
 
@@ -98,7 +102,8 @@ def _qualified(parsed: Any, function: Any) -> str:
 def choose(
     sample: int, seed: int, only: Mapping[str, str], folder: Path = CORE
 ) -> tuple[int, list[Mutant]]:
-    """How many mutants there are, and `sample` of them by chance (0: all), or exactly those of `only`: their names and diffs."""
+    """How many mutants there are, and `sample` of them by chance (0: all), or exactly those of
+    `only`: their names and diffs."""
     found = [item for path in sorted(folder.rglob("*.py")) for item in _of_file(path)]
     if only:
         chosen = _again(found, only)
@@ -111,7 +116,8 @@ def choose(
 
 
 def _again(found: list[tuple[str, Path, Any, Any]], only: Mapping[str, str]) -> list[Mutant]:
-    """Those mutants, by their name at first; where a function has changed, by their diff. To make one takes a while."""
+    """Those mutants, by their name at first; where a function has changed, by their diff. To make
+    one takes a while."""
     left = Counter((name.rpartition(":")[0], diff) for name, diff in only.items())
     chosen: list[Mutant] = []
     for item in sorted(found, key=lambda item: item[0] not in only):
@@ -164,9 +170,10 @@ def _statement(source: str, line: int) -> set[int]:
     return best
 
 
-# -- taking a function's place ---------------------------------------------------------------------------------------
+# -- taking a function's place
 def swap(module: Any, source: str) -> int:
-    """Give the module's functions the bytecode of this source. Returns how many do something else now."""
+    """Give the module's functions the bytecode of this source. Returns how many do something else
+    now."""
     fresh: dict[str, Any] = {"__name__": module.__name__, "__file__": module.__file__}
     exec(compile(source, module.__file__, "exec"), fresh)
     theirs = dict(_functions(module.__name__, vars(module)))
@@ -205,7 +212,7 @@ def _shape(code: CodeType) -> tuple[Any, ...]:
     return code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars
 
 
-# -- trying them -----------------------------------------------------------------------------------------------------
+# -- trying them
 class Coverage:
     """A pytest plugin that notes which test runs which lines of the engine."""
 
@@ -234,7 +241,8 @@ class Coverage:
 
 
 class Trials:
-    """A pytest plugin that runs, for each mutant and in a fork, the tests that come by its lines, until one fails."""
+    """A pytest plugin that runs, for each mutant and in a fork, the tests that come by its lines,
+    until one fails."""
 
     def __init__(self, mutants: list[Mutant], jobs: int, folder: Path) -> None:
         self.mutants = mutants
@@ -357,7 +365,7 @@ def run(mutants: list[Mutant], jobs: int) -> None:
         raise SystemExit(trials.problem or f"{said.getvalue()}\nnot every mutant was tried")
 
 
-# -- what it says ----------------------------------------------------------------------------------------------------
+# -- what it says
 def summary_of(existing: int, tried: list[Mutant], known: list[dict[str, str]]) -> dict[str, Any]:
     """The report. A survivor counts as equivalent while it is the very change that was judged."""
     judged = {(entry["where"], entry["diff"]) for entry in known}

@@ -1,4 +1,5 @@
-"""The mutation check itself: a mutant takes its function's place, and what is judged to mean the same does not count."""
+"""The mutation check itself: a mutant takes its function's place, and what is judged to mean the
+same does not count."""
 
 import importlib.util
 import sys

@@ -1,7 +1,8 @@
 """The rule machines for a night: `python tests/nightly/nightly_run.py --histories 100000`.
 
-Splits the histories over the cores, in processes of their own and each portion under a seed of its own; writes a report with what the
-histories came by, so that a walk that reaches nothing shows. A failure is shrunk and printed with the line that tells it again.
+Splits the histories over the cores, in processes of their own and each portion under a seed of its
+own; writes a report with what the histories came by, so that a walk that reaches nothing shows. A
+failure is shrunk and printed with the line that tells it again.
 """
 
 import argparse

@@ -1,4 +1,5 @@
-"""The night's walk itself: it counts, it tells a failure with the line that walks it again, and the same seed finds it again."""
+"""The night's walk itself: it counts, it tells a failure with the line that walks it again, and the
+same seed finds it again."""
 
 import importlib.util
 import sys

@@ -1,4 +1,5 @@
-"""The wheel holds the product and its data: no test, no training code, nothing of the test tools."""
+"""The wheel holds the product and its data: no test, no training code, nothing of the test
+tools."""
 
 import ast
 import subprocess

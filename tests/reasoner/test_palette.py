@@ -220,7 +220,8 @@ def test_prompts_go_only_where_somebody_listens() -> None:
 
 def test_beside_a_goal_only_its_going_on_is_allowed() -> None:
     found = palette(manifest_of("vla"), managed=["detector"])
-    for call in (ExecuteRskill(rskill_id="lab/vla"), LocateInView(query="x"), QueryScene(question="x"),
+    for call in (ExecuteRskill(rskill_id="lab/vla"), LocateInView(query="x"),
+    QueryScene(question="x"),
                  LifecycleTransition(node="detector", transition="deactivate")):  # fmt: skip
         assert isinstance(found.check(call, goal_runs=True), NotPermitted)
     for ending in (Wait(), StopGoal()):

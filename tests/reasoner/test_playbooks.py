@@ -27,7 +27,8 @@ def playbook_file(
         " playbook\nembodiment_tags: [any]\n"
         "chunk_size: 1\nlatency_budget: {per_chunk_ms: 5000}\ndescription: How to look for a"
         " thing.\nactions: [plan]\n"
-        f"playbook: {{trigger: a thing is lost, body_uri: {body}, composes_tools: {tools}, done_predicate: it is in view, max_steps: 4}}\n"
+        f"playbook: {{trigger: a thing is lost, body_uri: {body}, composes_tools: {tools}, "
+        "done_predicate: it is in view, max_steps: 4}\n"
     )
     (folder / "PLAYBOOK.md").write_text("Turn left first.\n")
     return file

@@ -11,12 +11,14 @@ from vram_arbiter.schemas.body import UNKNOWN_BODY, Body, read_body
 from vram_arbiter.schemas.manifest import RSkillManifest
 
 BASE: dict[str, Any] = {
-    "name": "lab/x", "version": "1.0.0", "kind": "vlm", "weights_uri": "local://models/x", "chunk_size": 1,
+    "name": "lab/x", "version": "1.0.0", "kind": "vlm", "weights_uri": "local://models/x",
+    "chunk_size": 1,
     "latency_budget": {"per_chunk_ms": 1}, "description": "d", "actions": ["query"],
 }  # fmt: skip
 ARM = Body(
     embodiment_tags=("so101_follower",),
-    capabilities={"has_gripper": True, "can_lift_kg": 0.25, "fingers": 2, "gripper_kind": "parallel", "bimanual": False},
+    capabilities={"has_gripper": True, "can_lift_kg": 0.25, "fingers": 2,
+    "gripper_kind": "parallel", "bimanual": False},
 )  # fmt: skip
 
 
@@ -71,7 +73,8 @@ def test_a_robot_is_one_robot(vague: str) -> None:
     ],
 )
 def test_capabilities_count_by_value(needs: dict[str, Any], said: str) -> None:
-    """The defect of the field: only their names were looked at, so that `can_lift_kg: 50` fitted every arm that can lift."""
+    """The defect of the field: only their names were looked at, so that `can_lift_kg: 50` fitted
+    every arm that can lift."""
     assert ARM.misfit(skill_for(["so101_follower"], **needs)) == said
 
 

@@ -1,4 +1,5 @@
-"""The simulated card as pure transitions: never over capacity, nothing lost, and a kill at any instant leaves it readable."""
+"""The simulated card as pure transitions: never over capacity, nothing lost, and a kill at any
+instant leaves it readable."""
 
 import json
 
@@ -29,7 +30,8 @@ class Folder:
         self.dead: set[ProcessKey] = set()
 
     def do(self, transition, *args, kill_at: int | None = None):
-        """Apply a transition as reader and writer do. `kill_at` n: only the first n pieces of I/O happen, the last log line torn."""
+        """Apply a transition as reader and writer do. `kill_at` n: only the first n pieces of I/O
+        happen, the last log line torn."""
         change = (
             fakegpu.read_card(self.texts, self.log[-fakegpu.LOG_TAIL_BYTES :])
             .then(lambda card: fakegpu.settle(card, self.now, lambda key: key not in self.dead))
@@ -66,7 +68,8 @@ def test_what_fits_is_allocated_and_what_does_not_is_refused_with_the_numbers():
     error = allocate(folder, B, 4 * GB).error
     assert isinstance(error, OutOfMemory)
     assert error.details == {
-        "requested_bytes": 4 * GB, "free_bytes": 3 * GB, "capacity_bytes": 8 * GB, "allocated_bytes": 0
+        "requested_bytes": 4 * GB, "free_bytes": 3 * GB, "capacity_bytes": 8 * GB,
+        "allocated_bytes": 0
     }  # fmt: skip
     assert error.message.startswith(
         "CUDA out of memory (simulated). Tried to allocate 3.73 GiB. GPU 0 has a total capacity"
@@ -242,7 +245,8 @@ def test_the_checker_finds_what_is_wrong():
 
     assert problems() == []
     for wrong in (
-        {"capacity": GB}, {"used_after": 1}, {"seq": 3}, {"t": -1.0}, {"process_bytes": 1}, {"op": "steal"},
+        {"capacity": GB}, {"used_after": 1}, {"seq": 3}, {"t": -1.0}, {"process_bytes": 1},
+        {"op": "steal"},
         {"op": "oom"}, {"op": "returned"},
     ):  # fmt: skip
         assert problems(**wrong), wrong

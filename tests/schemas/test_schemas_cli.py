@@ -1,4 +1,5 @@
-"""`python -m vram_arbiter.schemas` as people run it, and the exported JSON Schemas that must not drift from the models."""
+"""`python -m vram_arbiter.schemas` as people run it, and the exported JSON Schemas that must not
+drift from the models."""
 
 import json
 import subprocess
@@ -79,7 +80,8 @@ def test_export_writes_valid_json(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out.splitlines() == [str(folder / name) for name in documents()]
     rskill = json.loads((folder / "rskill.json").read_text(encoding="utf-8"))
     assert rskill["required"] == [
-        "name", "version", "kind", "embodiment_tags", "chunk_size", "latency_budget", "description", "actions",
+        "name", "version", "kind", "embodiment_tags", "chunk_size", "latency_budget", "description",
+        "actions",
     ]  # fmt: skip
 
 

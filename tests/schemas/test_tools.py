@@ -1,4 +1,5 @@
-"""Tool calls: what a model may say, what is refused, and that what is offered is what is accepted."""
+"""Tool calls: what a model may say, what is refused, and that what is offered is what is
+accepted."""
 
 import json
 import re

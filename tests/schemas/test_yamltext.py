@@ -1,4 +1,5 @@
-"""One loader reads all YAML of the product; a hostile text ended in RecursionError, AttributeError or gigabytes of memory."""
+"""One loader reads all YAML of the product; a hostile text ended in RecursionError, AttributeError
+or gigabytes of memory."""
 
 import re
 import time
@@ -119,8 +120,10 @@ def test_no_other_module_reads_yaml() -> None:
 
 
 WORDS = st.sampled_from(
-    ["a: ", "gpu: ", "sensors: ", "hal: ", "- ", "? ", ": ", "[", "]", "{", "}", ",", "\n", "\n  ", "&a ", "*a ", "<<: ", "!!timestamp ",
-     "!!binary ", "!!int ", "!!set ", "!!omap ", "!!merge ", "! ", "!x ", "!!null ", "~", "1", "x", "'", '"', "|\n", ">-\n", "=", "%", "--- ",
+    ["a: ", "gpu: ", "sensors: ", "hal: ", "- ", "? ", ": ", "[", "]", "{", "}", ",", "\n", "\n  ",
+    "&a ", "*a ", "<<: ", "!!timestamp ",
+     "!!binary ", "!!int ", "!!set ", "!!omap ", "!!merge ", "! ", "!x ", "!!null ", "~", "1", "x",
+     "'", '"', "|\n", ">-\n", "=", "%", "--- ",
      "... ", "0x", "1:1", ".nan", "2026-01-02", "1e999", "# "]
 )  # fmt: skip
 

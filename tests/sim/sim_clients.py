@@ -1,8 +1,10 @@
-"""Simulated programs on the real client library: `clients.client`, `clients.lease` and `clients._protocol.protocol` under simulated time.
+"""Simulated programs on the real client library: `clients.client`, `clients.lease` and
+`clients._protocol.protocol` under simulated time.
 
-A `Consumer` is a process with models: it waits, loads in steps, works in uses, leaves when asked or by itself, and misbehaves as
-its `Character` says. A `Runner` marks uses on other processes' leases. An `Observer` asks questions, an `Operator` acts by hand. Every
-wait is remembered, so that in the end nobody may still be waiting.
+A `Consumer` is a process with models: it waits, loads in steps, works in uses, leaves when asked or
+by itself, and misbehaves as its `Character` says. A `Runner` marks uses on other processes' leases.
+An `Observer` asks questions, an `Operator` acts by hand. Every wait is remembered, so that in the
+end nobody may still be waiting.
 """
 
 import asyncio
@@ -76,7 +78,8 @@ class SimClient(AsyncClient):
         return self._session.now()
 
     def may_load(self, lease: AsyncLease) -> bool:
-        """What a careful holder asks before it puts more on the card: is the lease still mine, by my own clock too?"""
+        """What a careful holder asks before it puts more on the card: is the lease still mine, by
+        my own clock too?"""
         record = self.protocol.holdings.held.get(lease.lease_id)
         return record is not None and self.now() < self.protocol.holdings.fence_at(record)
 
@@ -94,7 +97,10 @@ class Ask:
     ended_at: float = 0.0
 
     def __str__(self) -> str:
-        return f"{self.who} ({self.process.key}) since {self.asked_at:.3f} for {self.spec.footprint.load_peak_bytes}"
+        return (
+            f"{self.who} ({self.process.key}) since {self.asked_at:.3f} for "
+            f"{self.spec.footprint.load_peak_bytes}"
+        )
 
 
 @dataclass(slots=True)
@@ -169,7 +175,8 @@ class Cast:
         self.refusals[error.code] = self.refusals.get(error.code, 0) + 1
 
     def used_by_others(self, holding: Holding) -> list[str]:
-        """Uses that living processes in contact with this very daemon began on a lease and have not ended."""
+        """Uses that living processes in contact with this very daemon began on a lease and have not
+        ended."""
         epoch = self.world.machine.epochs[-1]
         return [
             use
@@ -329,7 +336,7 @@ class Consumer(Program):
             self.world.fail(f"{self.process.name}: {type(error).__name__}: {error}")
             raise
 
-    # -- holding -----------------------------------------------------------------------------------------------------
+    # -- holding
     async def _hold(self, lease: AsyncLease) -> None:
         holding = self.cast.holdings[lease.lease_id]
         try:
@@ -380,7 +387,8 @@ class Consumer(Program):
             self.cast.count_refusal(error)
 
     async def _load(self, holding: Holding) -> bool:
-        """In steps, context first; the last step is the temporary peak. False: given up or failed."""
+        """In steps, context first; the last step is the temporary peak. False: given up or
+        failed."""
         card, key = self.world.cards[holding.gpu], self.process.key
         footprint = holding.lease.spec.footprint
         load_s = self.random.uniform(0.05, 1.2)
@@ -423,7 +431,8 @@ class Consumer(Program):
         )
 
     async def _settle(self, holding: Holding) -> int | None:
-        """Drop the temporary peak; perhaps take more than was declared. Returns what is to be reported."""
+        """Drop the temporary peak; perhaps take more than was declared. Returns what is to be
+        reported."""
         card, key, chance = self.world.cards[holding.gpu], self.process.key, self.world.clock.chance
         lease_id, footprint = holding.lease.lease_id, holding.lease.spec.footprint
         steady = max(0, footprint.steady_bytes - self.residue_bytes)

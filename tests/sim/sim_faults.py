@@ -1,4 +1,5 @@
-"""What goes wrong, chosen by chance: one table of faults, each a few lines. A new feature adds its faults as rows."""
+"""What goes wrong, chosen by chance: one table of faults, each a few lines. A new feature adds its
+faults as rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,7 +58,7 @@ class Nemesis:
         ]
         self._plan()
 
-    # -- when ----------------------------------------------------------------------------------------------------------
+    # -- when
     def _plan(self) -> None:
         self.clock.after(self.random.expovariate(1 / FAULT_PAUSE_S), self._strike)
 
@@ -110,7 +111,7 @@ class Nemesis:
         faults.unlisted = faults.unnamed_bytes = faults.forgets_the_dead = False
         faults.blind_to.clear()
 
-    # -- processes -----------------------------------------------------------------------------------------------------
+    # -- processes
     def kill_process(self) -> None:
         index = self.random.randrange(len(self.slots))
         program = self.running[index]
@@ -137,7 +138,7 @@ class Nemesis:
             lambda: loop.thaw() if loop.frozen and not loop.dead else None,
         )
 
-    # -- the wire ------------------------------------------------------------------------------------------------------
+    # -- the wire
     def cut_link(self) -> None:
         if links := self.world.wire.open_links():
             self.random.choice(links).cut(told=True)
@@ -181,7 +182,7 @@ class Nemesis:
 
         self._for_a_while(undo)
 
-    # -- the daemon ----------------------------------------------------------------------------------------------------
+    # -- the daemon
     def kill_daemon(self) -> None:
         if self.world.serving:
             self.world.kill_daemon()
@@ -228,7 +229,8 @@ class Nemesis:
         self._for_a_while(undo, 3.0)
 
     def suspend(self) -> None:
-        """The laptop sleeps: the clock stands still, the daemon learns of it before its next event."""
+        """The laptop sleeps: the clock stands still, the daemon learns of it before its
+        next event."""
         self.world.machine.slept_s = self.random.choice((3.0, 600.0))
 
     def power_cut(self) -> None:
@@ -239,7 +241,7 @@ class Nemesis:
                 self.random.uniform(2.0, 5.0), lambda index=index: self._respawn(index, None)
             )
 
-    # -- cards and probes ----------------------------------------------------------------------------------------------
+    # -- cards and probes
     def _spoil(self, spoil: Callable[[ProbeFaults], None]) -> None:
         faults = self.random.choice(list(self.world.machine.probe_faults.values()))
         spoil(faults)
@@ -275,7 +277,8 @@ class Nemesis:
         self._spoil(spoil)
 
     def understate(self) -> None:
-        """A lie in the dangerous direction: nobody can be safe from it, but everybody must come out of it."""
+        """A lie in the dangerous direction: nobody can be safe from it, but everybody must come out
+        of it."""
 
         def spoil(faults: ProbeFaults) -> None:
             faults.factor = self.random.choice((0.0, 0.5))

@@ -1,7 +1,9 @@
-"""Runs simulations: `python tests/sim/sim_run.py --seed 7` (one, with its story) or `--seeds 1000` (0 … 999 on all cores).
+"""Runs simulations: `python tests/sim/sim_run.py --seed 7` (one, with its story) or `--seeds 1000`
+(0 … 999 on all cores).
 
-One run: some consumers, runners, an observer and an operator live for a while under faults; then the faults stop, everybody finishes
-what they began, and nothing may be left: no waiter, no lease, no byte charged, no record in the journal.
+One run: some consumers, runners, an observer and an operator live for a while under faults; then
+the faults stop, everybody finishes what they began, and nothing may be left: no waiter, no lease,
+no byte charged, no record in the journal.
 """
 
 import argparse
@@ -176,7 +178,8 @@ def _status(world: World) -> str:
 
 
 def _let_a_residue_go(world: World, cast: Cast) -> None:
-    """What idle processes keep on the card (their contexts) can be all that is in the way, and only their exit frees it."""
+    """What idle processes keep on the card (their contexts) can be all that is in the way, and only
+    their exit frees it."""
     for ask in cast.asks:
         if ask.outcome or not ask.process.alive:
             continue
@@ -195,7 +198,7 @@ def _let_a_residue_go(world: World, cast: Cast) -> None:
             return
 
 
-# -- many ------------------------------------------------------------------------------------------------------------
+# -- many
 def run_many(seeds: Sequence[int], jobs: int, stop_at: int = 5) -> list[Report]:
     """All seeds, on `jobs` processes; stops early after some failures."""
     reports: list[Report] = []

@@ -1,4 +1,5 @@
-"""The whole arbiter under faults, a few seeds of it; `make sim SEEDS=1000` runs more, `make sim SEED=n` one again."""
+"""The whole arbiter under faults, a few seeds of it; `make sim SEEDS=1000` runs more, `make sim
+SEED=n` one again."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
@@ -41,7 +42,7 @@ def test_sums_over_runs_name_the_seeds_that_failed() -> None:
     assert sums["granted"] == 2 * report.granted
 
 
-# -- the checks can fail ---------------------------------------------------------------------------------------------
+# -- the checks can fail
 def world_with_daemon(tmp_path: Path) -> World:
     made = World(7, tmp_path)
     made.start_daemon()
@@ -98,7 +99,7 @@ def test_a_token_that_does_not_grow_is_a_breach(tmp_path: Path) -> None:
     made.kill_daemon()
 
 
-# -- the parts ---------------------------------------------------------------------------------------------------------
+# -- the parts
 def test_a_frozen_process_catches_up_and_a_dead_one_never_does() -> None:
     clock = Clock(1)
     loop, dead, happened = ProcessLoop(clock, "frozen"), ProcessLoop(clock, "dead"), []
@@ -126,7 +127,7 @@ def test_the_card_refuses_what_it_has_not_got_and_gives_back_late() -> None:
     assert card.used_bytes() == 4 * GIB
 
 
-# -- clients -----------------------------------------------------------------------------------------------------------
+# -- clients
 async def parked_slowly(
     client: SimClient, size: int, parked: list[str], **fields: object
 ) -> AsyncLease:
@@ -189,7 +190,8 @@ def test_a_lease_that_is_given_up_while_it_parks_ends(tmp_path: Path) -> None:
 
 
 def test_a_wait_to_come_back_outlives_the_daemon(tmp_path: Path) -> None:
-    """Regression: after a restart the arbiter knew that the lease was parked, but not that it was wanted."""
+    """Regression: after a restart the arbiter knew that the lease was parked, but not that it was
+    wanted."""
     made = world_with_daemon(tmp_path)
     parked: list[str] = []
 
@@ -213,7 +215,8 @@ def test_a_wait_to_come_back_outlives_the_daemon(tmp_path: Path) -> None:
 
 
 def test_a_lease_that_finds_no_host_ram_to_park_is_released_all_the_same(tmp_path: Path) -> None:
-    """Regression: a release that was refused ended the task that leaves, and the lease stayed `unloading` for ever."""
+    """Regression: a release that was refused ended the task that leaves, and the lease stayed
+    `unloading` for ever."""
     made = world_with_daemon(tmp_path)
     parked: list[str] = []
 

@@ -1,8 +1,9 @@
 """Attacks on a server's socket, by a process that may connect: what no libzmq client would send.
 
-Plain blocking sockets that speak ZMTP by hand. Every attack ends by itself after the seconds it was given, takes a
-refusal (a cut connection) as a reason to go on with the next connection, and keeps at most `CONNECTIONS` of them. Used
-by hostile tests, the storm and the benchmarks; must not be pointed at anything but a server that the caller started.
+Plain blocking sockets that speak ZMTP by hand. Every attack ends by itself after the seconds it was
+given, takes a refusal (a cut connection) as a reason to go on with the next connection, and keeps
+at most `CONNECTIONS` of them. Used by hostile tests, the storm and the benchmarks; must not be
+pointed at anything but a server that the caller started.
 """
 
 import contextlib
@@ -75,7 +76,8 @@ def _hello(path: str) -> socket.socket:
 def _pour(
     path: str, end_s: float, open_one: Callable[[str], socket.socket], data: Iterator[bytes]
 ) -> None:
-    """Send `data` over one connection after another, each until the server cuts it or reads no more."""
+    """Send `data` over one connection after another, each until the server cuts it or reads no
+    more."""
     while time.monotonic() < end_s:
         try:
             with contextlib.closing(open_one(path)) as peer:

@@ -1,4 +1,5 @@
-"""A run of the engine with a bit of everything, reproducible from a seed. For tests of logs and replays."""
+"""A run of the engine with a bit of everything, reproducible from a seed. For tests of logs and
+replays."""
 
 from random import Random
 
@@ -10,7 +11,8 @@ GIB, MIB = d.GIB, d.MIB
 
 
 def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDriver:
-    """Four consumers that load, use, release, cancel, report and die, on a card that lags and sometimes cannot be read."""
+    """Four consumers that load, use, release, cancel, report and die, on a card that lags and
+    sometimes cannot be read."""
     random = Random(seed)
     driver = CoreDriver(settings={"policy": policy})
     driver.card.lag_s = 0.03

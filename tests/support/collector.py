@@ -1,4 +1,5 @@
-"""A telemetry collector for tests: takes OTLP over HTTP on loopback and hands out what came, decoded. Needs the extra `telemetry`."""
+"""A telemetry collector for tests: takes OTLP over HTTP on loopback and hands out what came,
+decoded. Needs the extra `telemetry`."""
 
 import socket
 import threading
@@ -50,9 +51,11 @@ class Point:
 
 
 class _Server(ThreadingHTTPServer):
-    """Knows which of its connections are open, and when one of our own has had its turn: the kernel hands them over in the order they came.
+    """Knows which of its connections are open, and when one of our own has had its turn: the kernel
+    hands them over in the order they came.
 
-    An exporter waits for a few seconds, then its program may end: what it sent lies in the kernel and is still to be read.
+    An exporter waits for a few seconds, then its program may end: what it sent lies in the kernel
+    and is still to be read.
     """
 
     request_queue_size = EXPORTERS_MAX
@@ -133,8 +136,8 @@ class Collector:
         return f"http://127.0.0.1:{self._server.server_port}"
 
     def environ(self, schedule_ms: int = 50) -> dict[str, str]:
-        """Variables that send a program's telemetry here, spans after at most so many milliseconds. A machine too busy to listen is no
-        collector that is away."""
+        """Variables that send a program's telemetry here, spans after at most so many milliseconds.
+        A machine too busy to listen is no collector that is away."""
         return {
             "OTEL_EXPORTER_OTLP_ENDPOINT": self.endpoint,
             "OTEL_EXPORTER_OTLP_TIMEOUT": str(WAIT_S),
@@ -168,26 +171,30 @@ class Collector:
             return [span for span in self._spans if name is None or span.name == name]
 
     def points(self, metric: str) -> list[Point]:
-        """Every report of a metric that was sent until now, oldest first: each export repeats the running totals."""
+        """Every report of a metric that was sent until now, oldest first: each export repeats the
+        running totals."""
         self._settle()
         with self._came:
             return [point for point in self._points if point.metric == metric]
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
-        """Until `condition()` holds, looked at whenever something came. Raises AssertionError with what was waited for and what came."""
+        """Until `condition()` holds, looked at whenever something came. Raises AssertionError with
+        what was waited for and what came."""
         self._waiting.now = True
         try:
             with self._came:
                 if not self._came.wait_for(condition, timeout_s):
                     raise AssertionError(
-                        f"no {what} within {timeout_s} s; spans: {sorted({s.name for s in self._spans})}, "
+                        f"no {what} within {timeout_s} s; spans: "
+                        f"{sorted({s.name for s in self._spans})}, "
                         f"metrics: {sorted({p.metric for p in self._points})}"
                     )
         finally:
             self._waiting.now = False
 
     def _settle(self) -> None:
-        """Not while `wait` looks: it looks again whenever something came, and what comes needs its lock."""
+        """Not while `wait` looks: it looks again whenever something came, and what comes needs its
+        lock."""
         if not self._over and not getattr(self._waiting, "now", False):
             self._server.settle()
 

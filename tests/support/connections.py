@@ -11,7 +11,8 @@ from vram_arbiter.schemas.runtime.procfs import start_ticks
 
 
 def peer_of(pid: int, uid: int | None = None, gid: int | None = None) -> Peer:
-    """The peer that a living process would be; `uid` and `gid` are this process's unless given. Its pidfd is none."""
+    """The peer that a living process would be; `uid` and `gid` are this process's unless given. Its
+    pidfd is none."""
     ticks = start_ticks(pid)
     assert ticks is not None, f"process {pid} has ended"
     own_uid, own_gid = os.getuid() if uid is None else uid, os.getgid() if gid is None else gid
@@ -19,7 +20,8 @@ def peer_of(pid: int, uid: int | None = None, gid: int | None = None) -> Peer:
 
 
 class KeptConnection:
-    """The shape of `arbiter.rpc.session.Connection`. It is reachable until it is closed, or told otherwise."""
+    """The shape of `arbiter.rpc.session.Connection`. It is reachable until it is closed, or told
+    otherwise."""
 
     def __init__(self, serial: int, peer: Peer) -> None:
         self.serial = serial

@@ -1,6 +1,8 @@
-"""Drive the sans-IO core by hand: a clock that only moves when told, simulated cards that answer `Sample`, a journal in a dict.
+"""Drive the sans-IO core by hand: a clock that only moves when told, simulated cards that answer
+`Sample`, a journal in a dict.
 
-For tests of the core and of whatever stands on it. Knows nothing of sockets or real cards; never sleeps.
+For tests of the core and of whatever stands on it. Knows nothing of sockets or real cards; never
+sleeps.
 
     driver = CoreDriver(capacity_bytes=8 * GIB)
     vlm = driver.consumer("vlm")
@@ -190,9 +192,10 @@ class CoreDriver:
         """The first card."""
         return next(iter(self.cards.values()))
 
-    # -- time and events -------------------------------------------------------------------------------------------
+    # -- time and events
     def post(self, event: Event) -> list[Effect]:
-        """Hand one event to the core at the present time and perform what it asks. Returns exactly those effects."""
+        """Hand one event to the core at the present time and perform what it asks. Returns exactly
+        those effects."""
         self.events.append((self.now, event))
         effects = self.arbiter.handle(event, self.now)
         self.arbiter.check_all()
@@ -255,7 +258,8 @@ class CoreDriver:
     def until(
         self, condition: Callable[[], bool], limit_s: float = 60.0, step_s: float = 0.005
     ) -> float:
-        """Let time pass until something is true. Returns the seconds it took; raises AssertionError at the limit."""
+        """Let time pass until something is true. Returns the seconds it took; raises AssertionError
+        at the limit."""
         began = self.now
         while not condition():
             if self.now - began > limit_s:
@@ -285,7 +289,7 @@ class CoreDriver:
         self.post(Recovered(records))
         self.advance(0.01)
 
-    # -- people ----------------------------------------------------------------------------------------------------
+    # -- people
     def consumer(
         self, name: str, *, pid: int | None = None, priority: int = d.PRIORITY, uid: int = 1000
     ) -> "Consumer":
@@ -305,7 +309,7 @@ class CoreDriver:
         self._requests += 1
         return RequestId(self._requests)
 
-    # -- looking ---------------------------------------------------------------------------------------------------
+    # -- looking
     def view(self, lease: LeaseId) -> dict[str, Any] | None:
         """The lease as `status` shows it; None when it is over."""
         views = self.status()["leases"]
@@ -359,7 +363,8 @@ class CoreDriver:
 
 @dataclass(slots=True)
 class Consumer:
-    """A process that leases, as its client library would: remembers its tokens, answers for its bytes on the card."""
+    """A process that leases, as its client library would: remembers its tokens, answers for its
+    bytes on the card."""
 
     driver: CoreDriver
     name: str
@@ -371,7 +376,7 @@ class Consumer:
     nonces: int = 0
     traceparent: str | None = None  # sent with what it asks for
 
-    # -- connection ------------------------------------------------------------------------------------------------
+    # -- connection
     def connect(self) -> list[Effect]:
         return self.driver.post(
             ClientConnected(
@@ -383,12 +388,13 @@ class Consumer:
         return self.driver.post(ClientLeft(self.client, reason))
 
     def die(self) -> list[Effect]:
-        """kill -9: the bytes go back to the card after its lag, the kernel says that the process is gone."""
+        """kill -9: the bytes go back to the card after its lag, the kernel says that the process is
+        gone."""
         for card in self.driver.cards.values():
             card.set(self.process, 0, self.driver.now)
         return self.driver.post(ProcessDied(self.process))
 
-    # -- requests --------------------------------------------------------------------------------------------------
+    # -- requests
     def spec(
         self,
         load_peak_bytes: int,
@@ -409,7 +415,8 @@ class Consumer:
         independent: bool = False,
         gang: tuple[str, int] | None = None,
     ) -> Spec:
-        """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
+        """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked
+        for."""
         return Spec(
             consumer=self.name,
             key=ModelKey(key or f"{self.name}-model"),
@@ -439,7 +446,8 @@ class Consumer:
         nonce: str | None = None,
         **spec: Any,
     ) -> LeaseId:
-        """Ask for a lease. Returns its id; raises AssertionError if it is refused (see `try_acquire`)."""
+        """Ask for a lease. Returns its id; raises AssertionError if it is refused (see
+        `try_acquire`)."""
         effects = self.try_acquire(
             load_peak_bytes, steady_bytes, wait_timeout_s=wait_timeout_s, nonce=nonce, **spec
         )
@@ -645,7 +653,7 @@ class Consumer:
         )
         return self.driver.post(Reattached(self.client, self.driver.next_request(), (item,)))
 
-    # -- as a cooperative holder -------------------------------------------------------------------------------------
+    # -- as a cooperative holder
     def hold(self, count: int, *, gpu: GpuId | None = None) -> None:
         """Bytes of this process on a card from now on."""
         card = self.driver.card if gpu is None else self.driver.cards[gpu]
@@ -663,7 +671,8 @@ class Consumer:
     def unload(
         self, lease: LeaseId, *, unload_s: float = 0.0, parked: bool = False
     ) -> list[Effect]:
-        """At a safe point: `unloading`, the bytes go (to host RAM if `parked`) but for the residue, `release`."""
+        """At a safe point: `unloading`, the bytes go (to host RAM if `parked`) but for the residue,
+        `release`."""
         view = self.driver.view(lease)
         if view is None:
             raise AssertionError(f"{lease} is over")
@@ -697,7 +706,8 @@ def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
 
 
 def _well_formed(effects: Sequence[Effect]) -> None:
-    """Answers name their request, and the history has only kinds that clients can ask for. Raises AssertionError."""
+    """Answers name their request, and the history has only kinds that clients can ask for. Raises
+    AssertionError."""
     for effect in effects:
         if isinstance(effect, Reply | Refuse) and not isinstance(effect.request, int):
             raise AssertionError(f"an answer to nothing: {effect}")
@@ -706,7 +716,8 @@ def _well_formed(effects: Sequence[Effect]) -> None:
 
 
 def _names(effect: Effect, lease: str) -> bool:
-    """Is this effect about a lease? As the executor decides what to hold back with a record that could not be written."""
+    """Is this effect about a lease? As the executor decides what to hold back with a record that
+    could not be written."""
     match effect:
         case Reply() | Push():
             view = getattr(effect.body, "lease", None)

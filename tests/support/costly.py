@@ -1,4 +1,5 @@
-"""The messages of at most 1 MiB that cost the most to decode, validate and refuse, by what makes them costly."""
+"""The messages of at most 1 MiB that cost the most to decode, validate and refuse, by what makes
+them costly."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -44,7 +45,8 @@ COSTLY: Final[Mapping[str, bytes]] = {
     "as many maps as may be": _pack(op="ping", x=[[{}] * LISTED_MAX] * _LISTS),
     "as many texts as may be": _pack(op="ping", x=[["ü" * 80] * LISTED_MAX] * _LISTS),
     "a long text": _pack(op="why", consumer="😀" * (_MIB // 4 - 32)),
-    "text that is not UTF-8 at its end": b"\x81\xa2op\xdb" + (_MIB - 9).to_bytes(4) + b"a" * (_MIB - 10) + b"\xff",
+    "text that is not UTF-8 at its "
+    "end": b"\x81\xa2op\xdb" + (_MIB - 9).to_bytes(4) + b"a" * (_MIB - 10) + b"\xff",
     "a long key": _pack(op="ping", **{"k" * (_MIB - 64): 1}),
     "digits for a number": _pack(op="ping") [:-1] + msgpack.packb("9" * (_MIB - 64)),
     "spaces for a number": _pack(op="cancel", lease_id=" " * (_MIB - 64)),
@@ -53,7 +55,8 @@ COSTLY: Final[Mapping[str, bytes]] = {
     "wrong uses": _reattach(20, use_ids=["\x01" * 128] * USES_PER_LEASE_MAX),
     "leases of unknown keys": _pack(op="reattach", leases=[{"spec": _junk()}] * 48),
     "unknown keys in every map": _pack(
-        op="acquire", nonce="n", spec={**_junk(55), "footprint": _junk(), "gang": _junk()}, **_junk(55)
+        op="acquire", nonce="n", spec={**_junk(55), "footprint": _junk(), "gang": _junk()},
+        **_junk(55)
     ),
     "kinds": _pack(op="history", kinds=["k" * 4000] * LISTED_MAX),
     "duplicates": b"\xde\x00\x40" + b"\xa2op\xa4ping" * 64,

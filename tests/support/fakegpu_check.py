@@ -1,7 +1,8 @@
-"""Independent checker of a simulated card's allocation log: proves afterwards that no instant exceeded the capacity.
+"""Independent checker of a simulated card's allocation log: proves afterwards that no instant
+exceeded the capacity.
 
-It reads the JSON lines by itself and shares no code with `schemas.fakegpu`, whose mistakes it is there to find.
-Run it with `python -m tests.support.fakegpu_check FOLDER`.
+It reads the JSON lines by itself and shares no code with `schemas.fakegpu`, whose mistakes it is
+there to find. Run it with `python -m tests.support.fakegpu_check FOLDER`.
 """
 
 import json
@@ -15,7 +16,8 @@ _OPS = {"context", "alloc", "cache", "free", "leak", "returned", "oom", "died", 
 
 @dataclass(slots=True)
 class Report:
-    """What a log shows. `problems` empty: the card was never over capacity and every byte is accounted for."""
+    """What a log shows. `problems` empty: the card was never over capacity and every byte is
+    accounted for."""
 
     lines: int = 0
     torn_lines: int = 0
@@ -29,9 +31,10 @@ class Report:
 def check_log(text: str) -> Report:
     """Replay a log line by line.
 
-    Rules: numbers rise by one, time never runs back; the sum of all deltas is what each line says is used; it stays within
-    the capacity; no process goes below zero, grows after its death, or is refused what would have fitted. What somebody wrote
-    into the folder by hand (`edited`: a test's stowaway) counts for the card, and cannot be told apart from a process's own bytes.
+    Rules: numbers rise by one, time never runs back; the sum of all deltas is what each line says
+    is used; it stays within the capacity; no process goes below zero, grows after its death, or is
+    refused what would have fitted. What somebody wrote into the folder by hand (`edited`: a test's
+    stowaway) counts for the card, and cannot be told apart from a process's own bytes.
     """
     report = Report()
     held: dict[tuple[int, int], int] = {}
@@ -104,8 +107,10 @@ def main() -> int:
     for problem in report.problems:
         print(problem)
     print(
-        f"{report.lines} changes by {report.processes} processes, peak {report.peak_bytes} of {report.capacity_bytes} bytes, "
-        f"{report.oom_events} refused, {report.torn_lines} torn lines, {len(report.problems)} problems"
+        f"{report.lines} changes by {report.processes} processes, peak {report.peak_bytes} of "
+        f"{report.capacity_bytes} bytes, "
+        f"{report.oom_events} refused, {report.torn_lines} torn lines, {len(report.problems)} "
+        "problems"
     )
     return 1 if report.problems else 0
 

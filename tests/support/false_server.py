@@ -1,6 +1,8 @@
-"""A process of another user that listens where a server of ours should: `python false_server.py FOLDER NAME UID`.
+"""A process of another user that listens where a server of ours should: `python false_server.py
+FOLDER NAME UID`.
 
-It tells each message that it gets as a line on stdout, and answers every one with `ok`. It ends when its stdin does.
+It tells each message that it gets as a line on stdout, and answers every one with `ok`. It ends
+when its stdin does.
 """
 
 import os

@@ -1,8 +1,9 @@
 """Many short-lived Python processes without paying for their imports each time.
 
-`ForkServer(program)` starts one process that imports a program file and then forks a child per `spawn`; the child runs the file's
-`main(arguments)` with pipes of its own, says JSON lines on its standard output and takes commands on its standard input. Must not
-know what the program does. POSIX only.
+`ForkServer(program)` starts one process that imports a program file and then forks a child per
+`spawn`; the child runs the file's `main(arguments)` with pipes of its own, says JSON lines on its
+standard output and takes commands on its standard input. Must not know what the program does. POSIX
+only.
 """
 
 import contextlib
@@ -25,7 +26,8 @@ _MESSAGE_MAX = 65_536
 
 
 class Child:
-    """A forked process: what it says, what it is told, and its end. Deaths are seen through a pidfd."""
+    """A forked process: what it says, what it is told, and its end. Deaths are seen through a
+    pidfd."""
 
     def __init__(self, pid: int, name: str, stdin: int, stdout: int) -> None:
         self.pid = pid
@@ -42,7 +44,8 @@ class Child:
         return self.pidfd not in select.select([self.pidfd], [], [], 0)[0]
 
     def until(self, event: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
-        """The next line with this event. Raises AssertionError if the child ends, or stays silent, before it says so."""
+        """The next line with this event. Raises AssertionError if the child ends, or stays silent,
+        before it says so."""
         deadline = time.monotonic() + timeout_s
         while True:
             while self._heard < len(self.said):
@@ -102,7 +105,8 @@ class Child:
 
 
 class ForkServer:
-    """The parent of all children. `close` ends it; the children live on and are closed by whoever spawned them."""
+    """The parent of all children. `close` ends it; the children live on and are closed by whoever
+    spawned them."""
 
     def __init__(self, program: Path, environ: Mapping[str, str], errors: Path) -> None:
         here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -150,7 +154,7 @@ class ForkServer:
         self.close()
 
 
-# -- the server's side -----------------------------------------------------------------------------------------------
+# -- the server's side
 def serve(program: Path, orders: socket.socket) -> None:
     """Fork a child for every order until the other end is closed."""
     spec = importlib.util.spec_from_file_location(program.stem, program)

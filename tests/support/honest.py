@@ -1,4 +1,5 @@
-"""An honest client beside hostile ones: it holds a lease in use, and measures what the others leave behind in the daemon."""
+"""An honest client beside hostile ones: it holds a lease in use, and measures what the others leave
+behind in the daemon."""
 
 import os
 import time
@@ -15,7 +16,8 @@ DESCRIPTOR_SLACK = 8
 
 
 class Honest:
-    """A client with a pinned lease in use. `client` has not said hello yet; the caller closes it."""
+    """A client with a pinned lease in use. `client` has not said hello yet; the caller
+    closes it."""
 
     def __init__(self, arbiter: ArbiterProcess, client: WireClient) -> None:
         self.arbiter = arbiter
@@ -47,7 +49,8 @@ class Honest:
         assert self.client.ask("renew", leases=[self.on])["alive"] == [self.on["lease_id"]]
 
     def is_alone(self) -> None:
-        """Every other client is gone without a trace. The death of a process is heard, and what it leaves is closed, a little later."""
+        """Every other client is gone without a trace. The death of a process is heard, and what it
+        leaves is closed, a little later."""
         with WireClient(self.arbiter.endpoint) as late:  # accepted behind every earlier connection
             assert late.hello("late", role="observer").ask("bye")["ok"]
         deadline = time.monotonic() + WAIT_S

@@ -1,7 +1,9 @@
-"""What nobody should send: valid requests of every op, drawn from the wire's own schema, and everything that can be made of them.
+"""What nobody should send: valid requests of every op, drawn from the wire's own schema, and
+everything that can be made of them.
 
-One generator for the property tests, the fuzzer and the hostile clients. It draws from a `random.Random` that it is given (Hypothesis
-hands one in whose draws it can shrink). Must not know sessions, sockets or the core.
+One generator for the property tests, the fuzzer and the hostile clients. It draws from a
+`random.Random` that it is given (Hypothesis hands one in whose draws it can shrink). Must not know
+sessions, sockets or the core.
 """
 
 import random
@@ -46,11 +48,13 @@ BOMBS: Mapping[str, bytes] = {
     "id that is true": msgpack.packb({"op": "ping", "id": True}),
     "empty": b"",
 }
-"""Frames by what is wrong with them. None of them is a request that may be obeyed twice, raise, or cost memory."""
+"""Frames by what is wrong with them. None of them is a request that may be obeyed twice, raise, or
+cost memory."""
 
 
 class Forger:
-    """Draws requests and frames. `lease_ids` and `tokens` are those to try; callers add what they learn."""
+    """Draws requests and frames. `lease_ids` and `tokens` are those to try; callers add what they
+    learn."""
 
     def __init__(self, draw: random.Random) -> None:
         self._draw = draw
@@ -82,7 +86,7 @@ class Forger:
             case _:
                 return pack(self.mutant(self.request()))
 
-    # -- valid -----------------------------------------------------------------------------------------------------
+    # -- valid
     def _sample(self, schema: Mapping[str, Any], name: str) -> Any:
         draw = self._draw
         if "$ref" in schema:
@@ -135,7 +139,7 @@ class Forger:
         )
         return text[: schema.get("maxLength", 1000)]
 
-    # -- wrong -----------------------------------------------------------------------------------------------------
+    # -- wrong
     def _mutate(self, value: Any) -> Any:
         draw = self._draw
         if isinstance(value, dict) and value:
@@ -159,9 +163,12 @@ class Forger:
         draw = self._draw
         return draw.choice(
             [
-                None, True, -1, 0, 1 << 53, (1 << 64) - 1, -(1 << 63), 1e308, float("nan"), float("inf"), -0.0, "", "x" * 5000,
-                "\x00", "\ud7ff", "ping", b"\xff", [], {}, [[]] * 100, {"op": "bye"}, [1, 2, 3], msgpack.ExtType(1, b"x"),
-                msgpack.Timestamp(0, 1), draw.randint(-1000, 1000), draw.choice(self.lease_ids), list(draw.choice(self.tokens)),
+                None, True, -1, 0, 1 << 53, (1 << 64) - 1, -(1 << 63), 1e308, float("nan"),
+                float("inf"), -0.0, "", "x" * 5000,
+                "\x00", "\ud7ff", "ping", b"\xff", [], {}, [[]] * 100, {"op": "bye"}, [1, 2, 3],
+                msgpack.ExtType(1, b"x"),
+                msgpack.Timestamp(0, 1), draw.randint(-1000, 1000), draw.choice(self.lease_ids),
+                list(draw.choice(self.tokens)),
             ]
         )  # fmt: skip
 

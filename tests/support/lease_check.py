@@ -1,13 +1,16 @@
-"""Independent checker of leases: three witnesses that never spoke to each other must tell one story.
+"""Independent checker of leases: three witnesses that never spoke to each other must tell one
+story.
 
-The card's allocation log says who held which bytes when; the history says what the arbiter decided; the consumers' own traces say
-what they were told and did. From these follow the rules below; the core's code is not used, its mistakes are what is looked for.
-`fakegpu_check` comes first and proves that the card's log is sound in itself.
+The card's allocation log says who held which bytes when; the history says what the arbiter decided;
+the consumers' own traces say what they were told and did. From these follow the rules below; the
+core's code is not used, its mistakes are what is looked for. `fakegpu_check` comes first and proves
+that the card's log is sound in itself.
 
 Rules (their names stand in `Finding.rule`):
   entitled   bytes are only put on the card under a lease: after its grant, before its end
   refused    whoever has a grant finds room for what it was granted
-  exclusive  nobody else has bytes beyond its context while an exclusive lease has, nor the other way round
+  exclusive  nobody else has bytes beyond its context while an exclusive lease has, nor the other
+  way round
   in_use     nothing is unloaded while it is in use
   loading    one load at a time per card
   tokens     tokens only grow, across restarts too
@@ -31,9 +34,12 @@ SLACK_S = 0.005
 UNSEEN_S = 2.5
 """A stowaway younger than the oldest reading that may carry a grant cannot have been seen."""
 NOISE_BYTES = RESERVE_BYTES + VERIFY_TOLERANCE_BYTES
-"""So much may be the driver's own, as far as a reading can tell: who has no more than that on its way back is not seen to be there.
+"""So much may be the driver's own, as far as a reading can tell: who has no more than that on its
+way back is not seen to be there.
 
-Where readings do not list processes, what a living process is charged for its context, and does not hold, hides as many bytes more."""
+Where readings do not list processes, what a living process is charged for its context, and does not
+hold, hides as many bytes more.
+"""
 STUCK_S = 60.0
 _LEASE_ID = re.compile(r"L(\d+)-\d+")
 _PROCESS = re.compile(r"(\d+)@\d+")
@@ -54,7 +60,8 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Hindrance:
-    """What the test itself did to a process: stopped from `since` to `until`, or killed (`until` is infinite)."""
+    """What the test itself did to a process: stopped from `since` to `until`, or killed (`until` is
+    infinite)."""
 
     pid: int
     since: float
@@ -63,7 +70,8 @@ class Hindrance:
 
 @dataclass(slots=True)
 class Claim:
-    """A lease as its holder knew it. `until`: when it was over for the holder or, earlier, for the arbiter."""
+    """A lease as its holder knew it. `until`: when it was over for the holder or, earlier, for the
+    arbiter."""
 
     lease_id: str
     pid: int
@@ -135,7 +143,7 @@ def check_leases(
     return story
 
 
-# -- claims ------------------------------------------------------------------------------------------------------------
+# -- claims
 def _claims(
     traces: Sequence[Line], events: Sequence[Line], times: Sequence[float]
 ) -> dict[int, list[Claim]]:
@@ -170,9 +178,11 @@ def _claims(
 def _kept(
     events: Sequence[Line], times: Sequence[float], traces: Sequence[Line]
 ) -> list[tuple[float, int, int]]:
-    """(when, pid, bytes): what the arbiter charged to a process outside its leases from then on, by its verdicts, for its context.
+    """(when, pid, bytes): what the arbiter charged to a process outside its leases from then on, by
+    its verdicts, for its context.
 
-    What it found there beyond what the process declared counts for nothing here: it would be excused by the arbiter's own finding.
+    What it found there beyond what the process declared counts for nothing here: it would be
+    excused by the arbiter's own finding.
     """
     declared = {
         line["name"]: (line["pid"], line["residue_bytes"])
@@ -199,7 +209,7 @@ def _claim_at(claims: Sequence[Claim], t: float) -> Claim | None:
     return next((claim for claim in reversed(claims) if claim.since <= t <= claim.until), None)
 
 
-# -- history -----------------------------------------------------------------------------------------------------------
+# -- history
 def _check_history(
     story: Story,
     events: Sequence[Line],
@@ -268,7 +278,8 @@ def _check_history(
 def _check_tokens(
     story: Story, events: Sequence[Line], times: Sequence[float], traces: Sequence[Line]
 ) -> None:
-    """The history has the order of the grants, their holders have the tokens. A lease of which one side missed a grant says nothing."""
+    """The history has the order of the grants, their holders have the tokens. A lease of which one
+    side missed a grant says nothing."""
     heard: dict[str, deque[tuple[int, int]]] = defaultdict(deque)
     for line in traces:
         if line["event"] == "granted":
@@ -302,10 +313,11 @@ def _hindered(hindrances: Sequence[Hindrance], pid: int, t: float, back_s: float
     )
 
 
-# -- card --------------------------------------------------------------------------------------------------------------
+# -- card
 @dataclass(slots=True)
 class _Held:
-    """Bytes of one process as the log tells them. `floor` is what belongs to no lease: its context and what it leaked."""
+    """Bytes of one process as the log tells them. `floor` is what belongs to no lease: its context
+    and what it leaked."""
 
     on_card: int = 0
     floor: int = 0
@@ -383,7 +395,8 @@ def _unfilled_bytes(
     dead: Mapping[int, float],
     at: float,
 ) -> int:
-    """What living processes were charged outside their leases at that time and did not have on the card."""
+    """What living processes were charged outside their leases at that time and did not have on the
+    card."""
     charged = {pid: count for t, pid, count in kept if t <= at and dead.get(pid, at) >= at}
     return sum(
         max(0, count - (held[pid].on_card if pid in held else 0)) for pid, count in charged.items()
@@ -408,7 +421,8 @@ def _check_refusal(
     story.bad(
         "refused",
         line["t"],
-        f"{claim.name} was granted {claim.bytes} under {claim.lease_id}, holds {mine.on_card} and finds no room for "
+        f"{claim.name} was granted {claim.bytes} under {claim.lease_id}, holds {mine.on_card} and "
+        "finds no room for "
         f"{line['bytes']}; others hold {others}",
     )
 
@@ -435,12 +449,13 @@ def _check_alone(
             story.bad(
                 "exclusive",
                 t,
-                f"{alone.lease_id} of {alone.name} is exclusive: {claim.name} has {held[claim.pid].own} bytes, "
+                f"{alone.lease_id} of {alone.name} is exclusive: {claim.name} has "
+                f"{held[claim.pid].own} bytes, "
                 f"{theirs.name} {other.own}",
             )
 
 
-# -- uses and waits ------------------------------------------------------------------------------------------------------
+# -- uses and waits
 def _check_uses(story: Story, lines: Sequence[Line], traces: Sequence[Line]) -> None:
     """No bytes go, and no unload begins, between `in_use` and `idle` of a process."""
     gone: dict[int, list[float]] = defaultdict(list)
@@ -500,7 +515,8 @@ def _check_waits(
 
 
 def _covered_s(spans: Iterable[Span], since: float, until: float) -> float:
-    """How much of the time between the two lies in any of the spans; what several of them cover counts once."""
+    """How much of the time between the two lies in any of the spans; what several of them cover
+    counts once."""
     covered_s, seen_until = 0.0, since
     for begin, end in sorted(spans):
         begin, end = max(begin, seen_until), min(end, until)

@@ -14,8 +14,8 @@ import pytest
 _KEY = pytest.StashKey[Path]()
 _FAILED = pytest.StashKey[bool]()
 KEPT = ("pytest-of-*", "torchinductor_*", "tmp*.json", "sidecar-*.log")
-"""What may lie there at the end, beside `tmp_path`: files that torch's compiler and lerobot's loader of
-configurations never remove, and the log that a client keeps of a sidecar it started."""
+"""What may lie there at the end, beside `tmp_path`: files that torch's compiler and lerobot's
+loader of configurations never remove, and the log that a client keeps of a sidecar it started."""
 
 
 def _is_worker() -> bool:

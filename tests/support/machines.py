@@ -1,8 +1,11 @@
-"""How properties are tried: a little in every test run, always the same way and on however slow a machine; far and at random in the night.
+"""How properties are tried: a little in every test run, always the same way and on however slow a
+machine; far and at random in the night.
 
-`steady`, the profile of a usual run, gives no example a time limit: a machine that stands still for a moment is no failure, and what fails once fails
-again. HYPOTHESIS_PROFILE or pytest's `--hypothesis-profile` chooses `nightly`; `make nightly` splits its histories over the cores
-(`tests/nightly`). A rule machine takes part with `TestThis.settings = walk(60)`, and in the night with a line in `tests/nightly/nightly_run.py`.
+`steady`, the profile of a usual run, gives no example a time limit: a machine that stands still for
+a moment is no failure, and what fails once fails again. HYPOTHESIS_PROFILE or pytest's
+`--hypothesis-profile` chooses `nightly`; `make nightly` splits its histories over the cores
+(`tests/nightly`). A rule machine takes part with `TestThis.settings = walk(60)`, and in the night
+with a line in `tests/nightly/nightly_run.py`.
 """
 
 import os
@@ -14,7 +17,8 @@ NIGHTLY_EXAMPLES = 100_000
 
 
 def register(nightly_examples: int = NIGHTLY_EXAMPLES) -> None:
-    """Make both profiles known, and load the one that HYPOTHESIS_PROFILE names; `steady` if it names none."""
+    """Make both profiles known, and load the one that HYPOTHESIS_PROFILE names; `steady` if it
+    names none."""
     settings.register_profile(
         STEADY,
         deadline=None,
@@ -34,8 +38,8 @@ def register(nightly_examples: int = NIGHTLY_EXAMPLES) -> None:
 
 
 def walk(examples: int, *, nightly_share: float = 1.0) -> settings:
-    """Settings of one machine. `examples`: in a usual test run, so that it takes less than 15 s there. `nightly_share`: of the histories
-    that the nightly profile says."""
+    """Settings of one machine. `examples`: in a usual test run, so that it takes less than 15 s
+    there. `nightly_share`: of the histories that the nightly profile says."""
     nightly = settings.get_current_profile_name() == NIGHTLY
     return settings(
         max_examples=max(1, round(nightly_share * settings().max_examples))

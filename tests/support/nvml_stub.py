@@ -1,4 +1,5 @@
-"""Control of a compiled `libnvidia-ml.so.1` for tests (`tests/arbiter/host/gpu/nvml_stub.c`): a text file that it reads at every call."""
+"""Control of a compiled `libnvidia-ml.so.1` for tests (`tests/arbiter/host/gpu/nvml_stub.c`): a
+text file that it reads at every call."""
 
 import os
 from dataclasses import dataclass, field

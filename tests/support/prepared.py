@@ -1,8 +1,8 @@
 """Daemons forked from an interpreter that has imported the daemon already.
 
 A daemon of its own for each test is most of what `make test` computes: an import takes 0.6 s of a
-core, a fork some milliseconds. `start` returns what `subprocess.Popen` would. A daemon whose imports
-matter (other environment, other program) is started afresh by `ArbiterProcess`.
+core, a fork some milliseconds. `start` returns what `subprocess.Popen` would. A daemon whose
+imports matter (other environment, other program) is started afresh by `ArbiterProcess`.
 """
 
 import atexit
@@ -94,7 +94,7 @@ def _server() -> socket.socket:
     return here
 
 
-# -- the server's side -------------------------------------------------------------------------------
+# -- the server's side
 def serve(orders: socket.socket) -> list[str] | None:
     """Fork a daemon for each order. Returns its arguments in the child, None when orders end."""
     running: dict[int, tuple[int, socket.socket]] = {}  # pidfd → pid, where its status goes

@@ -1,4 +1,5 @@
-"""A real daemon for tests: `python -m vram_arbiter.arbiter` in a folder of its own, started until READY, ended by its pid."""
+"""A real daemon for tests: `python -m vram_arbiter.arbiter` in a folder of its own, started until
+READY, ended by its pid."""
 
 import os
 import select
@@ -21,11 +22,13 @@ _ROOT = Path(__file__).parents[2]
 
 
 class ArbiterProcess:
-    """One runtime folder with at most one daemon in it at a time; it can be killed and started again on the same state.
+    """One runtime folder with at most one daemon in it at a time; it can be killed and started
+    again on the same state.
 
-    The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the simulated card `fakegpu/` and
-    `arbiter.log`. `environ` is what clients need to find it. `prepared`: fork the daemon from an
-    interpreter that has imported it, unless it is started with variables or a program of its own.
+    The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the
+    simulated card `fakegpu/` and `arbiter.log`. `environ` is what clients need to find it.
+    `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with
+    variables or a program of its own.
     """
 
     def __init__(
@@ -108,7 +111,8 @@ class ArbiterProcess:
         return self.process
 
     def start(self, extra_environ: Mapping[str, str] | None = None) -> "ArbiterProcess":
-        """Start the daemon and wait until it says READY. Raises RuntimeError with its log if it ends or stays silent."""
+        """Start the daemon and wait until it says READY. Raises RuntimeError with its log if it
+        ends or stays silent."""
         self.spawn(extra_environ)
         self.wait_for("READY=1", START_S)
         return self
@@ -143,7 +147,8 @@ class ArbiterProcess:
             os.close(died)
 
     def heard(self, seconds: float) -> list[str]:
-        """What the daemon tells its manager from now on, for so long; what it told before is put aside (`messages`)."""
+        """What the daemon tells its manager from now on, for so long; what it told before is put
+        aside (`messages`)."""
         self._put_aside()
         found: list[str] = []
         deadline = time.monotonic() + seconds
@@ -155,7 +160,8 @@ class ArbiterProcess:
         return found
 
     def _put_aside(self) -> None:
-        """What the daemon has told by now. The kernel keeps no more than ten of its messages, and drops the rest."""
+        """What the daemon has told by now. The kernel keeps no more than ten of its messages, and
+        drops the rest."""
         while select.select([self._notify.fileno()], [], [], 0)[0]:
             self.messages.append(self._notify.recv(4096).decode())
 

@@ -39,7 +39,8 @@ def write_log(driver: CoreDriver, folder: Path, *, made_at: float = START_S) -> 
 
 @dataclass(slots=True)
 class Recording:
-    """A simulated engine whose every event goes to a log file: what a daemon with these consumers would have recorded."""
+    """A simulated engine whose every event goes to a log file: what a daemon with these consumers
+    would have recorded."""
 
     engine: Engine
     file: TextIO

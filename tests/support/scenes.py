@@ -1,4 +1,5 @@
-"""Scenes that several files of the core's tests begin with: a resident holder, a detector that was sent away, a tree of leases."""
+"""Scenes that several files of the core's tests begin with: a resident holder, a detector that was
+sent away, a tree of leases."""
 
 from typing import Any, Literal
 
@@ -23,7 +24,8 @@ def held(
 
 
 def hidden_card(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
-    """A card of 8 GiB as it is from the first reading on: with or without a list of processes, late by so much."""
+    """A card of 8 GiB as it is from the first reading on: with or without a list of processes, late
+    by so much."""
     driver = CoreDriver(8 * GIB, start=False)
     driver.card.lists_processes = lists
     driver.card.lag_s = lag_s

@@ -1,6 +1,8 @@
-"""A sidecar of the tests, in a process of its own: the op family on `clients.net.server`, without any model. Not a test module.
+"""A sidecar of the tests, in a process of its own: the op family on `clients.net.server`, without
+any model. Not a test module.
 
-Usage: server_process.py ENDPOINT [crash | silent | slow]. `crash` prints and exits with 3, `silent` never serves.
+Usage: server_process.py ENDPOINT [crash | silent | slow]. `crash` prints and exits with 3, `silent`
+never serves.
 """
 
 import asyncio
@@ -13,7 +15,8 @@ from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.errors import CODES, VramError
 
 DYING_S = 1.5
-"""A process that held gigabytes of a card hangs up long before the kernel says that it has ended."""
+"""A process that held gigabytes of a card hangs up long before the kernel says that it has
+ended."""
 
 
 def failure(error: VramError) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""The tests' telemetry collector: what was sent is there, however late it is read and whether or not its sender lives."""
+"""The tests' telemetry collector: what was sent is there, however late it is read and whether or
+not its sender lives."""
 
 import http.client
 import socket
@@ -25,7 +26,8 @@ def connected(collector: Collector) -> socket.socket:
 
 
 def test_what_an_exporter_sent_before_it_ended_is_there() -> None:
-    """Regression: on a slow machine a program had ended before the test's own thread had read its last spans."""
+    """Regression: on a slow machine a program had ended before the test's own thread had read its
+    last spans."""
     with Collector() as collector:
         body = batch("last")
         head = (

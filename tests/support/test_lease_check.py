@@ -99,7 +99,7 @@ def test_a_sound_story_is_not_complained_about() -> None:
     assert (story.grants, story.uses, story.allocations, len(story.waits)) == (2, 1, 2, 2)
 
 
-# -- each rule, broken -----------------------------------------------------------------------------------------------------
+# -- each rule, broken
 def without_a_lease(scene: Scene) -> None:
     scene.op(A, "alloc", 1)
 
@@ -202,7 +202,7 @@ def test_each_broken_rule_is_found(rule: str, breaks: Callable[[Scene], None]) -
     assert rule in {finding.rule for finding in scene.judge().findings}
 
 
-# -- what is excused -----------------------------------------------------------------------------------------------------
+# -- what is excused
 def test_a_stowaway_that_nobody_can_have_seen_excuses_a_refusal() -> None:
     scene = Scene()
     scene.born(A)
@@ -255,7 +255,8 @@ def test_a_killed_waiter_is_not_stuck() -> None:
 def beside_what_is_on_its_way(
     left_gib: float, *, charged_gib: float, declared_gib: float = 0.25, ended: str = ""
 ) -> list[str]:
-    """B is granted a card to itself when this much of A's is still there, and IDLE is charged a context that it never put there."""
+    """B is granted a card to itself when this much of A's is still there, and IDLE is charged a
+    context that it never put there."""
     scene = Scene()
     for pid in (A, B, IDLE):
         scene.born(pid)
@@ -293,7 +294,8 @@ MOST_GIB = NOISE_BYTES / GIB
 def test_what_no_reading_can_tell_may_be_beside_an_exclusive_lease_and_no_byte_more(
     charged_gib: float,
 ) -> None:
-    """Without process lists, what a process is charged and does not hold cannot be told from what another still has."""
+    """Without process lists, what a process is charged and does not hold cannot be told from what
+    another still has."""
     assert beside_what_is_on_its_way(MOST_GIB + charged_gib, charged_gib=charged_gib) == []
     assert beside_what_is_on_its_way(MOST_GIB + charged_gib + 1 / GIB, charged_gib=charged_gib) == [
         "exclusive"
@@ -320,7 +322,8 @@ def test_what_the_arbiter_found_beyond_a_context_hides_nothing() -> None:
 def test_time_without_an_arbiter_is_no_wait(
     outages: list[tuple[float, float]], stuck: bool
 ) -> None:
-    """Regression (storm, seed 7): killed and stopped again and again, the daemon had answered for 29 s of 70."""
+    """Regression (storm, seed 7): killed and stopped again and again, the daemon had answered for
+    29 s of 70."""
     scene = sound()
     scene.trace(A, "asked", bytes=1, exclusive=False)
     asked_at = scene.t
@@ -337,7 +340,8 @@ def test_time_without_an_arbiter_is_no_wait(
 
 
 def test_what_ended_in_a_part_of_the_history_that_was_lost_is_not_missed() -> None:
-    """Regression (storm, seed 7): the end of a use was never written, the disk being full until the daemon was killed."""
+    """Regression (storm, seed 7): the end of a use was never written, the disk being full until the
+    daemon was killed."""
 
     def story(lost: int) -> list[str]:
         scene = Scene()
@@ -367,7 +371,8 @@ def test_what_ended_in_a_part_of_the_history_that_was_lost_is_not_missed() -> No
 
 
 def test_a_start_that_a_full_disk_kept_out_of_the_history_is_seen_by_the_names_of_leases() -> None:
-    """Regression: a use whose end the killed daemon did not write down counted on in the next one's life."""
+    """Regression: a use whose end the killed daemon did not write down counted on in the next one's
+    life."""
 
     def story(wanted_by: str) -> list[str]:
         scene = Scene()

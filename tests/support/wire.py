@@ -1,6 +1,7 @@
 """A bare client of the wire for tests: one DEALER, one msgpack map per frame, nothing else.
 
-It can also send what no real client sends. Blocking, with a deadline on every wait; knows nothing of leases.
+It can also send what no real client sends. Blocking, with a deadline on every wait; knows nothing
+of leases.
 """
 
 import time
@@ -41,7 +42,8 @@ class WireClient:
         self._socket.send_multipart(frames)
 
     def send(self, op: str, **fields: Any) -> int:
-        """Send a request without waiting for its reply; returns its id. A hello says the version."""
+        """Send a request without waiting for its reply; returns its id. A hello says the
+        version."""
         self._id += 1
         if op == "hello":
             fields = {"version": d.WIRE_VERSION, **fields}
@@ -102,7 +104,8 @@ class WireClient:
                 self.replies[found["re"]] = found
 
     def acquire(self, consumer: str, load_peak_bytes: int, **spec: Any) -> dict[str, Any]:
-        """Ask for a lease of `load_peak_bytes` (steady the same, no residue unless given); the reply."""
+        """Ask for a lease of `load_peak_bytes` (steady the same, no residue unless given); the
+        reply."""
         footprint = {
             "load_peak_bytes": load_peak_bytes,
             "steady_bytes": spec.pop("steady_bytes", load_peak_bytes),
@@ -121,7 +124,8 @@ class WireClient:
         return self.ask("acquire", spec=wanted, **fields)
 
     def granted(self, consumer: str, load_peak_bytes: int, **spec: Any) -> dict[str, Any]:
-        """`acquire`, and wait for the grant, which a daemon that has just begun to read its card gives later; the lease."""
+        """`acquire`, and wait for the grant, which a daemon that has just begun to read its card
+        gives later; the lease."""
         reply = self.acquire(consumer, load_peak_bytes, **spec)
         assert reply["ok"], reply
         lease: dict[str, Any] = reply["lease"]

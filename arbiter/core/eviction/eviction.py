@@ -1,7 +1,8 @@
 """The ladder towards a holder: ask, ask again until heard, remind, deadline.
 
-A holder is only ever *asked*. It unloads by itself at its safe point; the core refuses its `unloading` before that. What comes after the
-deadline was agreed by the holder itself (`on_overstay` of its own lease), and is never done to a process that uses anything.
+A holder is only ever *asked*. It unloads by itself at its safe point; the core refuses its
+`unloading` before that. What comes after the deadline was agreed by the holder itself
+(`on_overstay` of its own lease), and is never done to a process that uses anything.
 """
 
 from typing import Literal
@@ -60,7 +61,8 @@ def ask(
 
 
 def push_revoke(core: Core, holder: Lease, eviction: Eviction) -> None:
-    """`uses` counts what still runs on the lease, also what others marked: at 0 the holder is at its safe point."""
+    """`uses` counts what still runs on the lease, also what others marked: at 0 the holder is at
+    its safe point."""
     assert holder.token is not None, f"{holder.id} is revoked without a token"
     waiter, order = None, eviction.order
     if eviction.wanted_by is not None and order is None:
@@ -119,7 +121,8 @@ def ask_again(core: Core, holder: Lease) -> None:
 
 
 def on_ladder_due(core: Core, lease_id: str) -> None:
-    """A step of the ladder. Who has begun to unload is asked nothing more, and has a whole deadline for it."""
+    """A step of the ladder. Who has begun to unload is asked nothing more, and has a whole deadline
+    for it."""
     holder = core.leases[LeaseId(lease_id)]
     eviction = holder.departure.eviction
     if holder.state is LeaseState.UNLOADING:
@@ -142,7 +145,8 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
 
 
 def _unload_hangs(core: Core, holder: Lease) -> None:
-    """It unloads, and has not ended within a deadline. Others are asked in its place, and the card is not kept free for its bytes."""
+    """It unloads, and has not ended within a deadline. Others are asked in its place, and the card
+    is not kept free for its bytes."""
     holder.departure.hangs = True
     if holder.departure.eviction is not None:
         holder.departure.eviction.overdue = True
@@ -150,7 +154,8 @@ def _unload_hangs(core: Core, holder: Lease) -> None:
 
 
 def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
-    """The holder outstayed. Its waiter is denied if that is its wish; the `revoke` stands in any case."""
+    """The holder outstayed. Its waiter is denied if that is its wish; the `revoke` stands in any
+    case."""
     wanted_by, consumer = (eviction.wanted_by, eviction.wanted_consumer) if eviction else (None, "")
     core.note("deadline_passed", holder, uses=len(holder.uses), wanted_by=consumer)
     core.wake(core.gpu_of(holder))
@@ -164,9 +169,11 @@ def _deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
 
 
 def on_overstay_due(core: Core, lease_id: str) -> None:
-    """Has the holder outstayed, idle, for the whole deadline since its last use or step? Then its process is told to end, as it agreed.
+    """Has the holder outstayed, idle, for the whole deadline since its last use or step? Then its
+    process is told to end, as it agreed.
 
-    Nothing is done to a process that uses any lease, its own or another's: that is looked at again later.
+    Nothing is done to a process that uses any lease, its own or another's: that is looked at again
+    later.
     """
     holder = core.leases[LeaseId(lease_id)]
     eviction = holder.departure.eviction
@@ -195,7 +202,8 @@ def on_overstay_due(core: Core, lease_id: str) -> None:
 
 
 def _overstays_at(core: Core, holder: Lease, eviction: Eviction) -> float:
-    """A whole deadline after it was asked, after its last use and after its last step towards the exit."""
+    """A whole deadline after it was asked, after its last use and after its last step towards the
+    exit."""
     if eviction.signalled:
         return core.now
     return (

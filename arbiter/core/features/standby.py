@@ -93,7 +93,7 @@ class Standby(Feature):
             self.watch(request)
         return False
 
-    # -- leaving -----------------------------------------------------------------------------------
+    # -- leaving
     def on_release(self, core: Core, event: ReleaseReported, lease: Lease) -> None:
         """Decide whether a lease goes on standby or is parked. Raises Refused."""
         if event.parked:
@@ -223,7 +223,7 @@ class Standby(Feature):
         self.host.drop(lease.id)
         return leaves
 
-    # -- wanted by the holder ----------------------------------------------------------------------
+    # -- wanted by the holder
     def on_acquire(self, core: Core, event: AcquireRequested, known: Lease | None) -> bool:
         """Take an acquire whose process has a lease for the model that is away."""
         if known is not None:
@@ -319,7 +319,7 @@ class Standby(Feature):
         lease.request.planned_gpu = None
         core.enqueue(lease)
 
-    # -- coming back by itself ---------------------------------------------------------------------
+    # -- coming back by itself
     def serve(self, core: Core, gpu: Gpu, head: Lease | None) -> None:
         """Grant the lease that comes back to a GPU for which nothing waits."""
         back = None if head is not None else self._next_back(core, gpu)
@@ -414,7 +414,7 @@ class Standby(Feature):
         lease = core.leases[LeaseId(subject)]
         _end(core, lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
 
-    # -- across a restart --------------------------------------------------------------------------
+    # -- across a restart
     def to_record(self, lease: Lease) -> Mapping[str, Any]:
         """Write down where a lease goes, or how it is away."""
         absence = self.absences.get(lease.id)
@@ -472,7 +472,7 @@ class Standby(Feature):
                 self.host.find(lease.id, lease.spec.park_bytes)
             let_go(core, lease, exiting=False, why=Why.LET_GO_BEFORE)
 
-    # -- answers -----------------------------------------------------------------------------------
+    # -- answers
     def can_park(self, lease: Lease) -> bool:
         """Return whether host RAM is booked for a revoked lease, or has room for another."""
         if lease.departure.eviction is not None:
@@ -514,7 +514,8 @@ class Standby(Feature):
         return Standing(gpu, lease, (lease,), (lease,), back=back, ahead=ahead, due_s=due_s)
 
     def _outlook(self, core: Core, lease: Lease) -> tuple[Return, str, float | None]:
-        """Return what a lease that is away waits for, the consumer before it, and in how many seconds it returns."""
+        """Return what a lease that is away waits for, the consumer before it, and in how many
+        seconds it returns."""
         absence = self.absences[lease.id]
         if not lease.attached:
             return Return.HOLDER, "", None

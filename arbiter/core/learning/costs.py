@@ -1,6 +1,8 @@
-"""What leaving and coming back costs, learnt: seconds to reload, how likely that is to be wanted, and who keeps switching with whom.
+"""What leaving and coming back costs, learnt: seconds to reload, how likely that is to be wanted,
+and who keeps switching with whom.
 
-Only ever orders victims that are otherwise alike, and stretches a residency within a cap: nothing learnt can make a wait endless.
+Only ever orders victims that are otherwise alike, and stretches a residency within a cap: nothing
+learnt can make a wait endless.
 """
 
 from vram_arbiter.arbiter.core.model.lease import Lease
@@ -35,9 +37,10 @@ def can_park(core: Core, lease: Lease) -> bool:
     return any(feature.can_park(lease) for feature in lease.features)
 
 
-# -- thrash ------------------------------------------------------------------------------------------------------------
+# -- thrash
 def switched(core: Core, gone: str, came: str) -> None:
-    """One consumer made room for another. Pairs that have not switched for a while are forgotten."""
+    """One consumer made room for another. Pairs that have not switched for a while are
+    forgotten."""
     window_s = core.settings.thrash_window_s
     for pair in [pair for pair, at in core.switches.items() if at <= core.now - window_s]:
         del core.switches[pair]
@@ -45,9 +48,11 @@ def switched(core: Core, gone: str, came: str) -> None:
 
 
 def hold_s(core: Core, holder: Lease, waiter: Lease) -> float:
-    """How long a holder may stay against this waiter because the two keep throwing each other out: one switch's learnt cost, capped.
+    """How long a holder may stay against this waiter because the two keep throwing each other out:
+    one switch's learnt cost, capped.
 
-    Nothing against a waiter of higher priority, nor once a pair has not switched both ways within the window.
+    Nothing against a waiter of higher priority, nor once a pair has not switched both ways within
+    the window.
     """
     a, b = holder.spec.consumer, waiter.spec.consumer
     if waiter.spec.priority > holder.spec.priority or not (

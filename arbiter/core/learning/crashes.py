@@ -1,8 +1,10 @@
 """Models that die in their load, again and again, do not throw others out for every try.
 
-Whoever supervises a program starts it again at once, and each start would empty the card for a load that fails. After a few failures in a
-row an acquire for which somebody would have to leave is refused for a while, twice as long after each, with the cause of the last one.
-What fits as the card is costs nobody anything and is granted as ever. One load that succeeds forgets it all; so does a restart.
+Whoever supervises a program starts it again at once, and each start would empty the card for a load
+that fails. After a few failures in a row an acquire for which somebody would have to leave is
+refused for a while, twice as long after each, with the cause of the last one. What fits as the card
+is costs nobody anything and is granted as ever. One load that succeeds forgets it all; so does a
+restart.
 """
 
 from typing import Final

@@ -1,8 +1,10 @@
-"""What leases really take, learnt from readings and from their holders' words, and who drifts from what it declared.
+"""What leases really take, learnt from readings and from their holders' words, and who drifts from
+what it declared.
 
-While a lease loads, its card is read often (`load_probe_s`), so that the peak between two readings is short; a sampled peak is a lower bound
-all the same, so only one *above* the declared is drift. What is resident is followed until it leaves. A process with several leases on
-one card shows one sum: nothing is learnt from it. Changes no charge: a footprint counts from the next acquire on.
+While a lease loads, its card is read often (`load_probe_s`), so that the peak between two readings
+is short; a sampled peak is a lower bound all the same, so only one *above* the declared is drift.
+What is resident is followed until it leaves. A process with several leases on one card shows one
+sum: nothing is learnt from it. Changes no charge: a footprint counts from the next acquire on.
 """
 
 from vram_arbiter.arbiter.core.events import Spec
@@ -17,13 +19,15 @@ _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
 
 
 def model_name(spec: Spec) -> str:
-    """Under which name a footprint is learnt: another consumer of the same model may load it in another way."""
+    """Under which name a footprint is learnt: another consumer of the same model may load it in
+    another way."""
     return f"{spec.consumer} {spec.key}"
 
 
-# -- what a request is charged -----------------------------------------------------------------------------------------
+# -- what a request is charged
 def expected_bytes(core: Core, spec: Spec) -> tuple[int, int]:
-    """(load peak, steady): the larger of declared and learnt. Learnt bytes alone never exceed the largest card's budget."""
+    """(load peak, steady): the larger of declared and learnt. Learnt bytes alone never exceed the
+    largest card's budget."""
     name = model_name(spec)
     steady_learnt = core.footprints.p95_bytes(name, "steady")
     peak_learnt = core.footprints.p95_bytes(name, "load_peak")
@@ -34,7 +38,7 @@ def expected_bytes(core: Core, spec: Spec) -> tuple[int, int]:
     return max(spec.load_peak_bytes, steady, peak_learnt), steady
 
 
-# -- what is seen ------------------------------------------------------------------------------------------------------
+# -- what is seen
 def on_evidence(core: Core, gpu: Gpu) -> None:
     """The ledger has taken the evidence of a reading."""
     for account in gpu.ledger.accounts.values():
@@ -65,7 +69,8 @@ def on_ready(core: Core, lease: Lease, measured: int | None) -> None:
 
 
 def on_leaving(core: Core, lease: Lease) -> None:
-    """It lets go, was lost, or expired: what it took at most is one life's figure. A load that was cut off says only if it was too much."""
+    """It lets go, was lost, or expired: what it took at most is one life's figure. A load that was
+    cut off says only if it was too much."""
     if lease.observed.steady_bytes:
         core.footprints.measured(model_name(lease.spec), "steady", lease.observed.steady_bytes)
         _note_drift(core, lease, "steady", lease.observed.steady_bytes)
@@ -78,7 +83,8 @@ def on_leaving(core: Core, lease: Lease) -> None:
 
 
 def on_verdict(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """A living process has given its lease back: what it holds now is its residue. Called before its charge is dropped."""
+    """A living process has given its lease back: what it holds now is its residue. Called before
+    its charge is dropped."""
     account = gpu.ledger.accounts[verification.process]
     if verification.vanishes or gpu.sample is None or len(account.charges) > 1:
         return
@@ -87,7 +93,7 @@ def on_verdict(core: Core, gpu: Gpu, verification: Verification) -> None:
         core.footprints.measured(verification.model, "residue", held)
 
 
-# -- what is shown -----------------------------------------------------------------------------------------------------
+# -- what is shown
 def measured_bytes(gpu: Gpu, lease: Lease) -> int:
     """What the newest reading shows of a lease; 0: it cannot say."""
     account = gpu.ledger.accounts[lease.process]
@@ -104,7 +110,8 @@ def held_bytes(gpu: Gpu, lease: Lease) -> int:
 
 
 def drift_bytes(core: Core, gpu: Gpu, lease: Lease) -> int:
-    """How far a resident lease is above (below: negative) what it declared; within the tolerance it is 0, as where nobody can say."""
+    """How far a resident lease is above (below: negative) what it declared; within the tolerance it
+    is 0, as where nobody can say."""
     if lease.state not in _RESIDENT or _size_changes(core, lease):
         return 0
     drift = (held_bytes(gpu, lease) or lease.spec.steady_bytes) - lease.spec.steady_bytes

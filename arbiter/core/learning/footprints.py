@@ -1,7 +1,9 @@
-"""What models really took: measured load peaks, steady bytes and residues per consumer and key, as far as the last 64 loads go.
+"""What models really took: measured load peaks, steady bytes and residues per consumer and key, as
+far as the last 64 loads go.
 
-Declared footprints are estimates, and estimates are wrong by gigabytes. A request is charged the larger of what it declares and the 95th
-percentile of what was measured. An out-of-memory report counts for the next loads whatever they measure. Knows nothing of leases or cards.
+Declared footprints are estimates, and estimates are wrong by gigabytes. A request is charged the
+larger of what it declares and the 95th percentile of what was measured. An out-of-memory report
+counts for the next loads whatever they measure. Knows nothing of leases or cards.
 """
 
 from collections import deque
@@ -15,7 +17,8 @@ HISTORY_MAX = 64
 MODELS_MAX = 256
 """Models remembered; the ones not heard of for longest are forgotten."""
 OOM_LOADS = 20
-"""An out-of-memory report holds for so many loads; with fewer measurements the 95th percentile is their maximum anyway."""
+"""An out-of-memory report holds for so many loads; with fewer measurements the 95th percentile is
+their maximum anyway."""
 
 type Part = Literal["load_peak", "steady", "residue"]
 PARTS: tuple[Part, ...] = ("load_peak", "steady", "residue")
@@ -61,7 +64,8 @@ class Footprints:
         model.oom_loads = OOM_LOADS
 
     def p95_bytes(self, name: str, part: Part) -> int:
-        """95th percentile (nearest rank) of what was measured, at least what an out-of-memory report asked for; 0: never seen."""
+        """95th percentile (nearest rank) of what was measured, at least what an out-of-memory
+        report asked for; 0: never seen."""
         model = self._models.get(name)
         if model is None:
             return 0
@@ -79,7 +83,8 @@ class Footprints:
         }
 
     def restore(self, kept: Mapping[str, Mapping[str, Any]]) -> None:
-        """What `kept` gave, perhaps long ago and by another version: what is not understood is left out."""
+        """What `kept` gave, perhaps long ago and by another version: what is not understood is left
+        out."""
         for name, parts in kept.items():
             model = self._model(name)
             for part in PARTS:

@@ -1,12 +1,14 @@
 """The bytes of one card: who is charged what, what processes keep, what strangers hold.
 
-Ledger and measurement are two gates. Booked bytes are what was granted; evidence (per-process readings) is only added on
-top where somebody holds more than was booked. Knows nothing of states, order or time beyond `now`.
+Ledger and measurement are two gates. Booked bytes are what was granted; evidence (per-process
+readings) is only added on top where somebody holds more than was booked. Knows nothing of states,
+order or time beyond `now`.
 
-One process shares one context among its leases, so an account counts max(its charges together, its residue): a residue is
-folded into the next lease of the same process and never charged twice.
+One process shares one context among its leases, so an account counts max(its charges together, its
+residue): a residue is folded into the next lease of the same process and never charged twice.
 
-Sums are kept as accounts change, never counted again: a decision must not cost more because many have leases. `disagreement` counts.
+Sums are kept as accounts change, never counted again: a decision must not cost more because many
+have leases. `disagreement` counts.
 """
 
 from collections.abc import Iterable, Mapping
@@ -22,7 +24,8 @@ NOBODY: Mapping[ProcessKey, int] = {}
 
 @dataclass(slots=True)
 class Charge:
-    """`approved_bytes` fitted when they were granted; what lies above came later, by the holder's own word (pressure)."""
+    """`approved_bytes` fitted when they were granted; what lies above came later, by the holder's
+    own word (pressure)."""
 
     booked_bytes: int
     approved_bytes: int
@@ -54,7 +57,8 @@ class Account:
         return max(self.charged_approved_bytes, self.residue_bytes)
 
     def kept_bytes(self) -> int:
-        """What the process keeps beyond its charges: bytes that a new charge would be folded with."""
+        """What the process keeps beyond its charges: bytes that a new charge would be
+        folded with."""
         return max(0, self.residue_bytes - self.charged_bytes)
 
     def occupied_bytes(self) -> int:
@@ -94,7 +98,7 @@ class GpuLedger:
         self._approved_bytes = 0
         self._strangers_bytes = 0
 
-    # -- reading ---------------------------------------------------------------------------------------------------
+    # -- reading
     def total_bytes(self) -> int:
         """Booked bytes, evidence above them, and stowaways."""
         return self._occupied_bytes + self._strangers_bytes + self.unnamed_bytes
@@ -116,12 +120,14 @@ class GpuLedger:
         return self._approved_bytes
 
     def pressure_bytes(self) -> int:
-        """By how much everything together exceeds the budget; less than the tolerance is no pressure."""
+        """By how much everything together exceeds the budget; less than the tolerance is no
+        pressure."""
         over = self.total_bytes() - self.budget_bytes
         return over if over > self._tolerance_bytes else 0
 
     def driver_bytes(self) -> int:
-        """What a reading may show that nobody is charged: the driver's own bytes, or the whole reserve while those were never seen."""
+        """What a reading may show that nobody is charged: the driver's own bytes, or the whole
+        reserve while those were never seen."""
         return self.info.reserve_bytes if self.overhead_bytes is None else self.overhead_bytes
 
     def unlisted_bytes(self, reading: MemorySampled) -> int | None:
@@ -157,7 +163,8 @@ class GpuLedger:
         *,
         stowaways: bool = True,
     ) -> int:
-        """Total bytes if some leases left (each keeping the residue given) and processes got so many more, beside stowaways or without."""
+        """Total bytes if some leases left (each keeping the residue given) and processes got so
+        many more, beside stowaways or without."""
         total = self.total_bytes() if stowaways else self._occupied_bytes
         if not leaving and not joining:
             return total
@@ -177,7 +184,8 @@ class GpuLedger:
         return total
 
     def total_if_moved(self, lease: LeaseId, count: int, to: ProcessKey) -> int:
-        """Total bytes if so much of a charge were booked on another process: evidence that it covered counts from then on."""
+        """Total bytes if so much of a charge were booked on another process: evidence that it
+        covered counts from then on."""
         owner = self._owner[lease]
         if owner == to:
             return self.total_bytes()
@@ -188,7 +196,8 @@ class GpuLedger:
     def process_after_bytes(
         self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool
     ) -> int:
-        """What a process may still hold once these leases are gone. A dead one without other debts: nothing."""
+        """What a process may still hold once these leases are gone. A dead one without other debts:
+        nothing."""
         account = self.accounts.get(process)
         if account is None:
             return 0
@@ -200,7 +209,8 @@ class GpuLedger:
     def total_after_bytes(
         self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool
     ) -> int:
-        """Total bytes once these leases of one process are gone: what a verification expects at most."""
+        """Total bytes once these leases of one process are gone: what a verification expects at
+        most."""
         total = self.total_bytes()
         for owner in {self._owner[lease] for lease in self.reserved}:
             total -= self.accounts[owner].occupied_bytes() - self._filled(self.accounts[owner])
@@ -225,7 +235,8 @@ class GpuLedger:
         )
 
     def filled_bytes(self, process: ProcessKey) -> int:
-        """What is booked for a process without what is only kept for leases of it that are not granted yet."""
+        """What is booked for a process without what is only kept for leases of it that are not
+        granted yet."""
         account = self.accounts.get(process)
         if account is None:
             return 0
@@ -239,15 +250,22 @@ class GpuLedger:
         return sum(charges[lease].booked_bytes for lease in self.reserved if lease in charges)
 
     def disagreement(self) -> str:
-        """Where the kept sums and the accounts disagree; "" if nowhere. Counts everything: for tests."""
+        """Where the kept sums and the accounts disagree; "" if nowhere. Counts everything: for
+        tests."""
         for process, account in self.accounts.items():
             booked = sum(charge.booked_bytes for charge in account.charges.values())
             approved = sum(charge.approved_bytes for charge in account.charges.values())
             if (booked, approved) != (account.charged_bytes, account.charged_approved_bytes):
-                return f"{process} is charged {booked} ({approved}), kept as {account.charged_bytes} ({account.charged_approved_bytes})"
+                return (
+                    f"{process} is charged {booked} ({approved}), kept as {account.charged_bytes} "
+                    f"({account.charged_approved_bytes})"
+                )
             for lease, charge in account.charges.items():
                 if charge.approved_bytes > charge.booked_bytes:
-                    return f"{lease} is booked {charge.booked_bytes} and approved {charge.approved_bytes}"
+                    return (
+                        f"{lease} is booked {charge.booked_bytes} and approved "
+                        f"{charge.approved_bytes}"
+                    )
         kept = (
             self._occupied_bytes,
             self._booked_bytes,
@@ -265,7 +283,7 @@ class GpuLedger:
     def _stranger_of(self, process: ProcessKey) -> Stranger | None:
         return self.strangers.get(process) or self.strangers.get(ProcessKey(process.pid, 0))
 
-    # -- changing --------------------------------------------------------------------------------------------------
+    # -- changing
     def charge(
         self,
         lease: LeaseId,
@@ -288,7 +306,8 @@ class GpuLedger:
         self.reserved.add(lease)
 
     def recharge(self, lease: LeaseId, booked_bytes: int, now: float) -> None:
-        """The holder is ready: book what it says it holds. What exceeds the grant was never approved."""
+        """The holder is ready: book what it says it holds. What exceeds the grant was never
+        approved."""
         account = self.accounts[self._owner[lease]]
         before = account.charges[lease]
         after = Charge(booked_bytes, min(before.approved_bytes, booked_bytes), before.debt)
@@ -312,9 +331,11 @@ class GpuLedger:
         self.accounts[self._owner[lease]].charges[lease].debt = True
 
     def drop(self, lease: LeaseId, residue_bytes: int, floor_bytes: int, now: float) -> int:
-        """The bytes of a lease came back but for a residue. Returns the residue now charged to its process.
+        """The bytes of a lease came back but for a residue. Returns the residue now charged to its
+        process.
 
-        Never more than was charged before: what a process holds beyond that is evidence, not a booking.
+        Never more than was charged before: what a process holds beyond that is evidence, not a
+        booking.
         """
         account = self.accounts[self._owner.pop(lease)]
         before_bytes = account.approved_bytes()
@@ -328,7 +349,8 @@ class GpuLedger:
         return account.residue_bytes
 
     def withdraw(self, lease: LeaseId, now: float) -> None:
-        """Take a charge back that was never filled, or a grant that nobody has heard of: the account is as it was before."""
+        """Take a charge back that was never filled, or a grant that nobody has heard of: the
+        account is as it was before."""
         self.reserved.discard(lease)
         account = self.accounts[self._owner.pop(lease)]
         self._charge(account, lease, None)
@@ -339,7 +361,8 @@ class GpuLedger:
     def set_residue(
         self, process: ProcessKey, residue_bytes: int, now: float, floor_bytes: int = 0
     ) -> None:
-        """Charge (or, with 0, forget) what a process keeps outside its leases; `floor_bytes` of it were declared."""
+        """Charge (or, with 0, forget) what a process keeps outside its leases; `floor_bytes` of it
+        were declared."""
         account = self._open(process, now)
         account.residue_bytes = residue_bytes
         account.residue_floor_bytes = max(account.residue_floor_bytes, floor_bytes)
@@ -348,7 +371,8 @@ class GpuLedger:
         self._close_if_empty(account)
 
     def bury(self, process: ProcessKey) -> None:
-        """The process died: it is not expected to keep anything. What is charged stays until measured gone."""
+        """The process died: it is not expected to keep anything. What is charged stays until
+        measured gone."""
         self.accounts[process].residue_floor_bytes = 0
 
     def observe(self, reading: MemorySampled, *, quiet: bool, pending_bytes: int = 0) -> None:
@@ -401,7 +425,8 @@ class GpuLedger:
         return account
 
     def _take_rest(self, rest_bytes: int, pending_bytes: int, *, complete: bool) -> None:
-        """What nobody explains: the driver's own up to the reserve, somebody's beyond it. What may be going is neither, if it is new."""
+        """What nobody explains: the driver's own up to the reserve, somebody's beyond it. What may
+        be going is neither, if it is new."""
         reserve = self.info.reserve_bytes
         stays_bytes = max(0, rest_bytes - pending_bytes)
         least, most = max(0, stays_bytes - reserve), max(0, rest_bytes - reserve)
@@ -432,7 +457,7 @@ class GpuLedger:
         account.measured_bytes = 0  # older evidence no longer says anything about this account
         self._count(account)
 
-    # -- kept sums -------------------------------------------------------------------------------------------------
+    # -- kept sums
     def _charge(self, account: Account, lease: LeaseId, charge: Charge | None) -> None:
         """The one place where an account's charges change. None: the charge goes."""
         before = account.charges.pop(lease, None) if charge is None else account.charges.get(lease)

@@ -66,11 +66,13 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 
 LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
 AWAY = frozenset({_S.PARKED, _S.STANDBY})
-"""States of a lease that lives on without bytes on a card: nobody renews it, it waits for nothing with a bound."""
+"""States of a lease that lives on without bytes on a card: nobody renews it, it waits for nothing
+with a bound."""
 EXPIRING = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING})
 """States that a holder must renew."""
 NONCES_MAX = 8
-"""Acquires remembered of a lease that is taken over again and again; an older repeat would be a new acquire."""
+"""Acquires remembered of a lease that is taken over again and again; an older repeat would be a new
+acquire."""
 STORY_MAX = 32
 """Steps remembered of a lease; one that goes and comes back lives long."""
 
@@ -85,7 +87,8 @@ class IllegalTransition(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """A busy interval. It ends with the client that marked it at the latest; "": it is from the journal, and not said again yet."""
+    """A busy interval. It ends with the client that marked it at the latest; "": it is from the
+    journal, and not said again yet."""
 
     id: UseId
     client: ClientId
@@ -117,7 +120,8 @@ class Eviction:
     verdict: str = ""
     gang: str = ""  # of the waiter
     order: Order | None = None  # an operator wanted it
-    # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited for
+    # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited
+    # for
     traceparent: str | None = None
 
     @property
@@ -240,7 +244,8 @@ class Lease:
         now: float,
         why: str,
     ) -> "Lease":
-        """Return a lease that a restart found in one of the states RECOVERED; no other way leads past the table."""
+        """Return a lease that a restart found in one of the states RECOVERED; no other way leads
+        past the table."""
         assert state in RECOVERED, f"{lease_id} cannot be found {state}"
         lease = cls(lease_id, spec, process, ClientId(""), request, state, token)
         lease.story.append((now, state, why))

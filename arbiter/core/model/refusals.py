@@ -1,7 +1,7 @@
 """Refusals of the engine: one class per cause, with the values that explain it.
 
-They hold codes and values only. Words are made in `arbiter.rpc.words`, so rewording a message changes no decision and
-no replay. The fields are the `details` of the error on the wire.
+They hold codes and values only. Words are made in `arbiter.rpc.words`, so rewording a message
+changes no decision and no replay. The fields are the `details` of the error on the wire.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ class Refused(Exception):
         self.refusal = refusal
 
 
-# -- sessions and tokens -----------------------------------------------------------------------------------------------
+# -- sessions and tokens
 @dataclass(frozen=True, slots=True)
 class NoSession(Refusal):
     """The connection has not said hello."""
@@ -59,7 +59,7 @@ class NotHolder(Refusal):
     pid: int
 
 
-# -- states ------------------------------------------------------------------------------------------------------------
+# -- states
 class Misfit(StrEnum):
     """Why a request does not fit the state of its lease."""
 
@@ -149,7 +149,8 @@ class LeaseOver(Refusal):
 
 @dataclass(frozen=True, slots=True)
 class TargetOver(Refusal):
-    """An operator named a lease that is over: the refusal that its holder would get, with `code` of that."""
+    """An operator named a lease that is over: the refusal that its holder would get, with `code` of
+    that."""
 
     code: str  # type: ignore[misc]  # of `ended`
     ended: Refusal
@@ -172,7 +173,7 @@ class Revoked(Refusal):
     revoked: RevokeCause | None = None
 
 
-# -- bytes and places --------------------------------------------------------------------------------------------------
+# -- bytes and places
 @dataclass(frozen=True, slots=True)
 class UnknownGpu(Refusal):
     """The selector names no GPU."""
@@ -185,7 +186,8 @@ class UnknownGpu(Refusal):
 
 @dataclass(frozen=True, slots=True)
 class TooLarge(Refusal):
-    """A request can never fit. `needed_bytes` exceeds `declared_bytes` where more was measured before."""
+    """A request can never fit. `needed_bytes` exceeds `declared_bytes` where more was measured
+    before."""
 
     code: ClassVar = "vram_insufficient"
 
@@ -250,7 +252,8 @@ class LimitReached(Refusal):
 
 @dataclass(frozen=True, slots=True)
 class LoadFails(Refusal):
-    """The model died in its load `failures` times in a row; no holder is revoked for it for `retry_in_s`."""
+    """The model died in its load `failures` times in a row; no holder is revoked for it for
+    `retry_in_s`."""
 
     code: ClassVar = "load_failing"
 
@@ -261,7 +264,7 @@ class LoadFails(Refusal):
     retry_in_s: float
 
 
-# -- ends --------------------------------------------------------------------------------------------------------------
+# -- ends
 @dataclass(frozen=True, slots=True)
 class CancelledRequest(Refusal):
     """A request ended because of its own client. `by` is the reason of a client that left."""
@@ -335,7 +338,7 @@ class NotJournaled(Refusal):
     problem: str
 
 
-# -- gangs -------------------------------------------------------------------------------------------------------------
+# -- gangs
 @dataclass(frozen=True, slots=True)
 class GangMismatch(Refusal):
     """A member does not fit its gang: another size (`asked`), or all members have asked already."""
@@ -372,7 +375,8 @@ class GangEnd(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class BrokenGang(Refusal):
-    """The gang will not be granted. `consumer`, `lease_id`, `state`: the fallen member; `because`: its refusal."""
+    """The gang will not be granted. `consumer`, `lease_id`, `state`: the fallen member; `because`:
+    its refusal."""
 
     code: ClassVar = "gang_broken"
 
@@ -384,7 +388,7 @@ class BrokenGang(Refusal):
     because: str = ""  # wire code
 
 
-# -- deadlocks ---------------------------------------------------------------------------------------------------------
+# -- deadlocks
 @dataclass(frozen=True, slots=True)
 class NamedLease:
     """A lease in a cycle."""

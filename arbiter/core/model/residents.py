@@ -30,7 +30,7 @@ class Residents(dict[LeaseId, Lease]):
         self.touched: set[LeaseId] = set()
         """Leases that came or went since the last check of the invariants."""
 
-    # -- changing ----------------------------------------------------------------------------------
+    # -- changing
     def __setitem__(self, lease_id: LeaseId, lease: Lease) -> None:
         self.pop(lease_id, None)
         super().__setitem__(lease_id, lease)
@@ -84,14 +84,15 @@ class Residents(dict[LeaseId, Lease]):
         for lease in [lease for lease in self.recent.values() if not self._after(lease, taken_at)]:
             del self.recent[lease.id]
 
-    # -- reading -----------------------------------------------------------------------------------
+    # -- reading
     def in_state(self, *states: LeaseState) -> list[Lease]:
         """Leases in these states, in the order in which they came to them."""
         return [lease for state in states for lease in self._by_state[state].values()]
 
     def any_in(self, states: Iterable[LeaseState]) -> bool:
         by_state = self._by_state
-        for state in states:  # noqa: SIM110 - asked with every event, and a generator costs more than the answer
+        # asked with every event, and a generator costs more than the answer
+        for state in states:  # noqa: SIM110
             if by_state[state]:
                 return True
         return False

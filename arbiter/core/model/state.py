@@ -92,7 +92,8 @@ class Reuse:
 
 @dataclass(slots=True)
 class Refusals:
-    """Notes of one process's refused requests (`refusals`): how many lately, and how many were left out."""
+    """Notes of one process's refused requests (`refusals`): how many lately, and how many were left
+    out."""
 
     at: float
     noted: float = 0.0
@@ -201,7 +202,7 @@ class Core:
         for gpu in self.gpus.values():
             self.wake(gpu)
 
-    # -- effects ---------------------------------------------------------------------------------------------------
+    # -- effects
     def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None:
         self.turn.effects.append(Reply(client, request, body))
 
@@ -226,7 +227,8 @@ class Core:
         self.turn.effects.append(JournalDelete(key))
 
     def want_sample(self, gpu: Gpu, not_before: float) -> None:
-        """Ask for a reading that begins at `not_before` or later, unless such a one is under way."""
+        """Ask for a reading that begins at `not_before` or later, unless such a one is
+        under way."""
         if gpu.asked_at is None or gpu.asked_at < not_before:
             gpu.asked_at = self.now
             self.turn.effects.append(Sample(gpu.info.id))
@@ -238,9 +240,10 @@ class Core:
         if planned is None or due < planned:
             self.timers.set(key, due)
 
-    # -- bookkeeping -----------------------------------------------------------------------------------------------
+    # -- bookkeeping
     def voice_of(self, lease: Lease) -> ClientId:
-        """Where pushes about a lease go: its client, or another living connection of the same process."""
+        """Where pushes about a lease go: its client, or another living connection of the same
+        process."""
         client = self.clients.get(lease.client)
         if client is not None and client.process == lease.process:
             return lease.client
@@ -252,8 +255,10 @@ class Core:
         return LeaseId(f"L{self.settings.epoch}-{self.serial}")
 
     def next_token(self) -> Token:
-        """Return a token greater than every one before it. With `Settings.token_secret` the distance to the last one cannot be guessed:
-        a token is what authorizes a use, and lease ids are public."""
+        """Return a token greater than every one before it. With `Settings.token_secret` the
+        distance to the last one cannot be guessed: a token is what authorizes a use, and lease ids
+        are public.
+        """
         self.serial += 1
         if self.settings.token_secret:
             key = bytes.fromhex(self.settings.token_secret)
@@ -271,7 +276,8 @@ class Core:
         return self.gpus[lease.gpu]
 
     def wake(self, gpu: Gpu) -> None:
-        """Serve the queue of a GPU in this turn: something changed that a waiter there may wait for."""
+        """Serve the queue of a GPU in this turn: something changed that a waiter there may wait
+        for."""
         self.turn.dirty[gpu.info.index] = gpu
         self.turn.touch(gpu)
 
@@ -311,7 +317,8 @@ class Core:
         return self._waiting_by.get(process, 0), self._waiting_by.get(uid, 0)
 
     def disagreement(self) -> str:
-        """Where the tables of owners and the leases disagree; "" if nowhere. Looks at everybody: for tests."""
+        """Where the tables of owners and the leases disagree; "" if nowhere. Looks at everybody:
+        for tests."""
         by_process = {
             lease_id: owner for owner, some in self._of_process.items() for lease_id in some
         }
@@ -442,7 +449,8 @@ class Core:
                 self.nonces.pop((oldest.process, nonce), None)
 
     def learn(self, consumer: str, phase: str, seconds: float) -> None:
-        """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a consumer."""
+        """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a
+        consumer."""
         phases = self.durations.pop(consumer, {})
         self.durations[consumer] = phases  # the newest last
         _forget_oldest(self.durations)
@@ -461,8 +469,10 @@ class Core:
         return median(seen) if seen else None
 
     def record_lease(self, lease: Lease, *, debt: bool = False, gates: bool = False) -> None:
-        """Write a lease that is resident (or its debt) or away to the journal. `gates`: it is a grant, which does not take place
-        unless its record is written. Whatever else is recorded has happened; a stale record makes a later recovery more careful."""
+        """Write a lease that is resident (or its debt) or away to the journal. `gates`: it is a
+        grant, which does not take place unless its record is written. Whatever else is recorded has
+        happened; a stale record makes a later recovery more careful.
+        """
         spec = lease.spec
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"

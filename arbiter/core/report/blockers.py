@@ -1,6 +1,8 @@
-"""What is in a waiter's way: how many bytes each holder has, and on which condition they come free. Reads only.
+"""What is in a waiter's way: how many bytes each holder has, and on which condition they come free.
+Reads only.
 
-Everything charged on the GPU is listed: holders, members of a gang that wait for their turn, contexts, debts, stowaways.
+Everything charged on the GPU is listed: holders, members of a gang that wait for their turn,
+contexts, debts, stowaways.
 """
 
 from heapq import nlargest
@@ -20,7 +22,8 @@ LONG_LOAD_S = 10.0
 
 
 def who_blocks(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> tuple[Blocker, ...]:
-    """List what holds bytes that the waiter lacks, or holds the GPU alone. The requests of a gang count as one."""
+    """List what holds bytes that the waiter lacks, or holds the GPU alone. The requests of a gang
+    count as one."""
     if waiter.id in gpu.ledger.reserved:  # it has its bytes, and waits for its turn
         loading = gpu.in_state(LeaseState.LOADING)
         return tuple(holder(core, gpu, lease, waiter) for lease in loading)
@@ -102,7 +105,8 @@ def _by(core: Core, lease: Lease, condition: Condition) -> str:
 
 
 def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:
-    """Requests whose bytes are charged here and that wait for their turn to load. The next one has the headroom too."""
+    """Requests whose bytes are charged here and that wait for their turn to load. The next one has
+    the headroom too."""
     if not gpu.ledger.reserved:
         return []
     waiting = [lease for lease in core.waiting.values() if lease.id in gpu.ledger.reserved]
@@ -123,7 +127,8 @@ def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:
 
 
 def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
-    """Processes without a resident lease that hold bytes: contexts of live processes, debts, stowaways."""
+    """Processes without a resident lease that hold bytes: contexts of live processes, debts,
+    stowaways."""
     ledger = gpu.ledger
     names = {client.process: client.name for client in core.clients.values()}
     kept: list[Blocker] = []

@@ -1,4 +1,5 @@
-"""Views of leases and GPUs, `status`, `why`, and the record of a switch: typed data without words. Reads only."""
+"""Views of leases and GPUs, `status`, `why`, and the record of a switch: typed data without words.
+Reads only."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -38,12 +39,16 @@ from vram_arbiter.schemas.wire.views import (
 )
 
 NOTE_KINDS: tuple[str, ...] = (
-    "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked", "revoke_acked", "reminded",
-    "deadline_passed", "unloading", "released", "verified", "denied", "refused", "cancelled", "expired", "lost", "reattached", "oom",
-    "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered", "serving", "operator", "resumed",
+    "queued", "granted", "ready", "switch", "use_began", "use_ended", "use_yielded", "revoke_asked",
+    "revoke_acked", "reminded",
+    "deadline_passed", "unloading", "released", "verified", "denied", "refused", "cancelled",
+    "expired", "lost", "reattached", "oom",
+    "pressure", "stowaway", "probe_failed", "probe_ok", "drift", "journal_failed", "recovered",
+    "serving", "operator", "resumed",
     "standby", "parked", "gang", "signalled", "resized",
 )  # fmt: skip
-"""Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether anybody had to leave."""
+"""Every kind of `effects.Note`. `switch` comes with each `ready`; its field `switched` says whether
+anybody had to leave."""
 
 DAEMON_KINDS: tuple[str, ...] = (
     "started",
@@ -52,7 +57,8 @@ DAEMON_KINDS: tuple[str, ...] = (
     "record_stopped",
     "record_resumed",
 )
-"""What the daemon itself adds to the history: its starts and ends, and what is wrong with its own files."""
+"""What the daemon itself adds to the history: its starts and ends, and what is wrong with its own
+files."""
 
 
 type PageKey = tuple[int, float, int]
@@ -65,12 +71,12 @@ MISSING_NAMED = 3
 """Holders that have not reattached and are named; the others are counted."""
 
 
-# -- views -------------------------------------------------------------------------------------------------------------
+# -- views
 def view_for(core: Core, lease: Lease, reader: ProcessKey | None) -> LeaseView:
     """A lease as `reader` may see it.
 
-    Its token is shown to the holder's process and to an operator (None) only: a token is all that is needed to mark a
-    use, which keeps a lease from being evicted.
+    Its token is shown to the holder's process and to an operator (None) only: a token is all that
+    is needed to mark a use, which keeps a lease from being evicted.
     """
     shown = view(core, lease)
     return shown if reader is None or reader == lease.process else replace(shown, token=None)
@@ -193,7 +199,8 @@ def status(
 ) -> StatusReply:
     """Return the status with the leases that follow `after`, at most `limit` of them.
 
-    A page costs what it holds, however many wait: the queues are sorted already. `reader`: see `view_for`.
+    A page costs what it holds, however many wait: the queues are sorted already. `reader`: see
+    `view_for`.
     """
     leases = list(islice(_listed(core, after, limit), limit))
     more = leases and len(leases) == limit
@@ -239,7 +246,8 @@ def _away(core: Core) -> Iterator[Lease]:
 
 
 def _in_queues(core: Core, after: tuple[float, int]) -> Iterator[Lease]:
-    """Waiters in the order of the queues, each once. Those that a feature keeps out of the queues are listed at their rank."""
+    """Waiters in the order of the queues, each once. Those that a feature keeps out of the queues
+    are listed at their rank."""
 
     def rank(lease: Lease) -> tuple[float, int]:
         return core.gpus[lease.request.gpus[0]].queue.rank(lease)
@@ -266,7 +274,7 @@ def _best_position(core: Core, lease: Lease) -> int:
     return min((queue.position(lease) for queue in places), default=0)
 
 
-# -- why ---------------------------------------------------------------------------------------------------------------
+# -- why
 def why(core: Core, consumer: str) -> WhyReply:
     """Explain why a consumer is not running, or that it is. A lease's id stands for that lease.
 
@@ -281,7 +289,8 @@ def why(core: Core, consumer: str) -> WhyReply:
 
 
 def _with_plan(core: Core, lease: Lease) -> Explanation:
-    """Explain a lease with the steps to come; they also give an estimate where no holder was revoked yet."""
+    """Explain a lease with the steps to come; they also give an estimate where no holder was
+    revoked yet."""
     told = explain_lease(core, lease)
     if lease.state is not LeaseState.QUEUED:
         return told
@@ -294,7 +303,8 @@ def _with_plan(core: Core, lease: Lease) -> Explanation:
 
 
 def _eta_of_plan(core: Core, standing: Standing, plan: Sequence[Step]) -> float | None:
-    """Seconds until it is loaded if every holder to be revoked takes as long as usual. None: never seen, or nothing planned."""
+    """Seconds until it is loaded if every holder to be revoked takes as long as usual. None: never
+    seen, or nothing planned."""
     load = _load_s(core, standing)
     ends: list[float] = []
     for step in plan:
@@ -356,7 +366,8 @@ def _place(core: Core, standing: Standing) -> int:
 
 
 def behind(core: Core, lease: Lease) -> str:
-    """Return the consumer of the request before this one, "" if there is none: only the head has blockers of its own."""
+    """Return the consumer of the request before this one, "" if there is none: only the head has
+    blockers of its own."""
     standing = standing_of(core, lease)
     if _place(core, standing) <= 1:
         return ""
@@ -426,7 +437,8 @@ def _leaving(core: Core, gpu: Gpu) -> tuple[Blocker, ...]:
 
 
 def _load_s(core: Core, standing: Standing) -> float | None:
-    """How long its load usually takes, with those of its gang that load before it. None: never seen, or not known yet."""
+    """How long its load usually takes, with those of its gang that load before it. None: never
+    seen, or not known yet."""
     if standing.loads is None:
         return None
     times = [core.learnt_s(one.spec.consumer, "load_s") for one in standing.loads]
@@ -435,7 +447,8 @@ def _load_s(core: Core, standing: Standing) -> float | None:
 
 
 def _eta(core: Core, standing: Standing, lease: Lease) -> float | None:
-    """Seconds until it is loaded, from learnt medians. None if anything on the way was never seen."""
+    """Seconds until it is loaded, from learnt medians. None if anything on the way was
+    never seen."""
     gpu = standing.gpu
     slowest = 0.0
     for other in gpu.residents.values():
@@ -466,9 +479,10 @@ def medians(core: Core) -> dict[str, dict[str, float]]:
     }
 
 
-# -- switch --------------------------------------------------------------------------------------------------------------
+# -- switch
 def switch_record(core: Core, lease: Lease) -> dict[str, Any]:
-    """Milliseconds of a grant from the acquire to `ready`, split by phase; of several victims the slowest counts."""
+    """Milliseconds of a grant from the acquire to `ready`, split by phase; of several victims the
+    slowest counts."""
     gone = lease.request.evicted
     first_asked = min((e.asked_at for e in gone), default=lease.granted_at)
     return {

@@ -1,4 +1,5 @@
-"""The present in numbers, for telemetry: who waits, and what every card holds. Reads only, no words; O(residents and processes)."""
+"""The present in numbers, for telemetry: who waits, and what every card holds. Reads only, no
+words; O(residents and processes)."""
 
 from typing import Any
 
@@ -6,7 +7,8 @@ from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.schemas.ids import ProcessKey
 
 RESIDUES = "(residues)"
-"""Stands for bytes that no resident lease has: residues of living processes, debts of leases that are over, what a gang keeps free."""
+"""Stands for bytes that no resident lease has: residues of living processes, debts of leases that
+are over, what a gang keeps free."""
 STOWAWAYS = "(stowaways)"
 """Stands for processes without a lease."""
 UNATTRIBUTED = "(unattributed)"
@@ -14,11 +16,14 @@ UNATTRIBUTED = "(unattributed)"
 
 
 def figures(core: Core) -> dict[str, Any]:
-    """Return `{"waiters", "drained", "gpus": [{"gpu", "capacity_bytes", "pressure_bytes", "used_bytes", "read_at", "charged", "measured"}]}`.
+    """Return `{"waiters", "drained", "gpus": [{"gpu", "capacity_bytes", "pressure_bytes",
+    "used_bytes", "read_at", "charged", "measured"}]}`.
 
-    `charged` and `measured` are bytes by consumer. `measured` and `used_bytes` are None while the GPU is unknown; the bytes of `measured`
-    add up to `used_bytes`, or to more where the driver's list and its total disagree. A process with leases of several consumers counts once, under their names joined by "+": its bytes cannot be
-    told apart. `read_at`: monotonic seconds of the newest successful reading, None before the first.
+    `charged` and `measured` are bytes by consumer. `measured` and `used_bytes` are None while the
+    GPU is unknown; the bytes of `measured` add up to `used_bytes`, or to more where the driver's
+    list and its total disagree. A process with leases of several consumers counts once, under their
+    names joined by "+": its bytes cannot be told apart. `read_at`: monotonic seconds of the newest
+    successful reading, None before the first.
     """
     return {
         "waiters": len(core.waiting),

@@ -1,6 +1,8 @@
-"""What the arbiter does next for a waiter, and at which instant where that is planned: typed steps without words.
+"""What the arbiter does next for a waiter, and at which instant where that is planned: typed steps
+without words.
 
-Reads only, for answers to `why`. Not on the path of a decision: looking ahead costs a search for victims per instant.
+Reads only, for answers to `why`. Not on the path of a decision: looking ahead costs a search for
+victims per instant.
 """
 
 from math import inf
@@ -33,7 +35,8 @@ def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
 
 
 def _of_unqueued(core: Core, gpu: Gpu, standing: Standing, waiter: Lease) -> list[Step]:
-    """Of a request that waits for the rest of its gang, or with its bytes reserved for its turn to load."""
+    """Of a request that waits for the rest of its gang, or with its bytes reserved for its turn to
+    load."""
     found: list[Step] = []
     if waiter.id in gpu.ledger.reserved:
         found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
@@ -67,7 +70,8 @@ def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
 
 
 def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
-    """Which holders will be revoked, and when: at the first instant at which a sufficient set may be."""
+    """Which holders will be revoked, and when: at the first instant at which a sufficient set may
+    be."""
     going = policy.leaving(gpu)
     looks = max(1, min(LOOKED_AT_MAX, LOOKS_AT_HOLDERS_MAX // (1 + len(gpu.residents))))
     for at in sorted({core.now, *policy.ask_times(core, gpu, waiter)})[:looks]:

@@ -1,4 +1,5 @@
-"""Leases that end without their holder's word: nobody renewed them, their process died, an operator gave them up.
+"""Leases that end without their holder's word: nobody renewed them, their process died, an operator
+gave them up.
 
 What they hold becomes a debt and is measured away (`measure`).
 """
@@ -20,8 +21,10 @@ def on_expiry_due(core: Core, lease_id: str) -> None:
 
 
 def expire(core: Core, lease: Lease, order: Order | None = None) -> None:
-    """The lease is over for good, perhaps before its time (an operator's word). Its holder may still be loading until it fences itself,
-    so no verdict before that; one that is loaded has to be measured gone (if that can be seen), or to have fenced itself."""
+    """The lease is over for good, perhaps before its time (an operator's word). Its holder may
+    still be loading until it fences itself, so no verdict before that; one that is loaded has to be
+    measured gone (if that can be seen), or to have fenced itself.
+    """
     why = Why.NOT_RENEWED if order is None else Why.GIVEN_UP
     refusal = no.Expired(lease.id, lease.spec.ttl_s, why, order)
     core.note("expired", lease, why=why, ttl_s=lease.spec.ttl_s)

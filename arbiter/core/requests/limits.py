@@ -1,7 +1,7 @@
 """Shares of limited places: no process and no user can take so many that others find none.
 
-Checks only; raises Refused with the limit's name, its value and what to do. Sessions, connections and rates are limited before a request
-becomes an event (`rpc`).
+Checks only; raises Refused with the limit's name, its value and what to do. Sessions, connections
+and rates are limited before a request becomes an event (`rpc`).
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,8 @@ from vram_arbiter.schemas import defaults
 
 
 def check_waiters(core: Core, client: Client, priority: int) -> None:
-    """May this client add a waiter? The last places are kept for requests above the default priority, of each user's share too."""
+    """May this client add a waiter? The last places are kept for requests above the default
+    priority, of each user's share too."""
     settings = core.settings
     places = settings.waiters_max
     kept = 0.0 if priority > defaults.PRIORITY else settings.priority_reserve
@@ -35,7 +36,8 @@ def check_leases(core: Core, client: Client) -> None:
 
 
 def check_uses(core: Core, lease: Lease, client: Client) -> None:
-    """May this client mark a use of the lease? The holder's own uses are counted apart: others cannot take its places."""
+    """May this client mark a use of the lease? The holder's own uses are counted apart: others
+    cannot take its places."""
     places = core.settings.uses_per_lease_max
     uses = lease.all_uses()
     own = sum(use.process == lease.process for use in uses)

@@ -1,8 +1,9 @@
-"""What an operator may do by hand: evict, pin and unpin, drain and resume, give up the lease of a dead holder.
+"""What an operator may do by hand: evict, pin and unpin, drain and resume, give up the lease of a
+dead holder.
 
-Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does, and a lease in use is never
-given up. Every action is a note that says who and why; a pin and a drain are journalled, so they outlive the daemon.
-The role was checked where the request came in.
+Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does,
+and a lease in use is never given up. Every action is a note that says who and why; a pin and a
+drain are journalled, so they outlive the daemon. The role was checked where the request came in.
 """
 
 from collections.abc import Mapping
@@ -24,7 +25,8 @@ from vram_arbiter.schemas.wire.replies import DrainReply, OperatorReply
 DRAIN_KEY = "drain"
 """Journal key of a drain."""
 SILENT_SHARE = 2 / 3
-"""A holder that has not been heard of for this share of its ttl has missed a renewal, and may be declared dead."""
+"""A holder that has not been heard of for this share of its ttl has missed a renewal, and may be
+declared dead."""
 
 
 def on_operator(core: Core, event: OperatorAsked) -> None:
@@ -48,7 +50,8 @@ def on_operator(core: Core, event: OperatorAsked) -> None:
 
 
 def find(core: Core, target: str) -> Lease:
-    """A live lease by its id, or by its consumer's name if that has exactly one. Refuses what names none or several."""
+    """A live lease by its id, or by its consumer's name if that has exactly one. Refuses what names
+    none or several."""
     lease = core.leases.get(LeaseId(target))
     if lease is not None:
         return lease
@@ -65,9 +68,11 @@ def find(core: Core, target: str) -> Lease:
 
 
 def evict(core: Core, lease: Lease, order: Order) -> None:
-    """Ask a holder to leave, as the engine would for a waiter. In use, it finishes first. Asking twice is fine.
+    """Ask a holder to leave, as the engine would for a waiter. In use, it finishes first. Asking
+    twice is fine.
 
-    What an operator sends away does not come back by itself: a lease on standby ends with it, a parked one waits for its holder.
+    What an operator sends away does not come back by itself: a lease on standby ends with it, a
+    parked one waits for its holder.
     """
     if lease.state in AWAY:
         _note(core, "evict", order, lease)
@@ -102,7 +107,8 @@ def _dismiss(core: Core, lease: Lease, order: Order) -> None:
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:
-    """Nobody makes this lease leave until it is unpinned. A waiter may be pinned too: it holds from its grant on."""
+    """Nobody makes this lease leave until it is unpinned. A waiter may be pinned too: it holds from
+    its grant on."""
     if lease.state in LEAVING:
         raise _impractical(lease, Impractical.LEAVING)
     lease.pinned = order
@@ -120,7 +126,8 @@ def unpin(core: Core, lease: Lease, order: Order) -> None:
 
 
 def release_dead(core: Core, lease: Lease, order: Order) -> None:
-    """Give up a lease whose holder is not heard of, before its time to live is over. Its bytes are measured gone as ever."""
+    """Give up a lease whose holder is not heard of, before its time to live is over. Its bytes are
+    measured gone as ever."""
     if lease.state not in EXPIRING:
         raise _impractical(lease, Impractical.NOT_HELD)
     if lease.uses:

@@ -1,10 +1,12 @@
-"""After a restart of the daemon alone: the journal says who held what, the holders come back or do not.
+"""After a restart of the daemon alone: the journal says who held what, the holders come back or do
+not.
 
-Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card is read at baseline) nothing is
-granted. Recovered bytes are charged from the first moment, until their holder says that they are gone, dies, or its time is over.
-A journal in doubt names some leases at best: its holders are believed, and grants wait as long as any holder may keep what it has.
-A record of a sub-lease, as versions before 0.2.0 wrote it, comes back as a plain lease: parent and sub-lease are each charged their own
-bytes until they are measured gone.
+Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card
+is read at baseline) nothing is granted. Recovered bytes are charged from the first moment, until
+their holder says that they are gone, dies, or its time is over. A journal in doubt names some
+leases at best: its holders are believed, and grants wait as long as any holder may keep what it
+has. A record of a sub-lease, as versions before 0.2.0 wrote it, comes back as a plain lease: parent
+and sub-lease are each charged their own bytes until they are measured gone.
 """
 
 from collections.abc import Mapping
@@ -47,11 +49,13 @@ from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
 
 EMPTY_JOURNAL = LeaseId("journal")
-"""Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL and the fence grace."""
+"""Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL
+and the fence grace."""
 
 
 def on_recovered(core: Core, event: Recovered) -> None:
-    """Charge everything that the journal names, then wait for the holders. Records of a card that is gone are dropped."""
+    """Charge everything that the journal names, then wait for the holders. Records of a card that
+    is gone are dropped."""
     core.recovering = set()
     for known in core.gpus.values():
         core.turn.touch(known)
@@ -71,7 +75,8 @@ def on_recovered(core: Core, event: Recovered) -> None:
         elif key.startswith("residue:"):
             process = ProcessKey(int(record["pid"]), int(record["start_ticks"]))
             account = gpu.ledger.accounts.get(process)
-            # it lies within what the process is charged for its leases, which were restored before it
+            # it lies within what the process is charged for its leases, which were restored before
+            # it
             own_bytes = 0 if account is None else account.approved_bytes()
             residue_bytes = min(int(record["residue_bytes"]), _room_bytes(gpu) + own_bytes)
             floor_bytes = min(int(record.get("floor_bytes", residue_bytes)), residue_bytes)
@@ -90,13 +95,15 @@ def on_recovered(core: Core, event: Recovered) -> None:
 
 
 def await_unnamed(core: Core) -> None:
-    """Holders that the journal does not name have their time from now on. A process with bytes that stays silent is a stowaway then."""
+    """Holders that the journal does not name have their time from now on. A process with bytes that
+    stays silent is a stowaway then."""
     grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
     core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
 
 
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
-    """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not come back before him either."""
+    """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not
+    come back before him either."""
     lease = _remembered(core, record, LeaseState(str(record["state"])))
     lease.request.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
     if not lease.request.gpus:  # the only card that it may come back to is gone
@@ -181,7 +188,8 @@ def _restore(core: Core, gpu: Gpu, record: Mapping[str, Any]) -> None:
 
 
 def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
-    """Charge what is there anyway. What the budget does not hold was never approved: it is pressure."""
+    """Charge what is there anyway. What the budget does not hold was never approved: it is
+    pressure."""
     approved_bytes = min(charge_bytes, _room_bytes(gpu))
     gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
     gpu.pending_free.give_up(
@@ -191,7 +199,8 @@ def _place(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
 
 
 def _room_bytes(gpu: Gpu) -> int:
-    """What can still be approved. A disk that was full keeps records that should be gone, and they may say more than the card has."""
+    """What can still be approved. A disk that was full keeps records that should be gone, and they
+    may say more than the card has."""
     return max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes())
 
 
@@ -220,9 +229,10 @@ def spec_from_record(record: Mapping[str, Any]) -> Spec:
     )
 
 
-# -- coming back -------------------------------------------------------------------------------------------------------
+# -- coming back
 def on_reattached(core: Core, event: Reattached) -> None:
-    """A client tells what it still holds. Every lease is answered for itself; nothing is lost because of a neighbour."""
+    """A client tells what it still holds. Every lease is answered for itself; nothing is lost
+    because of a neighbour."""
     client = client_of(core, event.client)
     answers: list[ReattachedView] = []
     for item in event.leases:
@@ -296,8 +306,9 @@ def _missed_its_grant(lease: Lease, client: Client, item: ReattachedLease) -> bo
 def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
     """What this client says runs is what runs, as far as its own uses go.
 
-    Other connections, of this process too, answer for theirs: after a restart they may have begun them again before this one
-    came. An earlier connection of the same instance is no other: ROUTER never says that it is gone.
+    Other connections, of this process too, answer for theirs: after a restart they may have begun
+    them again before this one came. An earlier connection of the same instance is no other: ROUTER
+    never says that it is gone.
     """
     others = {c.id for c in core.clients.values() if c.instance != client.instance}
     for use in list(lease.uses.values()):
@@ -314,12 +325,14 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
 
 
 def _seen_bytes(gpu: Gpu, process: ProcessKey) -> int:
-    """What the newest reading shows of a process; nothing where it cannot say. The journal that knew the card is lost."""
+    """What the newest reading shows of a process; nothing where it cannot say. The journal that
+    knew the card is lost."""
     return 0 if gpu.sample is None else gpu.sample.bytes_of(process) or 0
 
 
 def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
-    """The journal does not know this lease but its token is of an earlier epoch: its holder is believed while recovering."""
+    """The journal does not know this lease but its token is of an earlier epoch: its holder is
+    believed while recovering."""
     if core.recovering is None or item.token.epoch >= core.settings.epoch:
         raise Refused(no.Lost(item.lease, Why.UNKNOWN))
     gpus = placement.selected(core, item.spec)
@@ -371,7 +384,7 @@ def _adopted_state(item: ReattachedLease) -> LeaseState:
     return LeaseState.HELD if item.held else LeaseState.LOADING
 
 
-# -- coming to an end --------------------------------------------------------------------------------------------------
+# -- coming to an end
 def account_for(core: Core, lease_id: LeaseId) -> None:
     """One lease less to wait for."""
     if core.recovering is not None and lease_id in core.recovering:
@@ -387,8 +400,9 @@ def on_recover_due(core: Core, subject: str) -> None:
 def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
     """The card is read as good as empty: nobody has to be waited for there.
 
-    The holders that have not come back live, and they alone can say that a lease is over, or their time: a model may sleep in host RAM,
-    and a reading may lie. Their bytes stay charged, and nobody asks them to leave before they are heard of.
+    The holders that have not come back live, and they alone can say that a lease is over, or their
+    time: a model may sleep in host RAM, and a reading may lie. Their bytes stay charged, and nobody
+    asks them to leave before they are heard of.
     """
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or gpu.sample is not sample:

@@ -1,7 +1,9 @@
-"""Requests for bytes that are refused at once, as notes: history and log say of each why nothing came of it.
+"""Requests for bytes that are refused at once, as notes: history and log say of each why nothing
+came of it.
 
-A process that asks and is refused thousands of times a second must not push everything else out of the history: beyond a number at once its
-refusals are counted, and the next note says how many were left out.
+A process that asks and is refused thousands of times a second must not push everything else out of
+the history: beyond a number at once its refusals are counted, and the next note says how many were
+left out.
 """
 
 from vram_arbiter.arbiter.core.events import AcquireRequested, Reacquired, ResizeAsked

@@ -1,7 +1,8 @@
-"""What clients ask for, one function a request. Each checks everything first (raising Refused) and then changes things.
+"""What clients ask for, one function a request. Each checks everything first (raising Refused) and
+then changes things.
 
-Who may: leases belong to a process, so a request on a lease must come from a client of that process. Uses (`uses`) are open to
-anyone who knows the exact token.
+Who may: leases belong to a process, so a request on a lease must come from a client of that
+process. Uses (`uses`) are open to anyone who knows the exact token.
 """
 
 from dataclasses import replace
@@ -47,7 +48,7 @@ from vram_arbiter.schemas.wire.replies import (
 )
 
 
-# -- who and which -------------------------------------------------------------------------------------------------
+# -- who and which
 def client_of(core: Core, client: ClientId) -> Client:
     known = core.clients.get(client)
     if known is None:
@@ -97,9 +98,10 @@ def bad_state(lease: Lease, misfit: Misfit, use_id: str = "") -> Refused:
     return Refused(no.BadLeaseState(lease.id, lease.state, uses, misfit, story, use_id))
 
 
-# -- waiting ---------------------------------------------------------------------------------------------------------
+# -- waiting
 def acquire(core: Core, event: AcquireRequested) -> None:
-    """Queue a lease; the scheduling after this event may grant it in the same breath, and answers either way."""
+    """Queue a lease; the scheduling after this event may grant it in the same breath, and answers
+    either way."""
     client = client_of(core, event.client)
     known = _known_by(core, event, client)
     if any(feature.on_acquire(core, event, known) for feature in core.hooked["on_acquire"]):
@@ -139,7 +141,8 @@ def new_lease(
     steady: int,
     gpus: tuple[GpuId, ...],
 ) -> Lease:
-    """A lease that is asked for, known by its nonce from now on. Refuses what is one too many for its connection."""
+    """A lease that is asked for, known by its nonce from now on. Refuses what is one too many for
+    its connection."""
     check_leases(core, client)
     lease = Lease(
         id=core.next_lease_id(),
@@ -190,7 +193,8 @@ def answer_queued(core: Core) -> None:
 
 
 def _known_by(core: Core, event: AcquireRequested, client: Client) -> Lease | None:
-    """Return the lease that an earlier acquire with the same nonce asked for. Raises Refused where it is over."""
+    """Return the lease that an earlier acquire with the same nonce asked for. Raises Refused where
+    it is over."""
     lease_id = core.nonces.get((client.process, event.nonce))
     if lease_id is None:
         return None
@@ -201,7 +205,8 @@ def _known_by(core: Core, event: AcquireRequested, client: Client) -> Lease | No
 
 
 def _answer_again(core: Core, event: AcquireRequested, lease: Lease) -> None:
-    """A repeat is answered as its lease is. The newest connection of a process is the one that listens."""
+    """A repeat is answered as its lease is. The newest connection of a process is the one that
+    listens."""
     core.hand_to(lease, event.client)
     state = str(lease.state) if lease.state in (LeaseState.QUEUED, *AWAY) else "loading"
     core.reply(event.client, event.request, AcquireReply(state, explain.view(core, lease)))
@@ -248,7 +253,7 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
     eviction.deny(core, lease, no.TimedOut(lease.spec.consumer, waited_s, why))
 
 
-# -- holding -----------------------------------------------------------------------------------------------------------
+# -- holding
 def ready(core: Core, event: ReadyReported) -> None:
     """Loaded: from now on the steady bytes are charged, or what the holder measured."""
     lease = own_lease(core, event.client, event.lease, event.token)
@@ -319,7 +324,7 @@ def renew(core: Core, event: Renewed) -> None:
     core.reply(event.client, event.request, RenewReply(tuple(alive), tuple(gone)))
 
 
-# -- leaving -----------------------------------------------------------------------------------------------------------
+# -- leaving
 def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
     lease = own_lease(core, event.client, event.lease, event.token)
     eviction.acknowledge(core, lease, event.safe_point_eta_s)
@@ -327,7 +332,8 @@ def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
 
 
 def unloading(core: Core, event: UnloadStarted) -> None:
-    """The holder is at its safe point and unloads. Refused while anybody uses the lease: this is the safe-point rule."""
+    """The holder is at its safe point and unloads. Refused while anybody uses the lease: this is
+    the safe-point rule."""
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.state is LeaseState.UNLOADING:  # a repeat
         core.reply(event.client, event.request, StateReply(lease.state))
@@ -351,7 +357,8 @@ def unloading(core: Core, event: UnloadStarted) -> None:
 
 
 def release(core: Core, event: ReleaseReported) -> None:
-    """The holder let go. Its bytes stay charged until they are measured gone. A repeat never ends a lease that went on standby."""
+    """The holder let go. Its bytes stay charged until they are measured gone. A repeat never ends a
+    lease that went on standby."""
     process = client_of(core, event.client).process
     ended = core.ended.get(event.lease)
     same = ended is not None and (ended.token, ended.process) == (event.token, process)
@@ -410,7 +417,8 @@ def let_go(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
 
 
 def oom(core: Core, event: OomReported) -> None:
-    """An allocation failed. If the holder asked for more than it was granted, its footprint was wrong: learn it."""
+    """An allocation failed. If the holder asked for more than it was granted, its footprint was
+    wrong: learn it."""
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.gpu is None:
         raise bad_state(lease, Misfit.HOLDS_NOTHING)

@@ -1,7 +1,8 @@
 """Connections and processes that come and go, and a journal that fails.
 
-Leases belong to processes: a connection that drops loses nothing that is resident (its process re-attaches or the ttl runs
-out); `bye` gives everything back; death ends everything, and what was held is measured away before anyone else gets it.
+Leases belong to processes: a connection that drops loses nothing that is resident (its process
+re-attaches or the ttl runs out); `bye` gives everything back; death ends everything, and what was
+held is measured away before anyone else gets it.
 """
 
 from dataclasses import replace
@@ -27,7 +28,8 @@ from vram_arbiter.schemas.wire.pushes import DeniedPush
 
 
 def on_connected(core: Core, event: ClientConnected) -> None:
-    """A hello. The same instance on a new connection is the same client: its leases, waits and uses are the new connection's."""
+    """A hello. The same instance on a new connection is the same client: its leases, waits and uses
+    are the new connection's."""
     if event.client in core.clients:
         _forget(core, core.clients[event.client])
     instance = (event.process, event.instance)
@@ -88,14 +90,16 @@ def _give_up(core: Core, lease: Lease, to: LeaseState, refusal: no.End) -> None:
 
 
 def concerns(core: Core, client: ClientId) -> bool:
-    """Whether a live lease, a request or a use is this client's: then losing its connection ends nothing."""
+    """Whether a live lease, a request or a use is this client's: then losing its connection ends
+    nothing."""
     if core.count_of_client(client):
         return True
     return any(use.client == client for lease in _concerned(core, []) for use in lease.all_uses())
 
 
 def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
-    """Somebody's own leases, and all that are in use, perhaps by him, in the order of their arrival."""
+    """Somebody's own leases, and all that are in use, perhaps by him, in the order of their
+    arrival."""
     used = (
         lease
         for gpu in core.gpus.values()
@@ -109,7 +113,8 @@ def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
 
 
 def on_died(core: Core, event: ProcessDied) -> None:
-    """Everything of a process ends. Its bytes become debts, measured gone before they count as free."""
+    """Everything of a process ends. Its bytes become debts, measured gone before they count as
+    free."""
     process = event.process
     core.refusals.pop(process, None)
     gone = [client for client in core.clients.values() if client.process == process]
@@ -143,8 +148,8 @@ def _bereave(core: Core, lease: Lease) -> None:
 
 
 def on_journal_failed(core: Core, event: JournalFailed) -> None:
-    """A grant that could not be written was not sent: it is taken back. The executor refuses the request whose
-    reply it held back; a waiter that was to hear by push is denied here.
+    """A grant that could not be written was not sent: it is taken back. The executor refuses the
+    request whose reply it held back; a waiter that was to hear by push is denied here.
 
     Other records only make a later recovery more careful; they are worth a note.
     """

@@ -1,11 +1,13 @@
-"""Uses: busy intervals on a lease, marked by anyone who knows its exact token (that is how a runner marks a goal on its policy
-sidecar's lease). A lease in use is not at its safe point.
+"""Uses: busy intervals on a lease, marked by anyone who knows its exact token (that is how a runner
+marks a goal on its policy sidecar's lease). A lease in use is not at its safe point.
 
-A use that yields pauses: it stays known, but nobody waits for its end. Beginning it again resumes it, unless its holder was
-asked to leave meanwhile. Must not know why anybody is asked to leave (`eviction`).
+A use that yields pauses: it stays known, but nobody waits for its end. Beginning it again resumes
+it, unless its holder was asked to leave meanwhile. Must not know why anybody is asked to leave
+(`eviction`).
 
-What others than the holder mark outlives the daemon: the journal names one use of each such process, which is enough to know whom to wait for.
-It is written when a process begins to use a lease and when that use ends, not for what it does there at the same time.
+What others than the holder mark outlives the daemon: the journal names one use of each such
+process, which is enough to know whom to wait for. It is written when a process begins to use a
+lease and when that use ends, not for what it does there at the same time.
 """
 
 from collections.abc import Sequence
@@ -65,12 +67,14 @@ def _note_begun(core: Core, lease: Lease, use: Use, *, resumed: bool) -> None:
 
 
 def _is_kept(lease: Lease, use: Use) -> bool:
-    """Is it the one of its process that the journal has of this lease? Never one of the holder's own: those cost no write."""
+    """Is it the one of its process that the journal has of this lease? Never one of the holder's
+    own: those cost no write."""
     return use.process != lease.process and use in lease.users()
 
 
 def yield_(core: Core, event: UseYielded) -> None:
-    """Pause a use of one's own; said again it is fine. A lease without busy uses is at its safe point."""
+    """Pause a use of one's own; said again it is fine. A lease without busy uses is at its safe
+    point."""
     client = client_of(core, event.client)
     lease = lease_for(core, event.lease, event.token)
     key = (client.process, event.use)
@@ -125,10 +129,10 @@ def _safe_point(core: Core, lease: Lease) -> None:
         core.wake(core.gpu_of(lease))
 
 
-# -- after a restart -------------------------------------------------------------------------------------------------
+# -- after a restart
 def restore(core: Core, lease: Lease, users: Sequence[Sequence[Any]]) -> None:
-    """Others used a recovered lease. It stays in use until they say so again (`begin`), end it or die; whoever is silent for as long as a
-    holder may be is not waited for any longer."""
+    """Others used a recovered lease. It stays in use until they say so again (`begin`), end it or
+    die; whoever is silent for as long as a holder may be is not waited for any longer."""
     for pid, start_ticks, use_id, label in users:
         process = ProcessKey(int(pid), int(start_ticks))
         core.mark(lease, Use(UseId(str(use_id)), FROM_JOURNAL, process, str(label), core.now))

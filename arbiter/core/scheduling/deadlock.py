@@ -1,12 +1,16 @@
-"""Waits that can never end: a process that is in the middle of a use waits for a lease whose room is kept, in a circle, by that use.
+"""Waits that can never end: a process that is in the middle of a use waits for a lease whose room
+is kept, in a circle, by that use.
 
-Found by reduction. Suppose that everything leaves which is not pinned and not in use by a process that waits; serve whoever fits then;
-its process waits no more, so its uses will end and their leases leave too; repeat. Who is left over waits for ever, and among them is
-a circle. Nothing is guessed: somebody in use who will merely be asked later (priorities, residencies), or bytes that others keep
-(pins, residues, stowaways), are a wait and no deadlock. A wait that the process does not depend on says so (`independent`).
+Found by reduction. Suppose that everything leaves which is not pinned and not in use by a process
+that waits; serve whoever fits then; its process waits no more, so its uses will end and their
+leases leave too; repeat. Who is left over waits for ever, and among them is a circle. Nothing is
+guessed: somebody in use who will merely be asked later (priorities, residencies), or bytes that
+others keep (pins, residues, stowaways), are a wait and no deadlock. A wait that the process does
+not depend on says so (`independent`).
 
-Looked for only when a process that uses something begins to wait, or one that waits begins to use something. Changes nothing but the wait
-of the newest in the circle, before anybody is asked to leave for it.
+Looked for only when a process that uses something begins to wait, or one that waits begins to use
+something. Changes nothing but the wait of the newest in the circle, before anybody is asked to
+leave for it.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -19,11 +23,13 @@ from vram_arbiter.arbiter.core.scheduling import policy
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 WAITS_MAX = 64
-"""A process that waits for more than so many leases at a time is not looked at: each look weighs all of them."""
+"""A process that waits for more than so many leases at a time is not looked at: each look weighs
+all of them."""
 
 
 def resolve(core: Core) -> None:
-    """Deny waiters until no circle is left. Each is answered like any request that is refused, or by push if it waited already."""
+    """Deny waiters until no circle is left. Each is answered like any request that is refused, or
+    by push if it waited already."""
     suspects = core.turn.suspects
     while any(
         core.users.get(process) and _is_looked_at(_waits_of(core, process)) for process in suspects
@@ -36,7 +42,8 @@ def resolve(core: Core) -> None:
 
 
 def find(core: Core) -> list[Lease]:
-    """The circle that the newest possible waiter is in, in its order; [] if everybody can be served some day."""
+    """The circle that the newest possible waiter is in, in its order; [] if everybody can be served
+    some day."""
     state = _Reduction(core)
     left = state.run()
     candidates = [w for w in left if w.process in state.waits and not w.spec.independent]
@@ -82,7 +89,8 @@ class _Reduction:
         return sorted(left, key=lambda lease: lease.request.arrival)
 
     def waits_for(self, waiter: Lease) -> list[Lease]:
-        """Other waiters (or itself) without which it cannot be served: those before it, and those whose processes use what is in its way."""
+        """Other waiters (or itself) without which it cannot be served: those before it, and those
+        whose processes use what is in its way."""
         found: dict[LeaseId, Lease] = {}
         for gpu_id in waiter.request.gpus:
             gpu = self.core.gpus[gpu_id]
@@ -106,7 +114,8 @@ class _Reduction:
             alike = waiter.process not in gpu.ledger.accounts and not gpu.ledger.strangers
             possible = known.get(wish) if alike else None
             if possible is None:
-                # one that could not be served even if every use ended waits for something else, and that may come
+                # one that could not be served even if every use ended waits for something else, and
+                # that may come
                 possible = policy.fits(gpu, waiter, going) or not policy.fits(
                     gpu, waiter, everything
                 )
@@ -136,7 +145,8 @@ class _Reduction:
         return [lease for lease in self.waits.get(process, ()) if lease.id not in self.served]
 
     def _blockers(self, gpu: Gpu, waiter: Lease) -> list[ProcessKey]:
-        """Processes whose uses are in the way of a waiter: those that alone suffice for that, else all others."""
+        """Processes whose uses are in the way of a waiter: those that alone suffice for that, else
+        all others."""
         users = [
             process
             for process in self._blocked()
@@ -190,7 +200,7 @@ def _way_back(start: Lease, waits_for: Callable[[Lease], list[Lease]]) -> list[L
     return []
 
 
-# -- telling -----------------------------------------------------------------------------------------------------------
+# -- telling
 def _deny(core: Core, waiter: Lease, cycle: list[Lease]) -> None:
     links = (_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle))
     eviction.deny(core, waiter, no.Deadlock(tuple(links)))

@@ -5,11 +5,15 @@ Per card, in this order (the numbers stand in `_serve`):
   2. a feature keeps the GPU for its own requests: it grants them (`Feature.blocks`, `serve`)
   3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
   4. nothing waits, or a feature owns the head: served by features alone
-  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a head for which another card is
+  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
+     head for which another card is
      being emptied is passed over from here on
-  6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out already
-  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head; behind one that waits for bytes
-     nobody can be asked for (a stowaway's), only who fits beside it on the day that they are gone, and may be asked itself
+  6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out
+     already
+  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head;
+     behind one that waits for bytes
+     nobody can be asked for (a stowaway's), only who fits beside it on the day that they are gone,
+     and may be asked itself
 """
 
 from collections.abc import Mapping
@@ -29,14 +33,16 @@ from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 def schedule(core: Core) -> None:
-    """Serve every dirty GPU. A grant on one may free a waiter's place on another, so until none is dirty."""
+    """Serve every dirty GPU. A grant on one may free a waiter's place on another, so until none is
+    dirty."""
     gpu: Gpu | None = None
     while (gpu := core.turn.next_dirty(gpu)) is not None:
         _serve(core, gpu)
 
 
 def on_plan_due(core: Core, gpu_id: str) -> None:
-    """Look at a GPU again: a residency ended, a waiter aged, or the GPU has been quiet for long enough."""
+    """Look at a GPU again: a residency ended, a waiter aged, or the GPU has been quiet for long
+    enough."""
     core.wake(core.gpus[GpuId(gpu_id)])
 
 
@@ -161,14 +167,16 @@ def _owner(request: Lease) -> Feature | None:
 
 
 def _may_be_asked(core: Core, lease: Lease) -> bool:
-    """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may need what this one took."""
+    """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may
+    need what this one took."""
     return (
         lease if lease.request.extends is None else core.leases[lease.request.extends]
     ).evictable
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Give the lease its card and its token. The record goes to the journal before the holder hears of it."""
+    """Give the lease its card and its token. The record goes to the journal before the holder hears
+    of it."""
     _collect_evictions(core, gpu, lease)
     if any(feature.grant(core, gpu, lease) for feature in lease.features):
         return
@@ -213,7 +221,8 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
 
 
 def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Who left for this lease, or for a waiter that has gone since; the rest stays on the card's list."""
+    """Who left for this lease, or for a waiter that has gone since; the rest stays on the card's
+    list."""
     mine = [
         e
         for e in gpu.evictions

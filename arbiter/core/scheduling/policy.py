@@ -1,6 +1,8 @@
-"""Pure decisions about one card: does it fit, is the measurement willing, who should leave, who may pass the head.
+"""Pure decisions about one card: does it fit, is the measurement willing, who should leave, who may
+pass the head.
 
-Nothing here changes anything but when a card is looked at again (`wake_when_evictable`, `is_best_place`).
+Nothing here changes anything but when a card is looked at again (`wake_when_evictable`,
+`is_best_place`).
 """
 
 from bisect import bisect_left
@@ -26,9 +28,10 @@ type _Covers = Callable[[Mapping[LeaseId, int]], bool]
 type _Choice = Callable[[Core, Sequence[Lease], _Covers, Mapping[LeaseId, int]], list[Lease]]
 
 
-# -- fits ------------------------------------------------------------------------------------------------------------
+# -- fits
 def blocked(core: Core, gpu: Gpu) -> Block | None:
-    """Return why nothing can be granted on a GPU now, for any request; None if grants are possible."""
+    """Return why nothing can be granted on a GPU now, for any request; None if grants are
+    possible."""
     if core.recovering is not None:
         return Block.RECOVERING
     if core.drain is not None:
@@ -50,7 +53,8 @@ def kept_by(gpu: Gpu) -> str:
 
 
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:
-    """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed a deadline do not count."""
+    """Leases whose bytes are on their way back, with the residue each leaves. Those that outstayed
+    a deadline do not count."""
     going: dict[LeaseId, int] = {}
     for lease in gpu.in_state(*_LEAVING):
         verification = gpu.verifications.get(lease.id)
@@ -85,7 +89,8 @@ def residue_under_measurement(gpu: Gpu) -> bool:
 
 
 def joining(lease: Lease) -> Mapping[ProcessKey, int]:
-    """What a grant charges, by process: one lease's load peak, or what the leases of a group need together."""
+    """What a grant charges, by process: one lease's load peak, or what the leases of a group need
+    together."""
     return (
         {lease.process: lease.request.load_peak_bytes}
         if lease.request.needs is None
@@ -134,7 +139,8 @@ def largest_fold_bytes(gpu: Gpu) -> int:
 
 
 def placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
-    """Is another card being emptied for this waiter? Then it is nobody's head here, unless it fits as it is.
+    """Is another card being emptied for this waiter? Then it is nobody's head here, unless it fits
+    as it is.
 
     Not once a holder there has outstayed the deadline, or has left and it was not enough.
     """
@@ -148,18 +154,21 @@ def placed_elsewhere(core: Core, gpu: Gpu, lease: Lease) -> bool:
 
 
 def front(core: Core, gpu: Gpu) -> Lease | None:
-    """Whose turn it is here: the head's, or of the first behind it for whom no other card is being emptied."""
+    """Whose turn it is here: the head's, or of the first behind it for whom no other card is being
+    emptied."""
     head = gpu.queue.head()
     if head is None or not placed_elsewhere(core, gpu, head) or fits(gpu, head):
         return head
     return next((lease for lease in gpu.queue if not placed_elsewhere(core, gpu, lease)), None)
 
 
-# -- the measurement ---------------------------------------------------------------------------------------------------
+# -- the measurement
 def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
-    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading young enough.
+    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading
+    young enough.
 
-    A lease that became ready since counts with its load peak: what it freed at the end of its load may not be back yet.
+    A lease that became ready since counts with its load peak: what it freed at the end of its load
+    may not be back yet.
     """
     sample = gpu.sample
     if (
@@ -182,7 +191,8 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
 
 
 def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
-    """What the reading must have free: what a grant charges, less what the processes already hold (their contexts)."""
+    """What the reading must have free: what a grant charges, less what the processes already hold
+    (their contexts)."""
     if lease.request.needs is None:
         return _unheld_bytes(gpu, lease.process, lease.request.load_peak_bytes)
     return sum(_unheld_bytes(gpu, process, count) for process, count in lease.request.needs.items())
@@ -203,15 +213,17 @@ def sample_is_behind(gpu: Gpu) -> bool:
     return gpu.sample is None or gpu.sample.taken_at < gpu.changed_at
 
 
-# -- victims -----------------------------------------------------------------------------------------------------------
+# -- victims
 def choose_victims(
     core: Core, gpu: Gpu, waiter: Lease, going: Mapping[LeaseId, int], at: float | None = None
 ) -> list[Lease] | None:
-    """The cheapest holders whose leaving lets the waiter in. None: nobody may be asked now, or it would not help.
+    """The cheapest holders whose leaving lets the waiter in. None: nobody may be asked now, or it
+    would not help.
 
-    Idle holders may be asked by anyone once they have had their minimum residency, holders in use only by a waiter of
-    at least their priority (they finish first). If a set with fewer holders in use is only a residency away, it is waited for.
-    `at`: as it will be then, if nothing else changes (default: now).
+    Idle holders may be asked by anyone once they have had their minimum residency, holders in use
+    only by a waiter of at least their priority (they finish first). If a set with fewer holders in
+    use is only a residency away, it is waited for. `at`: as it will be then, if nothing else
+    changes (default: now).
     """
     at = core.now if at is None else at
     priority = waiter.priority_at(at, core.settings.ageing_s_per_point)
@@ -236,7 +248,8 @@ def choose_victims(
 def choose_relief(
     core: Core, gpu: Gpu, going: Mapping[LeaseId, int], over_bytes: int
 ) -> list[Lease]:
-    """Idle holders to ask while the card is under pressure: the cheapest that cover it, or all of them."""
+    """Idle holders to ask while the card is under pressure: the cheapest that cover it, or all of
+    them."""
     idle = [
         lease
         for lease in gpu.in_state(LeaseState.HELD)
@@ -252,7 +265,8 @@ def choose_relief(
 
 
 def may_ask(lease: Lease) -> bool:
-    """Return whether a holder may be revoked for others: not before it reattached after a restart, nor while a feature protects it.
+    """Return whether a holder may be revoked for others: not before it reattached after a restart,
+    nor while a feature protects it.
 
     Processes that use a lease that has not reattached may be on their way back to it.
     """
@@ -269,8 +283,8 @@ def protected_by(lease: Lease) -> str:
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
     """Until when a holder is not asked to leave for this waiter (or for relief).
 
-    Who came back by itself and was not used since has no claim to stay: its return must cost nobody time. Two that keep throwing each
-    other out stay longer, by what a switch of theirs costs.
+    Who came back by itself and was not used since has no claim to stay: its return must cost nobody
+    time. Two that keep throwing each other out stay longer, by what a switch of theirs costs.
     """
     if any(feature.unclaimed(lease) for feature in lease.features):
         return lease.ready_at
@@ -300,7 +314,8 @@ def ask_times(core: Core, gpu: Gpu, waiter: Lease | None) -> list[float]:
 
 
 def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) -> bool:
-    """Of several cards that a waiter could be placed on, is emptying this one the cheapest? Wakes the better one."""
+    """Of several cards that a waiter could be placed on, is emptying this one the cheapest? Wakes
+    the better one."""
     best, best_cost = gpu, _cost(plan, gpu.info.index)
     for gpu_id in waiter.request.gpus:
         other = core.gpus[gpu_id]
@@ -326,7 +341,8 @@ def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) ->
 
 
 def _load_ends_by(core: Core, gpu: Gpu) -> float:
-    """Until when a load is waited for, rather than emptying another card, if it is all that keeps this one from granting; else 0."""
+    """Until when a load is waited for, rather than emptying another card, if it is all that keeps
+    this one from granting; else 0."""
     loading = gpu.in_state(LeaseState.LOADING)
     if (
         not loading
@@ -394,8 +410,10 @@ def _cheapest(
 def _search(
     core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
 ) -> list[Lease]:
-    """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority, fewest; of those alike the ones that
-    can park, that cost the least to reload as far as that is likely, the least bytes, LRU."""
+    """Cheapest covering set; all candidates together do cover. Fewest in use, then lowest priority,
+    fewest; of those alike the ones that can park, that cost the least to reload as far as that is
+    likely, the least bytes, LRU.
+    """
     if len(candidates) > EXACT_SEARCH_MAX:
         return _greedy(core, candidates, covers, freed)
     idle = [lease for lease in candidates if not lease.in_use]
@@ -425,7 +443,8 @@ def _search(
 def _oldest(
     core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
 ) -> list[Lease]:
-    """Idle ones first, then least recent use alone, until it is enough; all candidates together are."""
+    """Idle ones first, then least recent use alone, until it is enough; all candidates together
+    are."""
     order = sorted(
         candidates,
         key=lambda lease: (
@@ -453,7 +472,8 @@ def _fineness(
 def _greedy(
     core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
 ) -> list[Lease]:
-    """Cheap classes first, the largest of a class first; then give back whoever turns out not to be needed."""
+    """Cheap classes first, the largest of a class first; then give back whoever turns out not to be
+    needed."""
     order = sorted(
         candidates,
         key=lambda lease: (
@@ -475,18 +495,21 @@ def _greedy(
 
 
 def spare_beside_bytes(gpu: Gpu, head: Lease, freed: Mapping[LeaseId, int]) -> int:
-    """How much a waiter behind the head may take and stay without delaying it, when these leases leave for it and that is enough."""
+    """How much a waiter behind the head may take and stay without delaying it, when these leases
+    leave for it and that is enough."""
     return gpu.ledger.budget_bytes - gpu.ledger.total_if(freed, joining(head))
 
 
 def spare_unplanned_bytes(
     gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool]
 ) -> tuple[int, bool]:
-    """The same for a head that nothing is planned for; and: does it wait for bytes that nobody can be asked for?
+    """The same for a head that nothing is planned for; and: does it wait for bytes that nobody can
+    be asked for?
 
-    Everything could leave some day, but for those that took their room while this one stood before them (`stays`). If it would not fit
-    even then, it is served when stowaways go; and if that is not enough either, when processes end that keep a residue. Only what is left
-    beside it on that day may be taken today.
+    Everything could leave some day, but for those that took their room while this one stood before
+    them (`stays`). If it would not fit even then, it is served when stowaways go; and if that is
+    not enough either, when processes end that keep a residue. Only what is left beside it on that
+    day may be taken today.
     """
     ledger, joins = gpu.ledger, joining(head)
     everything = _ever_freed(gpu, head, going, None)

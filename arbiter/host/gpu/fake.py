@@ -1,6 +1,8 @@
-"""Reader of simulated cards (`schemas.fakegpu`): what NVML is to a real one. It also makes a card's folder.
+"""Reader of simulated cards (`schemas.fakegpu`): what NVML is to a real one. It also makes a card's
+folder.
 
-Reading lets time pass on the card: a death is noticed, and what is due comes back. It never allocates.
+Reading lets time pass on the card: a death is noticed, and what is due comes back. It never
+allocates.
 """
 
 import os
@@ -91,9 +93,11 @@ def _unreadable(folder: Path, error: OSError | UnicodeDecodeError) -> ConfigErro
 
 
 def open_cards(text: str, runtime: Path) -> FakeProbe:
-    """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the card in RUNTIME/fakegpu) or a folder.
+    """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the card in
+    RUNTIME/fakegpu) or a folder.
 
-    Sizes may be listed, `8GiB,16GiB`: the second card lies in RUNTIME/fakegpu-1, and so on. Raises ConfigError.
+    Sizes may be listed, `8GiB,16GiB`: the second card lies in RUNTIME/fakegpu-1, and so on. Raises
+    ConfigError.
     """
     if "/" in text:
         return FakeProbe([Path(text)])
@@ -121,7 +125,8 @@ def make_card(
     index: int = 0,
     release_lag_s: float = fakegpu.RELEASE_LAG_S,
 ) -> None:
-    """Make a card in `folder`, or keep the one there. Raises ConfigError if that one is in use with another capacity."""
+    """Make a card in `folder`, or keep the one there. Raises ConfigError if that one is in use with
+    another capacity."""
     boot_id = procfs.boot_id()
     wanted = fakegpu.CardConfig(
         uuid=f"GPU-fake-{uuid.uuid4()}",

@@ -1,6 +1,7 @@
 """Reader of NVIDIA cards through NVML (nvidia-ml-py, module `pynvml`).
 
-NVML only reads: it creates no CUDA context, which alone would cost 120-550 MB of the card. It knows nothing of leases.
+NVML only reads: it creates no CUDA context, which alone would cost 120-550 MB of the card. It knows
+nothing of leases.
 """
 
 import threading
@@ -18,8 +19,9 @@ _HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a 
 class NvmlProbe:
     """`GpuProbe` over all NVIDIA cards of the machine, by UUID.
 
-    `nvml` is the module `pynvml` unless a test brings its own. Raises NoGpu without library, driver or card, ConfigError for a card in
-    MIG mode. When no card answers any more, everything is opened anew: after a reset of the driver old handles are dead.
+    `nvml` is the module `pynvml` unless a test brings its own. Raises NoGpu without library, driver
+    or card, ConfigError for a card in MIG mode. When no card answers any more, everything is opened
+    anew: after a reset of the driver old handles are dead.
     """
 
     def __init__(self, nvml: Any = None, pids: PidMap | None = None) -> None:
@@ -54,7 +56,8 @@ class NvmlProbe:
                 gpu = GpuId(_text(nvml.nvmlDeviceGetUUID(handle)))
                 if self._is_split(handle):
                     raise ConfigError(
-                        f"{gpu} is in MIG mode: its instances have memory of their own, which cannot be leased",
+                        f"{gpu} is in MIG mode: its instances have memory of their own, which "
+                        "cannot be leased",
                         hint=f"nvidia-smi -i {index} -mig 0",
                     )
                 handles[gpu] = handle
@@ -117,7 +120,8 @@ class NvmlProbe:
         return Reading(used, total, self._processes(handle))
 
     def memory_supported(self) -> bool:
-        """False where the card has no memory of its own (GB10): NVML says NOT_SUPPORTED. Other failures may pass."""
+        """False where the card has no memory of its own (GB10): NVML says NOT_SUPPORTED. Other
+        failures may pass."""
         handle = next(iter(self._handles.values()))
         try:
             self._nvml.nvmlDeviceGetMemoryInfo(handle)
@@ -148,7 +152,8 @@ class NvmlProbe:
             pass  # it was shut down already: nothing is held
 
     def _memory(self, gpu: GpuId, handle: Any) -> tuple[int, int, int]:
-        """(used, total, reserved) in bytes. What the driver reserves for itself counts neither as used nor as there."""
+        """(used, total, reserved) in bytes. What the driver reserves for itself counts neither as
+        used nor as there."""
         nvml = self._nvml
         try:
             try:
@@ -164,7 +169,8 @@ class NvmlProbe:
         return int(info.used), int(info.total) - int(info.reserved), int(info.reserved)
 
     def _processes(self, handle: Any) -> tuple[ProcessUse, ...] | None:
-        """Compute and graphics processes; None where the driver does not list them. A process in both lists counts once."""
+        """Compute and graphics processes; None where the driver does not list them. A process in
+        both lists counts once."""
         nvml = self._nvml
         if not self._pids.knows:
             return None

@@ -1,8 +1,11 @@
-"""Pids of the driver as pids of this namespace: NVML counts in the host's, a daemon may run in a container.
+"""Pids of the driver as pids of this namespace: NVML counts in the host's, a daemon may run in a
+container.
 
-On a host there is nothing to translate (the kernel gives the pids of clients in containers as the host's). In a container the same number
-is another process, so a pid is believed only if the host's /proc, mounted somewhere here, leads from it to one of ours: NSpid names its pids
-in every namespace below, and the start time must agree. Evidence only: a reading's total does not depend on any of this.
+On a host there is nothing to translate (the kernel gives the pids of clients in containers as the
+host's). In a container the same number is another process, so a pid is believed only if the host's
+/proc, mounted somewhere here, leads from it to one of ours: NSpid names its pids in every namespace
+below, and the start time must agree. Evidence only: a reading's total does not depend on any of
+this.
 """
 
 import logging
@@ -22,8 +25,8 @@ INITIAL_NAMESPACE = "pid:[4026531836]"
 class PidMap:
     """`translate(pid)` says which process of this namespace a driver's pid is.
 
-    `pids`: `own`: the driver counts as we do; `host`: it counts as `host_proc` does; `auto`: `own` on a host, `host` in a container.
-    `proc` is the daemon's own /proc.
+    `pids`: `own`: the driver counts as we do; `host`: it counts as `host_proc` does; `auto`: `own`
+    on a host, `host` in a container. `proc` is the daemon's own /proc.
     """
 
     def __init__(
@@ -38,7 +41,8 @@ class PidMap:
         self._told: set[int] = set()
         if not self.knows:
             log.warning(
-                "pid_unmapped: this daemon lives in a pid namespace and cannot tell whose bytes the driver lists; totals decide alone. "
+                "pid_unmapped: this daemon lives in a pid namespace and cannot tell whose bytes "
+                "the driver lists; totals decide alone. "
                 "Mount the host's /proc and set gpu.host_proc, or set gpu.pids to own"
             )
 
@@ -48,7 +52,8 @@ class PidMap:
         return self._own or self._host_proc is not None
 
     def translate(self, pid: int) -> tuple[ProcessKey, str]:
-        """(process, name). A process of another namespace gets its host's pid, negative, so that it is never taken for one of ours."""
+        """(process, name). A process of another namespace gets its host's pid, negative, so that it
+        is never taken for one of ours."""
         if self._own:
             return process_key(self._proc, pid), process_name(self._proc, pid)
         assert self._host_proc is not None, "there is nothing to translate with"
@@ -75,7 +80,8 @@ def process_key(proc: Path, pid: int) -> ProcessKey:
 
 
 def process_name(proc: Path, pid: int) -> str:
-    """Program and, for an interpreter, what it runs: `python -m vram_arbiter.sidecars` says more than `python`."""
+    """Program and, for an interpreter, what it runs: `python -m vram_arbiter.sidecars` says more
+    than `python`."""
     try:
         words = (proc / str(pid) / "cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
@@ -91,7 +97,8 @@ def _is_initial(proc: Path) -> bool:
 
 
 def _inner_pids(host_proc: Path, pid: int) -> list[int]:
-    """Its pids in the namespaces below the host's, outermost first; none for a process of the host itself."""
+    """Its pids in the namespaces below the host's, outermost first; none for a process of the host
+    itself."""
     try:
         lines = (host_proc / str(pid) / "status").read_text(errors="replace").splitlines()
     except OSError:

@@ -1,8 +1,11 @@
-"""Reader of machines whose GPU has no memory of its own: Jetson (Tegra) and GB10 (DGX Spark). /proc/meminfo is the truth there.
+"""Reader of machines whose GPU has no memory of its own: Jetson (Tegra) and GB10 (DGX Spark).
+/proc/meminfo is the truth there.
 
-NVML answers NOT_SUPPORTED for their memory, and cudaMemGetInfo counts the page cache as used. `MemAvailable` is what can still be had without
-swapping. The whole machine lives in that memory, so it fluctuates: the card asks for a larger reserve and a larger tolerance than others.
-Bytes per process are evidence where there is a source: nvmap's list of clients on an Orin (debugfs, root only), NVML's on Thor and GB10.
+NVML answers NOT_SUPPORTED for their memory, and cudaMemGetInfo counts the page cache as used.
+`MemAvailable` is what can still be had without swapping. The whole machine lives in that memory, so
+it fluctuates: the card asks for a larger reserve and a larger tolerance than others. Bytes per
+process are evidence where there is a source: nvmap's list of clients on an Orin (debugfs, root
+only), NVML's on Thor and GB10.
 """
 
 import os
@@ -19,7 +22,8 @@ from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, Unknown
 from vram_arbiter.schemas.ids import GpuId
 
 MARGIN_SHARE = 0.15
-"""Of the machine's memory that is never leased: kernel, desktop, cameras and their growth. A discrete card needs 300 MiB."""
+"""Of the machine's memory that is never leased: kernel, desktop, cameras and their growth. A
+discrete card needs 300 MiB."""
 MARGIN_MIN_BYTES = GIB
 NOISE_BYTES = 256 * MIB
 """By how much the free memory of a quiet machine moves."""
@@ -32,7 +36,8 @@ type Evidence = Callable[[], tuple[ProcessUse, ...] | None]
 class UnifiedProbe:
     """`GpuProbe` with one card: the memory of the machine.
 
-    `root` is where /proc, /sys and /etc are looked for; `evidence` lists bytes per process; None where that is impossible.
+    `root` is where /proc, /sys and /etc are looked for; `evidence` lists bytes per process; None
+    where that is impossible.
     """
 
     def __init__(self, gpu: GpuId, name: str, root: Path, evidence: Evidence) -> None:
@@ -75,7 +80,8 @@ def read_meminfo(root: Path) -> tuple[int, int]:
 def nvmap_clients(root: Path) -> tuple[ProcessUse, ...] | None:
     """Bytes per process by Tegra's memory manager: lines `user NAME PID SIZEK`.
 
-    None where it cannot be read (it needs root), or says nothing: on a Thor CUDA does not allocate through nvmap, and all rows are 0K.
+    None where it cannot be read (it needs root), or says nothing: on a Thor CUDA does not allocate
+    through nvmap, and all rows are 0K.
     """
     try:
         lines = (root / NVMAP_CLIENTS).read_text(errors="replace").splitlines()
@@ -105,17 +111,20 @@ def nvmap_clients(root: Path) -> tuple[ProcessUse, ...] | None:
 _UNITS = {"K": KIB, "M": MIB, "B": 1}
 
 
-# -- which backend -------------------------------------------------------------------------------------------------------
+# -- which backend
 def choose(
     source: Literal["auto", "nvml", "unified"],
     pids: PidMap,
     root: Path = Path("/"),
     nvml: Any = None,
 ) -> tuple[GpuProbe, str]:
-    """(backend, `nvml` or `unified`) for a source. A machine with a card of its own is never read by its main memory.
+    """(backend, `nvml` or `unified`) for a source. A machine with a card of its own is never read
+    by its main memory.
 
-    1. Tegra: unified. 2. NVML answers and knows the memory: nvml. 3. It answers and does not (GB10): unified, named by NVML. 4. No NVML,
-    but the machine calls itself a GB10: unified. Raises NoGpu, or ConfigError for a source that this machine does not have.
+    1. Tegra: unified. 2. NVML answers and knows the memory: nvml. 3. It answers and does not
+       (GB10): unified, named by NVML. 4. No NVML,
+    but the machine calls itself a GB10: unified. Raises NoGpu, or ConfigError for a source that
+    this machine does not have.
     """
     tegra = tegra_name(root)
     if source == "nvml" and tegra is not None:

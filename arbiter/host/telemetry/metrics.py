@@ -1,7 +1,9 @@
-"""The daemon's metrics. Counters and histograms are told what happened; gauges show what the loop last saw.
+"""The daemon's metrics. Counters and histograms are told what happened; gauges show what the loop
+last saw.
 
-Imported only where telemetry is on. The SDK asks for gauges on threads of its own, which must never touch the core: the loop leaves them a
-finished picture every PICTURE_S, and a picture that is old is not shown at all.
+Imported only where telemetry is on. The SDK asks for gauges on threads of its own, which must never
+touch the core: the loop leaves them a finished picture every PICTURE_S, and a picture that is old
+is not shown at all.
 """
 
 import asyncio
@@ -18,9 +20,11 @@ from vram_arbiter.schemas.runtime.telemetry import names as names
 
 PICTURE_S = 1.0
 PICTURE_MAX_AGE_S = 10.0
-"""A loop that is stuck for so long knows nothing of the present: a gap in the curve, not a straight line."""
+"""A loop that is stuck for so long knows nothing of the present: a gap in the curve, not a straight
+line."""
 CONSUMERS_MAX = 200
-"""Names of consumers that get curves of their own; clients choose their names, and every curve lives as long as the daemon."""
+"""Names of consumers that get curves of their own; clients choose their names, and every curve
+lives as long as the daemon."""
 OTHERS = "(others)"
 
 Figures = Mapping[str, Any]

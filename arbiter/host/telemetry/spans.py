@@ -1,12 +1,15 @@
-"""The daemon's spans and metrics, made outside the core from the facts of its history and from what it is about to say.
+"""The daemon's spans and metrics, made outside the core from the facts of its history and from what
+it is about to say.
 
-Imported only where telemetry is on. Runs on the loop's thread and never waits: exporting is the SDK's threads' work. Every span that is
-begun is ended, by a fact or at the daemon's end, and their number is bounded. Must not decide anything, nor change an effect but for the
-`traceparent` of a `revoke`, which becomes that of its `lease.evict` span.
+Imported only where telemetry is on. Runs on the loop's thread and never waits: exporting is the
+SDK's threads' work. Every span that is begun is ended, by a fact or at the daemon's end, and their
+number is bounded. Must not decide anything, nor change an effect but for the `traceparent` of a
+`revoke`, which becomes that of its `lease.evict` span.
 
     lease.acquire (child of the acquirer's span)   from the request to `ready`
       lease.queue                                  until the grant, for one that had to wait
-      lease.evict                                  one for each lease that had to leave, from the first `revoke` to the verdict
+      lease.evict                                  one for each lease that had to leave, from the
+      first `revoke` to the verdict
         lease.verify                               from the release to the verdict
       lease.load                                   from the grant to `ready`
 """
@@ -28,8 +31,8 @@ from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.pushes import AnyPush, RevokePush
 
 OPEN_MAX = 32_768
-"""Spans of acquires that are open at a time, and as many of evictions: twice the waiters that the default limits allow. The oldest is
-ended when one more begins."""
+"""Spans of acquires that are open at a time, and as many of evictions: twice the waiters that the
+default limits allow. The oldest is ended when one more begins."""
 REASON_CHARS = 300
 
 _W3C = TraceContextTextMapPropagator()
@@ -52,7 +55,8 @@ class Counts(Protocol):
     def granted(
         self, consumer: str, waited_s: float, handover_s: float | None, context: Context
     ) -> None:
-        """`handover_s`: from the first revoke to the grant, where an eviction made room. `context`: its span, for exemplars."""
+        """`handover_s`: from the first revoke to the grant, where an eviction made room. `context`:
+        its span, for exemplars."""
 
     def denied(self, code: str) -> None: ...
 
@@ -63,7 +67,8 @@ class Counts(Protocol):
 
 @dataclass(slots=True)
 class _Acquire:
-    """The open spans of a lease that is asked for and not ready. Times in nanoseconds since 1970."""
+    """The open spans of a lease that is asked for and not ready. Times in nanoseconds
+    since 1970."""
 
     consumer: str
     span: trace.Span
@@ -76,14 +81,16 @@ class _Acquire:
 
 @dataclass(slots=True)
 class _Leaving:
-    """The open spans of a lease on its way out. `evict` None: it leaves by itself, or its process died."""
+    """The open spans of a lease on its way out. `evict` None: it leaves by itself, or its process
+    died."""
 
     evict: trace.Span | None = None
     verify: trace.Span | None = None
 
 
 class LeaseTelemetry:
-    """`outgoing` before a batch is performed, `revoke` for each push of one, `observe` with every event of the history, `close` at the end."""
+    """`outgoing` before a batch is performed, `revoke` for each push of one, `observe` with every
+    event of the history, `close` at the end."""
 
     def __init__(
         self, tracer: trace.Tracer, counts: Counts, wall_ns: Callable[[], int] = time.time_ns
@@ -95,9 +102,10 @@ class LeaseTelemetry:
         self._leaving: OrderedDict[str, _Leaving] = OrderedDict()
         self._growths: dict[str, str] = {}  # lease → the waiter for its growth
 
-    # -- what the core wants done ------------------------------------------------------------------------------------------
+    # -- what the core wants done
     def outgoing(self, effects: Sequence[fx.Effect]) -> None:
-        """Begin the spans of evictions before a revoke is sent, and count refusals, which history leaves out."""
+        """Begin the spans of evictions before a revoke is sent, and count refusals, which history
+        leaves out."""
         asked: dict[str, Event] = {}
         told: list[str] = []
         for effect in effects:
@@ -117,7 +125,8 @@ class LeaseTelemetry:
                     self._counts.denied(refusal.code)
 
     def revoke(self, body: AnyPush) -> AnyPush:
-        """A push on its way out; a `revoke` names its own span, so that the holder's unloading becomes its child."""
+        """A push on its way out; a `revoke` names its own span, so that the holder's unloading
+        becomes its child."""
         if not isinstance(body, RevokePush):
             return body
         leaving = self._leaving.get(body.lease_id)
@@ -132,9 +141,10 @@ class LeaseTelemetry:
         """One transaction of the journal."""
         self._counts.wrote(seconds, failed=failed)
 
-    # -- what has happened -------------------------------------------------------------------------------------------------
+    # -- what has happened
     def observe(self, event: Event) -> Mapping[str, str]:
-        """One event of the history. Returns `trace_id` and `span_id` of what it belongs to, for its line of the log."""
+        """One event of the history. Returns `trace_id` and `span_id` of what it belongs to, for its
+        line of the log."""
         lease_id = event.get("lease_id")
         if not isinstance(lease_id, str):
             return _NONE
@@ -176,7 +186,7 @@ class LeaseTelemetry:
         for lease_id in list(self._leaving):
             self._end_leaving(lease_id, now_ns, names.EVENT_DAEMON_STOPPED)
 
-    # -- asking and getting --------------------------------------------------------------------------------------------------
+    # -- asking and getting
     def _queued(self, lease_id: str, event: Event, at_ns: int) -> trace.Span:
         acquire = self._acquire(lease_id, event["consumer"], event.get("traceparent"), at_ns)
         if (grows := event.get("grows")) is not None:
@@ -227,7 +237,8 @@ class LeaseTelemetry:
         *,
         by_itself: bool = False,
     ) -> _Acquire:
-        """The open acquire, or a new one. One that comes back by itself does so long after its acquirer's trace: it only points there."""
+        """The open acquire, or a new one. One that comes back by itself does so long after its
+        acquirer's trace: it only points there."""
         if (found := self._acquires.get(lease_id)) is not None:
             return found
         parent = _W3C.extract({"traceparent": traceparent}, Context()) if traceparent else Context()
@@ -267,9 +278,10 @@ class LeaseTelemetry:
         _end(acquire.span, at_ns, failed)
         return acquire.span
 
-    # -- leaving -------------------------------------------------------------------------------------------------------------
+    # -- leaving
     def _begin_evict(self, asked: Event, traceparent: str | None, at_ns: int) -> None:
-        """`asked`: the note `revoke_asked`. It belongs to the request's trace; under pressure it is a trace of its own."""
+        """`asked`: the note `revoke_asked`. It belongs to the request's trace; under pressure it is
+        a trace of its own."""
         lease_id, wanted_by = asked["lease_id"], asked["wanted_by_lease"]
         parent = Context()
         if wanted_by is not None:

@@ -1,4 +1,5 @@
-"""The daemon's telemetry put together, on the SDK that `schemas.runtime.telemetry.setup` has installed. Imported only then."""
+"""The daemon's telemetry put together, on the SDK that `schemas.runtime.telemetry.setup` has
+installed. Imported only then."""
 
 import asyncio
 import logging
@@ -21,7 +22,8 @@ _NONE: Mapping[str, str] = {}
 
 
 class Harmless:
-    """`LeaseTelemetry` that cannot stop the daemon: a defect in it is said once, and it is not asked again."""
+    """`LeaseTelemetry` that cannot stop the daemon: a defect in it is said once, and it is not
+    asked again."""
 
     def __init__(self, leases: LeaseTelemetry) -> None:
         self._leases: LeaseTelemetry | None = leases
@@ -55,7 +57,8 @@ class Harmless:
 
 
 class Traced:
-    """`leases` goes to the executor, `log_event` too; `watch` once the core is there, `close` before the SDK ends.
+    """`leases` goes to the executor, `log_event` too; `watch` once the core is there, `close`
+    before the SDK ends.
 
     The daemon's own run is a span beside what it serves, `cli.command`.
     """
@@ -69,7 +72,8 @@ class Traced:
         self.leases = Harmless(LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics))
 
     def log_event(self, event: Mapping[str, Any]) -> None:
-        """One event of the history: as spans and numbers, and as a line of the log that names its span."""
+        """One event of the history: as spans and numbers, and as a line of the log that names its
+        span."""
         telemetry.log_event(event, self.leases.observe(event))
 
     def watch(

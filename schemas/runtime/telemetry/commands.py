@@ -1,8 +1,10 @@
-"""A program from its start to its end, as the span `cli.command`: telemetry is set up before, and sent off after, however it ends.
+"""A program from its start to its end, as the span `cli.command`: telemetry is set up before, and
+sent off after, however it ends.
 
-What a command does (`vramctl run`, a reasoner's task, a benchmark) is in its trace. A server's command is a span of its own beside the traces of
-those it serves: they would otherwise be one trace for as long as it runs. A program that was started inside a trace (W3C `TRACEPARENT`
-in its environment) joins it.
+What a command does (`vramctl run`, a reasoner's task, a benchmark) is in its trace. A server's
+command is a span of its own beside the traces of those it serves: they would otherwise be one trace
+for as long as it runs. A program that was started inside a trace (W3C `TRACEPARENT` in its
+environment) joins it.
 """
 
 import os
@@ -37,10 +39,12 @@ def command(
     attributes: Mapping[str, str] | None = None,
     flush_s: float = otel.FLUSH_S,
 ) -> Iterator[Command]:
-    """Run a program's work inside. `program` is the service's name, `name` the command; `attributes` go to all that it sends.
+    """Run a program's work inside. `program` is the service's name, `name` the command;
+    `attributes` go to all that it sends.
 
-    Without telemetry it does nothing and imports nothing. With it, SIGTERM ends a program that does not handle it by SystemExit(143), so that
-    what it recorded is sent. Raises ConfigError for OTEL_ variables that make no sense, before any work is done.
+    Without telemetry it does nothing and imports nothing. With it, SIGTERM ends a program that does
+    not handle it by SystemExit(143), so that what it recorded is sent. Raises ConfigError for OTEL_
+    variables that make no sense, before any work is done.
     """
     running = Command()
     installed = otel.set_up(program, environ=environ, attributes=attributes)

@@ -1,7 +1,8 @@
-"""Counts and measurements by the names of `schemas.runtime.telemetry.names`. On the API alone: costs next to nothing until `schemas.runtime.telemetry.setup` has installed an SDK.
+"""Counts and measurements by the names of `schemas.runtime.telemetry.names`. On the API alone:
+costs next to nothing until `schemas.runtime.telemetry.setup` has installed an SDK.
 
-Labels are ATTR_ names with values from small sets (a skill, a tool, an operation, a code of an error), never ids: each combination is
-a series that is kept as long as the process lives.
+Labels are ATTR_ names with values from small sets (a skill, a tool, an operation, a code of an
+error), never ids: each combination is a series that is kept as long as the process lives.
 """
 
 import math
@@ -30,7 +31,8 @@ def count(name: str, labels: Labels | None = None, times: int = 1) -> None:
 
 
 def measure(name: str, value: float, labels: Labels | None = None) -> None:
-    """One value of a distribution, in the unit of its name. What is no number, or negative, is no measurement and left out."""
+    """One value of a distribution, in the unit of its name. What is no number, or negative, is no
+    measurement and left out."""
     if math.isfinite(value) and value >= 0:
         _histogram(name).record(value, exported.labels(labels))
 

@@ -1,12 +1,14 @@
-"""Names of all spans, span events, metrics and attributes, in one place. Names only: nothing is recorded here.
+"""Names of all spans, span events, metrics and attributes, in one place. Names only: nothing is
+recorded here.
 
-Recorded by: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner `reasoner.*`, a sidecar `sidecar.*`,
-every command line `cli.command`. One trace runs through all of them by the W3C `traceparent` on their sockets.
+Recorded by: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner
+`reasoner.*`, a sidecar `sidecar.*`, every command line `cli.command`. One trace runs through all of
+them by the W3C `traceparent` on their sockets.
 """
 
 TRACER = "vram-arbiter"
 
-# -- spans ------------------------------------------------------------------------------------------------------------
+# -- spans
 SPAN_COMMAND = "cli.command"
 
 SPAN_ACQUIRE = "lease.acquire"  # from the request to `ready`; children: what the time went into
@@ -34,7 +36,7 @@ SPAN_SIDECAR_LOAD = "sidecar.load"
 SPAN_SIDECAR_UNLOAD = "sidecar.unload"
 SPAN_SIDECAR_REQUEST = "sidecar.request"
 
-# -- events within a span -----------------------------------------------------------------------------------------------
+# -- events within a span
 EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
 EVENT_ESTOP = "vram.event.estop_requested"
 EVENT_STALE = "vram.event.staleness_latched"
@@ -49,7 +51,7 @@ EVENT_DAEMON_STOPPED = "vram.event.daemon_stopped"  # the lease goes on, its spa
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
 EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
 
-# -- metrics: name, unit in the name's comment; labels are ATTR_ names -----------------------------------------------------
+# -- metrics: name, unit in the name's comment; labels are ATTR_ names
 METRIC_GRANTS = "vram.lease.grants"  # 1, by consumer
 METRIC_DENIALS = "vram.lease.denials"  # 1, by reason
 METRIC_WAIT = "vram.lease.wait"  # s, from request to grant
@@ -79,7 +81,7 @@ METRIC_TOOL_CALLS = "vram.reasoner.tool_calls"  # 1, by tool and outcome
 METRIC_SIDECAR_LOAD = "vram.sidecar.load"  # s, by model
 METRIC_SIDECAR_REQUEST = "vram.sidecar.request"  # ms, by operation and outcome
 
-# -- attributes and labels: a closed set, so that no metric's cardinality grows with use -----------------------------------------
+# -- attributes and labels: a closed set, so that no metric's cardinality grows with use
 ATTR_LEASE = "vram.lease_id"  # spans only
 ATTR_CONSUMER = "vram.consumer"
 ATTR_MODEL = "vram.model"

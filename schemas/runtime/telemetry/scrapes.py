@@ -1,8 +1,10 @@
-"""The Prometheus endpoint: HTTP on loopback in one thread of its own, bounded so that no local user keeps the scraper out.
+"""The Prometheus endpoint: HTTP on loopback in one thread of its own, bounded so that no local user
+keeps the scraper out.
 
-Every user of this machine may connect to a loopback port. So connections are counted by the user behind them: beyond its share, or
-beyond the total, the oldest connection of the user with the most is closed, and a new one is always taken. A connection has SCRAPE_S for
-its request and its answer together. Pages are made at most every PAGE_S, however often they are read.
+Every user of this machine may connect to a loopback port. So connections are counted by the user
+behind them: beyond its share, or beyond the total, the oldest connection of the user with the most
+is closed, and a new one is always taken. A connection has SCRAPE_S for its request and its answer
+together. Pages are made at most every PAGE_S, however often they are read.
 """
 
 import asyncio
@@ -38,10 +40,12 @@ Owners = Callable[[Peer], int | None]
 
 
 class KernelTable:
-    """The kernel's list of this machine's TCP sockets as it was at one moment, read when it is first asked.
+    """The kernel's list of this machine's TCP sockets as it was at one moment, read when it is
+    first asked.
 
-    A TCP socket has no SO_PEERCRED. But the other end of a loopback connection is a socket of this machine, and listed with its owner. A
-    flood of connections makes the list long, so one reading serves all connections that were accepted before it.
+    A TCP socket has no SO_PEERCRED. But the other end of a loopback connection is a socket of this
+    machine, and listed with its owner. A flood of connections makes the list long, so one reading
+    serves all connections that were accepted before it.
     """
 
     def __init__(self) -> None:
@@ -187,12 +191,16 @@ class ScrapeServer:
 
 
 def _response(status: str, body: bytes, kind: str, *, head_only: bool) -> bytes:
-    head = f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+    head = (
+        f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\nConnection: "
+        "close\r\n\r\n"
+    )
     return head.encode() + (b"" if head_only else body)
 
 
 def page_of(registry: Any) -> Page:
-    """The page of a `prometheus_client` registry, in its text format or as OpenMetrics (with exemplars)."""
+    """The page of a `prometheus_client` registry, in its text format or as OpenMetrics (with
+    exemplars)."""
     from prometheus_client.exposition import choose_encoder
 
     def page(accept: str) -> tuple[bytes, str]:

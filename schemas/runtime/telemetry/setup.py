@@ -43,7 +43,8 @@ _PROTOCOLS = {"": "http", "http/protobuf": "http", "grpc": "grpc"}
 
 _BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 _BOUNDS_WRITE_S = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.05, 0.25, 1.0, 5.0)
-_BOUNDS_MS = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 33.0, 40.0, 50.0, 100.0, 250.0, 500.0, 1000.0, 5000.0)  # fmt: skip
+_BOUNDS_MS = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 33.0, 40.0, 50.0, 100.0, 250.0,
+500.0, 1000.0, 5000.0)  # fmt: skip
 _BOUNDS: Mapping[str, Sequence[float]] = {
     telemetry.METRIC_WAIT: _BOUNDS_S,
     telemetry.METRIC_HANDOVER: _BOUNDS_S,
@@ -367,7 +368,8 @@ def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any]
     except OSError as error:
         raise ConfigError(
             f"no Prometheus endpoint on {host}:{wanted}: {error}",
-            hint="another program has the port; set OTEL_EXPORTER_PROMETHEUS_PORT or the configuration",
+            hint="another program has the port; set OTEL_EXPORTER_PROMETHEUS_PORT or the "
+            "configuration",
         ) from error
     ends.append(server.close)
     server.start()

@@ -1,7 +1,8 @@
-"""Spans and the way of a trace over a socket. On the API alone: costs next to nothing until `schemas.runtime.telemetry.setup` has installed an SDK.
+"""Spans and the way of a trace over a socket. On the API alone: costs next to nothing until
+`schemas.runtime.telemetry.setup` has installed an SDK.
 
-The wire is W3C `traceparent` whatever `OTEL_PROPAGATORS` says: it is a field of our messages. Without an SDK a caller's trace is not recorded
-here, but handed on to what is called next.
+The wire is W3C `traceparent` whatever `OTEL_PROPAGATORS` says: it is a field of our messages.
+Without an SDK a caller's trace is not recorded here, but handed on to what is called next.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +26,8 @@ _LEFT_OUT = present_context.create_key("left-out")
 def span(
     name: str, traceparent: str | None = None, attributes: Attributes | None = None
 ) -> AbstractContextManager[trace.Span]:
-    """A span, the present one's child, or the caller's when it sent a W3C traceparent. A bad one begins a trace of its own."""
+    """A span, the present one's child, or the caller's when it sent a W3C traceparent. A bad one
+    begins a trace of its own."""
     if traceparent is None and present_context.get_value(_LEFT_OUT):
         return nullcontext(trace.get_current_span())
     made: AbstractContextManager[trace.Span] = _TRACER.start_as_current_span(
@@ -37,14 +39,16 @@ def span(
 def begin(
     name: str, traceparent: str | None = None, attributes: Attributes | None = None
 ) -> trace.Span:
-    """A span for work that is spread over several tasks: `inside` makes it the present one, `end()` ends it."""
+    """A span for work that is spread over several tasks: `inside` makes it the present one, `end()`
+    ends it."""
     return _TRACER.start_span(
         name, context=_of(traceparent) if traceparent else None, attributes=attributes
     )
 
 
 def inside(span: trace.Span) -> AbstractContextManager[trace.Span]:
-    """Within the block the span is the present one, also for the tasks that are made there. It is not ended."""
+    """Within the block the span is the present one, also for the tasks that are made there. It is
+    not ended."""
     made: AbstractContextManager[trace.Span] = trace.use_span(
         span, record_exception=False, set_status_on_exception=False
     )
@@ -53,7 +57,8 @@ def inside(span: trace.Span) -> AbstractContextManager[trace.Span]:
 
 @contextmanager
 def joined(traceparent: str | None) -> Iterator[None]:
-    """Within the block the caller's span is the present one, or none where it sent none: whatever was present before is left alone."""
+    """Within the block the caller's span is the present one, or none where it sent none: whatever
+    was present before is left alone."""
     token = present_context.attach(
         _of(traceparent) if traceparent else trace.set_span_in_context(trace.INVALID_SPAN)
     )
@@ -65,8 +70,10 @@ def joined(traceparent: str | None) -> Iterator[None]:
 
 @contextmanager
 def left_out(traceparent: str | None) -> Iterator[None]:
-    """Within the block nothing is recorded, here or in anything called from here. What the work would have joined (the caller's span or the
-    present one, if any) is still what `carrier` names, marked as not sampled."""
+    """Within the block nothing is recorded, here or in anything called from here. What the work
+    would have joined (the caller's span or the present one, if any) is still what `carrier` names,
+    marked as not sampled.
+    """
     caller = trace.get_current_span(_of(traceparent)) if traceparent else trace.get_current_span()
     known = caller.get_span_context()
     unsampled = trace.SpanContext(
@@ -94,7 +101,8 @@ def carrier() -> dict[str, str] | None:
 
 
 def log_ids() -> dict[str, str]:
-    """`trace_id` and `span_id` of the present span for a line of a log, in hexadecimal; {} outside any trace."""
+    """`trace_id` and `span_id` of the present span for a line of a log, in hexadecimal; {} outside
+    any trace."""
     context = trace.get_current_span().get_span_context()
     if not context.is_valid:
         return {}

@@ -1,7 +1,8 @@
 """A caller's W3C `traceparent`, read once and in one way, on every wire and of every environment.
 
-Telemetry never refuses a request: a malformed traceparent is ignored, and the request begins a trace of its own. A later version than ours (00) is read as
-far as ours goes, which is what https://www.w3.org/TR/trace-context/ asks for, and handed on as ours. Pure.
+Telemetry never refuses a request: a malformed traceparent is ignored, and the request begins a
+trace of its own. A later version than ours (00) is read as far as ours goes, which is what
+https://www.w3.org/TR/trace-context/ asks for, and handed on as ours. Pure.
 """
 
 import re
@@ -10,14 +11,16 @@ from typing import Annotated
 from pydantic import BeforeValidator, Field
 
 READ_MAX_CHARS = 512
-"""Of a later version, with what it has behind ours: as much as OpenTelemetry's own propagators read."""
+"""Of a later version, with what it has behind ours: as much as OpenTelemetry's own propagators
+read."""
 
 _SHAPE = re.compile(r"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})(-.*)?", re.ASCII)
 _SAMPLED = 0x01
 
 
 def read(value: object) -> str | None:
-    """`00-TRACE-SPAN-FLAGS` in lower-case hexadecimal, or None for everything that is no traceparent."""
+    """`00-TRACE-SPAN-FLAGS` in lower-case hexadecimal, or None for everything that is no
+    traceparent."""
     if not isinstance(value, str) or len(value) > READ_MAX_CHARS:
         return None
     found = _SHAPE.fullmatch(value.strip(" \t"))

@@ -1,4 +1,5 @@
-"""What an event costs does not grow with those whom it does not concern: counted in instructions, which no neighbour disturbs."""
+"""What an event costs does not grow with those whom it does not concern: counted in instructions,
+which no neighbour disturbs."""
 
 import sys
 from dataclasses import replace
@@ -29,7 +30,8 @@ SIZE = 4096
 
 
 class Counted:
-    """A core with some leases and as many connections that nothing happens to, and the instructions that each event took."""
+    """A core with some leases and as many connections that nothing happens to, and the instructions
+    that each event took."""
 
     def __init__(self, leases: int, *, listed: bool) -> None:
         gpu = GpuInfo(CARD, 0, "card", d.GIB, 0)
@@ -76,8 +78,10 @@ class Counted:
 
     def asking(self, client: ClientId) -> ev.AcquireRequested:
         spec = ev.Spec(
-            consumer="small", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=SIZE, steady_bytes=SIZE,
-            residue_bytes=0, priority=50, evictable=True, ttl_s=1e9, min_residency_s=0.0, deny_on_deadline=False,
+            consumer="small", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=SIZE,
+            steady_bytes=SIZE,
+            residue_bytes=0, priority=50, evictable=True, ttl_s=1e9, min_residency_s=0.0,
+            deny_on_deadline=False,
         )  # fmt: skip
         return ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
 
@@ -129,7 +133,8 @@ def test_no_event_costs_more_beside_a_hundred_times_as_many_leases_and_connectio
 
 
 def test_no_event_costs_more_beside_gangs_that_gather() -> None:
-    """Each event looked at every gang: two thousand that wait for their second member made a renewal cost 160 times as much."""
+    """Each event looked at every gang: two thousand that wait for their second member made a
+    renewal cost 160 times as much."""
 
     def renewal(gangs: int) -> int:
         counted = Counted(1, listed=True)

@@ -1,4 +1,5 @@
-"""What a crowd leaves behind in the engine has a bound, whatever names it used and however often it came."""
+"""What a crowd leaves behind in the engine has a bound, whatever names it used and however often it
+came."""
 
 from collections.abc import Sized
 from typing import Any

@@ -1,4 +1,5 @@
-"""Each invariant, broken by hand, is found by its number. A sound state is never complained about (the other tests)."""
+"""Each invariant, broken by hand, is found by its number. A sound state is never complained about
+(the other tests)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -235,7 +236,8 @@ def test_a_table_that_lies_is_found(breaks: Callable[[Broken], None], says: str)
 
 
 def test_a_charge_lost_long_ago_is_found_by_the_full_check_alone() -> None:
-    """`check` looks at who was touched; nobody else can have changed, unless somebody went around the ledger's methods."""
+    """`check` looks at who was touched; nobody else can have changed, unless somebody went around
+    the ledger's methods."""
     broken = Broken()
     del broken.gpu.ledger._owner[broken.held.id]
     invariants.check(broken.core)

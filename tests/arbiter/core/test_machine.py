@@ -1,10 +1,12 @@
-"""A rule machine drives the core against the physical card and a small ledger of its own: whatever happens in whatever order, as long as
-holders load only what they were granted and leave when asked, the card never overflows, every byte that somebody holds is charged, tokens
-grow, no wake-up is lost, and everybody is served in the end, within a bound, however many arrive after him.
+"""A rule machine drives the core against the physical card and a small ledger of its own: whatever
+happens in whatever order, as long as holders load only what they were granted and leave when asked,
+the card never overflows, every byte that somebody holds is charged, tokens grow, no wake-up is
+lost, and everybody is served in the end, within a bound, however many arrive after him.
 
-What has to hold is looked at after every event, not only after every rule. Rules are enabled only where they do something, and breakdowns
-only now and then: a history that restarts the daemon all the time grants nothing. Every history begins with some who hold or wait, for
-Hypothesis leaves out some rules in each.
+What has to hold is looked at after every event, not only after every rule. Rules are enabled only
+where they do something, and breakdowns only now and then: a history that restarts the daemon all
+the time grants nothing. Every history begins with some who hold or wait, for Hypothesis leaves out
+some rules in each.
 """
 
 from collections.abc import Callable
@@ -45,7 +47,8 @@ EXITS = range(
 )  # turns in which a process exits: its context may be in the way
 AGEING_S = (max(PRIORITIES) - min(PRIORITIES)) * d.AGEING_S_PER_POINT
 WAIT_MAX_S = AGEING_S + 100.0
-"""Who waits has aged past every newcomer after `AGEING_S`; the rest serves those ahead of him, one after the other."""
+"""Who waits has aged past every newcomer after `AGEING_S`; the rest serves those ahead of him, one
+after the other."""
 NEWCOMERS = 3  # who wait or hold at a time, as long as somebody waits who was there before them
 
 type Wish = tuple[int, bool, float | None, dict[str, Any]]
@@ -74,7 +77,8 @@ def some(*states: LeaseState) -> Callable[["Leases"], bool]:
 
 
 class Leases(RuleBasedStateMachine):
-    """Model: what each process holds on the card by its own doing; `mine` are the leases as their processes know them."""
+    """Model: what each process holds on the card by its own doing; `mine` are the leases as their
+    processes know them."""
 
     @initialize(
         lag=st.sampled_from([0.0, 0.03, 0.8]),
@@ -128,7 +132,7 @@ class Leases(RuleBasedStateMachine):
     def breaks(self, kind: str) -> None:
         self.broke[kind] = len(self.driver.events)
 
-    # -- what people do --------------------------------------------------------------------------------------------
+    # -- what people do
     @precondition(lambda self: bool(self.asking()))
     @rule(who=PICK, wish=WISHES)
     def acquire(self, who: int, wish: Wish) -> None:
@@ -272,7 +276,7 @@ class Leases(RuleBasedStateMachine):
         self.people[who].die()
         self.people[who] = self.driver.consumer(f"p{who}")
 
-    # -- what the world does -----------------------------------------------------------------------------------------
+    # -- what the world does
     @rule(seconds=st.sampled_from([0.002, 0.02, 0.3, 0.3, 2.0, 35.0]))
     def wait(self, seconds: float) -> None:
         if self.having(LOADING):  # the card is read twenty times a second then
@@ -294,7 +298,8 @@ class Leases(RuleBasedStateMachine):
     @precondition(lambda self: self.quiet("restart"))
     @rule()
     def restart(self) -> None:
-        """kill -9 of the daemon: the journal survives, holders come back with their tokens, waiters have to ask again."""
+        """kill -9 of the daemon: the journal survives, holders come back with their tokens, waiters
+        have to ask again."""
         self.breaks("restart")
         resident = self.having(LOADING, HELD, REVOKING, LeaseState.UNLOADING)
         held = {
@@ -312,7 +317,7 @@ class Leases(RuleBasedStateMachine):
         for lease, (state, token) in away.items():
             self.mine[lease].reattach(lease, token, away=True, parked=state is LeaseState.PARKED)
 
-    # -- what must hold after every event ----------------------------------------------------------------------------
+    # -- what must hold after every event
     def sound(self) -> None:
         self.card_never_overflows()
         self.every_byte_is_charged()
@@ -333,8 +338,9 @@ class Leases(RuleBasedStateMachine):
         assert sum(self.driver.card.shown(self.driver.now).values()) + coming <= CAPACITY
 
     def every_byte_is_charged(self) -> None:
-        """The ledger of the core never has less for a process than the process holds. Where the card lists nobody, what one holds is
-        known as exactly only as what an empty card may show."""
+        """The ledger of the core never has less for a process than the process holds. Where the
+        card lists nobody, what one holds is known as exactly only as what an empty card may show.
+        """
         (gpu,) = self.driver.arbiter.inspect().gpus.values()
         unsure = (
             0 if self.driver.card.lists_processes else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
@@ -354,7 +360,8 @@ class Leases(RuleBasedStateMachine):
         self.seen = len(self.driver.effects)
 
     def no_lost_wake_up(self) -> None:
-        """Whenever readings are in and nothing blocks, the head does not fit (else it would have been granted)."""
+        """Whenever readings are in and nothing blocks, the head does not fit (else it would have
+        been granted)."""
         core = state_of(self.driver.arbiter)
         (gpu,) = core.gpus.values()
         head = gpu.queue.head()
@@ -376,10 +383,12 @@ class Leases(RuleBasedStateMachine):
             else:
                 assert self.driver.now <= until, f"{lease} still waits"
 
-    # -- and in the end ----------------------------------------------------------------------------------------------
+    # -- and in the end
     def teardown(self) -> None:
-        """Everybody cooperates: uses end, who is asked leaves, pinned ones go home, processes whose context may be all that is in the
-        way exit. Then every waiter is served within the bound, also if others keep arriving with a higher priority."""
+        """Everybody cooperates: uses end, who is asked leaves, pinned ones go home, processes whose
+        context may be all that is in the way exit. Then every waiter is served within the bound,
+        also if others keep arriving with a higher priority.
+        """
         if not hasattr(self, "driver"):
             return
         self.driver.card.failing = ""
@@ -408,7 +417,8 @@ class Leases(RuleBasedStateMachine):
                 self.unload(lease)
 
     def newcomers(self, turn: int) -> None:
-        """They are more urgent than anybody, leave only when asked, and exit then; another one comes."""
+        """They are more urgent than anybody, leave only when asked, and exit then; another one
+        comes."""
         people = {
             person.name: person for person in self.mine.values() if person.name.startswith("new")
         }

@@ -1,4 +1,5 @@
-"""What users of other arbiters and model servers complain about, as tests. Numbers are those of the list of complaints."""
+"""What users of other arbiters and model servers complain about, as tests. Numbers are those of the
+list of complaints."""
 
 from tests.support.core_driver import CoreDriver, answer, refusal
 from tests.support.scenes import held
@@ -8,7 +9,8 @@ GIB = d.GIB
 
 
 def test_1_freed_is_not_free_yet() -> None:
-    """llama-swap#97, ollama#9160, comfyui-mcp#2050: the next load starts before the driver returns the memory."""
+    """llama-swap#97, ollama#9160, comfyui-mcp#2050: the next load starts before the driver returns
+    the memory."""
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 1.5
     det, lease = held(driver, "det", 5)

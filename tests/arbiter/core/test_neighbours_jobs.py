@@ -1,4 +1,6 @@
-"""What users of other arbiters and model servers complain about, where one job needs several models. Numbers are those of the list."""
+"""What users of other arbiters and model servers complain about, where one job needs several
+models. Numbers are those of the list.
+"""
 
 from tests.support.core_driver import CoreDriver, refusal
 from vram_arbiter.schemas import defaults as d
@@ -27,7 +29,10 @@ def test_3_a_hung_holder_is_not_stopping_for_ever() -> None:
 
 
 def test_3_the_end_of_a_ttl_and_an_unload_do_not_block_each_other() -> None:
-    """llama-swap#946: a ttl that runs out while the model unloads deadlocks both. Here either order ends in the same state."""
+    """llama-swap#946: a ttl that runs out while the model unloads deadlocks both.
+
+    Here either order ends in the same state.
+    """
     for released_first in (True, False):
         driver = CoreDriver(8 * GIB)
         policy = driver.consumer("policy")

@@ -1,4 +1,5 @@
-"""What users of other arbiters suffer from, where leases park, stand by, grow and switch. Numbers are those of the list of complaints."""
+"""What users of other arbiters suffer from, where leases park, stand by, grow and switch. Numbers
+are those of the list of complaints."""
 
 import pytest
 
@@ -13,7 +14,8 @@ GIB, MIB = d.GIB, d.MIB
 
 
 def alternate(driver: CoreDriver, seconds: float) -> int:
-    """Two consumers with a request a second each, on a card for one of them. Returns how often they switched."""
+    """Two consumers with a request a second each, on a card for one of them. Returns how often they
+    switched."""
     people = {name: driver.consumer(name) for name in ("a", "b")}
     leases: dict[str, LeaseId] = {}
     ends = driver.now + seconds
@@ -41,7 +43,8 @@ def test_4_two_models_that_are_wanted_alike_do_not_load_all_the_time() -> None:
 
 @pytest.mark.parametrize("priority", [0, 50])
 def test_4_an_idle_holder_does_not_keep_a_card_for_minutes(priority: int) -> None:
-    """aprender#3986: a lock held for 25 minutes at 97 % idle, six waiters. Whatever was learnt, the wait has a bound."""
+    """aprender#3986: a lock held for 25 minutes at 97 % idle, six waiters. Whatever was learnt, the
+    wait has a bound."""
     learnt = {
         name: {"load_s": 1000.0, "unload_s": 1000.0, "verify_s": 1000.0} for name in ("idle", "w")
     }
@@ -56,7 +59,8 @@ def test_4_an_idle_holder_does_not_keep_a_card_for_minutes(priority: int) -> Non
 
 
 def test_4_nobody_starves_behind_leases_that_come_back_by_themselves() -> None:
-    """Standby leases that return all the time never stand in a waiter's way for longer than the load that is under way."""
+    """Standby leases that return all the time never stand in a waiter's way for longer than the
+    load that is under way."""
     driver = CoreDriver(8 * GIB)
     people = [held(driver, f"s{n}", 2, standby=True, min_residency_s=0.5) for n in range(3)]
     waiting = driver.consumer("low").acquire(7 * GIB, priority=0)
@@ -139,7 +143,8 @@ def test_10_nothing_that_comes_back_or_grows_touches_a_pinned_model() -> None:
 
 
 def test_16_parked_is_charged_as_parked_and_resumed_as_resumed() -> None:
-    """Berth v0.4.0-rc.3: a resumed waiter was charged the whole card, and a hold waited with nothing to drain."""
+    """Berth v0.4.0-rc.3: a resumed waiter was charged the whole card, and a hold waited with
+    nothing to drain."""
     driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 16 * GIB})
     vlm, lease = held(driver, "vlm", 3, park_bytes=3 * GIB, residue_bytes=450 * MIB)
     vlm.unload(lease, parked=True)
@@ -172,7 +177,8 @@ def test_18_a_restore_waits_until_the_room_is_measured() -> None:
 
 
 def test_19_a_model_that_cannot_be_moved_to_host_ram_is_never_told_to() -> None:
-    """bitsandbytes#1815: `.to("cpu")` fails for NF4. Parking is declared by who can, not assumed."""
+    """bitsandbytes#1815: `.to("cpu")` fails for NF4. Parking is declared by who can, not
+    assumed."""
     driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 64 * GIB})
     nf4, lease = held(driver, "nf4", 5)
     driver.consumer("w").acquire(5 * GIB)
@@ -183,7 +189,8 @@ def test_19_a_model_that_cannot_be_moved_to_host_ram_is_never_told_to() -> None:
 
 
 def test_3_stuck_holders_are_ended_only_where_they_agreed() -> None:
-    """ollama#7606 `Stopping…` for ever; llama-swap#125 only SIGKILL helps. By default nothing is done to what may move a robot."""
+    """ollama#7606 `Stopping…` for ever; llama-swap#125 only SIGKILL helps. By default nothing is
+    done to what may move a robot."""
     for agreed, sent in (("wait", []), ("kill", ["term", "kill"])):
         driver = CoreDriver(8 * GIB)
         held(driver, "stuck", 5, on_overstay=agreed)

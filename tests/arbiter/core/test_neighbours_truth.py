@@ -1,4 +1,5 @@
-"""What users of neighbouring systems complain about in *measuring* memory, as tests. Numbers are those of the list of complaints."""
+"""What users of neighbouring systems complain about in *measuring* memory, as tests. Numbers are
+those of the list of complaints."""
 
 import subprocess
 import sys
@@ -16,7 +17,7 @@ GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
 
 
-# -- 1: freed is not free yet --------------------------------------------------------------------------------------------
+# -- 1: freed is not free yet
 def test_1_one_reading_with_a_lot_free_is_believed_only_if_the_next_agrees() -> None:
     """comfyui-mcp#2050: 1205 MB free, 24 GB a moment later, and the other way round."""
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
@@ -50,7 +51,8 @@ def test_1_waiting_for_the_driver_costs_no_more_than_the_driver_takes(lag_s: flo
 
 
 def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> None:
-    """And a reading may come in between, before anybody says that it died: those bytes are its own still, and no stowaway's."""
+    """And a reading may come in between, before anybody says that it died: those bytes are its own
+    still, and no stowaway's."""
     driver = CoreDriver(8 * GIB)
     det, lease = held(
         driver, "det", 4, min_residency_s=60.0
@@ -70,7 +72,8 @@ def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> 
 
 @pytest.mark.parametrize("outage_s", [0.0, 2.0])
 def test_1_a_dead_holders_bytes_are_waited_for_longer_than_a_verdict_takes(outage_s: float) -> None:
-    """The driver no longer lists it, its bytes come back late, and meanwhile the card may not be readable: none of that frees them."""
+    """The driver no longer lists it, its bytes come back late, and meanwhile the card may not be
+    readable: none of that frees them."""
     driver = CoreDriver(8 * GIB, settings={"verify_timeout_s": 1.0})
     det, lease = held(driver, "det", 4, min_residency_s=60.0)
     waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
@@ -105,7 +108,8 @@ def test_1_what_nobody_lists_long_after_a_death_is_a_stowaways() -> None:
 
 
 def test_1_a_holder_that_the_driver_cannot_list_is_not_charged_twice() -> None:
-    """NVML shows no process of another container. What is beyond what such a holder is charged is a stowaway all the same."""
+    """NVML shows no process of another container. What is beyond what such a holder is charged is a
+    stowaway all the same."""
     driver = CoreDriver(8 * GIB, reserve_bytes=0)
     det, _ = held(driver, "det", 4)
     driver.card.unlisted |= {det.process, BROWSER}
@@ -128,7 +132,7 @@ def test_1_a_recovery_that_never_comes_is_not_admitted_after_a_while() -> None:
     assert driver.gpu()["charged_bytes"] == 5 * GIB
 
 
-# -- 2: unload doesn't unload --------------------------------------------------------------------------------------------
+# -- 2: unload doesn't unload
 def test_2_an_unload_that_frees_a_fraction_is_charged_for_the_rest_and_named() -> None:
     """vramd: freed 82 of 4764 MiB. Triton#2023, vLLM#47654, IsaacLab-Arena#670."""
     driver = CoreDriver(8 * GIB)
@@ -170,7 +174,7 @@ def test_2_stranded_bytes_have_an_owner() -> None:
     }
 
 
-# -- 7: estimates are wrong ----------------------------------------------------------------------------------------------
+# -- 7: estimates are wrong
 def test_7_a_wrong_estimate_is_wrong_once() -> None:
     """ollama#6160, OpenRAL: declared 4.0, resident 6.0, peak 7.63 GiB."""
     driver = CoreDriver(10 * GIB)
@@ -191,7 +195,7 @@ def test_7_a_wrong_estimate_is_wrong_once() -> None:
     assert driver.gpu()["charged_bytes"] == 6 * GIB
 
 
-# -- 11: other processes -------------------------------------------------------------------------------------------------
+# -- 11: other processes
 def test_11_a_game_that_starts_is_charged_named_and_makes_idle_models_leave() -> None:
     driver = CoreDriver(8 * GIB)
     _, idle = held(driver, "idle", 3)
@@ -222,13 +226,14 @@ def test_11_bytes_that_nobody_is_listed_for_are_reserve_too() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
-# -- 12: the manager itself eats VRAM ------------------------------------------------------------------------------------
+# -- 12: the manager itself eats VRAM
 def test_12_no_part_of_the_arbiter_loads_cuda() -> None:
     """llama.cpp#20582: cudaMemGetInfo in the router cost 120-550 MB of every card."""
     look = (
         "import sys, arbiter.daemon, arbiter.__main__, arbiter.host.gpu.unified\n"
         "maps = open('/proc/self/maps').read()\n"
-        "print([n for n in ('torch', 'cupy', 'numba', 'cuda', 'pycuda') if n in sys.modules] + [w for w in ('libcuda', 'libcudart') if w in maps])"
+        "print([n for n in ('torch', 'cupy', 'numba', 'cuda', 'pycuda') if n in sys.modules] + [w "
+        "for w in ('libcuda', 'libcudart') if w in maps])"
     )
     done = subprocess.run(
         [sys.executable, "-c", look], capture_output=True, text=True, timeout=60, check=False
@@ -236,7 +241,7 @@ def test_12_no_part_of_the_arbiter_loads_cuda() -> None:
     assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
 
 
-# -- 13: double counting and fail-open -----------------------------------------------------------------------------------
+# -- 13: double counting and fail-open
 def test_13_a_probe_that_fails_between_two_good_readings_does_not_complete_a_verification() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
     det, lease = held(driver, "det", 5)
@@ -266,7 +271,8 @@ def test_13_a_reading_from_before_is_not_newer_because_it_arrives_later() -> Non
 
 
 def test_13_measured_free_memory_never_overrules_the_ledger() -> None:
-    """A lease that has not loaded yet holds nothing on the card, and all of its bytes in the ledger."""
+    """A lease that has not loaded yet holds nothing on the card, and all of its bytes in the
+    ledger."""
     driver = CoreDriver(8 * GIB)
     driver.consumer("a").acquire(6 * GIB, evictable=False)
     driver.advance(5.0)
@@ -276,9 +282,10 @@ def test_13_measured_free_memory_never_overrules_the_ledger() -> None:
     assert driver.state(waiter) == "queued"
 
 
-# -- 20: Jetson ----------------------------------------------------------------------------------------------------------
+# -- 20: Jetson
 def shared_memory(driver: CoreDriver, gib: float) -> None:
-    """The machine itself takes so much of the memory that CPU and GPU share; nobody lists processes."""
+    """The machine itself takes so much of the memory that CPU and GPU share; nobody lists
+    processes."""
     driver.card.lists_processes = False
     driver.card.set(ProcessKey(1, 1), int(gib * GIB), driver.now)
     driver.advance(1.5)
@@ -287,7 +294,8 @@ def shared_memory(driver: CoreDriver, gib: float) -> None:
 def test_20_on_shared_memory_a_model_that_goes_is_verified_by_the_total_although_the_machine_breathes() -> (
     None
 ):
-    """ollama#12283, sglang#10075: MemAvailable moves by itself, so the tolerance is larger there."""
+    """ollama#12283, sglang#10075: MemAvailable moves by itself, so the tolerance is larger
+    there."""
     driver = CoreDriver(8 * GIB, settings={"verify_tolerance_bytes": 256 * MIB})
     shared_memory(driver, 1.5)
     det, lease = held(driver, "det", 3)
@@ -328,8 +336,8 @@ def test_20_what_the_machine_itself_takes_is_not_leased() -> None:
 def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease() -> (
     None
 ):
-    """A storm of faults found it: the card fell by as much as was waited for, because a stowaway had died unseen, and an exclusive lease
-    was granted beside bytes that were still there."""
+    """A storm of faults found it: the card fell by as much as was waited for, because a stowaway
+    had died unseen, and an exclusive lease was granted beside bytes that were still there."""
     driver = CoreDriver(8 * GIB)
     ghost = ProcessKey(9, 9)
     driver.card.set(ghost, 2 * GIB, driver.now)
@@ -351,8 +359,10 @@ def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_
 
 
 def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it() -> None:
-    """A storm of faults found it: the daemon was killed between an unload and its release. The driver listed the process with its
-    context only, the total still had its model, and the next lease was granted beside it."""
+    """A storm of faults found it: the daemon was killed between an unload and its release. The
+    driver listed the process with its context only, the total still had its model, and the next
+    lease was granted beside it.
+    """
     driver = CoreDriver(8 * GIB)
     job, lease = held(driver, "job", 2, exclusive=True, residue_bytes=128 * MIB)
     token = job.token(lease)

@@ -1,4 +1,5 @@
-"""What users of the neighbours complain about: waiting, turns, loads without an end and models nobody wanted gone. Numbers are those of the list."""
+"""What users of the neighbours complain about: waiting, turns, loads without an end and models
+nobody wanted gone. Numbers are those of the list."""
 
 import pytest
 
@@ -9,7 +10,7 @@ from vram_arbiter.schemas import defaults as d
 GIB, MIB = d.GIB, d.MIB
 
 
-# -- 3: stuck for ever -------------------------------------------------------------------------------------------------
+# -- 3: stuck for ever
 @pytest.mark.parametrize("asked", [True, False])
 def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(asked: bool) -> None:
     """ollama#7606, #12179, #7779: "Stopping…" for ever, and everything behind it waits too."""
@@ -53,7 +54,8 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
 def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_it_unloads() -> (
     None
 ):
-    """ollama#10831. `on_deadline: deny` is a typed error after the deadline, whatever the holder says that it is doing."""
+    """ollama#10831. `on_deadline: deny` is a typed error after the deadline, whatever the holder
+    says that it is doing."""
     driver = CoreDriver(8 * GIB)
     stuck, lease = held(driver, "stuck", 5, ttl_s=3600.0)
     waiter = driver.consumer("w").acquire(5 * GIB, deny_on_deadline=True)
@@ -75,9 +77,10 @@ def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_
     driver.until(lambda: driver.state(lease) == "over", limit_s=2.0)
 
 
-# -- 4: thrash and starvation ------------------------------------------------------------------------------------------
+# -- 4: thrash and starvation
 def test_4_a_job_that_runs_is_finished_before_the_swap() -> None:
-    """llama-swap#19, #611: the swap comes in the middle of the answer. Also a waiter of the highest priority waits for its end."""
+    """llama-swap#19, #611: the swap comes in the middle of the answer. Also a waiter of the highest
+    priority waits for its end."""
     driver = CoreDriver(8 * GIB)
     writer, lease = held(driver, "writer", 5, priority=10)
     writer.use_begin(lease, "answer")
@@ -93,7 +96,8 @@ def test_4_a_job_that_runs_is_finished_before_the_swap() -> None:
 
 
 def test_4_whoever_waits_long_enough_is_next() -> None:
-    """llama-swap#784, ageing: "future" there. An endless stream of more important ones does not starve a background job."""
+    """llama-swap#784, ageing: "future" there. An endless stream of more important ones does not
+    starve a background job."""
     driver = CoreDriver(8 * GIB)
     people = {name: driver.consumer(name) for name in ("a", "b")}
     leases = {
@@ -118,7 +122,8 @@ def test_4_whoever_waits_long_enough_is_next() -> None:
 
 
 def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
-    """aprender#3986: one lock for the whole card, held for 25 minutes at 97 % idle, six waiters. Bytes are leased, not the card."""
+    """aprender#3986: one lock for the whole card, held for 25 minutes at 97 % idle, six waiters.
+    Bytes are leased, not the card."""
     driver = CoreDriver(8 * GIB)
     _, idle = held(driver, "idle", 1)
     people = [driver.consumer(f"w{n}") for n in range(6)]
@@ -130,7 +135,8 @@ def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
 
 
 def test_4_a_slow_stop_and_the_next_load_do_not_race() -> None:
-    """Ordo-AI-Stack PR#69: the stop takes 30 s, the load does not wait for it, both run out of memory and restart each other."""
+    """Ordo-AI-Stack PR#69: the stop takes 30 s, the load does not wait for it, both run out of
+    memory and restart each other."""
     driver = CoreDriver(8 * GIB)
     slow, lease = held(driver, "slow", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -143,9 +149,10 @@ def test_4_a_slow_stop_and_the_next_load_do_not_race() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
 
 
-# -- 6: VRAM-aware swap ------------------------------------------------------------------------------------------------
+# -- 6: VRAM-aware swap
 def test_6_what_fits_together_stays_together_without_groups() -> None:
-    """llama-swap#158, #315, #319: nobody writes down who may run beside whom; a newcomer costs as few as the bytes need."""
+    """llama-swap#158, #315, #319: nobody writes down who may run beside whom; a newcomer costs as
+    few as the bytes need."""
     driver = CoreDriver(16 * GIB)
     leases = [held(driver, f"m{n}", gib)[1] for n, gib in enumerate((4, 6, 3))]
     _, small = held(driver, "small", 2)
@@ -175,7 +182,7 @@ def test_6_of_equals_the_least_recently_used_leaves() -> None:
     }  # fmt: skip
 
 
-# -- 7: estimates are wrong --------------------------------------------------------------------------------------------
+# -- 7: estimates are wrong
 def test_7_what_is_measured_when_it_is_loaded_is_charged() -> None:
     """ollama#6160: 22 GB expected, 16 taken, and the model is put on the CPU although it fits."""
     driver = CoreDriver(24 * GIB)
@@ -187,9 +194,10 @@ def test_7_what_is_measured_when_it_is_loaded_is_charged() -> None:
     assert driver.state(driver.consumer("x").acquire(7 * GIB)) == "loading"
 
 
-# -- 8: two loads at once ----------------------------------------------------------------------------------------------
+# -- 8: two loads at once
 def test_8_memory_that_comes_back_during_a_load_confuses_neither() -> None:
-    """vLLM#56830: asserts if free memory grows while it measures itself. A sibling gives its bytes back in the middle of a load."""
+    """vLLM#56830: asserts if free memory grows while it measures itself. A sibling gives its bytes
+    back in the middle of a load."""
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 0.5
     leaver, going = held(driver, "leaver", 3)
@@ -208,9 +216,10 @@ def test_8_memory_that_comes_back_during_a_load_confuses_neither() -> None:
     assert driver.gpu()["stowaway_bytes"] == 0
 
 
-# -- 9: evicts a busy model --------------------------------------------------------------------------------------------
+# -- 9: evicts a busy model
 def test_9_idle_is_what_its_holder_says_and_never_a_guess() -> None:
-    """LLMKube#516: where the idle check gets no answer, it must not count as idle. Whoever uses and is silent is not unloaded for others."""
+    """LLMKube#516: where the idle check gets no answer, it must not count as idle. Whoever uses and
+    is silent is not unloaded for others."""
     driver = CoreDriver(8 * GIB)
     silent, lease = held(driver, "silent", 5, ttl_s=3600.0)
     silent.use_begin(lease)
@@ -220,9 +229,10 @@ def test_9_idle_is_what_its_holder_says_and_never_a_guess() -> None:
     assert driver.gpu()["charged_bytes"] == 5 * GIB
 
 
-# -- 21: manual recipes ------------------------------------------------------------------------------------------------
+# -- 21: manual recipes
 def test_21_an_idle_model_stays_until_somebody_needs_its_room() -> None:
-    """ServerlessLLM#306: lazy unload. No keep-alive to tune, no call to free the memory by hand (ComfyUI#3192, comfy-mcp#116)."""
+    """ServerlessLLM#306: lazy unload. No keep-alive to tune, no call to free the memory by hand
+    (ComfyUI#3192, comfy-mcp#116)."""
     driver = CoreDriver(8 * GIB)
     first, lease = held(driver, "first", 5, ttl_s=3600.0)
     driver.advance(3000.0)
@@ -235,7 +245,8 @@ def test_21_an_idle_model_stays_until_somebody_needs_its_room() -> None:
 
 @pytest.mark.parametrize("pause_s", [0.0, 0.015])
 def test_21_a_detector_that_starts_again_at_once_waits_behind_the_policy(pause_s: float) -> None:
-    """OpenRAL ADR-0050: about 15 ms after it was deactivated, autostart activates it again, into the memory that was made free."""
+    """OpenRAL ADR-0050: about 15 ms after it was deactivated, autostart activates it again, into
+    the memory that was made free."""
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 0.2
     detector, lease = held(driver, "detector", 5)
@@ -248,9 +259,10 @@ def test_21_a_detector_that_starts_again_at_once_waits_behind_the_policy(pause_s
     assert driver.state(again) == "queued"
 
 
-# -- 22: timeouts are guesses ------------------------------------------------------------------------------------------
+# -- 22: timeouts are guesses
 def test_22_a_load_may_take_as_long_as_it_takes() -> None:
-    """ollama's load timeout, llama-swap's health check: a large model on a slow disk is killed at 99 %. Whoever is heard of is left alone."""
+    """ollama's load timeout, llama-swap's health check: a large model on a slow disk is killed at
+    99 %. Whoever is heard of is left alone."""
     driver = CoreDriver(8 * GIB)
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(5 * GIB, ttl_s=10.0)

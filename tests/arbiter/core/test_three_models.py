@@ -73,7 +73,8 @@ def test_find_navigate_grab_and_find_again() -> None:
     assert not robot.asked(policy)
     assert driver.gpu()["charged_bytes"] == VLM + POLICY + RESIDUE
 
-    # the runner runs a goal on the policy's lease; the detector needs both to go and waits for the goal
+    # the runner runs a goal on the policy's lease; the detector needs both to go and waits for the
+    # goal
     robot.runner.use_begin(policy, "goal-1", robot.policy.token(policy), "grab")
     driver.advance(d.MIN_RESIDENCY_S)
     detector = robot.acquire(robot.detector, DETECTOR)
@@ -89,8 +90,8 @@ def test_find_navigate_grab_and_find_again() -> None:
     assert driver.state(policy) == "revoking"
     text = driver.why("detector")["leases"][0]["text"]
     assert (
-        "waits for policy to finish 1 use (asked 3.0 s ago), then it unloads and 4.00 GiB are verified"
-        in text
+        "waits for policy to finish 1 use (asked 3.0 s ago), then it unloads and 4.00 GiB are "
+        "verified" in text
     )
 
     robot.runner.use_end(policy, "goal-1", robot.policy.token(policy))

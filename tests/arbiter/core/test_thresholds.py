@@ -1,4 +1,5 @@
-"""Decisions at their very edge: one byte less, or one moment earlier, and it is decided the other way."""
+"""Decisions at their very edge: one byte less, or one moment earlier, and it is decided the other
+way."""
 
 from typing import Any
 
@@ -15,7 +16,7 @@ TOLERANCE = d.VERIFY_TOLERANCE_BYTES
 BUDGET = 8 * GIB - d.RESERVE_BYTES
 
 
-# -- what a process keeps ------------------------------------------------------------------------------------------------
+# -- what a process keeps
 def kept(driver: CoreDriver, who: Consumer) -> int:
     """What the journal has of the residue of a process, which is what is charged for it."""
     record = driver.journal.get(f"residue:{who.process}:GPU-0", {"residue_bytes": 0})
@@ -107,7 +108,7 @@ def test_one_that_has_a_lease_does_not_keep_others_residues_from_falling() -> No
     assert kept(driver, person) == 1 * GIB
 
 
-# -- others that grew ----------------------------------------------------------------------------------------------------
+# -- others that grew
 def stranger(driver: CoreDriver, pid: int, count: int) -> None:
     key = ProcessKey(pid, 7 * pid)
     driver.card.names[key] = f"p{9 - pid}"
@@ -171,9 +172,10 @@ def test_a_process_without_a_figure_has_not_grown() -> None:
     assert culprits(driver) == [(9, "browser", GIB)]
 
 
-# -- waiting for a load on another card ------------------------------------------------------------------------------------
+# -- waiting for a load on another card
 def two_cards() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
-    """An idle holder on the first card; somebody loads on the second, where there is room for one more."""
+    """An idle holder on the first card; somebody loads on the second, where there is room for one
+    more."""
     driver = CoreDriver(8 * GIB, cards=2)
     _, idle = held(driver, "idle", 6, gpu="0")
     slow = driver.consumer("slow")
@@ -222,7 +224,7 @@ def test_a_gang_that_loads_is_not_waited_for() -> None:
     assert driver.state(idle) == "revoking"
 
 
-# -- who has not come back -----------------------------------------------------------------------------------------------
+# -- who has not come back
 @pytest.mark.parametrize("count", [1, 3, 4])
 def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
     driver = CoreDriver(8 * GIB)
@@ -236,7 +238,7 @@ def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
     )
 
 
-# -- gangs that load -----------------------------------------------------------------------------------------------------
+# -- gangs that load
 def gang_of(driver: CoreDriver, *sizes: tuple[int, int]) -> list[tuple[Consumer, LeaseId]]:
     """Members with these load peaks and steady bytes, the first of which loads."""
     found = []
@@ -304,7 +306,8 @@ def test_while_one_leaves_for_a_gang_nobody_else_is_asked() -> None:
 def test_the_next_member_loads_once_the_last_byte_is_on_its_way_back(
     shown: int, after: str, says: int
 ) -> None:
-    """What the one before still shows of its peak may be there as long as all of it fits beside the load."""
+    """What the one before still shows of its peak may be there as long as all of it fits beside the
+    load."""
     driver = CoreDriver(8 * GIB)
     one, (_, second) = gang_of(driver, (4 * GIB, 3 * GIB), (4 * GIB, 3 * GIB))
     ready_with(one, 4 * GIB + 1, says)
@@ -388,7 +391,7 @@ def test_a_gang_that_may_be_given_up_says_when_and_why() -> None:
     assert driver.state(second) == "over"
 
 
-# -- residues in the journal -----------------------------------------------------------------------------------------------
+# -- residues in the journal
 def restarted_with(driver: CoreDriver, person: Consumer, **changes: Any) -> None:
     """A restart that finds another record of what the process keeps."""
     key = f"residue:{person.process}:GPU-0"

@@ -34,7 +34,8 @@ def test_a_cleared_timer_never_fires() -> None:
 
 
 def test_cleared_timers_do_not_pile_up_until_they_would_be_due() -> None:
-    """Waits of a year that were given up at once stayed in the heap for the year: the daemon grew with every one."""
+    """Waits of a year that were given up at once stayed in the heap for the year: the daemon grew
+    with every one."""
     timers = Timers()
     timers.set(("ttl", "a"), 5.0)
     for number in range(10 * SLACK):

@@ -1,4 +1,5 @@
-"""Events to JSON and back by their hints alone, and a digest that sees every byte of the effects."""
+"""Events to JSON and back by their hints alone, and a digest that sees every byte of the
+effects."""
 
 import json
 from dataclasses import fields, is_dataclass, replace

@@ -1,4 +1,5 @@
-"""A log through the engine again: identical, or the first decision that is another, with its surroundings."""
+"""A log through the engine again: identical, or the first decision that is another, with its
+surroundings."""
 
 import json
 from pathlib import Path

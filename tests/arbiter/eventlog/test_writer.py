@@ -1,4 +1,5 @@
-"""The event log's writer: rotation within a bound, a disk that fails, and what is left after a crash. Real threads and files."""
+"""The event log's writer: rotation within a bound, a disk that fails, and what is left after a
+crash. Real threads and files."""
 
 import asyncio
 import json
@@ -22,7 +23,8 @@ KIB = d.KIB
 
 
 class Recorded:
-    """An engine that is recorded as the daemon does it: a run's events, as many at a time as the test says."""
+    """An engine that is recorded as the daemon does it: a run's events, as many at a time as the
+    test says."""
 
     def __init__(self, run: CoreDriver, folder: Path, **bounds: int) -> None:
         self.folder = folder / FOLDER
@@ -142,7 +144,8 @@ def test_the_folder_stays_within_its_bound(busy: CoreDriver, tmp_path: Path) -> 
 def test_a_state_that_is_larger_than_a_file_does_not_begin_a_new_one_at_every_event(
     busy: CoreDriver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file that began with it was full at once: the engine was copied again and again, a quarter of a second each time."""
+    """The file that began with it was full at once: the engine was copied again and again, a
+    quarter of a second each time."""
     monkeypatch.setattr(
         module, "header_line", lambda header: header_line(header)[:-1] + " " * 100 * KIB + "\n"
     )

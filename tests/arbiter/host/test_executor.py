@@ -1,4 +1,5 @@
-"""Effects are performed in order, and nothing is said about a grant that could not be written down."""
+"""Effects are performed in order, and nothing is said about a grant that could not be
+written down."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -121,7 +122,8 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
 
 
 def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be_written() -> None:
-    """Records are written first, for all that the batch says; it still waits for what came after the grant only."""
+    """Records are written first, for all that the batch says; it still waits for what came after
+    the grant only."""
     recorder = Recorder()
     recorder.disk_full = True
     recorder.executor.perform(
@@ -142,7 +144,8 @@ def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be
 
 
 def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None:
-    """Regression: with a full disk a release was refused and missing in the history although it had taken place."""
+    """Regression: with a full disk a release was refused and missing in the history although it had
+    taken place."""
     recorder = Recorder()
     recorder.disk_full = True
     recorder.executor.perform(

@@ -163,7 +163,8 @@ def test_a_wild_wall_clock_only_dates_events(tmp_path: Path) -> None:
 def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(
     tmp_path: Path,
 ) -> None:
-    """Regression: a robot boots in 1970 and hears the time from the network; its morning was pruned as older than a week."""
+    """Regression: a robot boots in 1970 and hears the time from the network; its morning was pruned
+    as older than a week."""
     store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
     assert store.last_seq() == 0
     store.add([{"seq": number, "at_wall_s": 60.0 * number, "kind": "x"} for number in range(1, 6)])
@@ -204,7 +205,8 @@ def test_without_a_disk_it_lives_in_memory(tmp_path: Path) -> None:
 
 
 class HangingDisk:
-    """A store whose first write hangs until it is let go; from then on it takes what it is given."""
+    """A store whose first write hangs until it is let go; from then on it takes what it is
+    given."""
 
     def __init__(self) -> None:
         self.hangs, self.goes_on = threading.Event(), threading.Event()
@@ -289,12 +291,14 @@ EVENT = "INSERT INTO events VALUES (?, 9e9, 'x', ?)"  # young enough to be kept
 
 @pytest.mark.parametrize(
     "text",
-    ["{", "[" * 100_000, "7", '{"seq": 1e999}', '{"n": ' + "9" * 5000 + "}", '{"n": ' + "9" * 30 + "}", b"\xff{}", '"\\ud800"'],
+    ["{", "[" * 100_000, "7", '{"seq": 1e999}', '{"n": ' + "9" * 5000 + "}",
+    '{"n": ' + "9" * 30 + "}", b"\xff{}", '"\\ud800"'],
 )  # fmt: skip
 def test_an_event_that_cannot_be_read_does_not_hide_the_others(
     tmp_path: Path, text: str | bytes
 ) -> None:
-    """Regression: one of them ended the thread that reads and writes the history, and no question was answered again."""
+    """Regression: one of them ended the thread that reads and writes the history, and no question
+    was answered again."""
     spoiled(tmp_path, EVENT, 3, text)
 
     async def test(history: History) -> None:

@@ -55,8 +55,10 @@ def test_another_boot_voids_every_record(tmp_path: Path) -> None:
 
 def test_a_commit_survives_kill_9(tmp_path: Path) -> None:
     script = (
-        "import sys, os, signal; from pathlib import Path; from vram_arbiter.arbiter.host.journal import Journal\n"
-        "j = Journal.open(Path(sys.argv[1]), 'boot-1'); j.apply([('lease:L1-1', {'state': 'held'})])\n"
+        "import sys, os, signal; from pathlib import Path; from vram_arbiter.arbiter.host.journal "
+        "import Journal\n"
+        "j = Journal.open(Path(sys.argv[1]), 'boot-1'); j.apply([('lease:L1-1', {'state': "
+        "'held'})])\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     root = str(Path(__file__).parents[3])

@@ -1,4 +1,5 @@
-"""What is lost or changed while the daemon is down is noticed at the next start; a kill at any instant is not taken for damage."""
+"""What is lost or changed while the daemon is down is noticed at the next start; a kill at any
+instant is not taken for damage."""
 
 import contextlib
 import errno
@@ -38,7 +39,8 @@ def problems(folder: Path) -> list[str]:
 
 
 def killed(folder: Path, changes: list[Records]) -> Records:
-    """A daemon that made these changes, one commit each, and was killed: the log is not folded into the database."""
+    """A daemon that made these changes, one commit each, and was killed: the log is not folded into
+    the database."""
     journal = Journal.open(folder, "boot-1")
     for change in changes:
         journal.apply(list(change.items()))
@@ -66,17 +68,29 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "seal emptied": (lambda at: os.truncate(at / "journal.seal", 0), "its seal has 0 bytes"),
     "seal too long": (lambda at: os.truncate(at / "journal.seal", 5000), "its seal has"),
     "seal zeroed": (lambda at: overwrite(at / "journal.seal", 0, bytes(64)), "its seal is damaged"),
-    "seal of another boot": (lambda at: overwrite(at / "journal.seal", 16, b"another boot....",), "of an earlier boot"),
-    "seal of an earlier start": (lambda at: overwrite(at / "journal.seal", 8, bytes(8)), "older than the last start"),
-    "seal and database deleted": (lambda at: [path.unlink() for path in at.glob("journal*")], "its seal is missing"),
-    "row changed": (lambda at: sql(at, "UPDATE records SET json = '{\"n\":3}' WHERE key = 'a'"), "not the ones that were written last"),
-    "row gone": (lambda at: sql(at, "DELETE FROM records WHERE key = 'a'"), "not the ones that were written last"),
-    "row too many": (lambda at: sql(at, "INSERT INTO records SELECT 'c', json, digest FROM records WHERE key = 'a'"), "not the ones"),
-    "digest changed": (lambda at: sql(at, "UPDATE records SET digest = zeroblob(16) WHERE key = 'a'"), "1 of its records cannot be used"),
-    "row without a digest": (lambda at: sql(at, "UPDATE records SET digest = NULL WHERE key = 'a'"), "1 of its records cannot be used"),
-    "row not text": (lambda at: sql(at, "UPDATE records SET json = x'ff00' WHERE key = 'a'"), "not the ones"),
-    "boot id changed": (lambda at: sql(at, "UPDATE meta SET value = 'boot-0' WHERE name = 'boot_id'"), "not the ones that were written last"),
-    "epoch file and seal deleted": (lambda at: [(at / name).unlink() for name in ("epoch", "journal.seal")], "its seal is missing"),
+    "seal of another boot": (lambda at: overwrite(at / "journal.seal", 16, b"another boot....",),
+    "of an earlier boot"),
+    "seal of an earlier start": (lambda at: overwrite(at / "journal.seal", 8, bytes(8)),
+    "older than the last start"),
+    "seal and database deleted": (lambda at: [path.unlink() for path in at.glob("journal*")],
+    "its seal is missing"),
+    "row changed": (lambda at: sql(at, "UPDATE records SET json = '{\"n\":3}' WHERE key = 'a'"),
+    "not the ones that were written last"),
+    "row gone": (lambda at: sql(at, "DELETE FROM records WHERE key = 'a'"),
+    "not the ones that were written last"),
+    "row too many": (lambda at: sql(at,
+    "INSERT INTO records SELECT 'c', json, digest FROM records WHERE key = 'a'"), "not the ones"),
+    "digest changed": (lambda at: sql(at,
+    "UPDATE records SET digest = zeroblob(16) WHERE key = 'a'"), "1 of its records cannot be used"),
+    "row without a digest": (lambda at: sql(at, "UPDATE records SET digest = NULL WHERE key = 'a'"),
+    "1 of its records cannot be used"),
+    "row not text": (lambda at: sql(at, "UPDATE records SET json = x'ff00' WHERE key = 'a'"),
+    "not the ones"),
+    "boot id changed": (lambda at: sql(at,
+    "UPDATE meta SET value = 'boot-0' WHERE name = 'boot_id'"),
+    "not the ones that were written last"),
+    "epoch file and seal deleted": (lambda at: [(at / name).unlink() for name in ("epoch",
+    "journal.seal")], "its seal is missing"),
 }  # fmt: skip
 
 
@@ -141,7 +155,8 @@ POWER_CUTS: dict[str, Callable[[Path], Any]] = {
 
 @pytest.mark.parametrize("cut", POWER_CUTS)
 def test_a_power_cut_is_not_doubted(tmp_path: Path, cut: str) -> None:
-    """Another boot emptied the GPU: a wait would help nobody. The epoch file alone is fsynced, so it alone has to be whole."""
+    """Another boot emptied the GPU: a wait would help nobody. The epoch file alone is fsynced, so
+    it alone has to be whole."""
     folder = tmp_path / "state"
     killed(folder, [{"a": {"n": 1}}])
     POWER_CUTS[cut](folder)
@@ -168,9 +183,10 @@ def test_a_database_of_an_earlier_version_is_taken_over(tmp_path: Path) -> None:
     assert opened(tmp_path).records == found.records
 
 
-# -- kills -----------------------------------------------------------------------------------------------------------
+# -- kills
 class Watched(Seal):
-    """A seal that copies the whole folder before and after each write: what a SIGKILL at that instant would leave."""
+    """A seal that copies the whole folder before and after each write: what a SIGKILL at that
+    instant would leave."""
 
     folder: ClassVar[Path]
     copies: ClassVar[list[Path]]
@@ -265,7 +281,8 @@ class Failing(Seal):
 def test_a_seal_that_cannot_be_written_stops_grants_and_nothing_else(
     batches: list[list[tuple[str, int | None]]], refused: set[int]
 ) -> None:
-    """A change is refused as a whole, or made and confirmed later; what was made is never taken for damage."""
+    """A change is refused as a whole, or made and confirmed later; what was made is never taken for
+    damage."""
     with tempfile.TemporaryDirectory(prefix="va") as root:
         folder = Path(root) / "state"
         Failing.writes, Failing.refused = 0, refused
@@ -302,7 +319,8 @@ def test_a_seal_that_cannot_be_written_stops_grants_and_nothing_else(
 def test_a_kill_in_the_middle_of_a_start_changes_nothing(
     tmp_path: Path, boot_id: str, doubted: bool
 ) -> None:
-    """The second start is killed between its three writes; the third finds what the first left, and its doubt."""
+    """The second start is killed between its three writes; the third finds what the first left, and
+    its doubt."""
     before = tmp_path / "before"
     killed(before, [{"a": {"n": 1}}])
     if doubted:
@@ -319,9 +337,10 @@ def test_a_kill_in_the_middle_of_a_start_changes_nothing(
             assert set(found.records) == set(first.records)
 
 
-# -- epochs ----------------------------------------------------------------------------------------------------------
+# -- epochs
 def test_a_deleted_state_folder_repeats_no_epoch(tmp_path: Path) -> None:
-    """Regression: it began again at 1, and an earlier holder's lease id and token belonged to another."""
+    """Regression: it began again at 1, and an earlier holder's lease id and token belonged to
+    another."""
     seen = []
     for _ in range(20):
         seen.append(opened(tmp_path / "state").epoch)
@@ -370,7 +389,8 @@ def test_an_epoch_that_cannot_be_is_put_aside(tmp_path: Path, text: str) -> None
 
 
 def test_a_folder_that_forgot_the_last_start_is_doubted(tmp_path: Path) -> None:
-    """The copy in the socket's lock file knows of it, whether the folder was deleted or an earlier one was put back."""
+    """The copy in the socket's lock file knows of it, whether the folder was deleted or an earlier
+    one was put back."""
     folder = tmp_path / "state"
     first = opened(folder)
     shutil.copytree(folder, tmp_path / "before")

@@ -1,4 +1,5 @@
-"""Timers that keep their microseconds. Real time and real descriptors; bounds hold on a busy machine because the best of many counts."""
+"""Timers that keep their microseconds. Real time and real descriptors; bounds hold on a busy
+machine because the best of many counts."""
 
 import os
 import selectors

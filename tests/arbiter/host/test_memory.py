@@ -1,4 +1,5 @@
-"""The budget for parked weights: the operator's word, else half of what the kernel calls available, else nothing."""
+"""The budget for parked weights: the operator's word, else half of what the kernel calls available,
+else nothing."""
 
 from pathlib import Path
 

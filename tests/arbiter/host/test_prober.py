@@ -1,4 +1,5 @@
-"""Readings with deadlines: failing, hanging and late probes. Threads are real, the probe is scripted."""
+"""Readings with deadlines: failing, hanging and late probes. Threads are real, the probe is
+scripted."""
 
 import asyncio
 import os
@@ -166,7 +167,8 @@ def test_a_hanging_reading_is_unknown_until_a_fresh_one_answers() -> None:
 
 
 def test_bytes_of_a_child_are_booked_on_who_holds_the_lease_when_the_reading_is_handed_on() -> None:
-    """This very process is the child, the test's parent holds the lease, and was granted it while the card was being read."""
+    """This very process is the child, the test's parent holds the lease, and was granted it while
+    the card was being read."""
     me, parent = read_kin(os.getpid()), read_kin(os.getppid())
     assert me is not None
     assert parent is not None

@@ -1,4 +1,5 @@
-"""Bytes of children on the ancestor that holds the lease; /proc is a dict here, except where its real text is read."""
+"""Bytes of children on the ancestor that holds the lease; /proc is a dict here, except where its
+real text is read."""
 
 import os
 import subprocess
@@ -33,7 +34,8 @@ def known(owners: tuple[int, ...] = (), clients: tuple[int, ...] = ()) -> Known:
 
 
 class Proc:
-    """`/proc` as a dict: pid → (parent's pid, name). 1 init, 20 shell, 30 vramctl, 40 program, 50 its worker."""
+    """`/proc` as a dict: pid → (parent's pid, name). 1 init, 20 shell, 30 vramctl, 40 program, 50
+    its worker."""
 
     def __init__(self) -> None:
         self.kin = {1: Kin(key(1), 0, "init")}

@@ -57,7 +57,8 @@ def watching(test: Callable[[ProcessWatch, "asyncio.Queue[ProcessKey]"], Awaitab
 
 
 def watched() -> int:
-    """Descriptors of processes that this one has open. Of others, earlier tests may have left some that are closed at any moment."""
+    """Descriptors of processes that this one has open. Of others, earlier tests may have left some
+    that are closed at any moment."""
     found = []
     for number in os.listdir("/proc/self/fd"):
         with contextlib.suppress(FileNotFoundError):  # the listing's own
@@ -68,7 +69,8 @@ def watched() -> int:
 def test_a_process_is_watched_by_the_descriptor_of_its_connection(
     children: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
-    """Between a connection's accept and its hello the process may die and its pid be reused: the pidfd still names the first one."""
+    """Between a connection's accept and its hello the process may die and its pid be reused: the
+    pidfd still names the first one."""
 
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
         child = children()

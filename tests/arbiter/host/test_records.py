@@ -1,6 +1,8 @@
-"""Records that say what cannot be: the daemon starts, answers, and names the record that it put aside.
+"""Records that say what cannot be: the daemon starts, answers, and names the record that it put
+aside.
 
-Regression: a pid of 2^40 ended every start in a traceback, a token of 10^30 left every request for the status unanswered.
+Regression: a pid of 2^40 ended every start in a traceback, a token of 10^30 left every request for
+the status unanswered.
 """
 
 import contextlib
@@ -53,7 +55,8 @@ def records_written() -> tuple[tuple[Settings, Records], ...]:
 
 
 def start_with(settings: Settings, texts: dict[str, str]) -> Opened:
-    """As the daemon does it, with an hour of work afterwards. Raises nothing, whatever the records say."""
+    """As the daemon does it, with an hour of work afterwards. Raises nothing, whatever the records
+    say."""
     with tempfile.TemporaryDirectory(prefix="va", dir="/dev/shm") as root:
         Journal.open(Path(root), "boot").close()
         with (
@@ -119,8 +122,10 @@ def test_what_the_core_writes_is_taken(index: int) -> None:
 
 
 NASTY = st.sampled_from(
-    [None, True, -1, 0, 1 << 31, 1 << 40, 1 << 63, 10**30, -(10**30), 0.5, 1e308, float("nan"), float("inf"), "", "x", "7", "\ud800",
-     "\0", "\x1b[2J", "x" * 100_000, [], [None], [1, 2], [[]], [-1, -1], [10**30, 1], {}, {"a": 1}, {"": []}, deep(70), deep(400)]
+    [None, True, -1, 0, 1 << 31, 1 << 40, 1 << 63, 10**30, -(10**30), 0.5, 1e308, float("nan"),
+    float("inf"), "", "x", "7", "\ud800",
+     "\0", "\x1b[2J", "x" * 100_000, [], [None], [1, 2], [[]], [-1, -1], [10**30, 1], {}, {"a": 1},
+     {"": []}, deep(70), deep(400)]
 )  # fmt: skip
 
 

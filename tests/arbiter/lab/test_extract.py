@@ -1,4 +1,5 @@
-"""A log as a workload: simulating the logged policy gives what the log says, and another policy gives something else."""
+"""A log as a workload: simulating the logged policy gives what the log says, and another policy
+gives something else."""
 
 import json
 from pathlib import Path
@@ -37,7 +38,8 @@ def near(value: float, wanted: float, share: float, slack: float) -> bool:
 
 @pytest.mark.parametrize("name", ["find-navigate-grab", "small-behind-large", "two-thrashing"])
 def test_the_simulator_reproduces_a_log_within_its_stated_error(name: str, tmp_path: Path) -> None:
-    """Switches and loads within 10 %, the longest wait within 15 % or half a second. docs/policies.md states this."""
+    """Switches and loads within 10 %, the longest wait within 15 % or half a second.
+    docs/policies.md states this."""
     log, truth = recorded(name, tmp_path)
     found = extract(runner.load(log))
     assert found.replayed.identical
@@ -140,7 +142,7 @@ def test_a_wild_log_is_taken_as_far_as_it_goes(
     assert compare.under(found.workload, found.settings, policy).total.ooms == 0
 
 
-# -- the programs --------------------------------------------------------------------------------------------------
+# -- the programs
 def test_what_if_prints_the_log_beside_the_policies(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,5 @@
-"""Simulated consumers under the engine and under other programs' rules: safe, reproducible, and as each rule says."""
+"""Simulated consumers under the engine and under other programs' rules: safe, reproducible, and as
+each rule says."""
 
 import pytest
 
@@ -23,7 +24,10 @@ def shipped(name: str) -> Scenario:
 def scenario_of(
     consumers: str, *, seconds: float = 120, lag_s: float = 0.5, card: str = "8GiB", more: str = ""
 ) -> Scenario:
-    text = f"about: test\nseconds: {seconds}\ncards: [{{capacity: {card}, release_lag_s: {lag_s}}}]\n{more}\nconsumers:\n"
+    text = (
+        f"about: test\nseconds: {seconds}\ncards: [{{capacity: {card}, release_lag_s: "
+        f"{lag_s}}}]\n{more}\nconsumers:\n"
+    )
     return load_scenario(text + consumers, "test.yaml")
 
 
@@ -138,7 +142,7 @@ def test_stowaways_are_charged_and_come_and_go() -> None:
     assert 20.0 < outcome.of("a").waits_s[0] < 24.0
 
 
-# -- other programs' rules -----------------------------------------------------------------------------------------
+# -- other programs' rules
 def test_without_anybody_to_decide_the_second_never_gets_in() -> None:
     outcome = under(scenario_of(TWO), "unmanaged")
     assert outcome.of("right").ooms > 50
@@ -182,7 +186,8 @@ def test_a_small_model_waits_behind_a_large_one_with_ollama_and_not_here() -> No
 def test_the_ports_know_one_card_and_names_are_checked() -> None:
     made = load_scenario(
         "about: t\nseconds: 5\ncards: [{capacity: 8GiB}, {capacity: 8GiB}]\nconsumers:\n"
-        "  a: {load_peak: 1GiB, use_s: 1, arrivals: {at_s: [0, 1]}}\n  b: {load_peak: 7GiB, use_s: 1, gpu: '1', arrivals: {at_s: [0]}}",
+        "  a: {load_peak: 1GiB, use_s: 1, arrivals: {at_s: [0, 1]}}\n  b: {load_peak: 7GiB, use_s: "
+        "1, gpu: '1', arrivals: {at_s: [0]}}",
         "two.yaml",
     )
     for policy in RULES:

@@ -128,8 +128,8 @@ def worst_leases(leases: int, **wrong: Any) -> list[dict[str, Any]]:
     ],
 )  # fmt: skip
 def test_validation_makes_few_errors_whatever_is_wrong(message: dict[str, Any]) -> None:
-    """On main a message of 1 MiB of unknown keys made 60,000 errors of pydantic and cost the loop up to 4.3 s.
-    Work is counted here, not time: tests/bench measures the time."""
+    """On main a message of 1 MiB of unknown keys made 60,000 errors of pydantic and cost the loop
+    up to 4.3 s. Work is counted here, not time: tests/bench measures the time."""
     with pytest.raises(codec.Undecodable) as raised:
         codec.decode(msgpack.packb(message), LIMIT)
     cause = raised.value.__cause__
@@ -145,7 +145,8 @@ def test_a_megabyte_of_unknown_keys_is_not_built() -> None:
 
 
 def test_a_client_with_all_its_leases_and_many_uses_reattaches() -> None:
-    """The limit of values must not refuse what an honest client holds: then its leases would expire."""
+    """The limit of values must not refuse what an honest client holds: then its leases would
+    expire."""
     size = {"load_peak_bytes": 5, "steady_bytes": 4, "residue_bytes": 1}
     spec = LeaseSpec(
         consumer="c", model_id="m", footprint=Footprint(**size), gang=Gang(id="g", size=2)

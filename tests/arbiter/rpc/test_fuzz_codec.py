@@ -1,4 +1,5 @@
-"""Whatever arrives is a request or a typed error, quickly, in little memory, and the answer to it can be sent and is short."""
+"""Whatever arrives is a request or a typed error, quickly, in little memory, and the answer to it
+can be sent and is short."""
 
 import random
 import tracemalloc
@@ -85,7 +86,8 @@ def test_a_bomb_is_defused_in_little_memory(name: str) -> None:
 
 @pytest.mark.parametrize("name", COSTLY)
 def test_the_costliest_messages_are_little_work(name: str) -> None:
-    """What is built is counted, not timed (`make bench` does that): values, errors of validation, and the answer's bytes."""
+    """What is built is counted, not timed (`make bench` does that): values, errors of validation,
+    and the answer's bytes."""
     message = COSTLY[name]
     assert len(message) <= MESSAGE_MAX_BYTES + 200_000, "it is of the size that a client may send"
     refused: codec.Undecodable | None = None

@@ -1,5 +1,7 @@
-"""Hostile connections against the session table, with a list for a core and with the real core: nothing raises, every frame is answered
-exactly once, nobody else's lease changes, and when the processes are gone nothing of them is left."""
+"""Hostile connections against the session table, with a list for a core and with the real core:
+nothing raises, every frame is answered exactly once, nobody else's lease changes, and when the
+processes are gone nothing of them is left.
+"""
 
 import os
 import random
@@ -64,7 +66,8 @@ class Recording:
 
 @dataclass
 class RealCore:
-    """The core with its executor, a card that shows nothing, a journal in a dict, and time that moves when told."""
+    """The core with its executor, a card that shows nothing, a journal in a dict, and time that
+    moves when told."""
 
     plant: "Plant"
     journal: dict[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -150,11 +153,13 @@ class Plant:
         self.outbox: Any = self  # the executor's way out, until the table is there
         values: dict[str, Any] = {
             "sessions_max": 50,
-            "processes_max": 1000, "rate_per_s": 1_000_000, "process_rate_per_s": 1_000_000, "subscribers_max": 3,
+            "processes_max": 1000, "rate_per_s": 1_000_000, "process_rate_per_s": 1_000_000,
+            "subscribers_max": 3,
             "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, **limits,
         }  # fmt: skip
         settings_ = SessionSettings(
-            epoch=1, boot_id="b", server="test", heartbeat_s=2.0, grace_s=5.0, message_max_bytes=d.MESSAGE_MAX_BYTES,
+            epoch=1, boot_id="b", server="test", heartbeat_s=2.0, grace_s=5.0,
+            message_max_bytes=d.MESSAGE_MAX_BYTES,
             operators_gid=None, **values,
         )  # fmt: skip
         self.core: Any = Recording() if not real else RealCore(self)
@@ -204,7 +209,8 @@ class Plant:
             self.table.disconnected(self.connections.pop(via), "the peer hung up")
 
     def say(self, via: bytes, peer: Peer, frame: bytes) -> list[dict[str, Any]]:
-        """Deliver a message; the answers (not pushes) to it. A connection that the table closed is opened again."""
+        """Deliver a message; the answers (not pushes) to it. A connection that the table closed is
+        opened again."""
         if via in self.connections and self.connections[via].closed:
             self.hang_up(via)
         connection = self.connection(via, peer)
@@ -249,7 +255,8 @@ class Plant:
 
 
 def attack_table(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
-    """Hellos, valid requests, mutants, bombs and noise over a few connections of two processes. Counts answers per frame."""
+    """Hellos, valid requests, mutants, bombs and noise over a few connections of two processes.
+    Counts answers per frame."""
     counts: Counter[int] = Counter()
     connections = [(b"c%d" % number, ATTACKERS[number % 2]) for number in range(6)]
     for number in range(frames):
@@ -302,7 +309,8 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
     core.advance(0.1)
     plant.hello(b"victim", VICTIM)
     spec = {"consumer": "victim", "model_id": "m", "evictable": False, "ttl_s": 3600.0,
-            "footprint": {"load_peak_bytes": d.GIB, "steady_bytes": d.GIB, "residue_bytes": 0}}  # fmt: skip
+            "footprint": {"load_peak_bytes": d.GIB, "steady_bytes": d.GIB,
+            "residue_bytes": 0}}  # fmt: skip
     lease = plant.ask(b"victim", VICTIM, "acquire", nonce="v", spec=spec)["lease"]
     on = {"lease_id": lease["lease_id"], "token": lease["token"]}
     assert plant.ask(b"victim", VICTIM, "ready", **on)["ok"]

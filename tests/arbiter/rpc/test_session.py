@@ -1,4 +1,5 @@
-"""Sessions: identity, roles, limits, and requests that become events. No socket: the wire is a list."""
+"""Sessions: identity, roles, limits, and requests that become events. No socket: the wire is a
+list."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -133,8 +134,10 @@ class Bench:
 
 def make_bench(**changes: Any) -> Bench:
     values: dict[str, Any] = {
-        "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "grace_s": 5.0, "message_max_bytes": 4096,
-        "sessions_max": 3, "processes_max": 1000, "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, "rate_per_s": 100,
+        "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "grace_s": 5.0,
+        "message_max_bytes": 4096,
+        "sessions_max": 3, "processes_max": 1000, "operator_reserve": 0, "user_share": 1.0,
+        "process_share": 1.0, "rate_per_s": 100,
         "process_rate_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
     }  # fmt: skip
     session_bench = Bench()
@@ -164,7 +167,8 @@ def acquire(session_bench: Bench) -> None:
 def test_hello_is_welcomed_and_the_core_hears_the_kernels_word(session_bench: Bench) -> None:
     reply = session_bench.hello()
     assert reply == {
-        "re": 1, "epoch": 3, "ok": True, "version": d.WIRE_VERSION, "boot_id": "boot", "server": "test", "role": "client",
+        "re": 1, "epoch": 3, "ok": True, "version": d.WIRE_VERSION, "boot_id": "boot",
+        "server": "test", "role": "client",
         "heartbeat_s": 2.0, "grace_s": 5.0,
     }  # fmt: skip
     assert session_bench.events == [
@@ -190,7 +194,8 @@ def test_another_version_is_refused(session_bench: Bench) -> None:
 
 
 def test_a_sub_lease_is_an_unknown_field(session_bench: Bench) -> None:
-    """Sub-leases went with version 2 of the wire: a spec that still names a parent is refused, not granted as a lease of its own."""
+    """Sub-leases went with version 2 of the wire: a spec that still names a parent is refused, not
+    granted as a lease of its own."""
     session_bench.hello()
     spec = {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}
     parent = {"lease_id": "L1-1", "token": [1, 1]}
@@ -200,7 +205,8 @@ def test_a_sub_lease_is_an_unknown_field(session_bench: Bench) -> None:
 
 
 def test_a_peer_that_cannot_be_seen_is_refused(session_bench: Bench) -> None:
-    """The kernel says pid 0 of a process of another pid namespace: its death would be heard by nothing."""
+    """The kernel says pid 0 of a process of another pid namespace: its death would be heard by
+    nothing."""
     reply = session_bench.hello(peer=Peer(ProcessKey(0, 0), 1000, 1000, -1))
     assert code(reply) == "not_permitted"
     assert "--pid=host" in reply["error"]["hint"]
@@ -256,7 +262,8 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
     session_bench.hello()
     session_bench.events.clear()
     me, token, on = session_bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
-    wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT, "mode": "exclusive",
+    wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT,
+    "mode": "exclusive",
               "priority": 60, "evictable": False, "on_deadline": "deny"}  # fmt: skip
     spec = ev.Spec(
         "detector", ModelKey("m", "r"), "any", True, 10, 8, 2, 60, False, 10.0, 2.0, True
@@ -326,10 +333,14 @@ def test_every_op_of_the_wire_is_dispatched(session_bench: Bench) -> None:
     on = {"lease_id": "L3-1", "token": [3, 7]}
     fields: dict[str, dict[str, Any]] = {
         "hello": {"version": d.WIRE_VERSION, "name": "n", "instance": "i-61"},
-        "acquire": {"nonce": "n", "spec": {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}},
-        "use_begin": {**on, "use_id": "u"}, "use_end": {**on, "use_id": "u"}, "renew": {"leases": []},
-        "cancel": {"lease_id": "L"}, "reacquire": on, "resize": {**on, "footprint": FOOTPRINT}, "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
-        "why": {"consumer": "c"}, **dict.fromkeys(("ready", "revoke_ack", "unloading", "release"), on),
+        "acquire": {"nonce": "n",
+        "spec": {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}},
+        "use_begin": {**on, "use_id": "u"}, "use_end": {**on, "use_id": "u"},
+        "renew": {"leases": []},
+        "cancel": {"lease_id": "L"}, "reacquire": on, "resize": {**on, "footprint": FOOTPRINT},
+        "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
+        "why": {"consumer": "c"},
+        **dict.fromkeys(("ready", "revoke_ack", "unloading", "release"), on),
     }  # fmt: skip
     session_bench.hello()
     for op in wire.OPS:
@@ -371,9 +382,10 @@ def test_a_dead_process_takes_its_sessions_along(session_bench: Bench) -> None:
     assert session_bench.left() == []
 
 
-# -- connections that are lost -----------------------------------------------------------------------------------------
+# -- connections that are lost
 def test_a_lost_connection_without_a_lease_ends_its_session_at_once(session_bench: Bench) -> None:
-    """libzmq's ROUTER never said that a peer had gone: such sessions stayed until their process died."""
+    """libzmq's ROUTER never said that a peer had gone: such sessions stayed until their process
+    died."""
     session_bench.hello()
     client = session_bench.client()
     session_bench.hang_up()
@@ -385,7 +397,8 @@ def test_a_lost_connection_without_a_lease_ends_its_session_at_once(session_benc
 
 
 def test_a_holder_that_loses_its_connection_keeps_its_session(session_bench: Bench) -> None:
-    """The end of a use makes a safe point: a connection that breaks while a robot moves must not make one."""
+    """The end of a use makes a safe point: a connection that breaks while a robot moves must not
+    make one."""
     session_bench.hello()
     acquire(session_bench)
     session_bench.concerned.add(session_bench.client())
@@ -464,7 +477,7 @@ def test_the_same_instance_of_another_process_is_another_client(session_bench: B
     assert len(session_bench.table) == 2
 
 
-# -- shares ------------------------------------------------------------------------------------------------------------
+# -- shares
 def test_the_rate_is_limited_per_session_and_refills(session_bench: Bench) -> None:
     session_bench.hello(b"a")
     session_bench.hello(b"b")
@@ -498,7 +511,8 @@ def test_connecting_again_does_not_refill_the_rate_of_a_process() -> None:
 
 
 def test_a_large_message_is_charged_for_its_size(session_bench: Bench) -> None:
-    """The cost of a message grows with its bytes: 2,000 of 1 MiB a second would take all the time there is."""
+    """The cost of a message grows with its bytes: 2,000 of 1 MiB a second would take all the time
+    there is."""
     session_bench.hello()
     assert code(session_bench.ask("ping", pad="x" * 3000)) == "bad_request"  # 1 + 2
     assert sum(session_bench.ask("ping")["ok"] for _ in range(150)) == 96
@@ -535,7 +549,8 @@ def test_one_over_the_rate_is_told_so_whatever_it_sent(session_bench: Bench) -> 
 
 
 def test_strangers_do_not_use_up_each_others_rate(session_bench: Bench) -> None:
-    """All connections without a hello shared one budget: one of them kept every other client from its hello."""
+    """All connections without a hello shared one budget: one of them kept every other client from
+    its hello."""
     for _ in range(150):
         session_bench.raw(b"junk", b"z")
     assert code(session_bench.raw(b"junk", b"z")) == "limit_exceeded"
@@ -561,7 +576,8 @@ def test_one_process_and_one_user_leave_room_for_others() -> None:
 
 
 def test_processes_that_held_something_and_left_have_a_share() -> None:
-    """Each costs a descriptor until it dies: processes of one user that lease, leave and live on took all there are."""
+    """Each costs a descriptor until it dies: processes of one user that lease, leave and live on
+    took all there are."""
     session_bench = make_bench(processes_max=4, user_share=0.5)
 
     def holder(number: int, uid: int, role: str = "client") -> dict[str, Any]:

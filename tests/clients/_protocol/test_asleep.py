@@ -94,7 +94,8 @@ def test_reacquire_is_granted_at_once_or_later_or_never(link: Wire) -> None:
 
 
 def test_one_requests_end_that_drops_another_does_not_stop_the_clock(link: Wire) -> None:
-    """Regression: the lease ended with its `reacquire`, its `use_end` was dropped and then failed too, and no tick came any more."""
+    """Regression: the lease ended with its `reacquire`, its `use_end` was dropped and then failed
+    too, and no tick came any more."""
     record = link.hold()
     evict(link, record)
     link.holdings.reacquire(record, None, link.now)
@@ -152,7 +153,8 @@ def back_in_contact(
 
 
 def test_who_wants_to_come_back_says_that_it_left_until_it_is_heard(link: Wire) -> None:
-    """Regression: after 5 s without the arbiter a lease on standby was over for its holder, and kept its room at the arbiter."""
+    """Regression: after 5 s without the arbiter a lease on standby was over for its holder, and
+    kept its room at the arbiter."""
     record = left_unheard(link)
     link.tick(3600.0)
     assert (record.asleep, link.told()) == ("standby", [])
@@ -179,7 +181,8 @@ def test_an_arbiter_that_will_not_have_it_back_is_believed_however_late(link: Wi
 
 
 def test_an_answer_to_its_release_does_not_touch_a_lease_that_has_returned(link: Wire) -> None:
-    """The arbiter had heard it before it died, and granted the lease again: the old token is none any more."""
+    """The arbiter had heard it before it died, and granted the lease again: the old token is none
+    any more."""
     record = left_unheard(link)
     (release,) = back_in_contact(link, record, token=[2, 9])
     assert link.told() == [r.Returned(record), r.Up(1)]

@@ -1,4 +1,5 @@
-"""The client's connection without sockets and without time passing by itself: greeting, requests, silence, history."""
+"""The client's connection without sockets and without time passing by itself: greeting, requests,
+silence, history."""
 
 from tests.support.protocol_wire import WELCOME, Wire, view
 from vram_arbiter.clients._protocol import records as r
@@ -6,7 +7,7 @@ from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S, SILENCE_B
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VersionMismatch
 
 
-# -- greeting ---------------------------------------------------------------------------------------------------------
+# -- greeting
 def test_requests_before_the_greeting_are_sent_after_it() -> None:
     link = Wire()
     request = link.connection.request("status", {}, link.now)
@@ -54,7 +55,7 @@ def test_words_from_a_lost_connection_are_ignored(link: Wire) -> None:
     assert link.told() == []
 
 
-# -- requests ---------------------------------------------------------------------------------------------------------
+# -- requests
 def test_an_error_reply_is_the_typed_error(link: Wire) -> None:
     request = link.connection.request("why", {"consumer": "x"}, link.now)
     link.refuse(link.one("why"), "limit_exceeded", limit="rate")
@@ -115,7 +116,7 @@ def test_a_session_that_the_arbiter_forgot_is_made_anew(link: Wire) -> None:
     assert isinstance(link.told()[0], r.Replied)
 
 
-# -- heartbeat --------------------------------------------------------------------------------------------------------
+# -- heartbeat
 def test_silence_is_asked_about_and_then_means_lost_contact(link: Wire) -> None:
     assert link.protocol.next_deadline() == link.now + 2.0
     link.tick(2.0)
@@ -129,7 +130,7 @@ def test_silence_is_asked_about_and_then_means_lost_contact(link: Wire) -> None:
     assert isinstance(lost, r.ContactLost)
 
 
-# -- history ----------------------------------------------------------------------------------------------------------
+# -- history
 def test_a_subscription_outlives_the_connection(link: Wire) -> None:
     link.protocol.subscribe(link.now)
     link.reply(link.one("subscribe"))

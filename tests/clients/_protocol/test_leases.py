@@ -204,7 +204,8 @@ FOOTPRINT = {"load_peak_bytes": 9, "steady_bytes": 9, "residue_bytes": 1}
 
 @pytest.mark.parametrize("ends", ["held", "resized", "refused"])
 def test_a_resize_outlives_the_daemon(link: Wire, ends: str) -> None:
-    """Regression: the daemon that was to tell its end was another one, and `resize` never returned."""
+    """Regression: the daemon that was to tell its end was another one, and `resize` never
+    returned."""
     record = link.hold()
     link.holdings.resize(record, FOOTPRINT, 5.0, link.now)
     link.reply(link.one("resize"), state="growing", lease=view())
@@ -248,7 +249,8 @@ def test_a_resize_that_was_answered_or_is_on_the_way_is_said_once(link: Wire, fi
 
 
 def test_a_resize_ends_when_the_lease_leaves_the_card(link: Wire) -> None:
-    """Regression: the arbiter drops a growth whose lease unloads and says nothing of it; `resize` never returned."""
+    """Regression: the arbiter drops a growth whose lease unloads and says nothing of it; `resize`
+    never returned."""
     record = link.hold()
     link.holdings.resize(record, FOOTPRINT, None, link.now)
     link.reply(link.one("resize"), state="growing", lease=view())

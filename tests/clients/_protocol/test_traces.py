@@ -1,4 +1,5 @@
-"""The caller's trace goes along with what the clients send, and nobody who does not trace pays for it."""
+"""The caller's trace goes along with what the clients send, and nobody who does not trace pays for
+it."""
 
 import asyncio
 import subprocess
@@ -28,7 +29,8 @@ Spec = Callable[..., LeaseSpec]
 
 def test_a_program_that_does_not_trace_does_not_import_the_api() -> None:
     code = (
-        "import sys, clients.client, clients.sync, clients.runner, clients.sidecar.policy, clients._protocol.traces as t\n"
+        "import sys, clients.client, clients.sync, clients.runner, clients.sidecar.policy, "
+        "clients._protocol.traces as t\n"
         "assert t.present() is None and t.along({'a': 1}) == {'a': 1}\n"
         "with t.joined('00-1-2-01'): pass\n"
         "print([name for name in sys.modules if name.startswith('opentelemetry')])"
@@ -101,7 +103,8 @@ def test_the_arbiter_hears_of_the_trace_of_an_acquire(
 def test_a_model_that_is_called_back_is_loaded_in_the_trace_of_who_wants_it(
     arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    """One that comes back by itself is nobody's: neither the evictor's nor that of whoever was just talking to the arbiter."""
+    """One that comes back by itself is nobody's: neither the evictor's nor that of whoever was just
+    talking to the arbiter."""
     loaded: list[str | None] = []
 
     async def story() -> None:

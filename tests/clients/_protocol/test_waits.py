@@ -134,8 +134,8 @@ def test_a_cancelled_acquire_that_was_never_answered_is_cleared_up_after_a_recon
 
 
 def test_a_grant_that_was_read_too_late_is_fenced_at_once(link: Wire) -> None:
-    """Regression: a process that was stopped while its grant lay in its socket took it for new, and loaded what had been given to
-    others meanwhile (`lost` had been lost with the connection)."""
+    """Regression: a process that was stopped while its grant lay in its socket took it for new, and
+    loaded what had been given to others meanwhile (`lost` had been lost with the connection)."""
     link.waits.acquire("n1", SPEC, link.now)
     link.reply(link.one("acquire"), state="queued", lease=view())
     link.now += 20.0  # stopped; the arbiter granted, waited for a renewal, and gave the room away

@@ -18,9 +18,12 @@ from vram_arbiter.clients.cli.demo_report import (
 
 GIB = 1 << 30
 SWITCH = {
-    "kind": "switch", "at_wall_s": 103.0, "seq": 4, "consumer": "grab", "switched": True, "verified": True,
-    "evicted": [{"consumer": "detector", "lease_id": "L1-1", "verdict": "verified", "charge_bytes": 5 * GIB}],
-    "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0, "total_ms": 15.0,
+    "kind": "switch", "at_wall_s": 103.0, "seq": 4, "consumer": "grab", "switched": True,
+    "verified": True,
+    "evicted": [{"consumer": "detector", "lease_id": "L1-1", "verdict": "verified",
+    "charge_bytes": 5 * GIB}],
+    "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0,
+    "total_ms": 15.0,
 }  # fmt: skip
 LOAD = SWITCH | {"seq": 5, "switched": False, "evicted": []}
 SUCCESS = {"status": "success", "vlm_confirmed": True, "attempts": 1, "reason": "held"}
@@ -37,7 +40,8 @@ def line(pid: int, t: float, op: str, process: int, used: int) -> str:
 def demo_summary(**changes: Any) -> dict[str, Any]:
     story = CardStory((), 5 * GIB, ())
     given: dict[str, Any] = {
-        "seed": 3, "arbiter": True, "task": "grab the red cube", "story": story, "capacity_bytes": 8 * GIB, "events": [LOAD, SWITCH],
+        "seed": 3, "arbiter": True, "task": "grab the red cube", "story": story,
+        "capacity_bytes": 8 * GIB, "events": [LOAD, SWITCH],
         "reasoner": SUCCESS, "truth": HELD, "target": "red cube", "seconds": 61.23,
     }  # fmt: skip
     return summarise(**(given | changes))
@@ -81,7 +85,8 @@ def test_switches_are_counted_apart_from_loads_beside_others() -> None:
     assert (told["switches"], told["switches_verified"]) == (1, 1)
     assert told["loads"][1] == {
         "consumer": "grab", "evicted": ["detector"], "verdicts": ["verified"],
-        "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0, "total_ms": 15.0,
+        "wait_ms": 1.0, "drain_ms": 2.0, "unload_ms": 3.0, "verify_ms": 4.0, "load_ms": 5.0,
+        "total_ms": 15.0,
     }  # fmt: skip
     assert demo_summary(events=[SWITCH | {"verified": False}])["switches_verified"] == 0
 

@@ -99,7 +99,8 @@ def test_the_newest_are_found_without_reading_everything(archive: Archive) -> No
 
 
 def test_the_newest_are_found_behind_several_crashes(archive: Archive) -> None:
-    """Each crash leaves 2,000 numbers out: after three of them `vramctl history` showed an empty list."""
+    """Each crash leaves 2,000 numbers out: after three of them `vramctl history` showed an empty
+    list."""
     for event in archive.events[-5:]:
         event["seq"] = int(str(event["seq"])) + 20_000
     found = collect(Wanted(limit=8), None)["events"]

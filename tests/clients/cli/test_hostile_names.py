@@ -1,7 +1,8 @@
-"""Names, labels and reasons of any local process are read by an operator at a terminal: none of them is obeyed there.
+"""Names, labels and reasons of any local process are read by an operator at a terminal: none of
+them is obeyed there.
 
-An escape sequence in a consumer name could clear the screen, rename the window or show a lease that does not exist; a line break in a
-reason forged lines of the log.
+An escape sequence in a consumer name could clear the screen, rename the window or show a lease that
+does not exist; a line break in a reason forged lines of the log.
 """
 
 import io
@@ -25,7 +26,10 @@ from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 
 GIB = 1 << 30
-HOSTILE = "x\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\u2066\u200b\x00\r\n2026 forged [red]line[/red]\t\udcff"
+HOSTILE = (
+    "x\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\u2066\u200b\x00\r\n2026 forged "
+    "[red]line[/red]\t\udcff"
+)
 
 
 def obeyed(shown: str) -> list[str]:
@@ -181,7 +185,7 @@ def test_columns_stay_columns_beside_an_escaped_name() -> None:
     assert head.index("PRIO") + len("PRIO") == len(one) == len(other)
 
 
-# -- the demo's display --------------------------------------------------------------------------------------------
+# -- the demo's display
 def test_the_demos_display_obeys_neither_escapes_nor_markup(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -206,7 +210,7 @@ def test_the_demos_table_has_no_markup() -> None:
     assert not obeyed(shown)
 
 
-# -- logs and errors -----------------------------------------------------------------------------------------------
+# -- logs and errors
 def log_line(set_up: Callable[[], None]) -> str:
     set_up()
     (handler,) = logging.getLogger().handlers

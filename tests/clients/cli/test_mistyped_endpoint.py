@@ -23,7 +23,8 @@ GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
     ],
 )
 def test_a_mistyped_endpoint_makes_no_folders(command: list[str], short_folder: Path) -> None:
-    """A daemon on a mistyped endpoint served there, alone, in folders that it had made on the way."""
+    """A daemon on a mistyped endpoint served there, alone, in folders that it had made on
+    the way."""
     endpoint = f"ipc://{short_folder}/runn/vram-arbiter/arbiter.sock"
     done = subprocess.run(
         [sys.executable, "-m", *(endpoint if word == "EP" else word for word in command)],

@@ -1,4 +1,5 @@
-"""What an operator may mistype, meet or forget: one line that says what is wrong and what to do, and the documented exit code.
+"""What an operator may mistype, meet or forget: one line that says what is wrong and what to do,
+and the documented exit code.
 
 Real daemon, real programs. The table of exit codes is in docs/operating.md.
 """
@@ -24,7 +25,8 @@ Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
 PATIENCE_S = 60.0
 EVERY_ACTION = (
-    ("evict", "x", "-r", "why"), ("pin", "x", "-r", "why"), ("unpin", "x"), ("release-dead", "x", "-r", "why"),
+    ("evict", "x", "-r", "why"), ("pin", "x", "-r", "why"), ("unpin", "x"),
+    ("release-dead", "x", "-r", "why"),
     ("drain", "-r", "why"), ("resume",),
 )  # fmt: skip
 STRANGER = """
@@ -38,7 +40,8 @@ vram_arbiter.clients.cli.main.main()
 
 
 def one_line(done: Finished) -> str:
-    """What was said, if it is an error as errors are: one line on stderr, `vramctl: what is wrong (what to do)`."""
+    """What was said, if it is an error as errors are: one line on stderr, `vramctl: what is wrong
+    (what to do)`."""
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert line.startswith("vramctl: ")
@@ -59,9 +62,11 @@ def typed(done: Finished) -> str:
     "command",
     [
         ("evict", "", "-r", "why"), ("evict", "x", "-r", ""), ("evict", "x" * 129, "-r", "why"),
-        ("pin", "x", "-r", "  "), ("release-dead", "x", "-r", "two\nlines"), ("unpin", "x\x1b[2J"), ("unpin", "x", "-r", "y" * 513),
+        ("pin", "x", "-r", "  "), ("release-dead", "x", "-r", "two\nlines"), ("unpin", "x\x1b[2J"),
+        ("unpin", "x", "-r", "y" * 513),
         ("drain", "-r", " "), ("resume", "-r", "a\tb"), ("why", ""), ("why", "x\ny"),
-        ("history", "-n", "0"), ("history", "--since", "yesterday"), ("replay",), ("replay", "x", "--policy", "best"),
+        ("history", "-n", "0"), ("history", "--since", "yesterday"), ("replay",),
+        ("replay", "x", "--policy", "best"),
         ("simulate", "desktop", "--timeline", "-3"),
     ],
 )  # fmt: skip
@@ -104,7 +109,8 @@ def test_1_for_what_cannot_be_done(
     )
     codes = {
         command: (done.returncode, typed(done))
-        for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"), ("history", "--kind", "grant"))
+        for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"),
+        ("history", "--kind", "grant"))
         for done in (vramctl(*command, "--json", environ=environ),)
     }  # fmt: skip
     assert list(codes.values()) == [

@@ -39,7 +39,10 @@ while True:
     signal.pause()
 """
 """Ends with 5 on SIGTERM and with 1 more for each SIGINT before."""
-DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
+DEAF = (
+    "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); "
+    "time.sleep(1000)"
+)
 
 
 def command(*options: str, program: str = PROGRAM) -> list[str]:
@@ -86,7 +89,7 @@ def said(process: "subprocess.Popen[str]") -> str:
     return process.stderr.readline()
 
 
-# -- the program ---------------------------------------------------------------------------------------------------------
+# -- the program
 @pytest.mark.e2e
 def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
     environ = {**arbiter_daemon.environ, "CUDA_VISIBLE_DEVICES": "3"}
@@ -173,7 +176,7 @@ def test_a_program_may_have_any_name(arbiter_daemon: ArbiterProcess, tmp_path: P
         assert "\x1b" not in done.stderr
 
 
-# -- signals ---------------------------------------------------------------------------------------------------------------
+# -- signals
 @pytest.mark.e2e
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 5), (signal.SIGQUIT, 9)])
 def test_run_passes_signals_on(
@@ -197,7 +200,8 @@ def test_an_interrupt_by_another_process_is_passed_on(arbiter_daemon: ArbiterPro
 
 @pytest.mark.e2e
 def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: ArbiterProcess) -> None:
-    """The terminal sends it to both. Passed on as well, a program would take it for the second Ctrl-C, which ends many at once."""
+    """The terminal sends it to both. Passed on as well, a program would take it for the second
+    Ctrl-C, which ends many at once."""
     master, slave = pty.openpty()
     attributes = termios.tcgetattr(slave)
     attributes[3] &= ~termios.ECHO
@@ -220,7 +224,7 @@ def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: Arbite
         os.close(slave)
 
 
-# -- room for others ---------------------------------------------------------------------------------------------------------
+# -- room for others
 @pytest.mark.e2e
 @pytest.mark.parametrize("options", [(), ("--pin",)], ids=["default", "pinned"])
 def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
@@ -307,16 +311,19 @@ def test_run_is_pinned_only_on_request(
     lease.release()
 
 
-# -- what it measured --------------------------------------------------------------------------------------------------------
+# -- what it measured
 @pytest.mark.e2e
 @pytest.mark.anyio
 async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     arbiter_daemon: ArbiterProcess, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The bytes of the program's process, charged to the lease of its parent; they are gone when the peak is said."""
+    """The bytes of the program's process, charged to the lease of its parent; they are gone when
+    the peak is said."""
     holder = (
-        "import sys; from pathlib import Path; from vram_arbiter.sidecars.device.fake import FakeMemory\n"
-        "memory = FakeMemory(Path(sys.argv[1]), 'job', 0); memory.allocate('x', 2 << 30); sys.stdin.read()"
+        "import sys; from pathlib import Path; from vram_arbiter.sidecars.device.fake import "
+        "FakeMemory\n"
+        "memory = FakeMemory(Path(sys.argv[1]), 'job', 0); memory.allocate('x', 2 << 30); "
+        "sys.stdin.read()"
     )
     spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)
     async with (

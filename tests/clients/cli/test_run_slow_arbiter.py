@@ -1,4 +1,5 @@
-"""`vramctl run` where the arbiter answers late or not as hoped: the program has begun, and is neither cut off from its signals nor left alone."""
+"""`vramctl run` where the arbiter answers late or not as hoped: the program has begun, and is
+neither cut off from its signals nor left alone."""
 
 import asyncio
 import contextlib
@@ -30,7 +31,10 @@ WELCOME = {
     "grace_s": 60.0,
 }
 VIEW = protocol_wire.view(token=[1, 2])
-PROGRAM = "import os, signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print(os.getpid(), flush=True); signal.pause()"
+PROGRAM = (
+    "import os, signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print(os.getpid(), "
+    "flush=True); signal.pause()"
+)
 
 
 class GrantsAtOnce:
@@ -76,7 +80,8 @@ class GrantsAtOnce:
 async def vramctl_run(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process]:
     """A program that ends with 5 on SIGTERM, once it is up."""
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", PROGRAM,
+        sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "1GiB", "--name", "job",
+        "--", sys.executable, "-c", PROGRAM,
         env={**os.environ, "VRAM_ARBITER_ENDPOINT": endpoint}, stdout=subprocess.PIPE,
     )  # fmt: skip
     assert process.stdout is not None
@@ -95,7 +100,8 @@ async def vramctl_run(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process
 async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_that_it_runs() -> (
     None
 ):
-    """Regression: until `ready` was answered nobody listened for signals. vramctl ended, its program stayed without a lease."""
+    """Regression: until `ready` was answered nobody listened for signals. vramctl ended, its
+    program stayed without a lease."""
     arbiter = GrantsAtOnce(ready=None)
     async with (
         asyncio.timeout(WAIT_S),
@@ -108,7 +114,8 @@ async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_t
 
 
 async def test_a_program_whose_lease_is_gone_when_it_has_started_is_waited_for() -> None:
-    """Regression: vramctl ended with the error, and its program went on with nobody to pass signals to it."""
+    """Regression: vramctl ended with the error, and its program went on with nobody to pass signals
+    to it."""
     arbiter = GrantsAtOnce(ready=LeaseLost("L1-1 expired"))
     async with (
         asyncio.timeout(WAIT_S),

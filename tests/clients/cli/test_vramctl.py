@@ -34,7 +34,7 @@ def nowhere(tmp_path: Path) -> dict[str, str]:
     return {**kept, "VRAM_ARBITER_RUNTIME": str(tmp_path), "PYTHONPATH": f"{root}/src:{root}"}
 
 
-# -- without a daemon ----------------------------------------------------------------------------------------------
+# -- without a daemon
 def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> None:
     code = (
         "import sys; sys.argv = ['vramctl', 'status']\n"
@@ -42,7 +42,8 @@ def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> No
         "try: main()\n"
         "except SystemExit as end: assert end.code == 3, end.code\n"
         "import msgpack, zmq\n"
-        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'rich', 'yaml', 'numpy'} & set(sys.modules)\n"
+        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'rich', 'yaml', 'numpy'} & "
+        "set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run(
@@ -103,7 +104,8 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
 
 
 EVERY_COMMAND = (
-    "status", "why", "history", "watch", "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
+    "status", "why", "history", "watch", "evict", "pin", "unpin", "drain", "resume", "release-dead",
+    "run", "doctor",
     "replay", "simulate", "demo",
 )  # fmt: skip
 
@@ -182,7 +184,7 @@ def test_a_socket_that_nobody_serves(nowhere: dict[str, str]) -> None:
     assert "no arbiter answers" in done.stderr
 
 
-# -- with a daemon -------------------------------------------------------------------------------------------------
+# -- with a daemon
 @pytest.mark.e2e
 def test_status_why_history(client: Client, arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
     environ = arbiter_daemon.environ

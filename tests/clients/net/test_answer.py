@@ -1,4 +1,5 @@
-"""A client that did not run for a while does not take that for the silence of whom it asked. Real sockets, processes that are really stopped."""
+"""A client that did not run for a while does not take that for the silence of whom it asked. Real
+sockets, processes that are really stopped."""
 
 import asyncio
 import os
@@ -77,7 +78,8 @@ class Answering:
 
 @pytest.fixture
 def serve_answer() -> Iterator[Callable[..., str]]:
-    """`serve(before, after)`: the endpoint of a server that calls these with its peer before and after it answers."""
+    """`serve(before, after)`: the endpoint of a server that calls these with its peer before and
+    after it answers."""
     with tempfile.TemporaryDirectory(prefix="va") as folder:
         made: list[Answering] = []
 
@@ -116,7 +118,8 @@ async def ask_reasoner(endpoint: str) -> None:
 def test_an_answer_that_came_while_the_loop_stood_still_counts(
     serve_answer: Callable[..., str], ask: Any
 ) -> None:
-    """Regression: a program that imported something for longer than its time limit said that nobody had answered."""
+    """Regression: a program that imported something for longer than its time limit said that nobody
+    had answered."""
     asked, standing, said = threading.Event(), threading.Event(), threading.Event()
 
     def before(_: Peer) -> None:
@@ -146,7 +149,8 @@ def test_an_answer_that_came_while_the_loop_stood_still_counts(
 def test_a_loop_that_stood_still_before_it_could_ask_still_asks(
     serve_answer: Callable[..., str], ask: Any
 ) -> None:
-    """A client says nothing before it knows whose server it is: its connection is noticed on its loop."""
+    """A client says nothing before it knows whose server it is: its connection is noticed on its
+    loop."""
     endpoint = serve_answer()
 
     async def run() -> None:

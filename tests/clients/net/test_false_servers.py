@@ -1,6 +1,8 @@
-"""A process of another user serves where ours should: no client says a word to it, and none believes what it says.
+"""A process of another user serves where ours should: no client says a word to it, and none
+believes what it says.
 
-A false arbiter was believed by every client, and a false runner answered an emergency stop with "the motors hold".
+A false arbiter was believed by every client, and a false runner answered an emergency stop with
+"the motors hold".
 """
 
 import asyncio
@@ -40,7 +42,8 @@ Heard = Callable[[], list[str]]
 
 @contextlib.contextmanager
 def false_server(short_folder: Path, name: str) -> Iterator[Heard]:
-    """A server of the user nobody on `folder/name`. What it yields ends it, and returns what it heard."""
+    """A server of the user nobody on `folder/name`. What it yields ends it, and returns what it
+    heard."""
     nobody = pwd.getpwnam("nobody").pw_uid
     owner = short_folder.stat().st_uid
     os.chown(short_folder, nobody, -1)
@@ -148,7 +151,8 @@ def test_a_user_that_was_named_is_believed(
 def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., object], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """libzmq reconnects by itself, to whatever listens then; the re-attachment holds every token."""
+    """libzmq reconnects by itself, to whatever listens then; the re-attachment holds every
+    token."""
     with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = client.acquire(spec("detector", 1))  # type: ignore[arg-type]
         lease.ready()

@@ -1,4 +1,5 @@
-"""One connection to one checked server: what it says before it hangs up is heard, and nothing is sent to its successor."""
+"""One connection to one checked server: what it says before it hangs up is heard, and nothing is
+sent to its successor."""
 
 import contextlib
 import os
@@ -30,7 +31,8 @@ def served(context: "zmq.Context[zmq.Socket[bytes]]", path: Path) -> "zmq.Socket
 def test_the_last_words_before_a_hang_up_are_heard(
     context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path
 ) -> None:
-    """libzmq's own way of not reconnecting discards what was received and not read: a goal's result was lost with it."""
+    """libzmq's own way of not reconnecting discards what was received and not read: a goal's result
+    was lost with it."""
     server = served(context, tmp_path / "s")
     link = Link(context, f"ipc://{tmp_path}/s", "runner")
     try:

@@ -1,4 +1,5 @@
-"""The server of the small programs, at its end: nobody is left without the answer that he was given."""
+"""The server of the small programs, at its end: nobody is left without the answer that he was
+given."""
 
 import asyncio
 import os
@@ -43,8 +44,8 @@ def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_p
 
 
 def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -> None:
-    """Regression: undecodable bytes of a command line or a file name ended the caller with a traceback, and left whoever had asked without an
-    answer."""
+    """Regression: undecodable bytes of a command line or a file name ended the caller with a
+    traceback, and left whoever had asked without an answer."""
     endpoint = f"ipc://{tmp_path}/s.sock"
 
     async def there_and_back() -> tuple[Message, str]:

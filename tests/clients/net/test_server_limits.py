@@ -267,7 +267,8 @@ def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
     ],
 )
 def test_only_the_path_of_a_socket_is_served(endpoint: str, says: str) -> None:
-    """Regression: over loopback tcp another user of the machine gave a robot goals, and stopped it."""
+    """Regression: over loopback tcp another user of the machine gave a robot goals, and
+    stopped it."""
     with pytest.raises(ConfigError, match=says):
         RouterServer(endpoint, refused)
     with pytest.raises(ConfigError, match=says):

@@ -15,8 +15,10 @@ from vram_arbiter.schemas.errors import BadRequest
 
 def test_plain_values_pass_and_numpy_is_not_imported_for_them() -> None:
     code = (
-        "import sys; from vram_arbiter.clients.sidecar import npy; v = {'a': [1, 'x', None, (2.0,)], 'b': b'y'}; "
-        "assert npy.unpack(npy.pack(v)) == {'a': [1, 'x', None, [2.0]], 'b': b'y'}; assert 'numpy' not in sys.modules"
+        "import sys; from vram_arbiter.clients.sidecar import npy; v = {'a': [1, 'x', None, "
+        "(2.0,)], 'b': b'y'}; "
+        "assert npy.unpack(npy.pack(v)) == {'a': [1, 'x', None, [2.0]], 'b': b'y'}; assert 'numpy' "
+        "not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -88,14 +90,17 @@ def test_only_arrays_of_numbers_whose_bytes_are_there() -> None:
             head("{'descr': [], 'fortran_order': 1, 'shape': 2}"),
         ],
         "not of numbers": [
-            npy_bytes(numpy.array(["text"])), npy_bytes(numpy.zeros(2, "c16")), npy_bytes(numpy.zeros(2, "M8[s]")),
+            npy_bytes(numpy.array(["text"])), npy_bytes(numpy.zeros(2, "c16")),
+            npy_bytes(numpy.zeros(2, "M8[s]")),
             npy_bytes(numpy.zeros(2, [("a", "f4")])), npy_bytes(numpy.zeros(2, "V8")),
         ],
         "by its header has": [
-            head(header % "1000000000000,"), npy_bytes(numpy.zeros(3))[:-1], npy_bytes(numpy.zeros(3)) + b"x",
+            head(header % "1000000000000,"), npy_bytes(numpy.zeros(3))[:-1],
+            npy_bytes(numpy.zeros(3)) + b"x",
             head(header % ("9" * 400 + ",")),
         ],
-        "an array of shape": [head(header % "-1,") + bytes(8), head(header % ("1," * 9)) + bytes(8)],
+        "an array of shape": [head(header % "-1,") + bytes(8),
+        head(header % ("1," * 9)) + bytes(8)],
     }  # fmt: skip
     for told, payloads in refused.items():
         for payload in payloads:

@@ -1,4 +1,5 @@
-"""Clients of sidecars against a real server process: lazy start, typed errors, death, and ending only one's own child."""
+"""Clients of sidecars against a real server process: lazy start, typed errors, death, and ending
+only one's own child."""
 
 import asyncio
 import os
@@ -73,7 +74,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-# -- life of a child -----------------------------------------------------------------------------------------------
+# -- life of a child
 async def test_the_first_call_starts_the_sidecar_and_close_ends_it(endpoint: str) -> None:
     client = DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint)))
     assert client.child is None
@@ -127,7 +128,8 @@ async def test_a_killed_child_is_replaced(detector: DetectorClient) -> None:
 async def test_a_child_that_takes_its_time_to_die_is_replaced_all_the_same(
     detector: DetectorClient,
 ) -> None:
-    """Regression: it was waited for as for one that boots, and its old end was the next call's error."""
+    """Regression: it was waited for as for one that boots, and its old end was the next call's
+    error."""
     await detector.detect(PNG, "x")
     first = detector.child
     assert first is not None
@@ -188,7 +190,8 @@ async def test_two_clients_starting_one_sidecar_end_up_with_one(endpoint: str) -
 async def test_a_sidecar_that_owns_the_endpoint_and_is_slow_is_waited_for(
     endpoint: str, foreign: Callable[[], subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Regression: our own child found the endpoint taken and ended, and that was the error, unless its owner answered within a second."""
+    """Regression: our own child found the endpoint taken and ended, and that was the error, unless
+    its owner answered within a second."""
     monkeypatch.setattr(base, "PROBE_S", 0.05)
     owner = foreign()
     async with SidecarClient(endpoint, connect_timeout_s=60.0) as waiting:
@@ -230,7 +233,7 @@ async def test_calls_do_not_wait_for_each_other(detector: DetectorClient) -> Non
     assert (await detector.ping(timeout_s=60.0))["state"] == "resident"
 
 
-# -- errors and shapes -----------------------------------------------------------------------------------------------
+# -- errors and shapes
 @pytest.mark.parametrize("kind", [Evicted, NotResident, Loading, OutOfMemory])
 async def test_errors_are_typed_and_never_an_empty_answer(
     detector: DetectorClient, kind: type[Exception]

@@ -63,8 +63,8 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
         config.write_text(
             "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter:"
             " so101_mujoco}\n"
-            f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, loop: {str(loop).lower()}, fps: {fps}}}}}\n"
-            + more
+            f"sensors:\n  - {{sensor_id: front, max_age_ms: 2000, backend_params: {{path: {video}, "
+            f"loop: {str(loop).lower()}, fps: {fps}}}}}\n" + more
         )
         environ = os.environ | {
             "VRAM_ARBITER_RUNTIME": str(tmp_path),
@@ -340,7 +340,10 @@ def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_
 
     with socket.create_server(("127.0.0.1", 0)) as listening:  # accepts, and never says a word
         port = listening.getsockname()[1]
-        more = f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', timeout_s: 60}}}}\n"
+        more = (
+            f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', "
+            "timeout_s: 60}}\n"
+        )
         process = start(more=more)
         listening.settimeout(60)
         connection, _ = listening.accept()  # it waits for a picture now

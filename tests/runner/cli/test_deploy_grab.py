@@ -24,7 +24,8 @@ def deployed(arbiter: ArbiterProcess) -> GrabPrograms:
     """Policy sidecar and `vram-runner deploy` on a file with the twin and two cameras."""
     config = arbiter.runtime / "robot.yaml"
     cameras = "".join(
-        f"  - {{sensor_id: {name}, max_age_ms: 2000, backend_params: {{path: {path}, loop: true}}}}\n"
+        f"  - {{sensor_id: {name}, max_age_ms: 2000, backend_params: {{path: {path}, loop: "
+        "true}}\n"
         for name, path in _videos(arbiter.runtime).items()
     )
     config.write_text(f"robot_id: bench\nhal: {{adapter: so101_mujoco}}\nsensors:\n{cameras}")

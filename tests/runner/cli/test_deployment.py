@@ -113,7 +113,10 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
         + "envelope: {human_in_loop_required: [grasp], max_force_n: 5}\n"
     )
     (folder / "rskill.yaml").write_text(text, encoding="utf-8")
-    sensors = "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, backend_params: {device: 1}}]\n"
+    sensors = (
+        "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, "
+        "backend_params: {device: 1}}]\n"
+    )
     _, out, err = dry_run(TWIN + sensors, skills=folder)
     assert err == ""
     said = [line for line in out.splitlines() if line.startswith("NOT KEPT")]
@@ -169,9 +172,11 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
             ),
         ),
         (
-            TWIN
-            + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
-            r"robot\.yaml:6: vla\.id: .* is not offered here: this runner has no ROS 2 action client; it stands in for control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose",
+            TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: "
+            "vram-arbiter/so101-navigate\n",
+            r"robot\.yaml:6: vla\.id: .* is not offered here: this runner has no ROS 2 action "
+            r"client; it stands in for control_msgs/FollowJointTrajectory, not for "
+            r"nav2_msgs/NavigateToPose",
         ),
         (
             TWIN + "embodiment_tags: [any]\n",
@@ -247,7 +252,10 @@ def test_the_fields_own_files_are_read_as_the_field_means_them(dry_run: DryRun) 
     """`vla.id` is the policy's family there and `vla.weights_uri` the skill, `quantization` a
     block, 0 turns pictures off, and tags are the fleet's own."""
     text = TWIN + CAMERAS + "thumbnail_hz: 0\nembodiment_tags: [so101_follower, our_lab_3]\n"
-    task = "task: {id: grab}\nvla:\n  id: act\n  weights_uri: {uri}\n  quantization: {dtype: {dtype}, extra: {}}\n"
+    task = (
+        "task: {id: grab}\nvla:\n  id: act\n  weights_uri: {uri}\n  quantization: {dtype: {dtype}, "
+        "extra: {}}\n"
+    )
     vla = task.replace("{dtype}", "fp32")
     for uri in ("rskills/so101-grab", "rskills/so101-grab/", "vram-arbiter/so101-grab"):
         code, out, err = dry_run(text + vla.replace("{uri}", uri), skills=GRAB)
@@ -320,7 +328,8 @@ def test_serving_goals_offers_only_what_is_licensed_and_fits(
     code, out, _ = dry_run(TWIN, skills=GRAB)
     assert code == 0
     assert re.search(
-        r"skill +vram-arbiter/so101-grab is not offered: .*needs the cameras front, wrist; there is none",
+        r"skill +vram-arbiter/so101-grab is not offered: .*needs the cameras front, wrist; there "
+        r"is none",
         out,
     ), out
 

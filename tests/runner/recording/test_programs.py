@@ -111,7 +111,8 @@ def test_a_deployment_records_into_its_save_dir(start_recording: Start, tmp_path
     config.write_text(
         "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter:"
         " so101_kinematic}\n"
-        f"task: {{id: nod, instruction: nod twice, max_steps: 400}}\nvla: {{id: {RSKILL}}}\nsave_dir: {root}\n"
+        "task: {id: nod, instruction: nod twice, max_steps: 400}\nvla: {id: "
+        f"{RSKILL}}}\nsave_dir: {root}\n"
     )
     process = start_recording(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")
     out, _ = process.communicate(timeout=WAIT_S)

@@ -418,10 +418,16 @@ def test_what_throws_in_cpp_lives_on_after_it(before: str) -> None:
     throws and catches one as it is imported) ended it with a segmentation fault.
     """
     pytest.importorskip("matplotlib")
-    draws = "import matplotlib; matplotlib.use('Agg'); import matplotlib.pyplot as p; p.figure().savefig('/dev/null', format='png')"
+    draws = (
+        "import matplotlib; matplotlib.use('Agg'); import matplotlib.pyplot as p; "
+        "p.figure().savefig('/dev/null', format='png')"
+    )
     fresh(f"{before}\n{TAKE_ONE}\n{draws}")
 
 
 def test_importing_it_loads_no_gstreamer() -> None:
-    loaded = "import sys, vram_arbiter.runner.sensors.gstreamer\nprint([name for name in ('gi', 'cv2', 'torch', 'numpy') if name in sys.modules])"
+    loaded = (
+        "import sys, vram_arbiter.runner.sensors.gstreamer\nprint([name for name in ('gi', 'cv2', "
+        "'torch', 'numpy') if name in sys.modules])"
+    )
     assert fresh(loaded).strip() == "[]"

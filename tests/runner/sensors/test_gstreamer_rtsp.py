@@ -75,7 +75,10 @@ class NetworkCamera:
                 method = lines[0].split(" ", 1)[0]
                 sequence = next(line for line in lines if line.lower().startswith("cseq"))
                 if self.password and "Authorization:" not in head.decode():
-                    answer = f'RTSP/1.0 401 Unauthorized\r\n{sequence}\r\nWWW-Authenticate: Basic realm="camera"\r\n\r\n'
+                    answer = (
+                        f"RTSP/1.0 401 Unauthorized\r\n{sequence}\r\nWWW-Authenticate: Basic "
+                        'realm="camera"\r\n\r\n'
+                    )
                 elif self.password:
                     answer = f"RTSP/1.0 403 Forbidden\r\n{sequence}\r\n\r\n"
                 else:
@@ -92,7 +95,8 @@ class NetworkCamera:
         )
         return {
             "OPTIONS": "Public: OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN\r\n\r\n",
-            "DESCRIBE": f"Content-Type: application/sdp\r\nContent-Length: {len(body)}\r\n\r\n{body}",
+            "DESCRIBE": "Content-Type: application/sdp\r\nContent-Length: "
+            f"{len(body)}\r\n\r\n{body}",
             "SETUP": "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n\r\n",
         }.get(method, "Session: 1\r\n\r\n")
 
@@ -198,7 +202,10 @@ def test_an_h264_stream_and_its_end(
 def test_the_cameras_own_jpeg(
     network_camera: Callable[..., NetworkCamera], watching: Callable[..., SlotReader]
 ) -> None:
-    source = f"videotestsrc is-live=true ! video/x-raw,format=I420,width={SIZE[0]},height={SIZE[1]} ! jpegenc ! rtpjpegpay"
+    source = (
+        f"videotestsrc is-live=true ! video/x-raw,format=I420,width={SIZE[0]},height={SIZE[1]} ! "
+        "jpegenc ! rtpjpegpay"
+    )
     reader = watching(network_camera("mjpeg", source).port, codec="mjpeg", encoding="jpeg")
     frame = frame_of(reader)
     assert (frame.width, frame.height, frame.encoding) == (*SIZE, "jpeg")

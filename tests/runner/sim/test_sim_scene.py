@@ -43,7 +43,10 @@ def test_scene_file_says_the_defaults() -> None:
     assert written == built_in
 
 
-CAMERA = "{parent: %s, width_px: 64, height_px: 48, fovy_deg: 43.0, pos_m: [0, 0, 1], look_at_m: [1, 0, 0]}"
+CAMERA = (
+    "{parent: %s, width_px: 64, height_px: 48, fovy_deg: 43.0, pos_m: [0, 0, 1], look_at_m: [1, 0, "
+    "0]}"
+)
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,19 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 
 VALUES = [
-    "[]", "{}", "{a: 1}", "!!timestamp x", "!!timestamp 2020-01-01", "2020-01-01", "null", "true", ".nan", ".inf",
-    "-1", "0", "1e400", "9" * 30, "''", "[[1]]", "[null]", "{1: 2}", "!!set {a}", "!foo x", "1:30", "~", "[{}]", "x",
-    "!!binary aGk=", "{[]: 1}", "1.5", "'1'", "[x, x]", "!!python/object:os.system x", '"\\ud800"', '"\\0"',
+    "[]", "{}", "{a: 1}", "!!timestamp x", "!!timestamp 2020-01-01", "2020-01-01", "null", "true",
+    ".nan", ".inf",
+    "-1", "0", "1e400", "9" * 30, "''", "[[1]]", "[null]", "{1: 2}", "!!set {a}", "!foo x", "1:30",
+    "~", "[{}]", "x",
+    "!!binary aGk=", "{[]: 1}", "1.5", "'1'", "[x, x]", "!!python/object:os.system x", '"\\ud800"',
+    '"\\0"',
 ]  # fmt: skip
 ROBOT = (
     "robot_id: bench\nhal: {adapter: so101_kinematic, transport: {port: /dev/x}, params: {a: 1}}\n"
-    "sensors: [{sensor_id: front, backend_params: {device: 0}, max_age_ms: 5}]\nembodiment_tags: [so101_follower]\n"
-    "task: {id: grab, instruction: x, max_steps: 5, metadata: {}}\nrate_hz: 30\nthumbnail_hz: 0\nsave_dir: /x\n"
+    "sensors: [{sensor_id: front, backend_params: {device: 0}, max_age_ms: 5}]\nembodiment_tags: "
+    "[so101_follower]\n"
+    "task: {id: grab, instruction: x, max_steps: 5, metadata: {}}\nrate_hz: 30\nthumbnail_hz: "
+    "0\nsave_dir: /x\n"
     "vla: {id: act, weights_uri: rskills/x, quantization: {dtype: fp32}, extra: {}}\n"
     "safety: {max_joint_speed_factor: 0.5}\ncapabilities: {has_vision: true}\n"
 )

@@ -1,4 +1,5 @@
-"""`schemas.config.robot`: the deployment file, its defaults, and mistakes named by line and field."""
+"""`schemas.config.robot`: the deployment file, its defaults, and mistakes named by line
+and field."""
 
 import pytest
 from hypothesis import given

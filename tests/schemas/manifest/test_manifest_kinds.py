@@ -1,4 +1,5 @@
-"""The table of kinds, cell by cell: what a kind requires is missed, what it forbids is refused, what is free is accepted."""
+"""The table of kinds, cell by cell: what a kind requires is missed, what it forbids is refused,
+what is free is accepted."""
 
 import copy
 from pathlib import Path

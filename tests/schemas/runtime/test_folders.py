@@ -15,7 +15,7 @@ FOREIGN = 54_321
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of another user")
 
 
-# -- folders -----------------------------------------------------------------------------------------------------------
+# -- folders
 def mode_of(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
@@ -57,7 +57,8 @@ def test_what_is_not_a_folder_of_its_own_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_others_may_write_is_refused(tmp_path: Path) -> None:
-    """They could exchange the socket and the lock file in it. The units' folder is sticky: members cannot."""
+    """They could exchange the socket and the lock file in it. The units' folder is sticky: members
+    cannot."""
     folder = tmp_path / "x"
     folder.mkdir()
     folder.chmod(0o1777)
@@ -94,7 +95,7 @@ def test_only_the_runtime_folder_is_made_for_a_socket(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-# -- lock files --------------------------------------------------------------------------------------------------------
+# -- lock files
 def test_a_second_holder_is_told_who_the_first_is(tmp_path: Path) -> None:
     first, second = (
         LockFile(tmp_path / "lock", "the socket"),
@@ -116,7 +117,10 @@ def test_a_second_holder_is_told_who_the_first_is(tmp_path: Path) -> None:
 
 def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    script = "import fcntl, os, sys; fd = os.open(sys.argv[1], os.O_RDWR | os.O_CREAT); fcntl.flock(fd, fcntl.LOCK_EX)"
+    script = (
+        "import fcntl, os, sys; fd = os.open(sys.argv[1], os.O_RDWR | os.O_CREAT); fcntl.flock(fd, "
+        "fcntl.LOCK_EX)"
+    )
     script += "; os.write(fd, b'123456789\\n'); print(flush=True); sys.stdin.read()"
     with subprocess.Popen(
         [sys.executable, "-c", script, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -143,7 +147,8 @@ def test_a_lock_that_cannot_be_made_is_a_config_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("tie", [Path.symlink_to, Path.hardlink_to])
 def test_a_lock_file_that_is_another_file_is_left_alone(tmp_path: Path, tie: object) -> None:
-    """A lock file linked to another file made a server truncate that file, with the rights of root."""
+    """A lock file linked to another file made a server truncate that file, with the rights
+    of root."""
     (tmp_path / "precious").write_text("kept")
     assert callable(tie)
     tie(tmp_path / "lock", tmp_path / "precious")
@@ -158,7 +163,8 @@ def test_a_lock_file_that_is_another_file_is_left_alone(tmp_path: Path, tie: obj
 
 @as_root
 def test_another_user_keeps_no_server_from_its_own_folder(tmp_path: Path) -> None:
-    """In the units' folder members of the group may add files: the arbiter would not have started again."""
+    """In the units' folder members of the group may add files: the arbiter would not have started
+    again."""
     tmp_path.chmod(0o1770)
     (tmp_path / "precious").write_text("kept")
     planted = tmp_path / "lock"
@@ -177,7 +183,8 @@ def test_another_user_keeps_no_server_from_its_own_folder(tmp_path: Path) -> Non
 def test_a_lock_file_of_another_user_in_a_shared_folder_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As for a sidecar in the folder of the arbiter's unit: it may not remove what others put there."""
+    """As for a sidecar in the folder of the arbiter's unit: it may not remove what others put
+    there."""
     monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", str(FOREIGN))
     folder = tmp_path / "shared"
     folder.mkdir(mode=0o700)

@@ -9,8 +9,10 @@ TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 
 def test_a_line_of_json_names_its_span() -> None:
     code = (
-        "import logging\nfrom vram_arbiter.schemas.runtime import logging as logs\nlogs.set_up('tool', 'info', 'json', '')\nlog = logging.getLogger('a')\n"
-        "log.info('before'); log.debug('hidden')\nfrom vram_arbiter.schemas.runtime.telemetry import spans as tracing\n"
+        "import logging\nfrom vram_arbiter.schemas.runtime import logging as "
+        "logs\nlogs.set_up('tool', 'info', 'json', '')\nlog = logging.getLogger('a')\n"
+        "log.info('before'); log.debug('hidden')\nfrom vram_arbiter.schemas.runtime.telemetry "
+        "import spans as tracing\n"
         f"with tracing.joined('00-{TRACE}-{SPAN}-01'):\n    log.warning('%s\\nlines', 'two')\n"
         "try: 1/0\nexcept ZeroDivisionError: log.exception('after')\n"
     )

@@ -1,4 +1,5 @@
-"""A message is counted before it is built: what it may cost is bounded by its limits, not by its bytes."""
+"""A message is counted before it is built: what it may cost is bounded by its limits, not by its
+bytes."""
 
 from typing import Any
 
@@ -33,9 +34,11 @@ def values_in(value: Any) -> int:
 
 
 _VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 64) - 1) | st.floats() | st.text() | st.binary()
+    st.none() | st.booleans() | st.integers(-(1 << 63),
+    (1 << 64) - 1) | st.floats() | st.text() | st.binary()
     | st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=20)),
-    lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=8), inner, max_size=20),
+    lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=8), inner,
+    max_size=20),
     max_leaves=30,
 )  # fmt: skip
 
@@ -43,7 +46,8 @@ _VALUES = st.recursive(
 @settings(deadline=None)
 @given(_VALUES)
 def test_the_count_is_that_of_the_decoded_value(value: Any) -> None:
-    """A count that reads a header otherwise than the decoder would let a bomb through, or refuse an honest message."""
+    """A count that reads a header otherwise than the decoder would let a bomb through, or refuse an
+    honest message."""
     assert count_values(msgpack.packb(value), 1_000_000) == values_in(value)
 
 
@@ -82,7 +86,8 @@ def test_any_bytes_are_a_map_or_a_typed_error(payload: bytes) -> None:
     ],
 )
 def test_a_bomb_is_refused_after_few_looks(payload: bytes) -> None:
-    """1 MiB of empty lists costs as many values as it has bytes when it is built first and counted afterwards."""
+    """1 MiB of empty lists costs as many values as it has bytes when it is built first and counted
+    afterwards."""
     counted = Counted(payload)
     assert count_values(counted, LIMITS.values_max) > LIMITS.values_max
     assert counted.looks <= 2 * LIMITS.values_max

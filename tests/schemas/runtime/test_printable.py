@@ -1,4 +1,5 @@
-"""Nothing that another program said reaches a terminal as a control: escapes would forge what an operator reads."""
+"""Nothing that another program said reaches a terminal as a control: escapes would forge what an
+operator reads."""
 
 import unicodedata
 

@@ -1,4 +1,5 @@
-"""`schemas.runtime.router` with real sockets: honest ZeroMQ peers beside peers that break every rule.
+"""`schemas.runtime.router` with real sockets: honest ZeroMQ peers beside peers that break every
+rule.
 
 libzmq's ROUTER, which served before, aborted the process or grew without bound under most of these.
 """
@@ -161,7 +162,8 @@ def test_an_unmodified_peer_is_answered(path: Path, kind: int) -> None:
 
 
 def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
-    """An identity equal to libzmq's next automatic routing id ended the daemon with `Assertion failed`."""
+    """An identity equal to libzmq's next automatic routing id ended the daemon with `Assertion
+    failed`."""
     ready = (
         b"\x04\x2e\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x05"
         + bytes(4)
@@ -199,7 +201,8 @@ def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
 def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
     path: Path, attack: bytes
 ) -> None:
-    """A message of two million empty frames let others wait for 18 s; MORE for ever grew without bound."""
+    """A message of two million empty frames let others wait for 18 s; MORE for ever grew without
+    bound."""
 
     async def scenario() -> None:
         handler = Echo()

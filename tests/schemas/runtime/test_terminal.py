@@ -1,4 +1,5 @@
-"""Programs whose reader leaves, whose output device is full (`| head`), or who are told Ctrl-C, end without a traceback."""
+"""Programs whose reader leaves, whose output device is full (`| head`), or who are told Ctrl-C, end
+without a traceback."""
 
 import errno
 import os
@@ -59,7 +60,8 @@ def test_a_reader_that_left_is_no_defect(arguments: list[str]) -> None:
 
 
 def test_ctrl_c_is_no_defect() -> None:
-    """The first line of a simulation is printed when the whole is known: it is told before, while it works."""
+    """The first line of a simulation is printed when the whole is known: it is told before, while
+    it works."""
     program = (
         "import signal, sys\n"
         "from vram_arbiter.schemas.runtime import terminal\n"
@@ -171,10 +173,12 @@ def test_another_error_of_the_system_keeps_its_traceback() -> None:
     ],
 )
 def test_a_missing_extra_is_one_line(arguments: list[str], extra: str, tmp_path: Path) -> None:
-    """In the base install `vramctl demo` and `vram-sidecar` ended with tracebacks, the second at its first request."""
+    """In the base install `vramctl demo` and `vram-sidecar` ended with tracebacks, the second at
+    its first request."""
     program = (
         "import runpy, sys\n"
-        "for name in ('torch', 'lerobot', 'mujoco', 'cv2', 'numpy'): sys.modules[name] = None\n"  # as if not installed
+        "for name in ('torch', 'lerobot', 'mujoco', 'cv2', 'numpy'): sys.modules[name] = "
+        "None\n"  # as if not installed
         "sys.argv = sys.argv[1:]\n"
         "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)\n"
     )

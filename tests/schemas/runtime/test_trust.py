@@ -1,4 +1,5 @@
-"""Clients ask the kernel which user serves a socket: a false server was believed by everything that asked it."""
+"""Clients ask the kernel which user serves a socket: a false server was believed by everything that
+asked it."""
 
 import os
 import pwd
@@ -65,7 +66,8 @@ def test_users_can_be_named() -> None:
 
 
 def test_the_units_users_are_those_that_are_trusted() -> None:
-    """Only for their own program: a sidecar, which reads foreign weights, is not believed as the arbiter."""
+    """Only for their own program: a sidecar, which reads foreign weights, is not believed as the
+    arbiter."""
     units = Path(__file__).parents[3] / "configs/systemd/system"
     for program, user in SERVICE_USERS.items():
         unit = units / (

@@ -1,4 +1,5 @@
-"""`schemas.runtime.zmtp`: recorded bytes of real peers, every refusal, and bounds that hold for any input."""
+"""`schemas.runtime.zmtp`: recorded bytes of real peers, every refusal, and bounds that hold for any
+input."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,5 @@
-"""Replies and pushes as clients read them: every op has a type, newer fields are ignored, older ones take defaults."""
+"""Replies and pushes as clients read them: every op has a type, newer fields are ignored, older
+ones take defaults."""
 
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.decode import REPLIES, decode_error, decode_push, decode_reply
@@ -7,7 +8,8 @@ from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.requests import OPS
 
 VIEW = {
-    "lease_id": "L1-1", "token": [1, 2], "state": "loading", "consumer": "vlm", "model": "m", "gpu": "GPU-0", "mode": "shared",
+    "lease_id": "L1-1", "token": [1, 2], "state": "loading", "consumer": "vlm", "model": "m",
+    "gpu": "GPU-0", "mode": "shared",
     "priority": 50, "evictable": True, "charge_bytes": 1, "uses": 0, "pid": 7, "since_s": 0.0,
 }  # fmt: skip
 
@@ -24,7 +26,8 @@ def test_a_grant_is_read_from_older_and_newer_arbiters() -> None:
 
 
 def test_a_push_is_read_by_its_kind() -> None:
-    revoke = {"push": "revoke", "seq": 1, "epoch": 1, "lease_id": "L1-1", "token": [1, 2], "reason": "r", "wanted_by": "w", "uses": 0, "park": False}  # fmt: skip
+    revoke = {"push": "revoke", "seq": 1, "epoch": 1, "lease_id": "L1-1", "token": [1, 2],
+    "reason": "r", "wanted_by": "w", "uses": 0, "park": False}  # fmt: skip
     push = decode_push({**revoke, "deadline_in_s": 3.0, "order": {"by": "ops", "reason": "test"}})
     assert isinstance(push, RevokePush)
     assert (push.token, push.order and push.order.by, push.uses) == (Token(1, 2), "ops", 0)

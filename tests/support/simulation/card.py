@@ -1,7 +1,7 @@
 """The simulated card as physics has it, and the probe through which the daemon sees it.
 
-`Device` knows who really holds what; the arbiter never reads it. `SimProber` has the contract of `arbiter.host.prober.Prober` and
-can fail, hang, lag and lie.
+`Device` knows who really holds what; the arbiter never reads it. `SimProber` has the contract of
+`arbiter.host.prober.Prober` and can fail, hang, lag and lie.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,8 @@ class SimOutOfMemory(Exception):
 
 @dataclass(slots=True)
 class Block:
-    """Bytes of one process for one purpose (`tag`: a lease id, `context`, `excess`, `leak`, `stranger`)."""
+    """Bytes of one process for one purpose (`tag`: a lease id, `context`, `excess`, `leak`,
+    `stranger`)."""
 
     process: ProcessKey
     tag: str

@@ -1,8 +1,8 @@
 """Simulated time: one heap of what is due, one event loop per simulated process, one trace.
 
-A `ProcessLoop` is an asyncio loop whose process can be frozen (SIGSTOP: what is due waits) or killed (what is due never
-happens). Two runs with the same seed do the same things in the same order; the trace's hash proves it. Knows nothing of
-arbiters.
+A `ProcessLoop` is an asyncio loop whose process can be frozen (SIGSTOP: what is due waits) or
+killed (what is due never happens). Two runs with the same seed do the same things in the same
+order; the trace's hash proves it. Knows nothing of arbiters.
 """
 
 import asyncio
@@ -89,7 +89,8 @@ class Clock:
 
 
 class ProcessLoop(asyncio.AbstractEventLoop):
-    """The loop of one simulated process. What asyncio's interface has beyond this (files, sockets, signals) raises NotImplementedError."""
+    """The loop of one simulated process. What asyncio's interface has beyond this (files, sockets,
+    signals) raises NotImplementedError."""
 
     def __init__(self, clock: Clock, name: str) -> None:
         self.clock = clock
@@ -102,7 +103,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
             asyncio.Task[Any]
         ] = []  # kept alive: a task of a killed process just never goes on
 
-    # -- the process -----------------------------------------------------------------------------------------------
+    # -- the process
     def freeze(self) -> None:
         self.frozen = True
 
@@ -134,7 +135,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         finally:
             asyncio._set_running_loop(None)
 
-    # -- asyncio's side --------------------------------------------------------------------------------------------
+    # -- asyncio's side
     def time(self) -> float:
         return self.clock.now
 

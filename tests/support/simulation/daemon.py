@@ -1,7 +1,9 @@
-"""The daemon under simulation: the real core, inbox, sessions, codec, executor and journal, on a simulated loop, wire, clock and card.
+"""The daemon under simulation: the real core, inbox, sessions, codec, executor and journal, on a
+simulated loop, wire, clock and card.
 
-It can be killed between any two effects of any event: before a record is written, after it and before the reply is sent, after that.
-What is in the journal stays; what the sockets had not handed to the kernel is lost with the process.
+It can be killed between any two effects of any event: before a record is written, after it and
+before the reply is sent, after that. What is in the journal stays; what the sockets had not handed
+to the kernel is lost with the process.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +36,8 @@ from vram_arbiter.schemas.wire.pushes import AnyPush
 from vram_arbiter.schemas.wire.replies import AnyReply, HistoryReply
 
 CHECK_ALL_EVERY = 4
-"""Events: what every event may have broken is checked after each by the core itself, the tables under that now and then."""
+"""Events: what every event may have broken is checked after each by the core itself, the tables
+under that now and then."""
 
 
 class Crashed(BaseException):
@@ -95,7 +98,7 @@ class SimDaemon:
         self._watched: set[ProcessKey] = set()
         self._connected: set[int] = set()
 
-    # -- life ------------------------------------------------------------------------------------------------------
+    # -- life
     def start(self) -> None:
         self.loop.enter(self._start)
 
@@ -194,7 +197,7 @@ class SimDaemon:
         found = [key.decode() for (key,) in rows]
         return [key for key in found if key not in self._executor.owed]
 
-    # -- in --------------------------------------------------------------------------------------------------------
+    # -- in
     def deliver(self, line: Line, payload: bytes) -> None:
         """A message from the wire; waits if the daemon is stopped."""
 
@@ -262,7 +265,7 @@ class SimDaemon:
         slept_s, self.machine.slept_s = self.machine.slept_s, 0.0
         return slept_s
 
-    # -- out -------------------------------------------------------------------------------------------------------
+    # -- out
     def _perform(self, effects: Sequence[Effect]) -> None:
         self.handled += 1
         if self.handled % CHECK_ALL_EVERY == 0:
@@ -302,7 +305,8 @@ class _Outbox:
 
 
 class _Records:
-    """The journal, with a crash point on both sides of every transaction, and a disk that can be full."""
+    """The journal, with a crash point on both sides of every transaction, and a disk that can be
+    full."""
 
     def __init__(self, daemon: SimDaemon, journal: Journal) -> None:
         self._daemon, self._journal = daemon, journal

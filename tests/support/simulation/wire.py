@@ -1,8 +1,10 @@
-"""The simulated wire between processes and the daemon: what ZeroMQ over `ipc://` does, with everything that can go wrong.
+"""The simulated wire between processes and the daemon: what ZeroMQ over `ipc://` does, with
+everything that can go wrong.
 
-Order is kept within one connection; across connections it is not. A connection that breaks loses what is under way; the daemon sees its
-end behind all that arrived on it, perhaps after the same client's next connection, and the client perhaps is not told. Messages are bytes
-and go through the real codec on both sides.
+Order is kept within one connection; across connections it is not. A connection that breaks loses
+what is under way; the daemon sees its end behind all that arrived on it, perhaps after the same
+client's next connection, and the client perhaps is not told. Messages are bytes and go through the
+real codec on both sides.
 """
 
 import asyncio
@@ -19,7 +21,8 @@ from vram_arbiter.schemas.runtime.peercred import Peer
 LATENCY_S = (0.00005, 0.0004)
 RECONNECT_S = (0.02, 0.5)
 QUEUE_MAX = 4096
-"""As `schemas.runtime.connection.OUT_MESSAGES_MAX`: a peer that does not read loses what comes beyond."""
+"""As `schemas.runtime.connection.OUT_MESSAGES_MAX`: a peer that does not read loses what comes
+beyond."""
 
 
 class Server(Protocol):
@@ -63,7 +66,8 @@ class Line:
 
 
 class Link:
-    """One DEALER socket of a process, from its opening to its closing; the shape of `clients.net.dealer.Dealer`."""
+    """One DEALER socket of a process, from its opening to its closing; the shape of
+    `clients.net.dealer.Dealer`."""
 
     def __init__(
         self,
@@ -89,7 +93,7 @@ class Link:
         self._arrived = asyncio.Event()
         wire.opened(self)
 
-    # -- the process's side ----------------------------------------------------------------------------------------
+    # -- the process's side
     def send(self, message: dict[str, Any]) -> bool:
         if self.closed or self.loop.dead:
             return True
@@ -116,7 +120,8 @@ class Link:
             self.close()
 
     def close(self) -> None:
-        """LINGER 0: what the kernel does not have yet is lost; what it has arrives, perhaps after a newer connection's first word."""
+        """LINGER 0: what the kernel does not have yet is lost; what it has arrives, perhaps after a
+        newer connection's first word."""
         if self.closed:
             return
         self.closed = True
@@ -125,7 +130,7 @@ class Link:
         self._end()
         self.wire.forget(self)
 
-    # -- the world's side ------------------------------------------------------------------------------------------
+    # -- the world's side
     def connect(self) -> None:
         """The socket found the daemon."""
         if self.closed or self.loop.dead or self.line is not None or self.wire.server is None:
@@ -139,7 +144,8 @@ class Link:
             self._go_up(payload)
 
     def cut(self, *, told: bool) -> None:
-        """The connection breaks; the socket comes back by itself. `told`: the socket's monitor says so to its owner."""
+        """The connection breaks; the socket comes back by itself. `told`: the socket's monitor says
+        so to its owner."""
         if self.closed or self.line is None:
             return
         self._generation += 1
@@ -240,7 +246,8 @@ class SimWire:
             self.seek(link)
 
     def gone(self) -> None:
-        """The daemon's socket is gone: every connection breaks. Libzmq's monitors tell most of the clients."""
+        """The daemon's socket is gone: every connection breaks. Libzmq's monitors tell most of the
+        clients."""
         self.server = None
         for link in list(self._open):
             link.cut(told=self.clock.chance(0.8))
@@ -248,7 +255,8 @@ class SimWire:
     def arrive_up(
         self, line: Line, same_connection: bool, server: Server | None, payload: bytes
     ) -> None:
-        """Also from a socket closed meanwhile: then the messages are older than what its owner says now."""
+        """Also from a socket closed meanwhile: then the messages are older than what its owner says
+        now."""
         if self.server is None or self.server is not server or not same_connection:
             self.lost += 1
             return

@@ -1,11 +1,14 @@
-"""The simulated machine: processes that live, hang and die, cards, a wire, and a daemon that can be killed and started again.
+"""The simulated machine: processes that live, hang and die, cards, a wire, and a daemon that can be
+killed and started again.
 
-Clients are brought by the caller (the daemon's tree must not import them): a client opens a `Link` for a `SimProcess` and runs on that
-process's loop. After every step of the clock the world looks at what must hold whatever happens; the first breach ends the run:
+Clients are brought by the caller (the daemon's tree must not import them): a client opens a `Link`
+for a `SimProcess` and runs on that process's loop. After every step of the clock the world looks at
+what must hold whatever happens; the first breach ends the run:
 
     * the core never raises (its own invariants are on), and no task of anybody fails
     * tokens grow over all grants, also across restarts
-    * on the physical card: what processes were granted or still occupy never exceeds the capacity, and nobody shares an exclusive card
+    * on the physical card: what processes were granted or still occupy never exceeds the capacity,
+    and nobody shares an exclusive card
     * no lost wake-up: whenever the core rests, the head of a queue does not fit
 """
 
@@ -43,7 +46,8 @@ QUICK: Mapping[str, float] = {
 
 
 class SimFailure(AssertionError):
-    """Something that must hold did not. The message has the seed and the last lines of the trace."""
+    """Something that must hold did not. The message has the seed and the last lines of the
+    trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +79,8 @@ class SimProcess:
 
 
 class World:
-    """One simulated machine. `entitlements` is the clients' side of the truth, set by whoever brings the clients."""
+    """One simulated machine. `entitlements` is the clients' side of the truth, set by whoever
+    brings the clients."""
 
     def __init__(
         self,
@@ -122,7 +127,7 @@ class World:
         self._last_token = (0, 0)
         self.clock.after_step = self._after_step
 
-    # -- failing -----------------------------------------------------------------------------------------------------
+    # -- failing
     @property
     def distrusted(self) -> bool:
         return self.clock.now < self.distrusted_until
@@ -138,7 +143,7 @@ class World:
             lines = "\n".join(self.clock.trace.lines)
             raise SimFailure(f"{lines}\nseed {self.seed}: {self.failure}")
 
-    # -- processes ---------------------------------------------------------------------------------------------------
+    # -- processes
     def spawn(self, name: str, pid: int | None = None, uid: int = 1000) -> SimProcess:
         """A new process; a pid may be one that a dead process had."""
         if pid is None:
@@ -169,7 +174,8 @@ class World:
         return link
 
     def kill(self, process: SimProcess) -> None:
-        """SIGKILL, also of a stopped process. The kernel takes its sockets and its memory; the daemon's pidfd becomes readable."""
+        """SIGKILL, also of a stopped process. The kernel takes its sockets and its memory; the
+        daemon's pidfd becomes readable."""
         if not process.alive:
             return
         self.clock.say(f"process {process.name} {process.key} dies")
@@ -190,7 +196,7 @@ class World:
         if self.daemon is not None:
             self.daemon.process_died(key)
 
-    # -- the daemon --------------------------------------------------------------------------------------------------
+    # -- the daemon
     def start_daemon(self) -> None:
         assert self.daemon is None or self.daemon.loop.dead, "the daemon runs already"
         self.daemon = SimDaemon(self.machine, self._core_failed)
@@ -206,7 +212,8 @@ class World:
         return self.daemon is not None and not self.daemon.loop.dead
 
     def reboot(self) -> None:
-        """Power cut: every process is gone, the cards are empty, the boot id is new. The journal's file survives."""
+        """Power cut: every process is gone, the cards are empty, the boot id is new. The journal's
+        file survives."""
         self.kill_daemon("power cut")
         for process in list(self.processes.values()):
             self.kill(process)
@@ -218,7 +225,7 @@ class World:
     def _core_failed(self, error: BaseException) -> None:
         self.fail(f"the core raised {type(error).__name__}: {error}")
 
-    # -- what must hold ----------------------------------------------------------------------------------------------
+    # -- what must hold
     def touch(self) -> None:
         """Somebody's belief or bytes changed: look at the cards after this step."""
         self._touched = True
@@ -253,7 +260,8 @@ class World:
         for entitlement in self.entitlements():
             if entitlement.gpu not in granted:
                 self.fail(
-                    f"{entitlement.process} believes that {entitlement.lease_id} is on {entitlement.gpu}"
+                    f"{entitlement.process} believes that {entitlement.lease_id} is on "
+                    f"{entitlement.gpu}"
                 )
                 return
             granted[entitlement.gpu].append(entitlement)
@@ -261,8 +269,10 @@ class World:
             self._check_card(card, granted[gpu])
 
     def _check_card(self, card: Device, granted: list[Entitlement]) -> None:
-        """Granted or still occupied: per lease the larger of the two, and one context for each process. What a process did not
-        free counts towards its next lease: its allocator hands it out again."""
+        """Granted or still occupied: per lease the larger of the two, and one context for each
+        process. What a process did not free counts towards its next lease: its allocator hands it
+        out again.
+        """
         held: dict[tuple[ProcessKey, str], int] = {}
         contexts: dict[ProcessKey, int] = {}
         leaks: dict[ProcessKey, int] = {}
@@ -307,9 +317,10 @@ class World:
             ):
                 self.fail(f"lost wake-up: {head.id} fits on {gpu.info.id} and nobody looks")
 
-    # -- running -----------------------------------------------------------------------------------------------------
+    # -- running
     def run(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
-        """Let simulated time pass. Raises SimFailure at the first breach. With `done`: whether it came to hold."""
+        """Let simulated time pass. Raises SimFailure at the first breach. With `done`: whether it
+        came to hold."""
         held = self.clock.run_until(self.clock.now + seconds, done)
         self.raise_failure()
         return held
@@ -317,7 +328,8 @@ class World:
 
 @contextlib.contextmanager
 def state_folder() -> Iterator[Path]:
-    """A folder for journals, in memory where the machine has one: the journal's own fsync is not under test here."""
+    """A folder for journals, in memory where the machine has one: the journal's own fsync is not
+    under test here."""
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(
         prefix="vram-sim-", dir=memory if memory.is_dir() else None

@@ -1,4 +1,5 @@
-"""After the ladder's deadline: what a holder agreed to for itself, never while its process uses anything, and nothing without agreement."""
+"""After the ladder's deadline: what a holder agreed to for itself, never while its process uses
+anything, and nothing without agreement."""
 
 from typing import Any
 
@@ -95,7 +96,8 @@ def test_a_lease_in_use_is_never_signalled_and_has_its_whole_time_after_it() -> 
 
 
 def test_a_process_that_uses_anything_is_not_signalled() -> None:
-    """Its idle lease outstays, but the same process drives the arm with another one, or with somebody else's."""
+    """Its idle lease outstays, but the same process drives the arm with another one, or with
+    somebody else's."""
     driver = CoreDriver(8 * GIB)
     det, _, _ = idle_and_revoked(driver, on_overstay="kill")
     policy = driver.consumer("policy")

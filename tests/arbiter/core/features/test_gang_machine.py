@@ -1,7 +1,8 @@
-"""A rule machine over gangs: yields, gangs and circles in any order, with deaths and restarts in between.
+"""A rule machine over gangs: yields, gangs and circles in any order, with deaths and restarts in
+between.
 
-Holders that load only what they were granted never overfill the card, every waiter is served in the end, and nothing stays charged when
-all processes are gone.
+Holders that load only what they were granted never overfill the card, every waiter is served in the
+end, and nothing stays charged when all processes are gone.
 """
 
 from typing import Any
@@ -39,7 +40,7 @@ class Gangs(RuleBasedStateMachine):
         self.gangs = 0
         self.dead: list[Consumer] = []
 
-    # -- asking ----------------------------------------------------------------------------------------------------
+    # -- asking
     def ask(self, who: Consumer, size: int, steady: int, spec: dict[str, Any]) -> Any:
         if (
             sum(
@@ -98,10 +99,11 @@ class Gangs(RuleBasedStateMachine):
         ]
         return multiple(*(lease for lease in made if lease is not None))
 
-    # -- holding ---------------------------------------------------------------------------------------------------
+    # -- holding
     @rule(lease=leases)
     def load(self, lease: LeaseId) -> None:
-        """To its peak and down again. It takes time: a reading that began before it cannot have seen it."""
+        """To its peak and down again. It takes time: a reading that began before it cannot have
+        seen it."""
         if self.driver.state(lease) != "loading":
             return
         self.driver.advance(MOMENT_S)
@@ -142,7 +144,7 @@ class Gangs(RuleBasedStateMachine):
             for n, person in enumerate(self.people):
                 person.use_end(lease, f"u{n}", self.mine[lease].token(lease))
 
-    # -- leaving ---------------------------------------------------------------------------------------------------
+    # -- leaving
     def unload(self, lease: LeaseId) -> None:
         who = self.mine[lease]
         began = who.unloading(lease)
@@ -185,7 +187,7 @@ class Gangs(RuleBasedStateMachine):
         self.dead.append(person)
         self.people[who] = self.driver.consumer(f"p{who}")
 
-    # -- the world -------------------------------------------------------------------------------------------------
+    # -- the world
     @rule(seconds=st.sampled_from([0.002, 0.02, 0.3, 2.0, 35.0]))
     def wait(self, seconds: float) -> None:
         self.driver.advance(seconds)
@@ -225,7 +227,8 @@ class Gangs(RuleBasedStateMachine):
             self.fits()
 
     def teardown(self) -> None:
-        """Everybody cooperates: whoever waits is served, and once all have died nothing is charged."""
+        """Everybody cooperates: whoever waits is served, and once all have died nothing is
+        charged."""
         if not hasattr(self, "driver"):
             return
         waiting: set[LeaseId] = set()

@@ -1,4 +1,6 @@
-"""Gangs and the card itself: what is kept for a member is charged, but it loads only when the card shows that it is free."""
+"""Gangs and the card itself: what is kept for a member is charged, but it loads only when the card
+shows that it is free.
+"""
 
 import pytest
 
@@ -21,7 +23,9 @@ def member(who: Consumer, peak: float, steady: float, **spec: object) -> LeaseId
 
 
 def to_peak_and_down(who: Consumer, lease: LeaseId) -> None:
-    """Readings that began before see nothing of it, those that begin after it see the peak for as long as the card lags."""
+    """Readings that began before see nothing of it, those that begin after it see the peak for as
+    long as the card lags.
+    """
     spec = who.specs[lease]
     who.driver.advance(MOMENT_S)
     who.hold(spec.load_peak_bytes)
@@ -70,7 +74,9 @@ def test_while_a_member_waits_for_its_memory_the_card_is_not_read_without_pause(
 
 
 def test_memory_that_does_not_come_back_breaks_the_gang_in_time() -> None:
-    """It counts from when the card first showed too little, not from the last thing that happened on it."""
+    """It counts from when the card first showed too little, not from the last thing that happened
+    on it.
+    """
     driver = hidden_card(lists=False)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = member(a, 3, 3), member(b, 4, 4)
@@ -108,7 +114,9 @@ def test_a_shortage_that_is_over_is_forgotten() -> None:
 
 
 def test_what_a_process_keeps_is_part_of_what_its_member_needs() -> None:
-    """Where readings do not list processes, the residue that the ledger knows is not asked for twice."""
+    """Where readings do not list processes, the residue that the ledger knows is not asked for
+    twice.
+    """
     driver = hidden_card(lists=False)
     who = driver.consumer("who")
     before = who.acquire(GIB, residue_bytes=GIB)
@@ -124,7 +132,9 @@ def test_what_a_process_keeps_is_part_of_what_its_member_needs() -> None:
 
 
 def test_bytes_kept_for_a_gang_do_not_verify_what_its_process_gives_back() -> None:
-    """A process lets go of a lease while it waits for its turn in a gang: what it still holds is not its member's."""
+    """A process lets go of a lease while it waits for its turn in a gang: what it still holds is
+    not its member's.
+    """
     driver = hidden_card(lag_s=0.8)
     a, b = driver.consumer("a"), driver.consumer("b")
     own = b.acquire(GIB)

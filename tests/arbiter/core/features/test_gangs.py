@@ -1,4 +1,5 @@
-"""Gangs: together or not at all, one after the other on a card, and what becomes of the rest when one of them fails."""
+"""Gangs: together or not at all, one after the other on a card, and what becomes of the rest when
+one of them fails."""
 
 from typing import Any
 
@@ -46,7 +47,7 @@ def codes(driver: CoreDriver, member: Member) -> list[str]:
     return [push["error"]["code"] for push in driver.pushes("denied", member.lease)]
 
 
-# -- gathering ---------------------------------------------------------------------------------------------------------
+# -- gathering
 def test_nobody_is_granted_before_all_have_come(driver: CoreDriver) -> None:
     a = Member(driver, "policy", 4, 3)
     driver.advance(10.0)
@@ -159,7 +160,7 @@ def test_one_that_gives_up_while_waiting_breaks_it(driver: CoreDriver, end: str)
     assert b.lease in note["reason"] or a.lease in note["reason"]
 
 
-# -- waiting -----------------------------------------------------------------------------------------------------------
+# -- waiting
 def test_victims_are_asked_only_if_the_whole_gang_then_fits(driver: CoreDriver) -> None:
     idle, first = held(driver, "idle", 3)
     held(driver, "pinned", 3, evictable=False)
@@ -222,7 +223,7 @@ def test_measured_memory_that_is_not_there_keeps_a_gang_waiting(driver: CoreDriv
     del person, lease
 
 
-# -- several cards -----------------------------------------------------------------------------------------------------
+# -- several cards
 def test_a_model_over_two_cards_is_a_gang_of_two_leases() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     who = driver.consumer("p")
@@ -285,7 +286,7 @@ def test_a_search_without_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> Non
     )
 
 
-# -- breaking ----------------------------------------------------------------------------------------------------------
+# -- breaking
 def test_a_member_that_fails_to_load_breaks_it_and_who_waits_is_denied(driver: CoreDriver) -> None:
     a, b = pair(driver)
     a.who.release(a.lease)
@@ -391,7 +392,7 @@ def test_a_gathering_gang_is_no_deadlock(driver: CoreDriver) -> None:
     del second
 
 
-# -- restarts ----------------------------------------------------------------------------------------------------------
+# -- restarts
 def again(driver: CoreDriver, member: Member, nonce: str = "n1") -> list[Effect]:
     """The client asks again by its nonce, as it does for whatever it waits for."""
     return member.who.try_acquire(2 * GIB, 2 * GIB, gang=("g", 2), nonce=nonce)
@@ -472,7 +473,8 @@ def test_memory_that_nobody_can_explain_is_not_free_for_a_gang(driver: CoreDrive
 
 
 def test_an_idle_card_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
-    """Two exclusive members and one card that can be emptied: the other one's holder is of higher priority."""
+    """Two exclusive members and one card that can be emptied: the other one's holder is of higher
+    priority."""
     driver = CoreDriver(8 * GIB, cards=2)
     busy, lease = held(driver, "busy", 2, gpu="1", priority=90)
     busy.use_begin(lease)

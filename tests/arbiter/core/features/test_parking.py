@@ -1,4 +1,5 @@
-"""Parked leases: off the card, weights in host RAM within one budget, charged the residue there and nothing twice."""
+"""Parked leases: off the card, weights in host RAM within one budget, charged the residue there and
+nothing twice."""
 
 from dataclasses import replace
 from typing import Any
@@ -51,7 +52,7 @@ def ram(driver: CoreDriver) -> int:
     return shown
 
 
-# -- the budget ------------------------------------------------------------------------------------------------------
+# -- the budget
 def test_the_budget_by_itself() -> None:
     host = HostRam(10)
     a, b = LeaseId("a"), LeaseId("b")
@@ -118,7 +119,7 @@ def test_who_declared_nothing_cannot_park_and_who_exits_keeps_nothing() -> None:
     assert driver.state(lease) == driver.state(second) == "held"
 
 
-# -- away and back ---------------------------------------------------------------------------------------------------
+# -- away and back
 def test_parked_it_is_charged_its_residue_on_the_card_and_its_weights_in_ram() -> None:
     driver = driver_with()
     vlm, lease, policy, wanted = parked(driver)
@@ -197,7 +198,8 @@ def test_giving_up_frees_the_ram() -> None:
         vlm, lease, policy, wanted = revoked_vlm(driver)
         vlm.unload(lease, parked=True)
         if "measured" not in end:
-            driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023  # reason: run at once
+            # run at once
+            driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023
             policy.load(wanted)
         assert ram(driver) == 5 * GIB
         if end == "cancel":
@@ -236,7 +238,7 @@ def test_an_operator_keeps_a_parked_one_from_coming_back_by_itself() -> None:
     assert answer(vlm.reacquire(lease))["state"] == "loading"
 
 
-# -- restarts --------------------------------------------------------------------------------------------------------
+# -- restarts
 def test_a_restart_keeps_what_is_parked_and_what_is_promised() -> None:
     driver = driver_with(11)
     vlm, lease, policy, wanted = parked(driver)

@@ -15,7 +15,7 @@ from vram_arbiter.schemas.ids import GpuId, LeaseId
 GIB, MIB = d.GIB, d.MIB
 
 
-# -- shrinking -------------------------------------------------------------------------------------------------------
+# -- shrinking
 @pytest.mark.parametrize("lists", [True, False])
 def test_a_shrink_is_believed_when_the_card_agrees(lists: bool) -> None:
     driver = CoreDriver(8 * GIB)
@@ -82,7 +82,8 @@ def test_a_failing_probe_shrinks_nobody() -> None:
 
 @pytest.mark.parametrize("lists", [True, False])
 def test_what_it_held_before_it_shrank_is_no_drift(lists: bool) -> None:
-    """Regression: it was compared with the new size, noted as drift, and the next load was charged the old one."""
+    """Regression: it was compared with the new size, noted as drift, and the next load was charged
+    the old one."""
     driver = CoreDriver(8 * GIB)
     driver.card.lists_processes = lists
     driver.card.lag_s = 0.5
@@ -180,7 +181,7 @@ def test_a_shrink_ends_with_its_lease() -> None:
     assert not driver.pushes("resized")
 
 
-# -- growing ---------------------------------------------------------------------------------------------------------
+# -- growing
 def test_a_growth_with_room_is_granted_at_once() -> None:
     driver = CoreDriver(8 * GIB)
     vlm, lease = held(driver, "vlm", 4)
@@ -356,7 +357,8 @@ def test_the_invariant_of_a_growth() -> None:
 
 @pytest.mark.parametrize("end", ["canceled", "connection lost"])
 def test_a_lease_outlives_its_growth(end: str) -> None:
-    """A growth that ended without a denial was still named by its lease, and the next request on that lease stopped the daemon."""
+    """A growth that ended without a denial was still named by its lease, and the next request on
+    that lease stopped the daemon."""
     driver = CoreDriver(8 * GIB)
     vlm, lease = held(driver, "vlm", 4)
     det, other = held(driver, "det", 3)

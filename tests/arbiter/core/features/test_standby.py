@@ -1,4 +1,5 @@
-"""Standby: who was asked to leave comes back by itself when there is room, never at anybody's cost, or as soon as its holder wants it."""
+"""Standby: who was asked to leave comes back by itself when there is room, never at anybody's cost,
+or as soon as its holder wants it."""
 
 from typing import Any
 
@@ -14,7 +15,7 @@ GIB = d.GIB
 MIB = d.MIB
 
 
-# -- there and back --------------------------------------------------------------------------------------------------
+# -- there and back
 def test_the_detector_returns_by_itself_after_the_grab() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver)
@@ -68,7 +69,8 @@ def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
 
 
 def test_cancel_on_the_way_to_standby_is_heard() -> None:
-    """Regression: it was refused while the bytes were measured, and the lease came back to a holder that did not want it."""
+    """Regression: it was refused while the bytes were measured, and the lease came back to a holder
+    that did not want it."""
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     driver.consumer("policy").acquire(5 * GIB)
@@ -158,7 +160,8 @@ def test_once_used_it_has_its_residency() -> None:
 def all_away(
     driver: CoreDriver, boss_gib: float, **wanted: tuple[float, dict[str, Any]]
 ) -> dict[str, tuple[Consumer, LeaseId]]:
-    """Several on standby, in this order of leaving, and the card is empty again; nobody is back before a second of quiet."""
+    """Several on standby, in this order of leaving, and the card is empty again; nobody is back
+    before a second of quiet."""
     people = {
         name: held(driver, name, gib, standby=True, min_residency_s=1.0, **spec)
         for name, (gib, spec) in wanted.items()
@@ -294,7 +297,7 @@ def test_the_reading_has_to_agree_before_it_comes_back() -> None:
     assert sum(driver.card.shown(driver.now).values()) == 0
 
 
-# -- wanted now ------------------------------------------------------------------------------------------------------
+# -- wanted now
 def test_reacquire_makes_it_a_waiter_that_makes_others_leave() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver)
@@ -408,7 +411,8 @@ def test_a_new_acquire_of_the_same_model_takes_the_lease_over() -> None:
 
 
 def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> None:
-    """Regression: the journal knew the spec of before, so after a restart 2 GiB were granted to a holder that loaded 6."""
+    """Regression: the journal knew the spec of before, so after a restart 2 GiB were granted to a
+    holder that loaded 6."""
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver, gib=2, policy_gib=7)
     policy.use_begin(wanted)
@@ -431,7 +435,8 @@ def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> No
 
 @pytest.mark.parametrize("reattaches", [True, False])
 def test_whoever_asks_on_for_a_lease_that_he_took_over_waits_again(reattaches: bool) -> None:
-    """Regression: a restart had ended the wait, and the repeat was told "standby", which its client took for a place in the queue."""
+    """Regression: a restart had ended the wait, and the repeat was told "standby", which its client
+    took for a place in the queue."""
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver)
     policy.use_begin(wanted)

@@ -1,4 +1,5 @@
-"""What ends or changes a lease on standby: its holder, its process, an operator; several cards; its invariants."""
+"""What ends or changes a lease on standby: its holder, its process, an operator; several cards; its
+invariants."""
 
 from collections.abc import Callable
 
@@ -15,7 +16,7 @@ from vram_arbiter.schemas import defaults as d
 GIB = d.GIB
 
 
-# -- ends ------------------------------------------------------------------------------------------------------------
+# -- ends
 def test_giving_up_a_lease_on_standby() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, _, _ = sent_away(driver)
@@ -74,7 +75,7 @@ def test_it_ends_with_its_process() -> None:
     assert driver.notes("lost")[-1]["lease_id"] == lease
 
 
-# -- operators -------------------------------------------------------------------------------------------------------
+# -- operators
 def test_whom_an_operator_evicts_does_not_come_back() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
@@ -96,7 +97,8 @@ def test_an_operators_word_outweighs_the_engines() -> None:
         if steps > 0:
             det.unload(lease)
         if steps > 1:
-            driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023  # reason: run at once
+            # run at once
+            driver.until(lambda: driver.state(wanted) == "loading")  # noqa: B023
         order(driver, "evict", lease)
         if steps == 0:
             det.unload(lease)
@@ -156,7 +158,7 @@ def test_a_pin_on_standby_holds_after_the_return() -> None:
     assert (driver.state(lease), driver.state(again)) == ("held", "queued")
 
 
-# -- several cards, invariants ---------------------------------------------------------------------------------------
+# -- several cards, invariants
 def test_it_may_come_back_on_another_card() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     det, lease = held(driver, "det", 5, standby=True)

@@ -46,7 +46,8 @@ def test_a_holder_that_does_not_come_back_loses_it() -> None:
 
 
 def test_who_asks_for_it_anew_before_re_attaching_has_come_back() -> None:
-    """After a restart it asks for the model again, and waits for longer than a holder has time to come back."""
+    """After a restart it asks for the model again, and waits for longer than a holder has time to
+    come back."""
     driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
     policy_token = policy.token(wanted)
@@ -102,7 +103,8 @@ def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish() -> Non
 
 
 def test_a_restart_does_not_let_a_revoke_outrun_the_uses_of_others() -> None:
-    """Regression: a lease restored as asked to leave refused the runner's goal, and unloaded in the middle of the grab."""
+    """Regression: a lease restored as asked to leave refused the runner's goal, and unloaded in the
+    middle of the grab."""
     driver = CoreDriver(8 * GIB)
     policy, lease = held(driver, "policy", 5, standby=True)
     runner = driver.consumer("runner")

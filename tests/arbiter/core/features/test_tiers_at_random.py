@@ -1,4 +1,5 @@
-"""Random lives of leases that stand by, park, grow, shrink and are sent away, over restarts: bytes, host RAM and turns stay right."""
+"""Random lives of leases that stand by, park, grow, shrink and are sent away, over restarts: bytes,
+host RAM and turns stay right."""
 
 import collections
 import random
@@ -18,7 +19,8 @@ BUDGET = CAPACITY - d.RESERVE_BYTES
 
 
 class Crowd:
-    """Four processes with one lease each at a time, and what each holds on its card by its own doing."""
+    """Four processes with one lease each at a time, and what each holds on its card by its own
+    doing."""
 
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)

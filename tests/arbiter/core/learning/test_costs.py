@@ -1,4 +1,5 @@
-"""What was learnt of leaving and coming back orders victims that are otherwise alike, and keeps two from throwing each other out."""
+"""What was learnt of leaving and coming back orders victims that are otherwise alike, and keeps two
+from throwing each other out."""
 
 from typing import Any
 
@@ -18,7 +19,7 @@ def asked(driver: CoreDriver, leases: dict[str, LeaseId]) -> list[str]:
     return [name for name, lease in leases.items() if driver.state(lease) == "revoking"]
 
 
-# -- victims ---------------------------------------------------------------------------------------------------------
+# -- victims
 def test_of_two_alike_the_one_that_reloads_faster_goes() -> None:
     driver = CoreDriver(
         8 * GIB, settings={"learnt": {"slow": {"load_s": 40.0}, "fast": {"load_s": 2.0}}}
@@ -101,7 +102,7 @@ def test_many_candidates_are_searched_with_parking_in_mind_too() -> None:
     assert asked(driver, leases) == ["n9"]
 
 
-# -- thrash ----------------------------------------------------------------------------------------------------------
+# -- thrash
 LEARNT = {name: {"load_s": 6.0, "unload_s": 1.0, "verify_s": 1.0} for name in ("a", "b")}
 
 
@@ -119,7 +120,8 @@ class Pair:
         return self.people["b" if self.holder == "a" else "a"].acquire(5 * GIB, **spec)
 
     def switch(self, wanted: LeaseId) -> float:
-        """The holder leaves when it is asked. Returns how long that took; the loads themselves take no time here."""
+        """The holder leaves when it is asked. Returns how long that took; the loads themselves take
+        no time here."""
         waited = self.driver.until(lambda: self.driver.state(self.lease) == "revoking")
         self.people[self.holder].unload(self.lease)
         self.driver.until(lambda: self.driver.state(wanted) == "loading")

@@ -13,7 +13,8 @@ GIB, MIB = d.GIB, d.MIB
 def lived(
     driver: CoreDriver, name: str, *, peak: float, steady: float, residue: float = 0.0
 ) -> None:
-    """One life: loads with a peak, serves, unloads, ends. It declared 2 GiB (and 450 MiB of residue)."""
+    """One life: loads with a peak, serves, unloads, ends. It declared 2 GiB (and 450 MiB of
+    residue)."""
     person = driver.consumer(name)
     lease = person.acquire(2 * GIB, residue_bytes=450 * MIB)
     driver.until(lambda: driver.state(lease) == "loading")

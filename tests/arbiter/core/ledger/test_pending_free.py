@@ -1,4 +1,5 @@
-"""What was given up a moment ago is still on the card, and is nobody's: it must not hide what the next one gives back."""
+"""What was given up a moment ago is still on the card, and is nobody's: it must not hide what the
+next one gives back."""
 
 import pytest
 
@@ -22,7 +23,7 @@ def reading(at: float, used: int, *uses: tuple[ProcessKey, int | None]) -> Memor
     return MemorySampled(GPU, at, used, 1000, listed)
 
 
-# -- what is watched -----------------------------------------------------------------------------------------------------
+# -- what is watched
 def test_what_was_given_up_counts_for_as_long_as_it_is_asked_for() -> None:
     pending = PendingFree()
     pending.give_up(A, 300, 10.0)
@@ -62,7 +63,7 @@ def test_a_holder_that_leaves_the_list_still_explains_what_it_is_booked() -> Non
     assert pending.since(1.0) == 50
 
 
-# -- what it means for the rest that nobody explains -----------------------------------------------------------------------
+# -- what it means for the rest that nobody explains
 @pytest.mark.parametrize("lists", [True, False])
 def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(lists: bool) -> None:
     books = GpuLedger(GpuInfo(GPU, 0, "card", 1000, 100), 10)
@@ -83,10 +84,11 @@ def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(list
     assert observe(7.0, 400, 0) == (300, 100)
 
 
-# -- verdicts --------------------------------------------------------------------------------------------------------------
+# -- verdicts
 @pytest.mark.parametrize("restarts", [False, True])
 def test_a_load_peak_on_its_way_back_hides_nobodys_bytes(restarts: bool) -> None:
-    """Regression (storm, seed 7): a release counted as measured while all its bytes were on the card, behind a peak that had ended."""
+    """Regression (storm, seed 7): a release counted as measured while all its bytes were on the
+    card, behind a peak that had ended."""
     driver = hidden_card(lists=False)
     small, lease = held(driver, "small", 0.7)
     driver.advance(2.0)
@@ -111,7 +113,8 @@ def test_a_load_peak_on_its_way_back_hides_nobodys_bytes(restarts: bool) -> None
 
 
 def test_a_stowaway_that_has_gone_hides_nobodys_bytes() -> None:
-    """Its process is off the list before its bytes are off the card, which then nobody in the list explains."""
+    """Its process is off the list before its bytes are off the card, which then nobody in the list
+    explains."""
     driver = CoreDriver(8 * GIB)
     small, lease = held(driver, "small", 1)
     driver.card.set(STRANGER, 2 * GIB, driver.now)
@@ -125,7 +128,7 @@ def test_a_stowaway_that_has_gone_hides_nobodys_bytes() -> None:
     assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(3.0, abs=0.1)
 
 
-# -- somebody unnamed leaves while a lease is measured -----------------------------------------------------------------------
+# -- somebody unnamed leaves while a lease is measured
 def without_lists(
     stranger_gib: float, *leases_gib: float
 ) -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
@@ -139,7 +142,8 @@ def without_lists(
 
 
 def test_an_unnamed_stowaway_that_leaves_hides_no_release() -> None:
-    """Regression (storm, seed 11): 2.4 GiB of two stowaways went, and so 750 MiB of a lease counted as measured while all were there."""
+    """Regression (storm, seed 11): 2.4 GiB of two stowaways went, and so 750 MiB of a lease counted
+    as measured while all were there."""
     driver, [(small, lease)] = without_lists(3, 0.75)
     driver.card.lag_s = 3.0
     small.unload(lease)
@@ -148,7 +152,8 @@ def test_an_unnamed_stowaway_that_leaves_hides_no_release() -> None:
 
 
 def test_the_doubt_ends_with_the_time_for_a_verdict() -> None:
-    """All that is known is a total: who holds what is left, a stowaway or the one that was to leave, it cannot say."""
+    """All that is known is a total: who holds what is left, a stowaway or the one that was to
+    leave, it cannot say."""
     driver, [(small, lease)] = without_lists(3, 0.75)
     driver.card.lag_s = 60.0
     small.unload(lease)
@@ -167,7 +172,8 @@ def test_when_all_that_nobody_named_is_gone_there_is_no_doubt() -> None:
 
 @pytest.mark.parametrize("apart_s", [0.0, 0.004, 0.05])
 def test_releases_beside_a_desktop_that_nobody_lists_explain_each_other(apart_s: float) -> None:
-    """WSL2: the desktop is in no list. Two models that leave together are gone as fast as they would be alone."""
+    """WSL2: the desktop is in no list. Two models that leave together are gone as fast as they
+    would be alone."""
     driver, [(one, first), (two, second)] = without_lists(2, 1, 1.5)
     one.unload(first)
     driver.advance(apart_s)

@@ -1,4 +1,5 @@
-"""The sub-tables of a card's residents follow every change; the full invariant check compares them with the leases."""
+"""The sub-tables of a card's residents follow every change; the full invariant check compares them
+with the leases."""
 
 import pytest
 
@@ -50,7 +51,8 @@ def test_a_reading_sees_what_happened_before_it_began() -> None:
 
 
 def test_who_fills_the_card_since_a_moment() -> None:
-    """Loads now, or became ready later, whatever it does since; whoever was ready before is not even looked at."""
+    """Loads now, or became ready later, whatever it does since; whoever was ready before is not
+    even looked at."""
     residents, (one, two, three, four) = crowd(4)
     for at, lease in enumerate((one, two, three, four)):
         lease.ready_at = float(at)

@@ -115,8 +115,10 @@ def test_why_follows_the_way_of_the_holder() -> None:
     det.release(lease)
     says.append(why(driver, "vlm")["next"])
     assert says == [
-        "waits for det to finish 2 uses (asked 0.1 s ago), then it unloads and 5.30 GiB are verified",
-        "waits for det to finish 1 use (asked 0.1 s ago), then it unloads and 5.30 GiB are verified",
+        "waits for det to finish 2 uses (asked 0.1 s ago), then it unloads and 5.30 GiB are "
+        "verified",
+        "waits for det to finish 1 use (asked 0.1 s ago), then it unloads and 5.30 GiB are "
+        "verified",
         "waits for det to unload (asked 0.1 s ago), then 5.30 GiB are verified",
         "det unloads, then 5.30 GiB are verified",
         "5.30 GiB of det are being verified",

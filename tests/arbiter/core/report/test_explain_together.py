@@ -1,4 +1,5 @@
-"""`why` of those who are not alone: members of a gang, and leases that were carved out of another, with whoever waits for them."""
+"""`why` of those who are not alone: members of a gang, and leases that were carved out of another,
+with whoever waits for them."""
 
 from typing import Any
 
@@ -32,7 +33,7 @@ def gang(driver: CoreDriver, **spec: Any) -> tuple[Consumer, LeaseId, Consumer, 
     return policy, first, reward, reward.acquire(3 * GIB, 2 * GIB, gang=("g", 2), **spec)
 
 
-# -- gangs -------------------------------------------------------------------------------------------------------------
+# -- gangs
 def test_every_member_that_waits_says_what_the_gang_needs_and_who_is_in_its_way() -> None:
     driver = CoreDriver()
     busy, lease = held(driver, "busy", 5, priority=60)

@@ -12,7 +12,7 @@ HERS = f"00-{'a' * 32}-{'1' * 16}-01"
 HIS = f"00-{'b' * 32}-{'2' * 16}-01"
 
 
-# -- figures -----------------------------------------------------------------------------------------------------------
+# -- figures
 def test_what_is_charged_and_measured_by_consumer() -> None:
     driver = CoreDriver(8 * GIB)
     person, _ = held(driver, "det", 2)
@@ -91,7 +91,7 @@ def test_pressure_a_drain_and_the_time_of_the_reading() -> None:
     assert driver.now - 1.1 <= card["read_at"] <= driver.now
 
 
-# -- traces ------------------------------------------------------------------------------------------------------------
+# -- traces
 def test_a_holder_is_asked_in_the_name_of_whoever_waits() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5)

@@ -1,4 +1,5 @@
-"""What happens next for a waiter, with its instant where one is planned; and it does happen then."""
+"""What happens next for a waiter, with its instant where one is planned; and it does
+happen then."""
 
 from typing import Any
 
@@ -109,7 +110,8 @@ def test_a_holder_on_its_way_out() -> None:
     assert step["in_s"] == pytest.approx(d.REVOKE_DEADLINE_S, abs=0.1)
     assert (
         step["text"]
-        == "waits for holder to let go for 30.0 s more, after that w waits on, and the holder's own rule applies"
+        == "waits for holder to let go for 30.0 s more, after that w waits on, and the holder's "
+        "own rule applies"
     )
     driver.advance(d.REVOKE_DEADLINE_S + 0.1)
     assert (only(driver)["action"], only(driver)["in_s"]) == ("wait", None)

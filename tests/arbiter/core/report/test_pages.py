@@ -24,7 +24,8 @@ def pages(driver: CoreDriver, limit: int) -> list[list[dict[str, Any]]]:
 
 
 def crowd() -> CoreDriver:
-    """Two GPUs on which somebody loads, a lease on standby, waiters for one GPU and for both, and a member of a gang that is not complete."""
+    """Two GPUs on which somebody loads, a lease on standby, waiters for one GPU and for both, and a
+    member of a gang that is not complete."""
     driver = CoreDriver(8 * GIB, cards=2)
     sleeper, first, second = (driver.consumer(name) for name in ("sleeper", "first", "second"))
     away = sleeper.acquire(7 * GIB, gpu="0", standby=True)

@@ -1,4 +1,5 @@
-"""What is told, word for word: views, records, notes and refusals are what clients, a restart and the history stand on."""
+"""What is told, word for word: views, records, notes and refusals are what clients, a restart and
+the history stand on."""
 
 from dataclasses import astuple, replace
 from typing import Any
@@ -26,7 +27,7 @@ def only(found: list[Any]) -> Any:
     return one
 
 
-# -- views -----------------------------------------------------------------------------------------------------------
+# -- views
 @pytest.mark.parametrize(("exclusive", "mode"), [(True, "exclusive"), (False, "shared")])
 def test_a_lease_as_it_is_shown(exclusive: bool, mode: str) -> None:
     driver = CoreDriver(8 * GIB)
@@ -115,7 +116,7 @@ def test_a_circle_names_its_leases_with_their_states() -> None:
     assert link["holds"] == [{"lease_id": lease, "consumer": "job", "state": "held"}]
 
 
-# -- answers ---------------------------------------------------------------------------------------------------------
+# -- answers
 def test_an_acquire_said_again_after_the_load_is_answered_as_granted() -> None:
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
@@ -156,7 +157,7 @@ def test_refusals_of_operators_say_why() -> None:
     assert refusal(other.post(evict)).message == f"{lease} is pinned: an operator pinned it"
 
 
-# -- the history -----------------------------------------------------------------------------------------------------
+# -- the history
 def test_a_load_is_noted_with_what_it_took() -> None:
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
@@ -233,7 +234,7 @@ def test_who_is_parked_is_noted_with_its_host_ram() -> None:
     assert only(driver.notes("parked"))["parked_bytes"] == 2 * GIB
 
 
-# -- who grows -------------------------------------------------------------------------------------------------------
+# -- who grows
 def test_a_growth_waits_for_its_bytes_alone() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(
@@ -260,7 +261,7 @@ def test_a_growth_waits_for_its_bytes_alone() -> None:
     )
 
 
-# -- the journal -----------------------------------------------------------------------------------------------------
+# -- the journal
 def test_a_record_holds_all_that_was_asked_for() -> None:
     driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 3 * GIB})
     det = driver.consumer("det")
@@ -342,7 +343,7 @@ def test_an_adopted_lease_says_where_it_comes_from() -> None:
     assert core_lease(driver, lease).story[0][2] == Why.ADOPTED
 
 
-# -- waiting beside what nobody owns -----------------------------------------------------------------------------------
+# -- waiting beside what nobody owns
 def test_a_small_one_may_pass_where_nobody_has_an_account() -> None:
     driver = CoreDriver(8 * GIB)
     driver.card.lists_processes = False

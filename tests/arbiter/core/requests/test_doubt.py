@@ -1,4 +1,5 @@
-"""A restart with a journal in doubt: it may have lost records, so holders know more than it does."""
+"""A restart with a journal in doubt: it may have lost records, so holders know more than
+it does."""
 
 from tests.support.core_driver import CoreDriver, answer
 from tests.support.scenes import held, sent_away
@@ -48,7 +49,8 @@ def test_an_empty_gpu_ends_the_doubt() -> None:
 
 
 def test_a_holder_with_a_later_token_is_believed() -> None:
-    """Its lease was granted again, and the record of that grant is lost. Without a doubt the token is refused."""
+    """Its lease was granted again, and the record of that grant is lost. Without a doubt the token
+    is refused."""
     for doubt in (True, False):
         driver = doubting()
         if not doubt:

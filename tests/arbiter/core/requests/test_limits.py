@@ -1,5 +1,5 @@
-"""Shares of limited places. One process took all places of the queue, or all uses of a lease, and locked everybody out: the lease's own
-holder too, which then could not use what it held."""
+"""Shares of limited places. One process took all places of the queue, or all uses of a lease, and
+locked everybody out: the lease's own holder too, which then could not use what it held."""
 
 from typing import Any
 
@@ -76,7 +76,8 @@ def test_a_place_is_free_again_when_its_waiter_is_gone() -> None:
 
 
 def test_strangers_never_take_the_uses_of_the_holder() -> None:
-    """Fails on a limit that counts all uses of a lease together: 256 uses of a stranger kept the holder from using its own lease."""
+    """Fails on a limit that counts all uses of a lease together: 256 uses of a stranger kept the
+    holder from using its own lease."""
     driver, holder, lease = full()
     holder.load(lease)
     token = holder.token(lease)

@@ -1,4 +1,5 @@
-"""What an operator does by hand: it is kept with who and why, and no rule for holders gets weaker."""
+"""What an operator does by hand: it is kept with who and why, and no rule for holders gets
+weaker."""
 
 from typing import Any
 
@@ -37,7 +38,7 @@ def noted(effects: list[Effect]) -> dict[str, Any]:
     return dict(note.data)
 
 
-# -- evict -------------------------------------------------------------------------------------------------------------
+# -- evict
 def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consumer) -> None:
     det, lease = held_bytes(driver, "det", 5 * GIB)
     det.use_begin(lease)
@@ -81,7 +82,8 @@ def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
 def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    """`vramctl run` lets a waiter of its own priority wait, and ends its program for an operator."""
+    """`vramctl run` lets a waiter of its own priority wait, and ends its program for an
+    operator."""
     det, lease = held_bytes(driver, "det", 5 * GIB)
     det.use_begin(lease)
     driver.consumer("vlm").acquire(5 * GIB)
@@ -111,7 +113,7 @@ def test_only_what_is_resident_can_be_evicted(driver: CoreDriver, ops: Consumer)
     assert refusal(order_of(ops, "evict", lease)).details["state"] == "loading"
 
 
-# -- who is meant --------------------------------------------------------------------------------------------------------
+# -- who is meant
 def test_a_consumer_with_several_leases_has_to_be_named_by_lease(
     driver: CoreDriver, ops: Consumer
 ) -> None:
@@ -147,14 +149,15 @@ def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evicta
     alive = refusal(order_of(ops, "release_dead", lease))
     assert alive.hint == ("evict it instead" if evictable else "end its program: it is pinned")
     for action, target in (
-        ("unpin", lease), ("evict", waiter), ("release_dead", waiter), ("pin", "nobody"), ("unpin", "L9-9"),
+        ("unpin", lease), ("evict", waiter), ("release_dead", waiter), ("pin", "nobody"),
+        ("unpin", "L9-9"),
     ):  # fmt: skip
         refused = refusal(order_of(ops, action, target))
         assert refused.message, action
         assert refused.hint, action
 
 
-# -- pins --------------------------------------------------------------------------------------------------------------
+# -- pins
 def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consumer) -> None:
     _, lease = held_bytes(driver, "det", 5 * GIB)
     vlm = driver.consumer("vlm")
@@ -225,7 +228,7 @@ def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
     assert view["pinned"] == f"{BY}: why not"
 
 
-# -- drain -------------------------------------------------------------------------------------------------------------
+# -- drain
 def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
     driver: CoreDriver, ops: Consumer
 ) -> None:
@@ -261,7 +264,7 @@ def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lea
     driver.until(lambda: driver.state(waiting) == "loading")
 
 
-# -- the dead ----------------------------------------------------------------------------------------------------------
+# -- the dead
 def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
     driver: CoreDriver, ops: Consumer
 ) -> None:
@@ -313,7 +316,8 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(
     restarts: int,
 ) -> None:
-    """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps until then is no mere residue."""
+    """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps
+    until then is no mere residue."""
     driver = CoreDriver(8 * GIB)
     ops = driver.consumer("ops")
     det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=30.0)
@@ -331,7 +335,8 @@ def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itsel
     (blocker,) = driver.why("policy")["leases"][0]["blockers"]
     assert (
         blocker["text"]
-        == f"is over, and its process (pid {det.process.pid}) keeps its bytes until it frees them or ends"
+        == f"is over, and its process (pid {det.process.pid}) keeps its bytes until it frees them "
+        "or ends"
     )
     assert driver.state(waiter) == "queued"
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=26.0)
@@ -343,7 +348,8 @@ def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itsel
 def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fences_itself(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    """What it holds beyond its context is less than a reading can be off: its bytes are "gone" while all of them are there."""
+    """What it holds beyond its context is less than a reading can be off: its bytes are "gone"
+    while all of them are there."""
     det, lease = held_bytes(driver, "det", 500 * MIB, residue_bytes=450 * MIB, ttl_s=10.0)
     driver.restart()
     ops.connect()

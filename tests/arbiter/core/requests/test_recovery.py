@@ -1,4 +1,5 @@
-"""A restart of the daemon alone: what the journal names stays charged, holders come back, and nobody is granted before."""
+"""A restart of the daemon alone: what the journal names stays charged, holders come back, and
+nobody is granted before."""
 
 from typing import Any
 
@@ -76,7 +77,8 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
 
 
 def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> None:
-    """Regression: after a restart the users may be back before the holder, whose list knows only its own uses."""
+    """Regression: after a restart the users may be back before the holder, whose list knows only
+    its own uses."""
     driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5)
     runner = driver.consumer("runner")
@@ -173,7 +175,8 @@ def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> No
 
 
 def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
-    """A reading that says that the card is empty may lie, and a model may sleep in host RAM. Nobody has to be waited for there, that is all."""
+    """A reading that says that the card is empty may lie, and a model may sleep in host RAM. Nobody
+    has to be waited for there, that is all."""
     driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5, ttl_s=10.0)
     loader = driver.consumer("loader")
@@ -251,7 +254,8 @@ def test_verifications_and_debts_go_on_after_the_restart() -> None:
 
 
 def test_a_debt_keeps_its_fence_grace_over_a_restart() -> None:
-    """Regression: the hung holder may still be loading until it fences itself; a restart forgot that and gave its room away."""
+    """Regression: the hung holder may still be loading until it fences itself; a restart forgot
+    that and gave its room away."""
     driver = CoreDriver(8 * GIB)
     hung = driver.consumer("hung")
     lease = hung.acquire(5 * GIB, ttl_s=2.0)
@@ -381,7 +385,8 @@ def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> Non
 
 
 def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
-    """They used to break the invariant on bytes at the start, and the whole journal was put aside for it."""
+    """They used to break the invariant on bytes at the start, and the whole journal was put aside
+    for it."""
     driver = CoreDriver(8 * GIB)
     _, lease, _ = held_with_token(driver, "det", 5)
     records = dict(driver.journal)
@@ -405,7 +410,8 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
 
 
 def test_records_of_sub_leases_come_back_as_plain_leases() -> None:
-    """Version 0.1 carved leases out of others. Each is charged its own bytes until it reattaches, or is measured gone."""
+    """Version 0.1 carved leases out of others. Each is charged its own bytes until it reattaches,
+    or is measured gone."""
     driver = CoreDriver(8 * GIB)
     runner, root, _ = held_with_token(driver, "runner", 1, exclusive=False)
     policy, leaf, token = held_with_token(driver, "policy", 4)

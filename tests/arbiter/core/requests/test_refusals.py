@@ -1,5 +1,6 @@
-"""Every request for bytes that comes to nothing is in the history with its reason. One that was refused at once left no trace: an operator saw
-a program fail and found nothing in history and log."""
+"""Every request for bytes that comes to nothing is in the history with its reason. One that was
+refused at once left no trace: an operator saw a program fail and found nothing in history and log.
+"""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""What clients ask for: exact effects, and every refusal with its code. A refused request changes nothing."""
+"""What clients ask for: exact effects, and every refusal with its code. A refused request changes
+nothing."""
 
 from typing import Any
 
@@ -20,7 +21,7 @@ def kinds(effects: list[Any]) -> list[str]:
     ]
 
 
-# -- acquire -----------------------------------------------------------------------------------------------------------
+# -- acquire
 def test_a_grant_is_journalled_before_it_is_told(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     effects = det.try_acquire(5 * GIB)
@@ -87,8 +88,8 @@ def test_what_can_never_fit_fails_at_once(driver: CoreDriver) -> None:
 
 @pytest.mark.parametrize("spec", [{}, {"exclusive": True}])
 def test_beside_a_pinned_holder_a_request_waits(driver: CoreDriver, spec: dict[str, Any]) -> None:
-    """A pinned program ends one day. Two `vramctl run --vram 6GiB` are no reason to say that the second can never fit: its own timeout
-    counts."""
+    """A pinned program ends one day. Two `vramctl run --vram 6GiB` are no reason to say that the
+    second can never fit: its own timeout counts."""
     pin, big = driver.consumer("pin"), driver.consumer("big")
     lease = pin.acquire(6 * GIB, evictable=False, **spec)
     pin.load(lease)
@@ -150,7 +151,7 @@ def test_a_wait_has_a_bound_and_says_who_was_in_the_way(driver: CoreDriver) -> N
     assert "probe died" in denied["error"]["details"]["why"]["text"]
 
 
-# -- cancel ------------------------------------------------------------------------------------------------------------
+# -- cancel
 def test_cancel_gives_up_a_wait_and_may_be_repeated(driver: CoreDriver) -> None:
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     held = det.acquire(5 * GIB)
@@ -164,7 +165,7 @@ def test_cancel_gives_up_a_wait_and_may_be_repeated(driver: CoreDriver) -> None:
     assert refusal(vlm.cancel(held)).code == "lease_lost"
 
 
-# -- tokens and ownership ----------------------------------------------------------------------------------------------
+# -- tokens and ownership
 def test_only_the_holder_with_the_exact_token_is_heard(driver: CoreDriver) -> None:
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     lease = det.acquire(5 * GIB)
@@ -186,7 +187,7 @@ def test_a_second_connection_of_the_same_process_speaks_for_it(driver: CoreDrive
     assert answer(other.load(lease))["lease"]["state"] == "held"
 
 
-# -- ready -------------------------------------------------------------------------------------------------------------
+# -- ready
 def test_ready_charges_the_steady_bytes_or_what_was_measured(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, 4 * GIB)
@@ -202,7 +203,7 @@ def test_ready_charges_the_steady_bytes_or_what_was_measured(driver: CoreDriver)
     assert refusal(vlm.ready(second)).code == "bad_state"
 
 
-# -- uses --------------------------------------------------------------------------------------------------------------
+# -- uses
 def test_uses_are_idempotent_and_counted_per_process(driver: CoreDriver) -> None:
     det, runner = driver.consumer("det"), driver.consumer("runner")
     lease = det.acquire(5 * GIB)
@@ -231,7 +232,7 @@ def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
     assert answer(det.use_begin(lease, "old")) == {"uses": 1}, "a repeat of what runs is fine"
 
 
-# -- renew -------------------------------------------------------------------------------------------------------------
+# -- renew
 def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, ttl_s=10.0, min_residency_s=100.0)
@@ -256,7 +257,7 @@ def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     assert driver.state(lease) == "over"
 
 
-# -- leaving -----------------------------------------------------------------------------------------------------------
+# -- leaving
 def test_unloading_waits_for_the_safe_point_whoever_marked_the_use(driver: CoreDriver) -> None:
     det, runner = driver.consumer("det"), driver.consumer("runner")
     lease = det.acquire(5 * GIB)
@@ -300,7 +301,7 @@ def test_an_acknowledgement_without_a_question_is_only_answered(driver: CoreDriv
     assert kinds(det.ack(lease)) == ["Reply"]
 
 
-# -- oom ---------------------------------------------------------------------------------------------------------------
+# -- oom
 def test_an_out_of_memory_raises_the_learnt_peak_of_its_model(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
@@ -330,7 +331,7 @@ def test_an_out_of_memory_within_the_grant_is_somebody_elses_doing(driver: CoreD
     assert not any(isinstance(effect, Push) for effect in effects)
 
 
-# -- memory --------------------------------------------------------------------------------------------------------------
+# -- memory
 def test_what_is_over_is_remembered_for_a_bounded_while(driver: CoreDriver) -> None:
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     det.acquire(5 * GIB)

@@ -1,4 +1,5 @@
-"""A laptop's lid: the monotonic clock stood still, so nobody expires, but everything measured is of yesterday."""
+"""A laptop's lid: the monotonic clock stood still, so nobody expires, but everything measured is of
+yesterday."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +15,8 @@ NIGHT_S = 8 * 3600.0
 
 
 def test_every_holder_gets_its_full_ttl_anew_and_none_expires() -> None:
-    """They wake up in any order, behind a driver that takes its time: the first to be late must not lose its lease for it."""
+    """They wake up in any order, behind a driver that takes its time: the first to be late must not
+    lose its lease for it."""
     driver = CoreDriver(8 * GIB)
     holders = [held(driver, name, 1, ttl_s=10.0) for name in ("a", "b", "c")]
     driver.advance(8.0)  # of ten
@@ -64,7 +66,8 @@ def newest(driver: CoreDriver, kind: str) -> Mapping[str, Any]:
 
 
 def test_a_verification_begins_again() -> None:
-    """Its time is up by what it waited for before; the readings of a new day decide, with the whole time for them."""
+    """Its time is up by what it waited for before; the readings of a new day decide, with the whole
+    time for them."""
     driver = CoreDriver(8 * GIB)
     driver.card.lag_s = 1000.0
     person, lease = held(driver, "a", 5, ttl_s=10.0)
@@ -127,7 +130,8 @@ def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:
 
 
 def test_what_was_there_before_the_night_has_to_come_back_before_a_dead_holder_is_gone() -> None:
-    """Regression (storm, seed 11): nobody had read the card since, so a context that another had never made hid what the dead one left."""
+    """Regression (storm, seed 11): nobody had read the card since, so a context that another had
+    never made hid what the dead one left."""
     driver = CoreDriver(8 * GIB, start=False)
     driver.card.lists_processes = False
     driver.advance(0.01)

@@ -201,7 +201,8 @@ def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
 
 
 def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
-    """Regression: a pin that a full disk did not take withdrew the lease of a holder that was loading, and its bytes were given away."""
+    """Regression: a pin that a full disk did not take withdrew the lease of a holder that was
+    loading, and its bytes were given away."""
     driver = CoreDriver(8 * GIB)
     det, ops = driver.consumer("det"), driver.consumer("ops")
     loading = det.acquire(5 * GIB)
@@ -251,7 +252,8 @@ def test_who_owns_bytes_of_a_card_and_who_is_connected() -> None:
 
 
 def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_own() -> None:
-    """However often it comes back: a client that reconnects for ever used to be remembered for ever."""
+    """However often it comes back: a client that reconnects for ever used to be remembered for
+    ever."""
     driver = CoreDriver(8 * GIB)
     det, other = driver.consumer("det"), driver.consumer("other")
     held = det.acquire(2 * GIB)

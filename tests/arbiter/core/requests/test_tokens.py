@@ -1,5 +1,7 @@
-"""Tokens are secrets. A token is all that another process needs to mark uses on a lease and keep it from being evicted, so a stranger that
-could read it in `status`, or guess it, could keep a holder on its GPU for ever."""
+"""Tokens are secrets. A token is all that another process needs to mark uses on a lease and keep it
+from being evicted, so a stranger that could read it in `status`, or guess it, could keep a holder
+on its GPU for ever.
+"""
 
 from itertools import pairwise
 from typing import Any
@@ -34,7 +36,8 @@ def test_a_token_is_shown_to_its_holder_and_to_an_operator_only() -> None:
 
 
 def test_nothing_that_is_said_to_others_holds_a_token() -> None:
-    """Every effect of a lease's life, from the acquire to the verdict, with a stranger that asks for everything it may."""
+    """Every effect of a lease's life, from the acquire to the verdict, with a stranger that asks
+    for everything it may."""
     driver = CoreDriver(8 * GIB, settings={"token_secret": SECRET})
     det, other = driver.consumer("det"), driver.consumer("other")
     lease = det.acquire(5 * GIB, standby=True)
@@ -71,7 +74,8 @@ def test_nothing_that_is_said_to_others_holds_a_token() -> None:
 
 
 def test_a_token_cannot_be_guessed_from_the_lease_id_or_from_another_token() -> None:
-    """Regression: tokens were the next number, so any client could keep a holder in use for ever."""
+    """Regression: tokens were the next number, so any client could keep a holder in use
+    for ever."""
 
     def tokens(secret: str) -> list[int]:
         driver = CoreDriver(8 * GIB, settings={"token_secret": secret})

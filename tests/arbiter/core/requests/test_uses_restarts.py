@@ -1,4 +1,5 @@
-"""Uses that others than the holder mark outlive the daemon: whoever is stopped across its restart still keeps the holder from being evicted."""
+"""Uses that others than the holder mark outlive the daemon: whoever is stopped across its restart
+still keeps the holder from being evicted."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -52,9 +53,10 @@ def writes(effects: list[Effect]) -> list[list[str]]:
     return [[use for _, _, use, _ in record.get("users", [])] for record in put]
 
 
-# -- after a restart ---------------------------------------------------------------------------------------------------
+# -- after a restart
 def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder() -> None:
-    """Regression: only its own client could mark the use again, and a holder was sent away in the middle of a grab."""
+    """Regression: only its own client could mark the use again, and a holder was sent away in the
+    middle of a grab."""
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver)
     restarted(driver, sidecar, lease, token)
@@ -188,7 +190,7 @@ def test_a_record_of_an_older_daemon_names_no_users() -> None:
     assert (driver.state(lease), shown(driver, lease)["uses"]) == ("held", 0)
 
 
-# -- what it costs -----------------------------------------------------------------------------------------------------
+# -- what it costs
 def test_the_holders_own_uses_are_not_written() -> None:
     driver = CoreDriver(8 * GIB)
     sidecar, lease = held(driver, "sidecar", 5)

@@ -1,4 +1,5 @@
-"""Waits that can never end are refused at once, with the circle in words; waits that can end are left alone."""
+"""Waits that can never end are refused at once, with the circle in words; waits that can end are
+left alone."""
 
 from typing import Any
 
@@ -45,7 +46,7 @@ def revokes_in(effects: list[Effect]) -> list[Any]:
     return [e for e in effects if getattr(e, "body", {}).get("push") == "revoke"]
 
 
-# -- circles -----------------------------------------------------------------------------------------------------------
+# -- circles
 def test_who_uses_what_is_in_his_way_is_told_at_once(driver: CoreDriver) -> None:
     job, lease = using(driver, "job", 5)
     effects = job.try_acquire(5 * GIB)
@@ -108,7 +109,8 @@ def test_a_circle_of_three_over_two_cards() -> None:
 
 
 def test_a_wait_behind_somebody_who_waits_for_my_use_is_a_circle_too(driver: CoreDriver) -> None:
-    """The small one would fit, but would delay the big one before it, and that one waits for the small one's process."""
+    """The small one would fit, but would delay the big one before it, and that one waits for the
+    small one's process."""
     job, _ = using(driver, "job", 5)
     big = driver.consumer("big").acquire(7 * GIB)
     assert driver.state(big) == "queued"
@@ -132,7 +134,7 @@ def test_several_circles_are_all_broken(driver: CoreDriver) -> None:
     assert [driver.state(lease) for lease in waits] == ["queued", "queued"]
 
 
-# -- no circles --------------------------------------------------------------------------------------------------------
+# -- no circles
 def test_what_fits_beside_my_use_is_no_circle(driver: CoreDriver) -> None:
     job, _ = using(driver, "job", 4)
     _, other = using(driver, "other", 3)
@@ -258,7 +260,8 @@ def test_who_only_waits_for_a_circle_is_not_the_one_to_be_refused() -> None:
 
 
 def test_a_process_that_waits_for_very_many_is_not_looked_at() -> None:
-    """One look weighs every wait: with thousands each acquire of a process in a use held the loop for a tenth of a second."""
+    """One look weighs every wait: with thousands each acquire of a process in a use held the loop
+    for a tenth of a second."""
     driver = CoreDriver(8 * GIB, settings={"leases_per_client_max": 1000})
     job, lease = using(driver, "job", 5)
     first, _ = using(driver, "other", 1)

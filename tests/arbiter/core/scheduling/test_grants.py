@@ -1,4 +1,5 @@
-"""Who gets the card next: serial loads, head and backfill, the measurement as second gate, pressure, several cards."""
+"""Who gets the card next: serial loads, head and backfill, the measurement as second gate,
+pressure, several cards."""
 
 import pytest
 
@@ -13,7 +14,7 @@ GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 
 
-# -- order and backfill --------------------------------------------------------------------------------------------------
+# -- order and backfill
 def test_a_higher_priority_passes_and_equals_keep_their_order() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = driver.consumer("det"), LeaseId("")
@@ -91,7 +92,7 @@ def test_an_exclusive_waiter_never_passes() -> None:
     ]
 
 
-# -- exclusive -------------------------------------------------------------------------------------------------------------
+# -- exclusive
 @pytest.mark.parametrize("end", ["death", "expiry"])
 def test_the_debt_of_an_exclusive_holder_keeps_the_card_to_itself(end: str) -> None:
     """Whoever would fit beside its bytes waits all the same until they are measured gone."""
@@ -119,7 +120,7 @@ def test_residues_may_stay_beside_an_exclusive_lease() -> None:
     assert driver.state(alone) == "loading"
 
 
-# -- the second gate ---------------------------------------------------------------------------------------------------------
+# -- the second gate
 def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 100.0})
     det = driver.consumer("det")
@@ -137,7 +138,8 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
 
 
 def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
-    """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are not free either."""
+    """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are
+    not free either."""
     driver = CoreDriver(8 * GIB)
     driver.card.lists_processes = False
     det, lease = held(driver, "det", 1)
@@ -153,7 +155,8 @@ def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
 
 
 def test_a_reading_from_before_the_last_ready_is_not_believed_to_be_full() -> None:
-    """It may have seen the bytes of the newcomer or not: they are subtracted, and if that is too little a fresh one is read."""
+    """It may have seen the bytes of the newcomer or not: they are subtracted, and if that is too
+    little a fresh one is read."""
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
     first = det.acquire(4 * GIB)
@@ -167,7 +170,8 @@ def test_a_reading_from_before_the_last_ready_is_not_believed_to_be_full() -> No
 
 
 def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
-    """Regression: the peak that a loader gave up with `ready` was believed free on a reading from before it was there."""
+    """Regression: the peak that a loader gave up with `ready` was believed free on a reading from
+    before it was there."""
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1.5})
     driver.card.lag_s = 1.0
     det = driver.consumer("det")
@@ -184,7 +188,8 @@ def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
 
 
 def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_gone() -> None:
-    """Regression: its debt kept its bytes charged, but a neighbour came in while its hung holder was still on the card."""
+    """Regression: its debt kept its bytes charged, but a neighbour came in while its hung holder
+    was still on the card."""
     driver = CoreDriver(8 * GIB)
     hung = driver.consumer("hung")
     lease = hung.acquire(2 * GIB, exclusive=True, ttl_s=2.0)
@@ -197,7 +202,7 @@ def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_g
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=10.0)
 
 
-# -- pressure ----------------------------------------------------------------------------------------------------------------
+# -- pressure
 def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
     driver = CoreDriver(8 * GIB)
     calm, calm_lease = held(driver, "calm", 2)
@@ -261,7 +266,7 @@ def test_ready_with_more_than_granted_is_pressure_and_no_violation() -> None:
     assert driver.state(second) == "revoking", "it is idle, and the card is too full"
 
 
-# -- several cards -------------------------------------------------------------------------------------------------------------
+# -- several cards
 def test_any_takes_the_first_card_where_it_fits_without_asking() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     a, b = driver.consumer("a"), driver.consumer("b")

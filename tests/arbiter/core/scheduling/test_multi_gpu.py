@@ -1,4 +1,5 @@
-"""Several cards: a lease is placed on one of them and never split, every card has its own queue, and no card waits for another's sake."""
+"""Several cards: a lease is placed on one of them and never split, every card has its own queue,
+and no card waits for another's sake."""
 
 import random
 
@@ -14,7 +15,7 @@ GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 
 
-# -- selector and placement ------------------------------------------------------------------------------------------
+# -- selector and placement
 @pytest.mark.parametrize(
     ("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)]
 )
@@ -81,7 +82,7 @@ def test_exclusive_means_alone_on_its_card() -> None:
     assert (place(driver, alone), place(driver, other)) == (ZERO, ONE)
 
 
-# -- queues ----------------------------------------------------------------------------------------------------------
+# -- queues
 def test_a_waiter_for_one_card_does_not_hold_up_another() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     busy, lease = held(driver, "busy", 6, gpu="0")
@@ -108,7 +109,8 @@ def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both
 
 
 def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_other() -> None:
-    """Regression: the head of both queues held up the other card while its victim finished a long use."""
+    """Regression: the head of both queues held up the other card while its victim finished a long
+    use."""
     driver = CoreDriver(8 * GIB, cards=2)
     busy, used = held(driver, "busy", 6, gpu="0", priority=10)
     idle, unused = held(driver, "idle", 6, gpu="1", evictable=False)
@@ -123,7 +125,8 @@ def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_ot
 
 
 def test_the_head_that_is_placed_elsewhere_does_not_keep_a_card_from_the_next() -> None:
-    """Regression: with `any` at the head, a waiter for card 1 waited until card 0 had been emptied."""
+    """Regression: with `any` at the head, a waiter for card 1 waited until card 0 had been
+    emptied."""
     driver = CoreDriver(8 * GIB, cards=2)
     first, a = held(driver, "a", 6, gpu="0", priority=10)
     second, b = held(driver, "b", 6, gpu="1", priority=20)
@@ -141,7 +144,8 @@ def test_the_head_that_is_placed_elsewhere_does_not_keep_a_card_from_the_next() 
 
 
 def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None:
-    """It is the head here: no backfill has to let it pass, and nothing is spared for a waiter that comes to another card."""
+    """It is the head here: no backfill has to let it pass, and nothing is spared for a waiter that
+    comes to another card."""
     driver = CoreDriver(8 * GIB, cards=2)
     first, a = held(driver, "a", 6, gpu="0", priority=10)
     second, b = held(driver, "b", 4, gpu="1", priority=90)
@@ -191,7 +195,8 @@ def test_a_holder_that_outstays_on_one_card_frees_its_waiter_for_another() -> No
 
 
 def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None:
-    """The bytes of the victim stay on card 0 as a residue that nobody expected: card 1 is emptied then."""
+    """The bytes of the victim stay on card 0 as a residue that nobody expected: card 1 is emptied
+    then."""
     driver = CoreDriver(8 * GIB, cards=2)
     leaky, a = held(driver, "leaky", 6, gpu="0", priority=10)
     _, b = held(driver, "b", 6, gpu="1", priority=20)
@@ -203,7 +208,7 @@ def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None
     assert driver.state(waiter) == "queued"
 
 
-# -- at once, and without asking -------------------------------------------------------------------------------------
+# -- at once, and without asking
 def test_what_fits_on_the_other_card_goes_there_and_nobody_is_asked() -> None:
     """The first card could be emptied, its holder is idle; the second is free."""
     driver = CoreDriver(8 * GIB, cards=2)
@@ -215,7 +220,8 @@ def test_what_fits_on_the_other_card_goes_there_and_nobody_is_asked() -> None:
 
 
 def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
-    """Regression: the idle holder of the first card was thrown out for the seconds that a load on the second took."""
+    """Regression: the idle holder of the first card was thrown out for the seconds that a load on
+    the second took."""
     driver = CoreDriver(8 * GIB, cards=2)
     _, idle = held(driver, "idle", 6, gpu="0")
     loads = driver.consumer("loads")
@@ -255,7 +261,7 @@ def test_one_that_names_its_card_waits_for_it_beside_an_empty_one() -> None:
     assert place(driver, waiter) == ONE
 
 
-# -- order and ageing ------------------------------------------------------------------------------------------------
+# -- order and ageing
 def test_whoever_came_first_is_first_on_every_card() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     people = [held(driver, f"busy{n}", 6, gpu=str(n), priority=90) for n in (0, 1)]
@@ -279,7 +285,8 @@ def test_whoever_came_first_is_first_on_every_card() -> None:
 
 
 def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
-    """Both holders are in use and above it; it is let to ask the lower one first, when it has aged to that."""
+    """Both holders are in use and above it; it is let to ask the lower one first, when it has aged
+    to that."""
     driver = CoreDriver(8 * GIB, cards=2)
     leases = []
     for index, priority in ((0, 56), (1, 54)):
@@ -313,7 +320,7 @@ def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_othe
     assert (place(driver, old), driver.state(young), driver.state(fills)) == (ONE, "queued", "held")
 
 
-# -- gangs -----------------------------------------------------------------------------------------------------------
+# -- gangs
 def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     busy, lease = held(driver, "busy", 6, gpu="0", priority=10)
@@ -344,9 +351,10 @@ def test_a_gang_over_two_cards_waits_for_both_of_which_one_cannot_be_read() -> N
     driver.until(lambda: [driver.state(m) for m in members] == ["loading", "loading"], limit_s=2.0)
 
 
-# -- standby ---------------------------------------------------------------------------------------------------------
+# -- standby
 def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
-    """A detector that left card 0 for a policy which is there now; card 1 is in use, and by nobody who may be asked."""
+    """A detector that left card 0 for a policy which is there now; card 1 is in use, and by nobody
+    who may be asked."""
     filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
     det, lease = held(driver, "det", 5, gpu=selector, standby=True)
     assert place(driver, lease) == ZERO
@@ -408,7 +416,7 @@ def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
     assert place(driver, lease) == ZERO
 
 
-# -- cards that fail, drains -----------------------------------------------------------------------------------------
+# -- cards that fail, drains
 def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     driver.cards[ZERO].failing = "NVML_ERROR_GPU_IS_LOST"
@@ -438,7 +446,8 @@ def test_a_card_whose_reading_hangs_blocks_itself_only() -> None:
 
 
 def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
-    """Unplugged in the middle: what was held there stays charged there, and whoever may go elsewhere does."""
+    """Unplugged in the middle: what was held there stays charged there, and whoever may go
+    elsewhere does."""
     driver = CoreDriver(8 * GIB, cards=2)
     _, b = held(driver, "b", 5, gpu="1")
     a, freed = held(driver, "a", 5, gpu="0")
@@ -480,7 +489,7 @@ def test_verifications_are_per_card() -> None:
     driver.until(lambda: driver.state(halves[1]) == "over", limit_s=4.0)
 
 
-# -- restarts --------------------------------------------------------------------------------------------------------
+# -- restarts
 def test_a_restart_keeps_every_lease_on_its_card() -> None:
     driver = CoreDriver(8 * GIB, cards=2)
     people = [held(driver, f"p{n}", 5, gpu=str(n)) for n in (0, 1)]
@@ -510,7 +519,7 @@ def test_without_a_journal_a_lease_is_found_on_the_card_that_shows_its_process(l
     assert place(driver, lease) == (ONE if lists else ZERO), "without a list nobody can say"
 
 
-# -- at random -------------------------------------------------------------------------------------------------------
+# -- at random
 @pytest.mark.parametrize("seed", range(8))
 def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -> None:
     draw = random.Random(seed)

@@ -1,4 +1,5 @@
-"""On which cards a lease may be, and what that becomes when pins end, daemons restart and cards go."""
+"""On which cards a lease may be, and what that becomes when pins end, daemons restart and
+cards go."""
 
 from dataclasses import replace
 from typing import Any
@@ -28,10 +29,11 @@ def busy_and_pinned(two_gpus: CoreDriver) -> tuple[Consumer, LeaseId, Consumer, 
     return busy, used, keeper, pinned
 
 
-# -- pins that end ---------------------------------------------------------------------------------------------------
+# -- pins that end
 @pytest.mark.parametrize("end", ["release", "death", "unpin"])
 def test_a_card_whose_pin_ended_is_a_place_for_who_waits(two_gpus: CoreDriver, end: str) -> None:
-    """Regression: whoever came while it was pinned waited for the other card only, for hours beside an empty one."""
+    """Regression: whoever came while it was pinned waited for the other card only, for hours beside
+    an empty one."""
     _, _, keeper, pinned = busy_and_pinned(two_gpus)
     if end == "unpin":
         keeper.unload(pinned)
@@ -82,7 +84,7 @@ def test_a_growth_stays_on_its_card(two_gpus: CoreDriver) -> None:
     assert growth.request.gpus == (ZERO,)
 
 
-# -- away ------------------------------------------------------------------------------------------------------------
+# -- away
 def gone_for_policy(
     two_gpus: CoreDriver, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
@@ -110,7 +112,8 @@ def test_a_card_that_was_pinned_when_it_asked_is_one_to_come_back_to(two_gpus: C
 
 
 def test_after_a_restart_it_comes_back_to_any_card_still(two_gpus: CoreDriver) -> None:
-    """Regression: a lease that was held when the daemon restarted could come back to its own card only."""
+    """Regression: a lease that was held when the daemon restarted could come back to its own card
+    only."""
     det, lease = held(two_gpus, "det", 5, standby=True)
     other, fills = held(two_gpus, "other", 6, gpu="1")
     tokens = [det.token(lease), other.token(fills)]

@@ -14,7 +14,8 @@ GIB = d.GIB
 
 
 class Room:
-    """8 GiB to lease out under one policy; holders load at once, and leave when they are asked while idle."""
+    """8 GiB to lease out under one policy; holders load at once, and leave when they are asked
+    while idle."""
 
     def __init__(self, policy: str) -> None:
         self.driver = CoreDriver(8 * GIB + d.RESERVE_BYTES, settings={"policy": policy})

@@ -1,4 +1,5 @@
-"""A head that waits for bytes nobody can be asked for (a stowaway's, a context's) holds back only those who would be in its way later."""
+"""A head that waits for bytes nobody can be asked for (a stowaway's, a context's) holds back only
+those who would be in its way later."""
 
 import random
 from typing import Any
@@ -25,7 +26,8 @@ def held_after_peak(
 
 
 def stowaway(driver: CoreDriver, gib: float) -> None:
-    """Somebody without a lease holds this much from now on; the next background reading shows it."""
+    """Somebody without a lease holds this much from now on; the next background reading
+    shows it."""
     driver.card.set(STRANGER, int(gib * GIB), driver.now)
     driver.advance(1.1)
 
@@ -41,10 +43,11 @@ def stuck(gib: float = 5, by: float = 4, *, lists: bool = True) -> tuple[CoreDri
     return driver, head
 
 
-# -- who passes ------------------------------------------------------------------------------------------------------
+# -- who passes
 @pytest.mark.parametrize("lists", [True, False])
 def test_small_ones_pass_a_head_that_waits_for_a_stowaway(lists: bool) -> None:
-    """Regression: everybody behind it waited until the stowaway had gone, beside 3.6 GiB that were free."""
+    """Regression: everybody behind it waited until the stowaway had gone, beside 3.6 GiB that were
+    free."""
     driver, head = stuck(lists=lists)
     small, lease = held_after_peak(driver, "small", 2)
     small.use_begin(lease)
@@ -55,7 +58,8 @@ def test_small_ones_pass_a_head_that_waits_for_a_stowaway(lists: bool) -> None:
 
 
 def test_what_the_head_will_need_is_kept_for_it() -> None:
-    """5 + 2.5 fit the 7.6 GiB, a second one of 2 GiB would not, though there are free bytes for it now."""
+    """5 + 2.5 fit the 7.6 GiB, a second one of 2 GiB would not, though there are free bytes for it
+    now."""
     driver, head = stuck(by=3)
     held_after_peak(driver, "small", 2.5)
     late = driver.consumer("late").acquire(2 * GIB)
@@ -66,7 +70,8 @@ def test_what_the_head_will_need_is_kept_for_it() -> None:
 
 
 def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room() -> None:
-    """It fits beside the stowaway once the holder has gone: what comes back of the stowaway is not counted on."""
+    """It fits beside the stowaway once the holder has gone: what comes back of the stowaway is not
+    counted on."""
     driver = CoreDriver(8 * GIB)
     busy, lease = held_after_peak(driver, "busy", 4, priority=90)
     busy.use_begin(lease)
@@ -82,7 +87,8 @@ def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room() -> None:
 
 
 def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
-    """The stowaway may give back a part: enough for the head alone, and then nobody could make room for it."""
+    """The stowaway may give back a part: enough for the head alone, and then nobody could make room
+    for it."""
     driver, head = stuck()
     pinned = driver.consumer("pinned").acquire(2 * GIB, evictable=False)
     _, other = held_after_peak(driver, "other", 1)
@@ -123,7 +129,7 @@ def test_with_no_backfill_nobody_passes() -> None:
     assert driver.state(small) == "queued"
 
 
-# -- the bound on the head's wait ------------------------------------------------------------------------------------
+# -- the bound on the head's wait
 def test_of_a_stowaway_that_gives_back_a_part_the_head_gets_it_all() -> None:
     """It fits beside what is left of the stowaway, not beside who passed it: that one is asked."""
     driver, head = stuck()
@@ -138,7 +144,8 @@ def test_of_a_stowaway_that_gives_back_a_part_the_head_gets_it_all() -> None:
 
 
 def test_the_ageing_bound_holds_against_those_who_passed() -> None:
-    """In use and of a higher priority, it is asked when the head has aged to it, counted from the head's arrival."""
+    """In use and of a higher priority, it is asked when the head has aged to it, counted from the
+    head's arrival."""
     driver, head = stuck(gib=5)
     asked_at = driver.now - 0.1 + 10 * driver.settings.ageing_s_per_point
     late = driver.consumer("small", priority=60)
@@ -196,7 +203,7 @@ def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -
     assert any(driver.state(lease) == "held" for lease in mine)
 
 
-# -- residues ----------------------------------------------------------------------------------------------------------
+# -- residues
 def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
     """7.4 GiB do not fit beside the context of a process that lives on; when it ends, both do."""
     driver = CoreDriver(8 * GIB)
@@ -224,9 +231,10 @@ def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
     assert driver.state(small) == "queued"
 
 
-# -- whose bytes -------------------------------------------------------------------------------------------------------
+# -- whose bytes
 def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
-    """It loaded 3 GiB before it asked: they are a part of its 6. Only the other one's bytes are counted on."""
+    """It loaded 3 GiB before it asked: they are a part of its 6. Only the other one's bytes are
+    counted on."""
     driver = CoreDriver(8 * GIB)
     eager = driver.consumer("eager")
     eager.hold(3 * GIB)
@@ -243,7 +251,8 @@ def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
 
 
 def test_a_growing_lease_does_not_free_itself() -> None:
-    """Regression: what a waiter behind a growth may take was counted as if the lease that grows left for it."""
+    """Regression: what a waiter behind a growth may take was counted as if the lease that grows
+    left for it."""
     driver = CoreDriver(8 * GIB)
     a, grows = held_after_peak(driver, "a", 3)
     b, busy = held_after_peak(driver, "b", 2, priority=90)
@@ -260,7 +269,8 @@ def test_a_growing_lease_does_not_free_itself() -> None:
 
 
 def away() -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
-    """Three are on standby, the one that loads with 5 GiB left first, and a stowaway of 4 GiB came as the one went that they left for."""
+    """Three are on standby, the one that loads with 5 GiB left first, and a stowaway of 4 GiB came
+    as the one went that they left for."""
     driver = CoreDriver(8 * GIB)
     people = [held_after_peak(driver, "large", 4.5, peak_gib=5, standby=True)]
     people += [held_after_peak(driver, name, 1.5, standby=True) for name in ("small", "late")]
@@ -280,7 +290,8 @@ def away() -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
 
 
 def test_standby_returns_beside_one_that_waits_for_a_stowaway() -> None:
-    """The largest left first. The next returns beside the room that it will have; the last would take that away, for good."""
+    """The largest left first. The next returns beside the room that it will have; the last would
+    take that away, for good."""
     driver, ((large, first), (small, second), (late, third)) = away()
     driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
     small.load(second)
@@ -292,7 +303,7 @@ def test_standby_returns_beside_one_that_waits_for_a_stowaway() -> None:
     assert (large.driver, late.driver) == (driver, driver)
 
 
-# -- those who passed stay -----------------------------------------------------------------------------------------------
+# -- those who passed stay
 def unplanned() -> tuple[CoreDriver, Consumer, LeaseId, LeaseId]:
     """A head of 5 GiB that may not ask the only holder, of 3: in use, of a higher priority."""
     driver = CoreDriver(8 * GIB)
@@ -303,7 +314,8 @@ def unplanned() -> tuple[CoreDriver, Consumer, LeaseId, LeaseId]:
 
 
 def test_those_who_passed_are_no_room_for_the_next_to_pass() -> None:
-    """Regression: each fitted beside the head, both together did not, and the head had to ask them."""
+    """Regression: each fitted beside the head, both together did not, and the head had to
+    ask them."""
     driver, busy, lease, head = unplanned()
     held_after_peak(driver, "first", 2)
     second = driver.consumer("second").acquire(2 * GIB)

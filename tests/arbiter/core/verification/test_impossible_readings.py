@@ -1,5 +1,5 @@
-"""A reading that cannot be true says nothing: its GPU is unknown. A driver that called a card of 8 GiB one of 2^60 bytes, or -1 bytes used, made
-room for grants that did not exist."""
+"""A reading that cannot be true says nothing: its GPU is unknown. A driver that called a card of 8
+GiB one of 2^60 bytes, or -1 bytes used, made room for grants that did not exist."""
 
 from dataclasses import replace
 from typing import Any
@@ -100,7 +100,8 @@ def test_a_little_more_than_everything_is_the_drivers_rounding() -> None:
 
 
 def test_a_reading_is_compared_with_what_is_leased_out_where_the_whole_is_not_known() -> None:
-    """The scenarios of `simulate`, and logs, name a capacity only; a larger whole is plausible there."""
+    """The scenarios of `simulate`, and logs, name a capacity only; a larger whole is plausible
+    there."""
     driver = CoreDriver(8 * GIB)
     (info,) = driver.settings.gpus
     driver.settings = replace(driver.settings, gpus=(replace(info, total_bytes=0),))

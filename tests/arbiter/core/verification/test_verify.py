@@ -1,4 +1,5 @@
-"""Verdicts. The bytes of a lease stay charged until a reading says that they came back, or whose they are."""
+"""Verdicts. The bytes of a lease stay charged until a reading says that they came back, or whose
+they are."""
 
 import itertools
 
@@ -25,7 +26,7 @@ def total_only(driver: CoreDriver) -> None:
     driver.advance(1.5)
 
 
-# -- verified ------------------------------------------------------------------------------------------------------------
+# -- verified
 def test_two_equal_readings_after_the_release_are_enough() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
@@ -206,7 +207,8 @@ def test_totals_alone_verify_by_what_the_lease_was_charged() -> None:
 
 
 def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes() -> None:
-    """Regression (storm, seed 3): a dead holder's 500 MiB were measured gone behind the 500 that somebody was about to load."""
+    """Regression (storm, seed 3): a dead holder's 500 MiB were measured gone behind the 500 that
+    somebody was about to load."""
     driver = CoreDriver(8 * GIB)
     total_only(driver)
     a, _ = held(driver, "a", 1)
@@ -256,7 +258,7 @@ def test_without_a_comparable_reading_the_ledger_bound_decides() -> None:
     assert verdicts(driver)[-1] == ("verified", True)
 
 
-# -- residue ---------------------------------------------------------------------------------------------------------------
+# -- residue
 def test_a_living_process_that_keeps_too_much_is_charged_for_it() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
@@ -291,7 +293,7 @@ def test_totals_alone_charge_the_shortfall_to_the_process_that_let_go() -> None:
     assert driver.gpu()["charged_bytes"] == 2 * GIB
 
 
-# -- contested -------------------------------------------------------------------------------------------------------------
+# -- contested
 def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
@@ -360,7 +362,7 @@ def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_th
     assert driver.state(first) == "held"
 
 
-# -- stale and unverifiable --------------------------------------------------------------------------------------------------
+# -- stale and unverifiable
 def test_no_reading_means_unknown_and_frees_nothing() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5)
@@ -407,7 +409,7 @@ def test_a_failed_reading_of_an_unknown_card_is_ignored() -> None:
     assert driver.post(ProbeFailed(GpuId("GPU-9"), driver.now, "no")) == []
 
 
-# -- expiry ------------------------------------------------------------------------------------------------------------------
+# -- expiry
 def test_expired_bytes_stay_charged_until_measured_gone_and_not_before_the_holder_fences_itself() -> (
     None
 ):
@@ -441,7 +443,7 @@ def test_a_lease_that_expires_while_it_loads_was_never_seen_complete() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
 
 
-# -- residues and their processes ----------------------------------------------------------------------------------------------
+# -- residues and their processes
 def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
     """A process that said bye and is neither connected nor on the card any more keeps nothing."""
     driver = CoreDriver(8 * GIB)
@@ -460,7 +462,8 @@ def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
 def test_a_residue_of_a_process_that_is_listed_without_its_bytes_stays_until_the_card_shows_it_gone() -> (
     None
 ):
-    """Regression: WSL2 lists processes without their bytes, and the next reading after the verdict took that for none."""
+    """Regression: WSL2 lists processes without their bytes, and the next reading after the verdict
+    took that for none."""
     driver = CoreDriver(8 * GIB)
     driver.card.knows_bytes = False
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)

@@ -1,5 +1,7 @@
-"""Holders that live and that the driver's list leaves out: another container's, or all of them for a moment. Only the total can tell what
-they gave back, and what nobody showed to be gone is nobody else's."""
+"""Holders that live and that the driver's list leaves out: another container's, or all of them for
+a moment. Only the total can tell what they gave back, and what nobody showed to be gone is nobody
+else's.
+"""
 
 from dataclasses import replace
 
@@ -137,7 +139,8 @@ def change_places(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
 
 
 def test_two_that_nobody_lists_change_places() -> None:
-    """What the one loads while the other leaves is not the other's; what it held before is no growth of its."""
+    """What the one loads while the other leaves is not the other's; what it held before is no
+    growth of its."""
     driver = CoreDriver(10 * GIB)
     driver.card.unlisted |= {ProcessKey(pid, 7 * pid) for pid in (101, 102, 103)}
     held(driver, "stays", 2)
@@ -204,9 +207,10 @@ def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     )
 
 
-# -- what the rule machines found by night -----------------------------------------------------------------------------------
+# -- what the rule machines found by night
 def test_a_lender_that_never_held_anything_keeps_nothing() -> None:
-    """Regression (families, seed 20778062350): a card that was empty all the time showed a residue of 4.3 GB, because so much was charged."""
+    """Regression (families, seed 20778062350): a card that was empty all the time showed a residue
+    of 4.3 GB, because so much was charged."""
     driver = hidden_card(lists=False)
     lender = driver.consumer("lender")
     lease = lender.acquire(int(4.3e9), exclusive=True)
@@ -220,7 +224,8 @@ def test_a_lender_that_never_held_anything_keeps_nothing() -> None:
 
 @pytest.mark.parametrize("leaves", [False, True])
 def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves: bool) -> None:
-    """Regression (leases, seed 20778062337): what had become ready since the reading began counted as on it, in place of what was going."""
+    """Regression (leases, seed 20778062337): what had become ready since the reading began counted
+    as on it, in place of what was going."""
     driver = hidden_card(lists=False)
     small, lease = held(driver, "small", 0.5)
     driver.advance(1.0)
@@ -259,7 +264,8 @@ def test_what_its_own_process_loads_hides_no_release() -> None:
 
 
 def test_what_a_process_keeps_is_restored_beside_its_lease() -> None:
-    """Regression (rule machine, seed 500085): a card that leases fill has room for contexts all the same, which lie within their leases."""
+    """Regression (rule machine, seed 500085): a card that leases fill has room for contexts all the
+    same, which lie within their leases."""
     driver = hidden_card(lists=False)
     small, first = held(driver, "small", 0.5, residue_bytes=450 * MIB)
     small.unload(first)

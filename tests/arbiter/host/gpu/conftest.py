@@ -1,4 +1,5 @@
-"""A `libnvidia-ml.so.1` that answers from a text file: the real `pynvml` loads it in a process of its own."""
+"""A `libnvidia-ml.so.1` that answers from a text file: the real `pynvml` loads it in a process of
+its own."""
 
 import shutil
 import subprocess

@@ -167,7 +167,8 @@ def test_readings_wait_for_the_lock(probe, card_folder):
 
 
 def test_what_a_killed_process_left_half_written_is_mended(probe, card_folder):
-    line = {"seq": 1, "t": 0.0, "pid": os.getpid(), "start": 0, "name": "", "op": "alloc", "label": "", "bytes": 5, "delta": 5,
+    line = {"seq": 1, "t": 0.0, "pid": os.getpid(), "start": 0, "name": "", "op": "alloc",
+    "label": "", "bytes": 5, "delta": 5,
             "process_bytes": 5, "used_after": 5, "capacity": 8 * GIB}  # fmt: skip
     (card_folder / "half.json").write_text(
         json.dumps({"pid": os.getpid(), "allocated_bytes": 5, "last": line})

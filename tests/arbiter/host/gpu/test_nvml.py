@@ -1,4 +1,5 @@
-"""What the NVML reader makes of the driver's answers; the module `pynvml` is handed in. The real one is tried where no driver is."""
+"""What the NVML reader makes of the driver's answers; the module `pynvml` is handed in. The real
+one is tried where no driver is."""
 
 import os
 from types import SimpleNamespace

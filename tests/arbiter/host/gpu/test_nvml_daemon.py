@@ -1,4 +1,5 @@
-"""A real daemon with `--gpu nvml` on a compiled library: grant → release → verdict, with lag, N/A, errors and a call that hangs."""
+"""A real daemon with `--gpu nvml` on a compiled library: grant → release → verdict, with lag, N/A,
+errors and a call that hangs."""
 
 import os
 import time
@@ -58,7 +59,8 @@ def seen(client: WireClient, used: int) -> None:
 
 
 def let_go(client: WireClient, nvml: NvmlStub, on: dict[str, Any], left: int, *lines: str) -> None:
-    """As holders do: say so first, so that no reading of what is half gone is taken for the state before; give back; release."""
+    """As holders do: say so first, so that no reading of what is half gone is taken for the state
+    before; give back; release."""
     assert client.ask("unloading", **on)["ok"]
     nvml.card(left)
     nvml.write(*lines)
@@ -155,7 +157,8 @@ def test_bytes_that_stay_are_charged_to_the_process_that_holds_them(
 def test_where_bytes_per_process_are_na_the_total_decides(
     client: WireClient, nvml: NvmlStub, left: int, verdict: str
 ) -> None:
-    """WSL2 and WDDM: processes are listed, their bytes are not. What stays is charged to who let go, as nobody else can be named."""
+    """WSL2 and WDDM: processes are listed, their bytes are not. What stays is charged to who let
+    go, as nobody else can be named."""
     assert client.ask("subscribe")["ok"]
     on = granted(client, "holder", 5 * GIB)
     nvml.card(5 * GIB)
@@ -190,7 +193,8 @@ def test_mig_mode_is_an_error_of_the_configuration(make_arbiter: Make, nvml: Nvm
 
 
 def test_the_daemon_makes_no_cuda_context(daemon: ArbiterProcess) -> None:
-    """llama.cpp#20582: a manager that asks CUDA for free memory eats 120-550 MB of every card itself."""
+    """llama.cpp#20582: a manager that asks CUDA for free memory eats 120-550 MB of every card
+    itself."""
     mapped = {
         Path(line.split()[-1]).name
         for line in Path(f"/proc/{daemon.pid}/maps").read_text().splitlines()

@@ -1,4 +1,5 @@
-"""The NVML reader through the real `pynvml` and a compiled library: structs, versions, N/A fields and error codes as they really arrive."""
+"""The NVML reader through the real `pynvml` and a compiled library: structs, versions, N/A fields
+and error codes as they really arrive."""
 
 import json
 import os
@@ -136,12 +137,14 @@ def test_no_card_at_all(nvml: NvmlStub) -> None:
 
 
 def test_a_card_that_was_lost_is_read_again_after_the_driver_came_back(nvml: NvmlStub) -> None:
-    """Every card failed, so everything is opened anew; a driver that is away meanwhile is one more failed reading."""
+    """Every card failed, so everything is opened anew; a driver that is away meanwhile is one more
+    failed reading."""
     card = f"card GPU-stub-0 {8 * GIB} 0"
     said = answer_of_child(
         nvml,
         LOST,
-        f"{card} 1\n{card} 2;error memory 15\n{card} 3;error init 9\ncard GPU-other {GIB} 0 4\n{card} 5\n{card} 6\n",
+        f"{card} 1\n{card} 2;error memory 15\n{card} 3;error init 9\ncard GPU-other {GIB} 0 "
+        f"4\n{card} 5\n{card} 6\n",
     )
     assert said[0] == 1
     assert "GPU is lost" in said[1]

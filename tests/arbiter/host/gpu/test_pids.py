@@ -1,4 +1,5 @@
-"""Pids of a driver that counts in the host's namespace, for a daemon that lives in one of its own. Both /proc are folders."""
+"""Pids of a driver that counts in the host's namespace, for a daemon that lives in one of its own.
+Both /proc are folders."""
 
 import logging
 import os
@@ -31,7 +32,8 @@ def namespace(proc: Path, link: str) -> Path:
 
 @pytest.fixture
 def container(tmp_path: Path) -> tuple[Path, Path]:
-    """(own /proc, the host's): host pid 500 is 7 here; host pid 7 is somebody else; 600 is in another container, as 7 too."""
+    """(own /proc, the host's): host pid 500 is 7 here; host pid 7 is somebody else; 600 is in
+    another container, as 7 too."""
     own, host = namespace(tmp_path / "own", "pid:[4026532999]"), tmp_path / "host"
     process(own, 7, 1111, "detector", [7])
     process(host, 500, 1111, "detector", [500, 7])

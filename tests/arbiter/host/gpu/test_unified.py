@@ -1,6 +1,8 @@
-"""Machines whose GPU shares the CPU's memory: Jetson and GB10, from their files under another root, and how a source is chosen.
+"""Machines whose GPU shares the CPU's memory: Jetson and GB10, from their files under another root,
+and how a source is chosen.
 
-The files have the layout of those machines (the GB10's totals are those that an owner published); `NVML` is handed in.
+The files have the layout of those machines (the GB10's totals are those that an owner published);
+`NVML` is handed in.
 """
 
 import os
@@ -126,7 +128,7 @@ def gb10(tmp_path: Path) -> Path:
     return tmp_path
 
 
-# -- Jetson ----------------------------------------------------------------------------------------------------------
+# -- Jetson
 def test_an_orin_is_read_by_what_is_available(orin: Path) -> None:
     probe, source = choose("auto", PIDS, orin, NO_DRIVER)
     assert source == "unified"
@@ -186,7 +188,7 @@ def test_on_a_tegra_nvml_is_an_error_of_the_configuration(orin: Path) -> None:
     assert "unified, or auto" in error.value.hint
 
 
-# -- GB10 ------------------------------------------------------------------------------------------------------------
+# -- GB10
 def test_a_gb10_has_nvmls_name_and_list_and_the_machines_memory(gb10: Path) -> None:
     probe, source = choose("auto", PIDS, gb10, UMA)
     assert source == "unified"
@@ -211,7 +213,7 @@ def test_on_a_gb10_nvml_alone_is_an_error_of_the_configuration(gb10: Path) -> No
         choose("nvml", PIDS, gb10, UMA)
 
 
-# -- other machines --------------------------------------------------------------------------------------------------
+# -- other machines
 @pytest.mark.parametrize("source", ["auto", "nvml"])
 def test_a_card_with_memory_of_its_own_is_read_by_nvml(tmp_path: Path, source: Any) -> None:
     probe, chosen = choose(source, PIDS, tmp_path, DISCRETE)
@@ -236,7 +238,7 @@ def test_a_machine_without_any_card_has_no_card(tmp_path: Path, source: Any) -> 
         choose(source, PIDS, tmp_path, NO_DRIVER)
 
 
-# -- readings and margins ----------------------------------------------------------------------------------------------
+# -- readings and margins
 @pytest.mark.parametrize(
     "text",
     [

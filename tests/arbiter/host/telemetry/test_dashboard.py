@@ -1,4 +1,5 @@
-"""The dashboard that is shipped shows what the daemon really exports, by the names that Prometheus sees."""
+"""The dashboard that is shipped shows what the daemon really exports, by the names that Prometheus
+sees."""
 
 import json
 import re
@@ -37,7 +38,8 @@ class NeverCalled:
 
 @pytest.fixture(scope="module")
 def exported() -> dict[str, set[str]]:
-    """Names of series → their labels, after a handover and a denial. Only metrics are on: there is no tracer."""
+    """Names of series → their labels, after a handover and a denial. Only metrics are on: there is
+    no tracer."""
     registry = CollectorRegistry()
     reader = PrometheusMetricReader(scope_info_enabled=False, registry=registry)
     meters = MeterProvider([reader], shutdown_on_exit=False)

@@ -35,7 +35,8 @@ HERS = f"00-{TRACE}-{PARENT}-01"
 
 
 class Listener:
-    """Hears what an engine says as the executor would hand it on, and keeps spans, numbers and the pushes as they were sent."""
+    """Hears what an engine says as the executor would hand it on, and keeps spans, numbers and the
+    pushes as they were sent."""
 
     def __init__(self, sampler: Any = None) -> None:
         self.exporter = InMemorySpanExporter()
@@ -114,7 +115,7 @@ def failed(span: ReadableSpan) -> str | None:
     return span.status.description if not span.status.is_ok and not span.status.is_unset else None
 
 
-# -- spans ---------------------------------------------------------------------------------------------------------------
+# -- spans
 def test_a_grant_at_once_is_a_load_inside_an_acquire(driver: CoreDriver, heard: Listener) -> None:
     det = driver.consumer("det")
     det.traceparent = HERS
@@ -466,7 +467,7 @@ def test_the_wall_clock_may_be_set_back(driver: CoreDriver, heard: Listener) -> 
     assert {seconds(span) for span in heard.spans()} == {0.0}
 
 
-# -- a long history ----------------------------------------------------------------------------------------------------
+# -- a long history
 def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
     heard = Listener()
     engine = Arbiter(busy.settings, START_S)
@@ -504,7 +505,7 @@ def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
     assert sum(heard.numbers("vram.lease.grants").values()) == len(granted) > 0
 
 
-# -- numbers -----------------------------------------------------------------------------------------------------------
+# -- numbers
 def test_counts_and_times_of_a_handover(driver: CoreDriver, heard: Listener) -> None:
     det, lease = held(driver, "det", 5)
     det.use_begin(lease)
@@ -523,7 +524,8 @@ def test_counts_and_times_of_a_handover(driver: CoreDriver, heard: Listener) -> 
 
 
 class Ticks:
-    """A loop as far as `watch` needs it: what is to be called later is called when the test says."""
+    """A loop as far as `watch` needs it: what is to be called later is called when the
+    test says."""
 
     def __init__(self) -> None:
         self.later: list[Callable[[], object]] = []

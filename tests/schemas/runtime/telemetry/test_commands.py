@@ -1,4 +1,5 @@
-"""`cli.command`: how a program's life and end are recorded, also when a signal ends it, and that nothing is when nobody asked."""
+"""`cli.command`: how a program's life and end are recorded, also when a signal ends it, and that
+nothing is when nobody asked."""
 
 import signal
 import socket
@@ -21,7 +22,10 @@ WAIT_S = 60.0
 def program(lines: str, collector: Collector | None, **environ: str) -> "subprocess.Popen[str]":
     """A program of these lines inside `command("tool", "do")`; `serves` and `sys` are at hand."""
     body = "\n".join(f"    {line}" for line in lines.splitlines())
-    code = f"import signal, sys\nfrom vram_arbiter.schemas.runtime.telemetry.commands import command\nwith command('tool', 'do') as running:\n{body}\n"
+    code = (
+        "import signal, sys\nfrom vram_arbiter.schemas.runtime.telemetry.commands import "
+        f"command\nwith command('tool', 'do') as running:\n{body}\n"
+    )
     given = {
         "PYTHONPATH": f"{ROOT}/src:{ROOT}",
         "PATH": "/usr/bin",
@@ -73,7 +77,8 @@ def test_sigterm_loses_nothing() -> None:
 
 def test_nobody_asked_nothing_is_imported_or_changed() -> None:
     process = program(
-        "print([name for name in sys.modules if name.startswith('opentelemetry')], signal.getsignal(signal.SIGTERM) is signal.SIG_DFL)",
+        "print([name for name in sys.modules if name.startswith('opentelemetry')], "
+        "signal.getsignal(signal.SIGTERM) is signal.SIG_DFL)",
         None,
     )
     out, err = process.communicate(timeout=WAIT_S)
@@ -89,7 +94,8 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
         (["vram_arbiter.runner", "replay", "--dataset", "x", "--frame", "0"], 2),
     ):
         done = subprocess.run(
-            [sys.executable, "-m", *argv], env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **nowhere},
+            [sys.executable, "-m", *argv],
+            env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **nowhere},
             capture_output=True, text=True, timeout=WAIT_S,
         )  # fmt: skip
         assert done.returncode == code, done.stderr
@@ -98,7 +104,8 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
 
 
 def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path) -> None:
-    """A variable for all programs of the machine; and the port that it names is the runner's own, whose robot shall stop."""
+    """A variable for all programs of the machine; and the port that it names is the runner's own,
+    whose robot shall stop."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         for said in (
             {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"},
@@ -108,7 +115,8 @@ def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path
             },
         ):
             done = subprocess.run(
-                [sys.executable, "-m", "vram_arbiter.runner", "estop", "--endpoint", f"ipc://{tmp_path}/runner.sock"],
+                [sys.executable, "-m", "vram_arbiter.runner", "estop", "--endpoint",
+                f"ipc://{tmp_path}/runner.sock"],
                 env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **said},
                 capture_output=True, text=True, timeout=WAIT_S,
             )  # fmt: skip
@@ -126,8 +134,10 @@ def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> No
             **collector.environ(),
         }
         lines = (
-            "import sys\nfrom vram_arbiter.clients.cli.main import main\nsys.argv = ['vramctl', *sys.argv[1:]]\n"
-            "try: main()\nfinally: print([name for name in sys.modules if name == 'opentelemetry'], file=sys.stderr)"
+            "import sys\nfrom vram_arbiter.clients.cli.main import main\nsys.argv = ['vramctl', "
+            "*sys.argv[1:]]\n"
+            "try: main()\nfinally: print([name for name in sys.modules if name == "
+            "'opentelemetry'], file=sys.stderr)"
         )
         said = {}
         for name in ("status", "doctor"):

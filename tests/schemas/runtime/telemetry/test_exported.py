@@ -81,8 +81,8 @@ t()
 
 @needs_sdk
 def test_half_a_surrogate_pair_costs_no_other_span_and_no_metric() -> None:
-    """Regression: an exception with an undecodable file name in its words took its whole batch of spans with it, and one such label every
-    later scrape of the Prometheus endpoint."""
+    """Regression: an exception with an undecodable file name in its words took its whole batch of
+    spans with it, and one such label every later scrape of the Prometheus endpoint."""
     with Collector() as collector:
         environ = {
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,

@@ -47,7 +47,8 @@ def serve() -> Iterator[Callable[..., ScrapeServer]]:
 
 
 class Users:
-    """Which user a port of this test stands for; a table of its own where `KernelTable` asks the kernel."""
+    """Which user a port of this test stands for; a table of its own where `KernelTable` asks the
+    kernel."""
 
     def __init__(self) -> None:
         self.of: dict[int, int] = {}
@@ -90,7 +91,8 @@ def test_a_page_is_answered_and_nothing_else_is(serve: Callable[..., ScrapeServe
 def test_one_user_with_many_silent_connections_does_not_keep_the_scraper_out(
     serve: Callable[..., ScrapeServer],
 ) -> None:
-    """Eight silent connections of any user shut the scraper out for 5 s, and for ever if they came again."""
+    """Eight silent connections of any user shut the scraper out for 5 s, and for ever if they came
+    again."""
     users = Users()
     port = serve(lambda: users).port
     silent = [users.connect(ATTACKER, port) for _ in range(CONNECTIONS_PER_USER)]
@@ -107,7 +109,8 @@ def test_one_user_with_many_silent_connections_does_not_keep_the_scraper_out(
 def test_a_reader_that_sends_a_byte_at_a_time_is_given_up(
     serve: Callable[..., ScrapeServer],
 ) -> None:
-    """Every byte began the 5 s anew: eight connections with a byte every 4 s held all places for ever."""
+    """Every byte began the 5 s anew: eight connections with a byte every 4 s held all places for
+    ever."""
     port = serve(scrape_s=0.3).port
     with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as slow:
         deadline = time.monotonic() + PATIENCE_S

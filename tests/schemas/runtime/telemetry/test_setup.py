@@ -1,4 +1,5 @@
-"""Telemetry is asked for in standard words, refused with words that help, and costs nothing when it is not asked for."""
+"""Telemetry is asked for in standard words, refused with words that help, and costs nothing when it
+is not asked for."""
 
 import ast
 import importlib.util
@@ -37,7 +38,7 @@ def run_program(code: str, environ: Mapping[str, str]) -> subprocess.CompletedPr
     )
 
 
-# -- what is asked for --------------------------------------------------------------------------------------------------
+# -- what is asked for
 OTLP = ("otlp",)
 
 
@@ -119,7 +120,7 @@ def test_an_exporter_that_cannot_be_made_is_named(environ: dict[str, str], words
     assert words in said.stdout, said.stderr
 
 
-# -- off ----------------------------------------------------------------------------------------------------------------
+# -- off
 def test_off_imports_nothing_of_opentelemetry_and_starts_nothing() -> None:
     result = run_program(
         "import sys, threading, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
@@ -139,7 +140,8 @@ def test_packages_that_are_missing_are_asked_for() -> None:
         "import sys\n"
         "class Hidden:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.startswith('{}'): raise ModuleNotFoundError('No module named ' + repr(name))\n"
+        "        if name.startswith('{}'): raise ModuleNotFoundError('No module named ' + "
+        "repr(name))\n"
         "sys.meta_path.insert(0, Hidden())\n"
         "import threading, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "try: o.set_up('robot')\n"
@@ -157,7 +159,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
         assert said.strip().endswith(" 1"), "no thread was left"
 
 
-# -- on -----------------------------------------------------------------------------------------------------------------
+# -- on
 PROGRAM = """
 import sys, vram_arbiter.schemas.runtime.telemetry.setup as o
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry, spans as tracing
@@ -320,8 +322,10 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
         "try:\n    o.set_up('robot', prometheus_port=0)\n"
         "except ConfigError as error:\n    print(error)\n"
         "from opentelemetry import metrics, trace\n"
-        "print(type(trace.get_tracer_provider()).__name__, type(metrics.get_meter_provider()).__name__)\n"
-        "import threading; print([x.name for x in threading.enumerate() if x.name == 'prometheus'])\n",
+        "print(type(trace.get_tracer_provider()).__name__, "
+        "type(metrics.get_meter_provider()).__name__)\n"
+        "import threading; print([x.name for x in threading.enumerate() if x.name == "
+        "'prometheus'])\n",
         {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, **wrong},
     )
     said, providers, servers = result.stdout.splitlines()
@@ -376,7 +380,8 @@ def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> 
         "sdk = logging.getLogger('opentelemetry.sdk._shared_internal')\n"
         "for n in range(3):\n"
         "    sdk.warning('Queue full, dropping %s.', 'Span')\n"
-        "    sdk.error('Exception while exporting %s.', 'Span')\n",  # another one between: the SDK's own filter lets both pass
+        "    sdk.error('Exception while exporting %s.', "
+        "'Span')\n",  # another one between: the SDK's own filter lets both pass
         {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE},
     )
     assert result.stderr.count("Queue full") == 1, result.stderr

@@ -1,4 +1,5 @@
-"""A caller's traceparent is read as W3C says, by one rule, wherever it comes in: one that is none begins a new trace and refuses nothing."""
+"""A caller's traceparent is read as W3C says, by one rule, wherever it comes in: one that is none
+begins a new trace and refuses nothing."""
 
 from typing import Any
 
@@ -58,7 +59,8 @@ def test_it_is_read_as_w3c_says(given: object, kept: str | None) -> None:
 
 @pytest.mark.parametrize(("given", "kept"), READ)
 def test_no_request_is_refused_for_it(given: object, kept: str | None) -> None:
-    """Regression: a goal, an acquire and a question to a sidecar were refused for a traceparent of more than 64 characters."""
+    """Regression: a goal, an acquire and a question to a sidecar were refused for a traceparent of
+    more than 64 characters."""
     image = b"\x89PNG\r\n\x1a\n"
     messages: list[tuple[Any, dict[str, Any]]] = [
         (REQUEST, {"op": "status", "id": 1}),
