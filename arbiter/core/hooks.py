@@ -172,3 +172,8 @@ def overriding(features: Iterable[Feature], hook: str) -> tuple[Feature, ...]:
     """Return the features that override a hook."""
     default = getattr(Feature, hook)
     return tuple(feature for feature in features if getattr(type(feature), hook) is not default)
+
+
+def owner_of(request: Lease) -> Feature | None:
+    """Return the feature that alone grants a request."""
+    return next((feature for feature in request.features if feature.owns(request)), None)

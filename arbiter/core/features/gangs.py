@@ -23,7 +23,7 @@ from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.refusals import GangEnd, Refused
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report.standing import Standing
-from vram_arbiter.arbiter.core.scheduling import grants, policy
+from vram_arbiter.arbiter.core.scheduling import admission, grants, placement, victims
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block, Wait
@@ -185,14 +185,14 @@ class Gangs(Feature):
         placement = self._plan(core, gang)
         if placement is None:
             _say(waiting, Wait.NO_VICTIM)
-            policy.wake_when_evictable(core, gpu, _bundle(gang, waiting))
+            victims.wake_when_evictable(core, gpu, _bundle(gang, waiting))
             return
         _say(waiting, Wait.MAKING_ROOM)
         for gpu, some in _by_gpu(core, placement):
-            bundle, going = _bundle(gang, some), policy.leaving(gpu)
-            if policy.fits(gpu, bundle, going):
+            bundle, going = _bundle(gang, some), admission.leaving(gpu)
+            if admission.fits(gpu, bundle, going):
                 continue
-            for victim in policy.choose_victims(core, gpu, bundle, going) or ():
+            for victim in victims.choose_victims(core, gpu, bundle, going) or ():
                 eviction.ask(core, gpu, victim, some[0])
 
     def _plan(self, core: Core, gang: Gang) -> _Placement | None:
@@ -211,27 +211,29 @@ class Gangs(Feature):
         return planned or None
 
     def _is_next(self, core: Core, gpu: Gpu, gang: Gang) -> bool:
-        front = policy.front(core, gpu)
-        return front is not None and self.of.get(front.id) is gang and not policy.blocked(core, gpu)
+        front = placement.front(core, gpu)
+        return (
+            front is not None and self.of.get(front.id) is gang and not admission.blocked(core, gpu)
+        )
 
     def _fits(self, core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
         return (
             self._is_next(core, gpu, gang)
             and not _clash(some)
-            and policy.fits(gpu, _bundle(gang, some))
+            and admission.fits(gpu, _bundle(gang, some))
         )
 
     def _can_be_made(self, core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
         if (
             not self._is_next(core, gpu, gang)
             or _clash(some)
-            or policy.residue_under_measurement(gpu)
+            or admission.residue_under_measurement(gpu)
         ):
             return False
-        going, bundle = policy.leaving(gpu), _bundle(gang, some)
+        going, bundle = admission.leaving(gpu), _bundle(gang, some)
         return (
-            policy.fits(gpu, bundle, going)
-            or policy.choose_victims(core, gpu, bundle, going) is not None
+            admission.fits(gpu, bundle, going)
+            or victims.choose_victims(core, gpu, bundle, going) is not None
         )
 
     # -- loading -----------------------------------------------------------------------------------
@@ -294,11 +296,11 @@ class Gangs(Feature):
 
     def _relieve(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, over: int) -> None:
         """Revoke holders that have grown since the gang was admitted, or break it."""
-        going = policy.leaving(gpu)
-        victims = [] if going else policy.choose_relief(core, gpu, going, over)
-        for victim in victims:
+        going = admission.leaving(gpu)
+        chosen = [] if going else victims.choose_relief(core, gpu, going, over)
+        for victim in chosen:
             eviction.ask(core, gpu, victim, lease)
-        if not going and not victims:
+        if not going and not chosen:
             self._break(core, gang, no.BrokenGang(gang.name, GangEnd.OTHERS_TOO_LARGE))
 
     def _is_free(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, *, crowded: bool) -> bool:
@@ -307,11 +309,11 @@ class Gangs(Feature):
         The member before needed some of them while it loaded. If they do not come back in time the
         gang is broken: it must not keep the GPU from other requests forever.
         """
-        room = policy.measured_room_bytes(core, gpu)
-        if not crowded and room is not None and room >= policy.measured_need_bytes(gpu, lease):
+        room = admission.measured_room_bytes(core, gpu)
+        if not crowded and room is not None and room >= admission.measured_need_bytes(gpu, lease):
             gang.short_since.pop(gpu.info.id, None)
             return True
-        if room is None or policy.sample_is_behind(gpu):
+        if room is None or admission.sample_is_behind(gpu):
             _want_reading(core, gpu, [lease])
             return False
         lease.request.reason = Wait.NOT_FREE
@@ -530,9 +532,9 @@ def _trim(core: Core, gpu: Gpu, gang: Gang) -> None:
 # -- readings --------------------------------------------------------------------------------------
 def _has_room(core: Core, gpu: Gpu, gang: Gang, some: list[Lease]) -> bool:
     """Return whether a reading shows room for members on a GPU; ask for one if none can."""
-    room = policy.measured_room_bytes(core, gpu)
-    need = policy.measured_need_bytes(gpu, _bundle(gang, some))
-    if room is None or (room < need and policy.sample_is_behind(gpu)):
+    room = admission.measured_room_bytes(core, gpu)
+    need = admission.measured_need_bytes(gpu, _bundle(gang, some))
+    if room is None or (room < need and admission.sample_is_behind(gpu)):
         _want_reading(core, gpu, some)
         return False
     if room < need:

@@ -18,7 +18,7 @@ from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import explain
 from vram_arbiter.arbiter.core.requests.limits import check_waiters
 from vram_arbiter.arbiter.core.requests.requests import bad_state, own_lease
-from vram_arbiter.arbiter.core.scheduling.policy import largest_growth_bytes
+from vram_arbiter.arbiter.core.scheduling.admission import largest_growth_bytes
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.pushes import ResizedPush

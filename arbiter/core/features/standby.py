@@ -44,7 +44,7 @@ from vram_arbiter.arbiter.core.requests.requests import (
     let_go,
     spec_of,
 )
-from vram_arbiter.arbiter.core.scheduling import grants, placement, policy
+from vram_arbiter.arbiter.core.scheduling import admission, backfill, grants, placement
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId
 from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.explained import Return
@@ -358,10 +358,10 @@ class Standby(Feature):
         spare_bytes = 0
         for lease in self._by_turn(gpu):
             if ahead is not None and (
-                ahead.spec.exclusive or policy.added_bytes(gpu, lease) > spare_bytes
+                ahead.spec.exclusive or admission.added_bytes(gpu, lease) > spare_bytes
             ):
                 continue
-            if policy.fits(gpu, lease):
+            if admission.fits(gpu, lease):
                 due_at = self._quiet_at(gpu, lease)
                 if due_at <= core.now:
                     return lease
@@ -370,7 +370,7 @@ class Standby(Feature):
             if ahead is None:
                 ahead = lease
                 passed = partial(self._returned_since, self.absences[lease.id].since)
-                spare_bytes, _ = policy.spare_unplanned_bytes(gpu, lease, {}, passed)
+                spare_bytes, _ = backfill.spare_unplanned_bytes(gpu, lease, {}, passed)
         return None
 
     def _by_turn(self, gpu: Gpu) -> list[Lease]:
@@ -524,11 +524,11 @@ class Standby(Feature):
         gpu = core.gpus[lease.request.gpus[0]]
         if (head := gpu.queue.head()) is not None:
             return Return.BEHIND, head.spec.consumer, None
-        if policy.blocked(core, gpu):
+        if admission.blocked(core, gpu):
             return Return.BLOCKED, "", None
         if self._left_for_is_here(gpu, lease):
             return Return.LEFT_FOR, absence.left_for, None
-        if not policy.fits(gpu, lease):
+        if not admission.fits(gpu, lease):
             return Return.NO_ROOM, "", None
         due_at = self._quiet_at(gpu, lease)
         if due_at > core.now:

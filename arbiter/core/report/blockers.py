@@ -10,7 +10,7 @@ from heapq import nlargest
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report.standing import standing_of
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission, victims
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.wire.explained import Blocker, Condition
 
@@ -79,13 +79,13 @@ def _condition(core: Core, lease: Lease, waiter: Lease | None) -> tuple[Conditio
             return Condition.MEASURED, None
     if not lease.attached:
         return Condition.NOT_BACK, lease.expires_at - core.now
-    if policy.protected_by(lease):
+    if victims.protected_by(lease):
         return Condition.GANG, None
     if not lease.evictable:
         return Condition.PINNED, None
     if waiter is None:
         return (Condition.IN_USE if lease.in_use else Condition.IDLE), None
-    ends_at = policy.residency_ends_at(core, lease, waiter)
+    ends_at = victims.residency_ends_at(core, lease, waiter)
     if ends_at > core.now:
         stretched = ends_at > lease.ready_at + lease.spec.min_residency_s
         return (Condition.THRASHING if stretched else Condition.RESIDENCY), ends_at - core.now
@@ -100,7 +100,7 @@ def _priority(core: Core, waiter: Lease) -> int:
 
 def _by(core: Core, lease: Lease, condition: Condition) -> str:
     if condition is Condition.GANG:
-        return policy.protected_by(lease)
+        return victims.protected_by(lease)
     return str(lease.pinned) if condition is Condition.PINNED and lease.pinned else ""
 
 
@@ -120,7 +120,7 @@ def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:
             state=lease.state,
             uses=0,
             condition=Condition.TURN,
-            by=policy.kept_by(gpu),
+            by=admission.kept_by(gpu),
         )
         for index, lease in enumerate(waiting)
     ]

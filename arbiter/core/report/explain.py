@@ -17,7 +17,7 @@ from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import outlook
 from vram_arbiter.arbiter.core.report.blockers import holder, who_blocks
 from vram_arbiter.arbiter.core.report.standing import Standing, standing_of
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.explained import (
@@ -146,7 +146,7 @@ def gpu_view(core: Core, gpu: Gpu) -> GpuView:
 
 def block_view(core: Core, gpu: Gpu) -> BlockView | None:
     """Why nothing is granted on a GPU now, with its values; None if grants are possible."""
-    code = policy.blocked(core, gpu) or gpu.blocked
+    code = admission.blocked(core, gpu) or gpu.blocked
     match code:
         case None:
             return None
@@ -163,7 +163,7 @@ def block_view(core: Core, gpu: Gpu) -> BlockView | None:
             loading = gpu.in_state(LeaseState.LOADING)[:1]
             return BlockView(code, tuple(one.spec.consumer for one in loading))
         case Block.GANG:
-            return BlockView(code, (policy.kept_by(gpu),))
+            return BlockView(code, (admission.kept_by(gpu),))
         case Block.PRESSURE:
             return BlockView(code, bytes=gpu.ledger.pressure_bytes())
         case _:
@@ -327,7 +327,7 @@ def explain_lease(core: Core, lease: Lease) -> Explanation:
     if lease.state is not LeaseState.QUEUED:
         return _explain_resident(core, standing, lease, free)
     free += kept
-    added = lease.request.load_peak_bytes if kept else policy.added_bytes(gpu, standing.request)
+    added = lease.request.load_peak_bytes if kept else admission.added_bytes(gpu, standing.request)
     deficit = max(0, added - free)
     position = _place(core, standing)
     blockers = who_blocks(core, gpu, standing.request, deficit)
@@ -422,7 +422,7 @@ def _situation(
     leaving = any(other.state in LEAVING for other in gpu.residents.values())
     if leaving and lease.request.planned_gpu == gpu.info.id:
         return Situation.MAKING_ROOM
-    if policy.blocked(core, gpu):
+    if admission.blocked(core, gpu):
         return Situation.BLOCKED
     if leaving:
         return Situation.MAKING_ROOM
@@ -466,7 +466,7 @@ def _eta(core: Core, standing: Standing, lease: Lease) -> float | None:
         slowest = max(slowest, sum(known) - (core.now - other.since))
     load = _load_s(core, standing)
     kept = lease.id in gpu.ledger.reserved
-    if load is None or (not slowest and not kept and not policy.fits(gpu, standing.request)):
+    if load is None or (not slowest and not kept and not admission.fits(gpu, standing.request)):
         return None
     return max(0.0, slowest) + load
 

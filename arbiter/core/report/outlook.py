@@ -10,7 +10,7 @@ from math import inf
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report.standing import Standing
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission, placement, victims
 from vram_arbiter.schemas.wire.explained import Action, Because, Step
 
 LOOKED_AT_MAX = 16
@@ -25,7 +25,7 @@ def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
     if not any(waiter in core.gpus[gpu_id].queue for gpu_id in waiter.request.gpus):
         found = _of_unqueued(core, gpu, standing, waiter)
     else:
-        first = policy.front(core, gpu)
+        first = placement.front(core, gpu)
         mine = any(first is one for one in standing.fellows)
         found = _of_head(core, gpu, standing.request) if mine else []
     if waiter.request.wait_timeout_s is not None:
@@ -61,25 +61,26 @@ def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
         return [_next_reading(core, gpu, Because.UNREADABLE)]
     found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
     found += [_leaving(core, gpu, waiter, lease) for lease in gpu.in_state(*LEAVING)]
-    going = policy.leaving(gpu)
-    if found or policy.blocked(core, gpu):
+    going = admission.leaving(gpu)
+    if found or admission.blocked(core, gpu):
         return found
-    if policy.fits(gpu, waiter, going):
+    if admission.fits(gpu, waiter, going):
         return [_next_reading(core, gpu, Because.MEASUREMENT)]
     return _asking(core, gpu, waiter)
 
 
 def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     """Which holders will be revoked, and when: at the first instant at which a sufficient set may
-    be."""
-    going = policy.leaving(gpu)
+    be.
+    """
+    going = admission.leaving(gpu)
     looks = max(1, min(LOOKED_AT_MAX, LOOKS_AT_HOLDERS_MAX // (1 + len(gpu.residents))))
-    for at in sorted({core.now, *policy.ask_times(core, gpu, waiter)})[:looks]:
-        victims = policy.choose_victims(core, gpu, waiter, going, at)
-        if victims is not None:
+    for at in sorted({core.now, *victims.ask_times(core, gpu, waiter)})[:looks]:
+        chosen = victims.choose_victims(core, gpu, waiter, going, at)
+        if chosen is not None:
             return [
                 _step(core, Action.ASK, victim, at, _because(core, waiter, victim, at))
-                for victim in victims
+                for victim in chosen
             ]
     if missing := [lease for lease in gpu.in_state(LeaseState.HELD) if not lease.attached]:
         last = max(missing, key=lambda lease: lease.expires_at)
@@ -90,7 +91,7 @@ def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
 def _because(core: Core, waiter: Lease, victim: Lease, at: float) -> Because:
     if at <= core.now:
         return Because.NEXT_READING
-    if at == policy.residency_ends_at(core, victim, waiter):
+    if at == victims.residency_ends_at(core, victim, waiter):
         return Because.RESIDENCY
     return Because.AGEING if victim.in_use else Because.TOGETHER
 

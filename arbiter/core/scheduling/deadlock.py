@@ -19,17 +19,20 @@ from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission, backfill
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 WAITS_MAX = 64
 """A process that waits for more than so many leases at a time is not looked at: each look weighs
-all of them."""
+all of them.
+"""
 
 
 def resolve(core: Core) -> None:
-    """Deny waiters until no circle is left. Each is answered like any request that is refused, or
-    by push if it waited already."""
+    """Deny waiters until no circle is left.
+
+    Each is answered like any request that is refused, or by push if it waited already.
+    """
     suspects = core.turn.suspects
     while any(
         core.users.get(process) and _is_looked_at(_waits_of(core, process)) for process in suspects
@@ -43,7 +46,8 @@ def resolve(core: Core) -> None:
 
 def find(core: Core) -> list[Lease]:
     """The circle that the newest possible waiter is in, in its order; [] if everybody can be served
-    some day."""
+    some day.
+    """
     state = _Reduction(core)
     left = state.run()
     candidates = [w for w in left if w.process in state.waits and not w.spec.independent]
@@ -90,7 +94,8 @@ class _Reduction:
 
     def waits_for(self, waiter: Lease) -> list[Lease]:
         """Other waiters (or itself) without which it cannot be served: those before it, and those
-        whose processes use what is in its way."""
+        whose processes use what is in its way.
+        """
         found: dict[LeaseId, Lease] = {}
         for gpu_id in waiter.request.gpus:
             gpu = self.core.gpus[gpu_id]
@@ -116,7 +121,7 @@ class _Reduction:
             if possible is None:
                 # one that could not be served even if every use ended waits for something else, and
                 # that may come
-                possible = policy.fits(gpu, waiter, going) or not policy.fits(
+                possible = admission.fits(gpu, waiter, going) or not admission.fits(
                     gpu, waiter, everything
                 )
                 if alike:
@@ -134,8 +139,8 @@ class _Reduction:
         """May it be served while somebody before it cannot be? As `grants` backfills."""
         if head.spec.exclusive or not self.core.settings.scheduling.backfill:
             return False
-        spare = policy.spare_beside_bytes(gpu, head, everything)
-        return policy.added_bytes(gpu, waiter) <= spare
+        spare = backfill.spare_beside_bytes(gpu, head, everything)
+        return admission.added_bytes(gpu, waiter) <= spare
 
     def _blocked(self) -> frozenset[ProcessKey]:
         """Processes in the middle of a use that wait for somebody who is not served."""
@@ -146,19 +151,20 @@ class _Reduction:
 
     def _blockers(self, gpu: Gpu, waiter: Lease) -> list[ProcessKey]:
         """Processes whose uses are in the way of a waiter: those that alone suffice for that, else
-        all others."""
+        all others.
+        """
         users = [
             process
             for process in self._blocked()
             if any(lease.gpu == gpu.info.id for lease in self.core.users[process].values())
         ]
         users.sort()
-        if policy.fits(gpu, waiter, self._going(gpu, users)):
+        if admission.fits(gpu, waiter, self._going(gpu, users)):
             return []
         alone = [
             process
             for process in users
-            if not policy.fits(gpu, waiter, self._going(gpu, [process]))
+            if not admission.fits(gpu, waiter, self._going(gpu, [process]))
         ]
         return alone or [process for process in users if process != waiter.process]
 
@@ -200,7 +206,7 @@ def _way_back(start: Lease, waits_for: Callable[[Lease], list[Lease]]) -> list[L
     return []
 
 
-# -- telling
+# -- telling ---------------------------------------------------------------------------------------
 def _deny(core: Core, waiter: Lease, cycle: list[Lease]) -> None:
     links = (_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle))
     eviction.deny(core, waiter, no.Deadlock(tuple(links)))

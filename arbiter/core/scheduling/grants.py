@@ -6,25 +6,23 @@ Per card, in this order (the numbers stand in `_serve`):
   3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
   4. nothing waits, or a feature owns the head: served by features alone
   5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
-     head for which another card is
-     being emptied is passed over from here on
+     head for which another card is being emptied is passed over from here on
   6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out
      already
   7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head;
-     behind one that waits for bytes
-     nobody can be asked for (a stowaway's), only who fits beside it on the day that they are gone,
-     and may be asked itself
+     behind one that waits for bytes nobody can be asked for (a stowaway's), only who fits beside it
+     on the day that they are gone, and may be asked itself
 """
 
 from collections.abc import Mapping
 
 from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.hooks import owner_of
 from vram_arbiter.arbiter.core.learning import costs
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report import explain
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission, backfill, placement, victims
 from vram_arbiter.arbiter.core.verification.evidence import note_pressure
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
@@ -33,8 +31,10 @@ from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 def schedule(core: Core) -> None:
-    """Serve every dirty GPU. A grant on one may free a waiter's place on another, so until none is
-    dirty."""
+    """Serve every dirty GPU.
+
+    A grant on one may free a waiter's place on another, so until none is dirty.
+    """
     gpu: Gpu | None = None
     while (gpu := core.turn.next_dirty(gpu)) is not None:
         _serve(core, gpu)
@@ -42,13 +42,14 @@ def schedule(core: Core) -> None:
 
 def on_plan_due(core: Core, gpu_id: str) -> None:
     """Look at a GPU again: a residency ended, a waiter aged, or the GPU has been quiet for long
-    enough."""
+    enough.
+    """
     core.wake(core.gpus[GpuId(gpu_id)])
 
 
 def _serve(core: Core, gpu: Gpu) -> None:
     note_pressure(core, gpu)
-    gpu.blocked = policy.blocked(core, gpu)
+    gpu.blocked = admission.blocked(core, gpu)
     if gpu.pressed and core.recovering is None:  # 1
         _relieve(core, gpu)
         return
@@ -61,40 +62,42 @@ def _serve(core: Core, gpu: Gpu) -> None:
         for feature in core.hooked["serve"]:
             feature.serve(core, gpu, None)
         return
-    head = policy.front(core, gpu)
+    head = placement.front(core, gpu)
     if head is None:
         return
-    owner = _owner(head)
+    owner = owner_of(head)
     if owner is not None:  # 4
         owner.serve(core, gpu, head)
         return
-    if policy.fits(gpu, head):  # 5
+    if admission.fits(gpu, head):  # 5
         grant_if_measured(core, gpu, head)
         return
-    leaving = policy.leaving(gpu)
-    planned = policy.fits(gpu, head, leaving)
+    leaving = admission.leaving(gpu)
+    planned = admission.fits(gpu, head, leaving)
     if planned:
         head.request.reason = Wait.MAKING_ROOM
     elif _ask_victims(core, gpu, head, leaving):  # 6
-        leaving, planned = policy.leaving(gpu), True
-    _backfill(core, gpu, head, leaving, planned=planned)  # 7
+        leaving, planned = admission.leaving(gpu), True
+    later = backfill.choose(core, gpu, head, leaving, planned=planned)  # 7
+    if later is not None:
+        grant_if_measured(core, gpu, later)
 
 
 def _relieve(core: Core, gpu: Gpu) -> None:
-    leaving = policy.leaving(gpu)
+    leaving = admission.leaving(gpu)
     over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
     if over <= 0:
         return
-    for victim in policy.choose_relief(core, gpu, leaving, over):
+    for victim in victims.choose_relief(core, gpu, leaving, over):
         eviction.ask(core, gpu, victim, None)
-    policy.wake_when_evictable(core, gpu, None)
+    victims.wake_when_evictable(core, gpu, None)
 
 
 def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
     """Grant a lease that fits by the ledger, once a reading shows its bytes as free too."""
-    room = policy.measured_room_bytes(core, gpu)
-    need = policy.measured_need_bytes(gpu, lease)
-    if room is None or (room < need and policy.sample_is_behind(gpu)):
+    room = admission.measured_room_bytes(core, gpu)
+    need = admission.measured_need_bytes(gpu, lease)
+    if room is None or (room < need and admission.sample_is_behind(gpu)):
         lease.request.reason = Wait.READING
         core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
         return
@@ -106,15 +109,15 @@ def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
 
 
 def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
-    if policy.residue_under_measurement(gpu):
+    if admission.residue_under_measurement(gpu):
         head.request.reason = Wait.RESIDUE
         return False
-    plan = policy.choose_victims(core, gpu, head, leaving)
+    plan = victims.choose_victims(core, gpu, head, leaving)
     if plan is None:
         head.request.reason = Wait.NO_VICTIM
-        policy.wake_when_evictable(core, gpu, head)
+        victims.wake_when_evictable(core, gpu, head)
         return False
-    if len(head.request.gpus) > 1 and not policy.is_best_place(core, gpu, head, plan):
+    if len(head.request.gpus) > 1 and not placement.is_best_place(core, gpu, head, plan):
         return False
     head.request.planned_gpu = gpu.info.id
     head.request.reason = Wait.MAKING_ROOM
@@ -125,58 +128,11 @@ def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, in
     return True
 
 
-def _backfill(
-    core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int], *, planned: bool
-) -> None:
-    if len(gpu.queue) < 2 or head.spec.exclusive or not core.settings.scheduling.backfill:
-        return
-    fold = policy.largest_fold_bytes(gpu)
-    smallest, free = (
-        gpu.queue.smallest_need_bytes() - fold,
-        gpu.ledger.budget_bytes - gpu.ledger.total_bytes(),
-    )
-    if smallest > free:
-        return
-    if policy.room_is_coming(gpu):
-        return  # the head's room is about to come; a load now would only be in its way
-    if planned:
-        spare, stuck = policy.spare_beside_bytes(gpu, head, leaving), False
-    else:
-        spare, stuck = policy.spare_unplanned_bytes(
-            gpu, head, leaving, lambda lease: policy.passed(gpu, lease, head)
-        )
-        if stuck and policy.residue_under_measurement(gpu):
-            return
-    if smallest > spare:
-        return
-    most = min(free, spare) + fold
-    alone = not gpu.ledger.leases()
-    for lease in gpu.queue.behind_head():
-        if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
-            continue  # seen at a glance: thousands may wait
-        if lease is head or _owner(lease) or (stuck and not _may_be_asked(core, lease)):
-            continue
-        if policy.added_bytes(gpu, lease) <= spare and policy.fits(gpu, lease):
-            grant_if_measured(core, gpu, lease)
-            return
-
-
-def _owner(request: Lease) -> Feature | None:
-    """Return the feature that alone grants a request."""
-    return next((feature for feature in request.features if feature.owns(request)), None)
-
-
-def _may_be_asked(core: Core, lease: Lease) -> bool:
-    """Could it be asked to leave once it is resident? If a stowaway gives back a part, the head may
-    need what this one took."""
-    return (
-        lease if lease.request.extends is None else core.leases[lease.request.extends]
-    ).evictable
-
-
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Give the lease its card and its token. The record goes to the journal before the holder hears
-    of it."""
+    """Give the lease its card and its token.
+
+    The record goes to the journal before the holder hears of it.
+    """
     _collect_evictions(core, gpu, lease)
     if any(feature.grant(core, gpu, lease) for feature in lease.features):
         return
@@ -217,12 +173,13 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
         evicted=[e.consumer for e in lease.request.evicted],
         **({"by_itself": True} if by_itself else {}),
     )
-    gpu.blocked = policy.blocked(core, gpu)
+    gpu.blocked = admission.blocked(core, gpu)
 
 
 def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
     """Who left for this lease, or for a waiter that has gone since; the rest stays on the card's
-    list."""
+    list.
+    """
     mine = [
         e
         for e in gpu.evictions

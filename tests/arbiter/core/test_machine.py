@@ -20,7 +20,7 @@ from tests.support.engine_state import state_of
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Push, Reply
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -365,13 +365,13 @@ class Leases(RuleBasedStateMachine):
         core = state_of(self.driver.arbiter)
         (gpu,) = core.gpus.values()
         head = gpu.queue.head()
-        if head is None or policy.blocked(core, gpu) or gpu.asked_at is not None:
+        if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
             return
-        room = policy.measured_room_bytes(core, gpu)
+        room = admission.measured_room_bytes(core, gpu)
         assert not (
-            policy.fits(gpu, head)
+            admission.fits(gpu, head)
             and room is not None
-            and room >= policy.measured_need_bytes(gpu, head)
+            and room >= admission.measured_need_bytes(gpu, head)
         )
 
     def waits_end_in_time(self) -> None:

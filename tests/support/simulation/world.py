@@ -25,7 +25,7 @@ from tests.support.simulation.card import Device, ProbeFaults
 from tests.support.simulation.clock import TRACE_LINES, Clock, ProcessLoop
 from tests.support.simulation.daemon import Happening, Machine, SimDaemon
 from tests.support.simulation.wire import Link, SimWire
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
@@ -307,13 +307,13 @@ class World:
         core = state_of(daemon.core)
         for gpu in core.gpus.values():
             head = gpu.queue.head()
-            if head is None or policy.blocked(core, gpu) or gpu.asked_at is not None:
+            if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
                 continue
-            room = policy.measured_room_bytes(core, gpu)
+            room = admission.measured_room_bytes(core, gpu)
             if (
-                policy.fits(gpu, head)
+                admission.fits(gpu, head)
                 and room is not None
-                and room >= policy.measured_need_bytes(gpu, head)
+                and room >= admission.measured_need_bytes(gpu, head)
             ):
                 self.fail(f"lost wake-up: {head.id} fits on {gpu.info.id} and nobody looks")
 

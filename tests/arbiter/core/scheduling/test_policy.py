@@ -8,7 +8,7 @@ from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Gpu
-from vram_arbiter.arbiter.core.scheduling import policy
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Block
@@ -218,13 +218,13 @@ def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
     driver = CoreDriver(8 * GIB, start=False)
     core = state_of(driver.arbiter)
     gpu = next(iter(core.gpus.values()))
-    assert policy.measured_room_bytes(core, gpu) is None
-    assert policy.blocked(core, gpu) == Block.UNREAD
-    assert policy.sample_is_behind(gpu)
+    assert admission.measured_room_bytes(core, gpu) is None
+    assert admission.blocked(core, gpu) == Block.UNREAD
+    assert admission.sample_is_behind(gpu)
     driver.advance(0.01)
-    assert policy.measured_room_bytes(core, gpu) == 8 * GIB
+    assert admission.measured_room_bytes(core, gpu) == 8 * GIB
     core.now += 5.0
-    assert policy.measured_room_bytes(core, gpu) is None
+    assert admission.measured_room_bytes(core, gpu) is None
 
 
 def test_the_measured_need_is_less_by_what_the_process_holds() -> None:
@@ -232,16 +232,16 @@ def test_the_measured_need_is_less_by_what_the_process_holds() -> None:
     lease = card.hold("a", 3, residue_bytes=450 * MIB)
     core = state_of(card.driver.arbiter)
     inner: Lease = core.leases[lease]
-    assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB, (
+    assert admission.measured_need_bytes(card.gpu, inner) == 3 * GIB, (
         "beside a resident lease of its own: everything"
     )
     card.people["a"].unload(lease)
     card.driver.until(lambda: card.driver.state(lease) == "over")
     card.driver.advance(0.1)
-    assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB
+    assert admission.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB
     card.driver.card.lists_processes = False
     card.driver.advance(2.0)
-    assert policy.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB, (
+    assert admission.measured_need_bytes(card.gpu, inner) == 3 * GIB - 450 * MIB, (
         "by the books, without a list"
     )
     card.people["b"] = card.driver.consumer("b")
