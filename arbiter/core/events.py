@@ -53,8 +53,8 @@ class ProcessDied:
 
 # -- requests
 @dataclass(frozen=True, slots=True)
-class Spec:
-    """A lease as asked for (validated; mirrors `schemas.wire.LeaseSpec`)."""
+class LeaseSpec:
+    """A lease as asked for, validated (`schemas.wire.requests.LeaseSpec`)."""
 
     consumer: str
     key: ModelKey
@@ -80,7 +80,7 @@ class AcquireRequested:
     client: ClientId
     request: RequestId
     nonce: str
-    spec: Spec
+    spec: LeaseSpec
     wait_timeout_s: float | None
     traceparent: str | None = None
 
@@ -197,7 +197,7 @@ class ResizeAsked:
 class ReattachedLease:
     lease: LeaseId
     token: Token
-    spec: Spec
+    spec: LeaseSpec
     held: bool  # False: still loading
     measured_bytes: int | None
     uses: tuple[UseId, ...]

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
+    LeaseSpec,
     MemorySampled,
     ReattachedLease,
     ReleaseReported,
-    Spec,
 )
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.refusals import End
@@ -60,7 +60,7 @@ class Feature:
         """
         return False
 
-    def on_refused(self, core: "Core", spec: Spec, refusal: Refusal) -> None:
+    def on_refused(self, core: "Core", spec: LeaseSpec, refusal: Refusal) -> None:
         """A request was refused: no GPU can ever hold it."""
 
     def on_request(self, core: "Core", request: Lease) -> bool:

@@ -15,11 +15,11 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Refuse, Reply
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
+    LeaseSpec,
     MemorySampled,
     ProbeFailed,
     ProcessDied,
     Reacquired,
-    Spec,
 )
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.settings import Settings
@@ -49,7 +49,7 @@ class _Story:
     """One lease, from its acquire to its end. Times are the log's."""
 
     process: ProcessKey
-    spec: Spec
+    spec: LeaseSpec
     acquired_at: float
     wait_timeout_s: float | None = None
     inherited: bool = False  # it was resident when the log began

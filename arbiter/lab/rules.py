@@ -25,11 +25,11 @@ from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     ClientConnected,
     Event,
+    LeaseSpec,
     MemorySampled,
     ProcessDied,
     ReadyReported,
     ReleaseReported,
-    Spec,
     Tick,
     UnloadStarted,
     UseBegan,
@@ -61,7 +61,7 @@ class _Model:
 
     id: LeaseId
     client: ClientId
-    spec: Spec
+    spec: LeaseSpec
     arrived_at: float
     state: str = "queued"  # queued, loading, held, leaving
     uses: set[str] = field(default_factory=set)

@@ -6,7 +6,7 @@ Every arrival and every duration is drawn beforehand, so that all policies get t
 from collections.abc import Iterator
 from random import Random
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.lab.workload import CardPlan, Follower, Job, Plan, Workload
 from vram_arbiter.schemas.config.scenario import JOBS_MAX, Scenario, ScenarioConsumer
@@ -86,7 +86,7 @@ def _arrivals(consumer: ScenarioConsumer, seconds: float, random: Random) -> lis
 
 def _job(name: str, consumer: ScenarioConsumer, due_s: float, random: Random) -> Job:
     steady = consumer.load_peak if consumer.steady is None else consumer.steady
-    spec = Spec(
+    spec = LeaseSpec(
         consumer=name,
         key=ModelKey(name),
         gpu=consumer.gpu,

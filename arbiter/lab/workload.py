@@ -6,7 +6,7 @@ Data only.
 
 from dataclasses import dataclass, field
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.settings import GpuInfo
 
 
@@ -15,7 +15,7 @@ class Job:
     """One piece of work that needs its consumer's model resident."""
 
     due_s: float
-    spec: Spec
+    spec: LeaseSpec
     use_s: float | None  # None: it only holds the bytes and marks no use
     load_s: float
     unload_s: float

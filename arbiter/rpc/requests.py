@@ -66,9 +66,9 @@ def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event | 
             return None
 
 
-def to_spec(spec: w.LeaseSpec) -> ev.Spec:
+def to_spec(spec: w.LeaseSpec) -> ev.LeaseSpec:
     """The wire's lease spec as the core knows it."""
-    return ev.Spec(
+    return ev.LeaseSpec(
         consumer=spec.consumer,
         key=ModelKey(spec.model_id, spec.revision),
         gpu=spec.gpu,

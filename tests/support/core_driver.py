@@ -37,6 +37,7 @@ from vram_arbiter.arbiter.core.events import (
     ClientLeft,
     Event,
     JournalFailed,
+    LeaseSpec,
     MemorySampled,
     OomReported,
     ProbeFailed,
@@ -51,7 +52,6 @@ from vram_arbiter.arbiter.core.events import (
     Renewed,
     ResizeAsked,
     RevokeAcknowledged,
-    Spec,
     Tick,
     UnloadStarted,
     UseBegan,
@@ -372,7 +372,7 @@ class Consumer:
     client: ClientId
     priority: int = d.PRIORITY
     uid: int = 1000
-    specs: dict[LeaseId, Spec] = field(default_factory=dict)
+    specs: dict[LeaseId, LeaseSpec] = field(default_factory=dict)
     nonces: int = 0
     traceparent: str | None = None  # sent with what it asks for
 
@@ -414,10 +414,9 @@ class Consumer:
         key: str | None = None,
         independent: bool = False,
         gang: tuple[str, int] | None = None,
-    ) -> Spec:
-        """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked
-        for."""
-        return Spec(
+    ) -> LeaseSpec:
+        """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
+        return LeaseSpec(
             consumer=self.name,
             key=ModelKey(key or f"{self.name}-model"),
             gpu=gpu,
@@ -637,7 +636,7 @@ class Consumer:
         held: bool = True,
         measured_bytes: int | None = None,
         uses: Sequence[str] = (),
-        spec: Spec | None = None,
+        spec: LeaseSpec | None = None,
         away: bool = False,
         parked: bool = False,
     ) -> list[Effect]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from vram_arbiter.arbiter.core.events import AcquireRequested, Spec
+from vram_arbiter.arbiter.core.events import AcquireRequested, LeaseSpec
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
@@ -108,7 +108,7 @@ class Gangs(Feature):
             raise Refused(no.GangMismatch(name, gang.size, size))
         return False
 
-    def on_refused(self, core: Core, spec: Spec, refusal: Refusal) -> None:
+    def on_refused(self, core: Core, spec: LeaseSpec, refusal: Refusal) -> None:
         """Break the gang of a refused member: it can never be complete."""
         gang = None if spec.gang is None else self.by_name.get(spec.gang[0])
         if gang is not None and gang.phase == "gathering":

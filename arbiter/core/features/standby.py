@@ -14,10 +14,10 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
+    LeaseSpec,
     Reacquired,
     ReattachedLease,
     ReleaseReported,
-    Spec,
 )
 from vram_arbiter.arbiter.core.features.parking import HostRam
 from vram_arbiter.arbiter.core.hooks import Feature
@@ -264,7 +264,7 @@ class Standby(Feature):
         core.hand_to(lease, client.id)
         core.reply(event.client, event.request, AcquireReply("queued", explain.view(core, lease)))
 
-    def _find(self, core: Core, process: ProcessKey, spec: Spec) -> Lease | None:
+    def _find(self, core: Core, process: ProcessKey, spec: LeaseSpec) -> Lease | None:
         if not self.away:
             return None
         return next(
@@ -536,7 +536,7 @@ class Standby(Feature):
         return Return.READING, "", None
 
 
-def _concerns(spec: Spec) -> bool:
+def _concerns(spec: LeaseSpec) -> bool:
     return spec.standby or spec.park_bytes > 0
 
 
@@ -549,7 +549,7 @@ def _still_waits(lease: Lease, event: AcquireRequested) -> bool:
     return event.nonce == lease.request.nonce and lease.granted_at <= lease.request.arrived_at
 
 
-def _places(core: Core, event: AcquireRequested | Reacquired, spec: Spec) -> tuple[GpuId, ...]:
+def _places(core: Core, event: AcquireRequested | Reacquired, spec: LeaseSpec) -> tuple[GpuId, ...]:
     """Return the GPUs that a lease may come back to on request. Raises Refused."""
     gpus = placement.places(core, spec, drift.expected_bytes(core, spec)[0])
     check_waiters(core, client_of(core, event.client), spec.priority)

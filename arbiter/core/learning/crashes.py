@@ -9,7 +9,7 @@ restart.
 
 from typing import Final
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.learning.drift import model_name
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import Failures, Lease, LeaseState
@@ -42,7 +42,7 @@ def succeeded(core: Core, lease: Lease) -> None:
     core.crashes.pop(model_name(lease.spec), None)
 
 
-def check(core: Core, spec: Spec, load_peak_bytes: int, gpus: tuple[GpuId, ...]) -> None:
+def check(core: Core, spec: LeaseSpec, load_peak_bytes: int, gpus: tuple[GpuId, ...]) -> None:
     """Refuses an acquire that would make somebody leave for one more try. Raises Refused."""
     seen = core.crashes.get(model_name(spec))
     if seen is None or (wait_s := seen.last_at + _pause_s(seen) - core.now) <= 0:
@@ -56,7 +56,7 @@ def _pause_s(seen: Failures) -> float:
     return min(PAUSE_MAX_S, PAUSE_S * 2.0 ** (seen.count - FREE - 1)) if seen.count > FREE else 0.0
 
 
-def _costs_nobody(gpu: Gpu, spec: Spec, load_peak_bytes: int) -> bool:
+def _costs_nobody(gpu: Gpu, spec: LeaseSpec, load_peak_bytes: int) -> bool:
     free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
     return (
         gpu.queue.head() is None

@@ -7,7 +7,7 @@ What is resident is followed until it leaves. A process with several leases on o
 sum: nothing is learnt from it. Changes no charge: a footprint counts from the next acquire on.
 """
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.learning.footprints import PARTS, Part
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
@@ -18,16 +18,14 @@ from vram_arbiter.schemas.wire.explained import FootprintView
 _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
 
 
-def model_name(spec: Spec) -> str:
-    """Under which name a footprint is learnt: another consumer of the same model may load it in
-    another way."""
+def model_name(spec: LeaseSpec) -> str:
+    """Under which name a footprint is learnt: another consumer of the same model may load it in another way."""
     return f"{spec.consumer} {spec.key}"
 
 
-# -- what a request is charged
-def expected_bytes(core: Core, spec: Spec) -> tuple[int, int]:
-    """(load peak, steady): the larger of declared and learnt. Learnt bytes alone never exceed the
-    largest card's budget."""
+# -- what a request is charged -----------------------------------------------------------------------------------------
+def expected_bytes(core: Core, spec: LeaseSpec) -> tuple[int, int]:
+    """(load peak, steady): the larger of declared and learnt. Learnt bytes alone never exceed the largest card's budget."""
     name = model_name(spec)
     steady_learnt = core.footprints.p95_bytes(name, "steady")
     peak_learnt = core.footprints.p95_bytes(name, "load_peak")

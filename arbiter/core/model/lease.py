@@ -10,7 +10,7 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol
 
-from vram_arbiter.arbiter.core.events import MemorySampled, Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec, MemorySampled
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.codes import Cause, Order, RevokeCause, Wait
 
@@ -212,7 +212,7 @@ class Lease:
     """A lease from its request to its end. The spec is what was asked for; a resize replaces it."""
 
     id: LeaseId
-    spec: Spec
+    spec: LeaseSpec
     process: ProcessKey
     client: ClientId
     request: Request
@@ -236,7 +236,7 @@ class Lease:
     def recovered(
         cls,
         lease_id: LeaseId,
-        spec: Spec,
+        spec: LeaseSpec,
         process: ProcessKey,
         request: Request,
         token: Token,

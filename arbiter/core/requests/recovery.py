@@ -15,11 +15,11 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import (
     DOUBT_KEY,
+    LeaseSpec,
     MemorySampled,
     Reattached,
     ReattachedLease,
     Recovered,
-    Spec,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
 from vram_arbiter.arbiter.core.learning import drift
@@ -204,9 +204,9 @@ def _room_bytes(gpu: Gpu) -> int:
     return max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes())
 
 
-def spec_from_record(record: Mapping[str, Any]) -> Spec:
+def spec_from_record(record: Mapping[str, Any]) -> LeaseSpec:
     """The inverse of what `Core.record_lease` writes."""
-    return Spec(
+    return LeaseSpec(
         consumer=str(record["consumer"]),
         key=ModelKey(str(record["model_id"]), str(record["revision"])),
         gpu=str(record["gpu"]),

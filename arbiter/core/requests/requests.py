@@ -10,12 +10,12 @@ from dataclasses import replace
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
+    LeaseSpec,
     OomReported,
     ReadyReported,
     ReleaseReported,
     Renewed,
     RevokeAcknowledged,
-    Spec,
     UnloadStarted,
 )
 from vram_arbiter.arbiter.core.eviction import eviction
@@ -127,7 +127,7 @@ def acquire(core: Core, event: AcquireRequested) -> None:
         core.enqueue(lease)
 
 
-def spec_of(core: Core, event: AcquireRequested) -> Spec:
+def spec_of(core: Core, event: AcquireRequested) -> LeaseSpec:
     """Return what is asked for, as the scheduling policy has it."""
     return replace(event.spec, exclusive=True) if core.settings.scheduling.alone else event.spec
 
@@ -136,7 +136,7 @@ def new_lease(
     core: Core,
     event: AcquireRequested,
     client: Client,
-    spec: Spec,
+    spec: LeaseSpec,
     load_peak: int,
     steady: int,
     gpus: tuple[GpuId, ...],

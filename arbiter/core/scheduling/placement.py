@@ -6,7 +6,7 @@ day: a request that only it keeps out waits, as long as its own timeout allows.
 
 from collections.abc import Sequence
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.refusals import Refused
@@ -16,14 +16,14 @@ from vram_arbiter.arbiter.core.scheduling.victims import choose_victims, cost_of
 from vram_arbiter.schemas.ids import GpuId
 
 
-def selected(core: Core, spec: Spec) -> list[Gpu]:
+def selected(core: Core, spec: LeaseSpec) -> list[Gpu]:
     """Return the GPUs that a selector names: `any`, a UUID or an index."""
     return [
         gpu for gpu in core.gpus.values() if spec.gpu in ("any", gpu.info.id, str(gpu.info.index))
     ]
 
 
-def places(core: Core, spec: Spec, load_peak: int) -> tuple[GpuId, ...]:
+def places(core: Core, spec: LeaseSpec, load_peak: int) -> tuple[GpuId, ...]:
     """Return the candidate GPUs of a request. Raises Refused if none could ever hold it."""
     gpus = selected(core, spec)
     if not gpus:

@@ -265,7 +265,7 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
     wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT,
     "mode": "exclusive",
               "priority": 60, "evictable": False, "on_deadline": "deny"}  # fmt: skip
-    spec = ev.Spec(
+    spec = ev.LeaseSpec(
         "detector", ModelKey("m", "r"), "any", True, 10, 8, 2, 60, False, 10.0, 2.0, True
     )
     trace = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     STORY_MAX,
@@ -16,7 +16,7 @@ from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
 
 def lease(priority: int = 50, residue_bytes: int = 7) -> Lease:
-    spec = Spec(
+    spec = LeaseSpec(
         "det", ModelKey("m"), "any", False, 10, 10, residue_bytes, priority, True, 10.0, 2.0, False
     )
     request = Request("n", 100.0, 1, 10, 10)

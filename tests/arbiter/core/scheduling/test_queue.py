@@ -1,13 +1,15 @@
 """Order of waiters: priority, arrival, and ageing that never reorders equals."""
 
-from vram_arbiter.arbiter.core.events import Spec
+from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.model.lease import Lease, Request
 from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
 
 
 def waiter(arrival: int, at: float, priority: int = 50, need: int = 10) -> Lease:
-    spec = Spec("c", ModelKey("m"), "any", False, need, need, 0, priority, True, 10.0, 0.0, False)
+    spec = LeaseSpec(
+        "c", ModelKey("m"), "any", False, need, need, 0, priority, True, 10.0, 0.0, False
+    )
     return Lease(
         LeaseId(f"L1-{arrival}"),
         spec,
