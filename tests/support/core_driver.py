@@ -415,7 +415,9 @@ class Consumer:
         independent: bool = False,
         gang: tuple[str, int] | None = None,
     ) -> LeaseSpec:
-        """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked for."""
+        """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked
+        for.
+        """
         return LeaseSpec(
             consumer=self.name,
             key=ModelKey(key or f"{self.name}-model"),

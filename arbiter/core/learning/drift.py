@@ -19,13 +19,18 @@ _RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
 
 
 def model_name(spec: LeaseSpec) -> str:
-    """Under which name a footprint is learnt: another consumer of the same model may load it in another way."""
+    """Under which name a footprint is learnt: another consumer of the same model may load it in
+    another way.
+    """
     return f"{spec.consumer} {spec.key}"
 
 
-# -- what a request is charged -----------------------------------------------------------------------------------------
+# -- what a request is charged ---------------------------------------------------------------------
 def expected_bytes(core: Core, spec: LeaseSpec) -> tuple[int, int]:
-    """(load peak, steady): the larger of declared and learnt. Learnt bytes alone never exceed the largest card's budget."""
+    """(load peak, steady): the larger of declared and learnt.
+
+    Learnt bytes alone never exceed the largest card's budget.
+    """
     name = model_name(spec)
     steady_learnt = core.footprints.p95_bytes(name, "steady")
     peak_learnt = core.footprints.p95_bytes(name, "load_peak")

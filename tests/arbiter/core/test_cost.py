@@ -78,9 +78,19 @@ class Counted:
 
     def asking(self, client: ClientId) -> ev.AcquireRequested:
         spec = ev.LeaseSpec(
-            consumer="small", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=SIZE, steady_bytes=SIZE,
-            residue_bytes=0, priority=50, evictable=True, ttl_s=1e9, min_residency_s=0.0, deny_on_deadline=False,
-        )  # fmt: skip
+            consumer="small",
+            key=ModelKey("m"),
+            gpu="any",
+            exclusive=False,
+            load_peak_bytes=SIZE,
+            steady_bytes=SIZE,
+            residue_bytes=0,
+            priority=50,
+            evictable=True,
+            ttl_s=1e9,
+            min_residency_s=0.0,
+            deny_on_deadline=False,
+        )
         return ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
 
     def acquire(self, client: ClientId) -> tuple[LeaseId, Token]:
