@@ -9,6 +9,9 @@ from vram_arbiter.schemas.ids import LeaseId
 
 GIB, MIB = d.GIB, d.MIB
 
+PROBE_FAILURE = "the driver hangs"
+"""What a failed reading of the driver reports."""
+
 
 def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDriver:
     """Four consumers that load, use, release, cancel, report and die, on a card that lags and
@@ -39,7 +42,7 @@ def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDri
                         held[lease] = person
                         person.specs[lease] = driver.arbiter.inspect().leases[lease].spec
             case 3:
-                driver.card.failing = "" if driver.card.failing else "the driver hangs"
+                driver.card.failing = "" if driver.card.failing else PROBE_FAILURE
             case 4 if random.random() < 0.3:
                 person.die()
                 people[name] = driver.consumer(name)
