@@ -13,9 +13,11 @@ import pytest
 
 _KEY = pytest.StashKey[Path]()
 _FAILED = pytest.StashKey[bool]()
-KEPT = ("pytest-of-*", "torchinductor_*", "tmp*.json", "sidecar-*.log")
-"""What may lie there at the end, beside `tmp_path`: files that torch's compiler and lerobot's
-loader of configurations never remove, and the log that a client keeps of a sidecar it started."""
+OF_TESTS = "p"
+"""Folder of `tmp_path`."""
+KEPT = (OF_TESTS, "torchinductor_*", "tmp*.json", "sidecar-*.log")
+"""What may lie there at the end: `tmp_path`, files that torch's compiler and lerobot's loader of
+configurations never remove, and the log that a client keeps of a sidecar it started."""
 
 
 def _is_worker() -> bool:
@@ -26,11 +28,13 @@ def _is_worker() -> bool:
 def pytest_configure(config: pytest.Config) -> None:
     """Give the run, its workers and its programs a temporary folder of their own."""
     if not _is_worker():
-        # Short: the path of a socket holds 107 bytes. Open: some programs become another user.
+        # Open: some programs become another user.
         made = Path(tempfile.mkdtemp(prefix="t"))
         made.chmod(0o1777)
         config.stash[_KEY] = made
         os.environ["TMPDIR"] = tempfile.tempdir = str(made)
+        # Short: the path of a socket in `tmp_path` holds 107 bytes.
+        config.option.basetemp = config.option.basetemp or str(made / OF_TESTS)
 
 
 @pytest.hookimpl(trylast=True)
