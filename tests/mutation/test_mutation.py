@@ -80,7 +80,7 @@ def test_only_the_very_change_that_was_judged_counts_as_equivalent(mutants_run: 
         return mutants_run.Mutant("gates.fits:1", "gates", [12], diff, "", outcome)
 
     known = [{"where": "gates.fits", "diff": "-a\n+b", "why": "they are the same"}]
-    report = mutants_run.summary(
+    report = mutants_run.summary_of(
         9, [tried("-a\n+b", "survived"), tried("-a\n+c", "survived"), tried("-a", "killed")], known
     )
     assert (report["killed"], report["survived"], report["equivalent"]) == (1, 1, 1)

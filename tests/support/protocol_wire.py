@@ -55,6 +55,7 @@ PLAIN: Mapping[str, Mapping[str, Any]] = {
         "clients": 1,
         "totals": {"leases": 0, "waiting": 0},
         "drained": "",
+        "problems": [],
         "host_ram": {"budget_bytes": 0, "parked_bytes": 0},
     },
     "ready": {"lease": view()},
@@ -68,6 +69,7 @@ PLAIN: Mapping[str, Mapping[str, Any]] = {
     "oom": {"learnt_load_peak_bytes": None},
 }
 """What the arbiter answers where a test does not say it."""
+REVOKE: dict[str, Any] = {"wanted_by": "", "deadline_in_s": 30.0, "uses": 0, "park": False}
 
 
 class Wire:
@@ -119,7 +121,7 @@ class Wire:
         )
 
     def push(self, kind: str, **body: Any) -> None:
-        plain = {"reason": "", "wanted_by": "", "deadline_in_s": 30.0} if kind == "revoke" else {}
+        plain = REVOKE if kind == "revoke" else {}
         head = {"push": kind, "seq": 1, "epoch": self.epoch}
         self.connection.receive({**head, **plain, **body}, self.now)
 

@@ -147,6 +147,7 @@ with commit.locked(Path(sys.argv[1])):
 
 
 def test_one_dataset_has_one_writer(tmp_path: Path) -> None:
+    pytest.importorskip("filelock", reason="needs the dataset extra")
     other = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
