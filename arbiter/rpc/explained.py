@@ -6,11 +6,11 @@ from typing import Final
 
 from vram_arbiter.schemas.wire.codes import Block, RevokeCause, Wait
 from vram_arbiter.schemas.wire.explained import (
-    Action,
     Because,
     Blocker,
     Condition,
     Explanation,
+    NextAction,
     Return,
     Situation,
     Step,
@@ -254,26 +254,26 @@ def _away(told: Explanation) -> str:
 def _step(step: Step) -> str:
     when = ""
     if step.in_s is not None:
-        more = step.action is Action.DEADLINE
+        more = step.action is NextAction.DEADLINE
         when = f" for {step.in_s:.1f} s more" if more else f" in {step.in_s:.1f} s"
     return f"{_action(step)}{when}, {_because(step)}"
 
 
 def _action(step: Step) -> str:
-    if step.action is Action.WAIT:
+    if step.action is NextAction.WAIT:
         return {
             Because.NO_VICTIM: "asks no holder",
             Because.NOT_BACK: f"gives {step.consumer} up",
         }.get(step.because, f"waits for {step.consumer} to let go")
     return {
-        Action.ASK: f"asks {step.consumer}",
-        Action.LOADED: f"lets {step.consumer} finish loading",
-        Action.READ: "reads the GPU again",
-        Action.MEASURE: f"measures {step.consumer}'s bytes again",
-        Action.DEADLINE: f"waits for {step.consumer} to let go",
-        Action.SERVE: "grants again",
-        Action.BREAK: f"gives gang {step.gang} up",
-        Action.GIVE_UP: "gives up",
+        NextAction.ASK: f"asks {step.consumer}",
+        NextAction.LOADED: f"lets {step.consumer} finish loading",
+        NextAction.READ: "reads the GPU again",
+        NextAction.MEASURE: f"measures {step.consumer}'s bytes again",
+        NextAction.DEADLINE: f"waits for {step.consumer} to let go",
+        NextAction.SERVE: "grants again",
+        NextAction.BREAK: f"gives gang {step.gang} up",
+        NextAction.GIVE_UP: "gives up",
     }[step.action]
 
 

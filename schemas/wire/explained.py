@@ -58,7 +58,7 @@ class Blocker:
     text: str = ""
 
 
-class Action(StrEnum):
+class NextAction(StrEnum):
     """What the arbiter does next."""
 
     ASK = "ask"  # revoke a holder
@@ -101,7 +101,7 @@ class Because(StrEnum):
 class Step:
     """What the arbiter does next for a waiter. `in_s` None: no instant is planned."""
 
-    action: Action
+    action: NextAction
     consumer: str
     lease_id: str | None
     in_s: float | None

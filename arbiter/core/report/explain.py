@@ -21,9 +21,9 @@ from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.explained import (
-    Action,
     Blocker,
     Explanation,
+    NextAction,
     Situation,
     Step,
     WhyReply,
@@ -308,7 +308,7 @@ def _eta_of_plan(core: Core, standing: Standing, plan: Sequence[Step]) -> float 
     load = _load_s(core, standing)
     ends: list[float] = []
     for step in plan:
-        if step.action is Action.ASK:
+        if step.action is NextAction.ASK:
             phases = [
                 core.learnt_s(step.consumer, phase) for phase in ("drain_s", "unload_s", "verify_s")
             ]

@@ -11,7 +11,7 @@ from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core, Gpu
 from vram_arbiter.arbiter.core.report.standing import Standing
 from vram_arbiter.arbiter.core.scheduling import admission, placement, victims
-from vram_arbiter.schemas.wire.explained import Action, Because, Step
+from vram_arbiter.schemas.wire.explained import Because, NextAction, Step
 
 LOOKED_AT_MAX = 16
 """Number of future eviction times to examine."""
@@ -30,7 +30,7 @@ def steps(core: Core, standing: Standing, waiter: Lease) -> list[Step]:
         found = _of_head(core, gpu, standing.request) if mine else []
     if waiter.request.wait_timeout_s is not None:
         at = waiter.request.arrived_at + waiter.request.wait_timeout_s
-        found.append(_step(core, Action.GIVE_UP, waiter, at, Because.TIMEOUT))
+        found.append(_step(core, NextAction.GIVE_UP, waiter, at, Because.TIMEOUT))
     return sorted(found, key=lambda step: inf if step.in_s is None else step.in_s)
 
 
@@ -44,19 +44,19 @@ def _of_unqueued(core: Core, gpu: Gpu, standing: Standing, waiter: Lease) -> lis
     if standing.gives_up is not None:
         at, because = standing.gives_up
         gang = "" if standing.gang is None else standing.gang.id
-        found.append(_step(core, Action.BREAK, None, at, because, gang=gang))
+        found.append(_step(core, NextAction.BREAK, None, at, because, gang=gang))
     return found
 
 
 def _load_ends(core: Core, lease: Lease) -> Step:
-    return _step(core, Action.LOADED, lease, _learnt_end(core, lease), Because.ONE_LOAD)
+    return _step(core, NextAction.LOADED, lease, _learnt_end(core, lease), Because.ONE_LOAD)
 
 
 def _of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     if core.recovering is not None:
         ends = [core.leases[lease].expires_at for lease in core.recovering if lease in core.leases]
         at = max(ends, default=None)
-        return [_step(core, Action.SERVE, None, at, Because.ACCOUNTED)]
+        return [_step(core, NextAction.SERVE, None, at, Because.ACCOUNTED)]
     if gpu.failed_at is not None or gpu.sample is None:
         return [_next_reading(core, gpu, Because.UNREADABLE)]
     found = [_load_ends(core, lease) for lease in gpu.in_state(LeaseState.LOADING)]
@@ -79,13 +79,13 @@ def _asking(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
         chosen = victims.choose_victims(core, gpu, waiter, going, at)
         if chosen is not None:
             return [
-                _step(core, Action.ASK, victim, at, _because(core, waiter, victim, at))
+                _step(core, NextAction.ASK, victim, at, _because(core, waiter, victim, at))
                 for victim in chosen
             ]
     if missing := [lease for lease in gpu.in_state(LeaseState.HELD) if not lease.attached]:
         last = max(missing, key=lambda lease: lease.expires_at)
-        return [_step(core, Action.WAIT, last, last.expires_at, Because.NOT_BACK)]
-    return [_step(core, Action.WAIT, None, None, Because.NO_VICTIM)]
+        return [_step(core, NextAction.WAIT, last, last.expires_at, Because.NOT_BACK)]
+    return [_step(core, NextAction.WAIT, None, None, Because.NO_VICTIM)]
 
 
 def _because(core: Core, waiter: Lease, victim: Lease, at: float) -> Because:
@@ -102,22 +102,22 @@ def _leaving(core: Core, gpu: Gpu, waiter: Lease, holder: Lease) -> Step:
         latest = max(0.0, verification.deadline_at - core.now)
         because = Because.VERDICT if latest else Because.MEASURED_GONE
         at = verification.next_poll_at
-        return _step(core, Action.MEASURE, holder, at, because, latest_s=latest or None)
+        return _step(core, NextAction.MEASURE, holder, at, because, latest_s=latest or None)
     eviction = holder.departure.eviction
     if eviction is None or eviction.overdue:
         because = Because.HANGING if holder.departure.hangs else Because.LEAVING
-        return _step(core, Action.WAIT, holder, None, because)
+        return _step(core, NextAction.WAIT, holder, None, because)
     unloads = holder.state is LeaseState.UNLOADING
     began_at = holder.since if unloads else eviction.asked_at
     at = began_at + core.settings.revoke_deadline_s
     because = Because.DENIED if waiter.spec.deny_on_deadline else Because.WAITS_ON
-    return _step(core, Action.DEADLINE, holder, at, because, waiter=waiter.spec.consumer)
+    return _step(core, NextAction.DEADLINE, holder, at, because, waiter=waiter.spec.consumer)
 
 
 def _next_reading(core: Core, gpu: Gpu, because: Because) -> Step:
     times = [core.timers.due((kind, gpu.info.id)) for kind in ("verify", "probe")]
     at = min((time for time in times if time is not None), default=None)
-    return _step(core, Action.READ, None, at, because)
+    return _step(core, NextAction.READ, None, at, because)
 
 
 def _learnt_end(core: Core, lease: Lease) -> float | None:
@@ -127,7 +127,7 @@ def _learnt_end(core: Core, lease: Lease) -> float | None:
 
 def _step(
     core: Core,
-    action: Action,
+    action: NextAction,
     lease: Lease | None,
     at: float | None,
     because: Because,
