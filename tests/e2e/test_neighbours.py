@@ -181,7 +181,7 @@ def test_1_while_the_card_cannot_be_read_no_figure_of_it_is_printed(stage: Stage
     assert "free" not in shown
     waiter = stage.spawn("waiter-1", 1)
     stage.event("queued", consumer="waiter-1")
-    assert "the card cannot be read" in stage.vramctl("why", "waiter-1")
+    assert "the GPU cannot be read" in stage.vramctl("why", "waiter-1")
     stage.configure(faults=fakegpu.Faults())
     waiter.until("ready")
 
