@@ -10,7 +10,7 @@ same effects.
      restart, a resume from suspend
      1.4 time: every timer that is due
   2. recovery ends when everybody is accounted for
-  3. waits that could never end are denied; who gets a card next (its own numbered tree: `grants`),
+  3. waits that could never end are denied; GPUs are granted (its own numbered tree: `grants`),
      and the answer to an acquire that has to wait
   4. background readings
   5. invariants

@@ -115,7 +115,7 @@ class UseEnded:
 
 @dataclass(frozen=True, slots=True)
 class UseYielded:
-    """A use pauses: until it is begun again it keeps nobody from being evicted."""
+    """A use pauses: until it is begun again it prevents no eviction."""
 
     client: ClientId
     request: RequestId
@@ -224,8 +224,10 @@ class OomReported:
 
 @dataclass(frozen=True, slots=True)
 class OperatorAsked:
-    """Somebody whose role allows it wants something done by hand. `target` is a lease or a consumer
-    ("" for drain and resume)."""
+    """An operator wants something done by hand.
+
+    `target` is a lease or a consumer ("" for drain and resume).
+    """
 
     client: ClientId
     request: RequestId

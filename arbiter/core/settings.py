@@ -55,7 +55,7 @@ class Settings:
     """Secret hexadecimal digits that keep tokens from being guessed. "": the next number
     each time."""
     host_ram_budget_bytes: int = 0
-    """Host RAM for the weights of parked leases; 0: nobody parks."""
+    """Host RAM for the weights of parked leases; 0: no parking."""
     policy: str = DEFAULT
     """A name of `core.scheduling.SCHEDULING`."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)

@@ -121,8 +121,10 @@ def ask_again(core: Core, holder: Lease) -> None:
 
 
 def on_ladder_due(core: Core, lease_id: str) -> None:
-    """A step of the ladder. Who has begun to unload is asked nothing more, and has a whole deadline
-    for it."""
+    """Take a step of the ladder.
+
+    A holder that unloads is asked nothing more, and has a whole deadline for it.
+    """
     holder = core.leases[LeaseId(lease_id)]
     eviction = holder.departure.eviction
     if holder.state is LeaseState.UNLOADING:

@@ -1,5 +1,5 @@
 """What leaving and coming back costs, learnt: seconds to reload, how likely that is to be wanted,
-and who keeps switching with whom.
+and which consumers keep switching.
 
 Only ever orders victims that are otherwise alike, and stretches a residency within a cap: nothing
 learnt can make a wait endless.
@@ -9,7 +9,7 @@ from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Core, Reuse
 
 REUSE_WITHIN_S = 60.0
-"""Who is wanted again so soon after it left should rather have stayed."""
+"""A consumer that is wanted again this soon after it left should rather have stayed."""
 
 
 def left(core: Core, consumer: str) -> None:

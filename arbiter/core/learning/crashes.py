@@ -1,10 +1,9 @@
 """Models that die in their load, again and again, do not throw others out for every try.
 
-Whoever supervises a program starts it again at once, and each start would empty the card for a load
-that fails. After a few failures in a row an acquire for which somebody would have to leave is
-refused for a while, twice as long after each, with the cause of the last one. What fits as the card
-is costs nobody anything and is granted as ever. One load that succeeds forgets it all; so does a
-restart.
+A supervisor starts a program again at once, and each start would empty the card for a load that
+fails. After a few failures in a row an acquire that needs an eviction is refused for a while, twice
+as long after each, with the cause of the last one. What fits as the card is costs nothing and is
+granted as ever. One load that succeeds forgets it all; so does a restart.
 """
 
 from typing import Final
@@ -43,7 +42,7 @@ def succeeded(core: Core, lease: Lease) -> None:
 
 
 def check(core: Core, spec: LeaseSpec, load_peak_bytes: int, gpus: tuple[GpuId, ...]) -> None:
-    """Refuses an acquire that would make somebody leave for one more try. Raises Refused."""
+    """Refuse an acquire that would need an eviction for one more try. Raises Refused."""
     seen = core.crashes.get(model_name(spec))
     if seen is None or (wait_s := seen.last_at + _pause_s(seen) - core.now) <= 0:
         return

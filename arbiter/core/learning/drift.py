@@ -1,5 +1,5 @@
-"""What leases really take, learnt from readings and from their holders' words, and who drifts from
-what it declared.
+"""What leases really take, learned from readings and from their holders' words, and which drift
+from what it declared.
 
 While a lease loads, its card is read often (`load_probe_s`), so that the peak between two readings
 is short; a sampled peak is a lower bound all the same, so only one *above* the declared is drift.
@@ -108,13 +108,13 @@ def _size_changes(core: Core, lease: Lease) -> bool:
 
 
 def held_bytes(gpu: Gpu, lease: Lease) -> int:
-    """The newest reading, else the holder's own word; 0: nobody can say."""
+    """The newest reading, else the holder's own word; 0: unknown."""
     return measured_bytes(gpu, lease) or lease.observed.reported_bytes or 0
 
 
 def drift_bytes(core: Core, gpu: Gpu, lease: Lease) -> int:
     """How far a resident lease is above (below: negative) what it declared; within the tolerance it
-    is 0, as where nobody can say."""
+    is 0, as where it is unknown."""
     if lease.state not in _RESIDENT or _size_changes(core, lease):
         return 0
     drift = (held_bytes(gpu, lease) or lease.spec.steady_bytes) - lease.spec.steady_bytes

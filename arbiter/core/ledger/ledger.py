@@ -1,7 +1,7 @@
-"""The bytes of one card: who is charged what, what processes keep, what strangers hold.
+"""The bytes of one GPU: charges, what processes retain, what stowaways hold.
 
 Ledger and measurement are two gates. Booked bytes are what was granted; evidence (per-process
-readings) is only added on top where somebody holds more than was booked. Knows nothing of states,
+readings) is only added on top where a process holds more than was booked. Knows nothing of states,
 order or time beyond `now`.
 
 One process shares one context among its leases, so an account counts max(its charges together, its
@@ -84,11 +84,9 @@ class GpuLedger:
         self.budget_bytes = info.capacity_bytes - info.reserve_bytes
         self.accounts: dict[ProcessKey, Account] = {}
         self.strangers: dict[ProcessKey, Stranger] = {}
-        self.unnamed_bytes = 0  # used, but in nobody's list, beyond the fixed reserve
+        self.unnamed_bytes = 0  # used, but in no process's list, beyond the fixed reserve
         self.overhead_bytes: int | None = None  # the driver's own; None: never seen
-        self.reserved: set[LeaseId] = (
-            set()
-        )  # charged for who is not granted yet: nobody holds these bytes
+        self.reserved: set[LeaseId] = set()  # charged for requests that are not granted yet
         self.touched: set[LeaseId] = (
             set()
         )  # charged or dropped since the invariants were checked last
@@ -126,7 +124,7 @@ class GpuLedger:
         return over if over > self._tolerance_bytes else 0
 
     def driver_bytes(self) -> int:
-        """What a reading may show that nobody is charged: the driver's own bytes, or the whole
+        """What a reading may show that is not charged: the driver's own bytes, or the whole
         reserve while those were never seen."""
         return self.info.reserve_bytes if self.overhead_bytes is None else self.overhead_bytes
 
@@ -292,7 +290,7 @@ class GpuLedger:
         approved_bytes: int,
         now: float,
     ) -> None:
-        """Book a grant (or, after a restart, what somebody says he holds)."""
+        """Book a grant (or, after a restart, what a holder reports)."""
         self.reserved.discard(lease)
         account = self._open(process, now)
         self._charge(account, lease, Charge(booked_bytes, approved_bytes))
@@ -301,7 +299,9 @@ class GpuLedger:
         self._changed(account, now)
 
     def reserve(self, lease: LeaseId, process: ProcessKey, count: int, now: float) -> None:
-        """Book bytes for who is granted later; `charge` makes it a grant, `withdraw` ends it."""
+        """Book bytes for a request that is granted later; `charge` makes it a grant, `withdraw`
+        ends it.
+        """
         self.charge(lease, process, count, count, now)
         self.reserved.add(lease)
 
@@ -349,7 +349,7 @@ class GpuLedger:
         return account.residue_bytes
 
     def withdraw(self, lease: LeaseId, now: float) -> None:
-        """Take a charge back that was never filled, or a grant that nobody has heard of: the
+        """Take a charge back that was never filled, or a grant that was never sent: the
         account is as it was before."""
         self.reserved.discard(lease)
         account = self.accounts[self._owner.pop(lease)]
@@ -425,7 +425,7 @@ class GpuLedger:
         return account
 
     def _take_rest(self, rest_bytes: int, pending_bytes: int, *, complete: bool) -> None:
-        """What nobody explains: the driver's own up to the reserve, somebody's beyond it. What may
+        """Unattributed bytes: the driver's own up to the reserve, a process's beyond it. What may
         be going is neither, if it is new."""
         reserve = self.info.reserve_bytes
         stays_bytes = max(0, rest_bytes - pending_bytes)

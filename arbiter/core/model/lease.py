@@ -66,8 +66,9 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 
 LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
 AWAY = frozenset({_S.PARKED, _S.STANDBY})
-"""States of a lease that lives on without bytes on a card: nobody renews it, it waits for nothing
-with a bound."""
+"""States of a lease that lives on without bytes on a GPU: it needs no renewal, and waits for
+nothing with a bound.
+"""
 EXPIRING = frozenset({_S.LOADING, _S.HELD, _S.REVOKING, _S.UNLOADING})
 """States that a holder must renew."""
 NONCES_MAX = 8
@@ -104,7 +105,7 @@ class Eviction:
     lease: LeaseId
     consumer: str
     charge_bytes: int
-    wanted_by: LeaseId | None  # None: nobody waits, the card is under pressure
+    wanted_by: LeaseId | None  # None: the GPU is under pressure
     wanted_consumer: str
     cause: Cause
     asked_at: float
@@ -120,7 +121,7 @@ class Eviction:
     verdict: str = ""
     gang: str = ""  # of the waiter
     order: Order | None = None  # an operator wanted it
-    # of whoever waits: goes with every `revoke`, so that the unloading is seen where it is waited
+    # of the waiter: goes with every `revoke`, so that the unloading is seen where it is waited
     # for
     traceparent: str | None = None
 

@@ -105,7 +105,7 @@ LEFT_KEPT = 64  # more verdicts than can fall between a baseline and its own
 
 @dataclass(slots=True)
 class Gpu:
-    """One card: its ledger, who is on it, who waits for it, what was measured."""
+    """One GPU: its ledger, residents, queue and readings."""
 
     info: GpuInfo
     ledger: GpuLedger
@@ -134,12 +134,12 @@ class Gpu:
         return self.residents.in_state(*states)
 
     def sees_loads(self) -> bool:
-        """Somebody loads, and readings can tell how much it takes."""
+        """Whether a lease loads, and readings can tell how much it takes."""
         listed = self.sample is not None and self.sample.lists_processes
         return listed and self.residents.any_in(_LOADING)
 
     def quiet(self) -> bool:
-        """Nobody loads or unloads: an unexplained rest in a reading means something."""
+        """Whether no lease loads or unloads, so that unattributed bytes mean something."""
         return not self.verifications and not self.residents.any_in(_MOVING)
 
 
@@ -194,7 +194,8 @@ class Core:
         self.refusals: dict[ProcessKey, Refusals] = {}  # the latest last
         self.reuse: dict[str, Reuse] = {}  # by consumer
         self.crashes: dict[str, Failures] = {}  # by model, the latest last
-        self.switches: dict[tuple[str, str], float] = {}  # (who left, for whom) → when last
+        # (consumer that left, consumer it left for) → when last
+        self.switches: dict[tuple[str, str], float] = {}
         self.durations: dict[str, dict[str, deque[float]]] = {}
         for consumer, medians in sorted(settings.learnt.items()):
             for phase, seconds in sorted(medians.items()):
@@ -545,7 +546,7 @@ class Core:
         )
 
     def active(self, gpu: Gpu) -> bool:
-        """Is anybody interested in this card?"""
+        """Whether a client, a lease or a waiter concerns this GPU."""
         return bool(
             self.clients
             or gpu.residents

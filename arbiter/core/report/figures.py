@@ -1,4 +1,4 @@
-"""The present in numbers, for telemetry: who waits, and what every card holds. Reads only, no
+"""The present in numbers, for telemetry: waiters, and what every GPU holds. Reads only, no
 words; O(residents and processes)."""
 
 from typing import Any

@@ -1,5 +1,5 @@
-"""Leases that end without their holder's word: nobody renewed them, their process died, an operator
-gave them up.
+"""Leases that end without their holder's word: they were not renewed, their process died, an
+operator gave them up.
 
 What they hold becomes a debt and is measured away (`measure`).
 """
@@ -15,7 +15,7 @@ from vram_arbiter.schemas.wire.pushes import LostPush
 
 
 def on_expiry_due(core: Core, lease_id: str) -> None:
-    """A holder did not renew (who has let go has no such timer)."""
+    """A holder did not renew (a released lease has no such timer)."""
     lease = core.leases[LeaseId(lease_id)]
     expire(core, lease)
 
@@ -43,7 +43,7 @@ def expire(core: Core, lease: Lease, order: Order | None = None) -> None:
             0.0, fenced_at - core.now
         )  # what is so small no reading can tell from nothing
     if core.recovering is not None:
-        # its bytes stay charged: nobody who fits beside them has to wait for the verdict
+        # its bytes stay charged: a request that fits beside them need not wait for the verdict
         core.recovering.discard(lease.id)
     lose(core, lease, LeaseState.EXPIRED, refusal, alive=True, grace_s=grace_s, fenced_at=fenced_at)
 

@@ -2,8 +2,9 @@
 dead holder.
 
 Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does,
-and a lease in use is never given up. Every action is a note that says who and why; a pin and a
-drain are journalled, so they outlive the daemon. The role was checked where the request came in.
+and a lease in use is never given up. Every action is a note with the operator and the reason; a pin
+and a drain are journalled, so they outlive the daemon. The role was checked where the request came
+in.
 """
 
 from collections.abc import Mapping
@@ -107,7 +108,7 @@ def _dismiss(core: Core, lease: Lease, order: Order) -> None:
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:
-    """Nobody makes this lease leave until it is unpinned. A waiter may be pinned too: it holds from
+    """Protect a lease from eviction until it is unpinned. A waiter may be pinned too: it holds from
     its grant on."""
     if lease.state in LEAVING:
         raise _impractical(lease, Impractical.LEAVING)
@@ -162,7 +163,7 @@ def restore_drain(core: Core, record: Mapping[str, Any]) -> None:
 
 
 def drained(core: Core) -> str:
-    """Who drained the arbiter and why; "" while it grants."""
+    """Return the operator that drained the arbiter and the reason; "" while it grants."""
     return "" if core.drain is None else str(core.drain)
 
 

@@ -1,4 +1,4 @@
-"""After a restart of the daemon alone: the journal says who held what, the holders come back or do
+"""After a restart of the daemon alone: the journal names the holders, and they reattach or do
 not.
 
 Until every recovered lease is accounted for (re-attached, given up, its process dead, or the card
@@ -83,7 +83,7 @@ def on_recovered(core: Core, event: Recovered) -> None:
             gpu.ledger.set_residue(process, residue_bytes, core.now, floor_bytes)
             if (
                 not residue_bytes
-            ):  # stale leases fill the card: nobody would ever take the record out
+            ):  # stale leases fill the GPU: nothing else would take the record out
                 core.forget(key)
         else:
             _restore(core, gpu, record)
@@ -102,8 +102,9 @@ def await_unnamed(core: Core) -> None:
 
 
 def _restore_away(core: Core, record: Mapping[str, Any]) -> None:
-    """A lease that is away holds nothing on a card: nobody waits for its holder, but it does not
-    come back before him either."""
+    """A lease that is away holds nothing on a GPU: recovery does not wait for its holder, but it
+    does not come back before it either.
+    """
     lease = _remembered(core, record, LeaseState(str(record["state"])))
     lease.request.gpus = tuple(gpu.info.id for gpu in placement.selected(core, lease.spec))
     if not lease.request.gpus:  # the only card that it may come back to is gone
@@ -263,7 +264,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
     core.hand_to(lease, client.id)
     if not lease.attached:
         lease.attached = True
-        # its residency begins anew: who marked uses on it may still be on the way back
+        # its residency begins anew: clients that marked uses on it may still be reconnecting
         lease.ready_at = core.now
         if lease.gpu is not None:
             core.gpu_of(lease).residents.recent[lease.id] = lease
@@ -293,7 +294,7 @@ def _journal_is_behind(core: Core, lease: Lease, client: Client, item: Reattache
 
 
 def _missed_its_grant(lease: Lease, client: Client, item: ReattachedLease) -> bool:
-    """It came back from standby while its holder was not connected, who knows the token before."""
+    """It came back from standby while its holder, which knows the token before, was away."""
     return (
         item.away
         and lease.state is LeaseState.LOADING
@@ -398,7 +399,7 @@ def on_recover_due(core: Core, subject: str) -> None:
 
 
 def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
-    """The card is read as good as empty: nobody has to be waited for there.
+    """The card is read as good as empty: no holder has to be waited for there.
 
     The holders that have not come back live, and they alone can say that a lease is over, or their
     time: a model may sleep in host RAM, and a reading may lie. Their bytes stay charged, and nobody

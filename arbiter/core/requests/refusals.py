@@ -16,7 +16,7 @@ PROCESSES_REMEMBERED = 1024
 
 
 def note(core: Core, event: AcquireRequested | Reacquired | ResizeAsked, refusal: Refusal) -> None:
-    """Say that a request was refused, by whom it was asked and why."""
+    """Note that a request was refused, its client and why."""
     client = core.clients.get(event.client)
     if client is None:
         return  # it has not said hello

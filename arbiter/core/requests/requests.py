@@ -1,8 +1,8 @@
 """What clients ask for, one function a request. Each checks everything first (raising Refused) and
 then changes things.
 
-Who may: leases belong to a process, so a request on a lease must come from a client of that
-process. Uses (`uses`) are open to anyone who knows the exact token.
+Permission: leases belong to a process, so a request on a lease must come from a client of that
+process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
 from dataclasses import replace
@@ -48,7 +48,7 @@ from vram_arbiter.schemas.wire.replies import (
 )
 
 
-# -- who and which
+# -- clients and leases
 def client_of(core: Core, client: ClientId) -> Client:
     known = core.clients.get(client)
     if known is None:
@@ -170,7 +170,7 @@ def new_lease(
 
 
 def answer_queued(core: Core) -> None:
-    """After the scheduling: whoever was not granted at once is told that it waits, and why."""
+    """After the scheduling: a request that was not granted at once is told that it waits, and why."""
     for lease in core.turn.unanswered:
         if (
             lease.state is LeaseState.QUEUED
@@ -332,7 +332,7 @@ def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
 
 
 def unloading(core: Core, event: UnloadStarted) -> None:
-    """The holder is at its safe point and unloads. Refused while anybody uses the lease: this is
+    """The holder is at its safe point and unloads. Refused while the lease is in use: this is
     the safe-point rule."""
     lease = own_lease(core, event.client, event.lease, event.token)
     if lease.state is LeaseState.UNLOADING:  # a repeat

@@ -46,7 +46,7 @@ def on_connected(core: Core, event: ClientConnected) -> None:
 
 
 def _take_over(core: Core, earlier: ClientId, client: ClientId) -> None:
-    """However often somebody reconnects, only its newest connection is remembered."""
+    """However often a client reconnects, only its newest connection is remembered."""
     core.part(earlier)
     mine = core.leases_of_client(earlier)
     for lease in _concerned(core, mine):
@@ -98,7 +98,7 @@ def concerns(core: Core, client: ClientId) -> bool:
 
 
 def _concerned(core: Core, own: list[Lease]) -> list[Lease]:
-    """Somebody's own leases, and all that are in use, perhaps by him, in the order of their
+    """A process's own leases, and all that are in use, perhaps by it, in the order of their
     arrival."""
     used = (
         lease
@@ -162,7 +162,7 @@ def on_journal_failed(core: Core, event: JournalFailed) -> None:
     core.forget(event.key)
     refusal = no.NotJournaled(lease.id, event.key, event.reason)
     core.move(lease, LeaseState.DENIED, refusal.code)
-    if lease.request.id is None:  # else: whoever held the reply back has refused the request
+    if lease.request.id is None:  # else: the session that held the reply back refused it
         core.push(lease, DeniedPush(lease.id, refusal.view()))
     core.note("denied", lease, code=refusal.code, refusal=refusal)
     core.end(lease, refusal)

@@ -1,13 +1,13 @@
-"""Uses: busy intervals on a lease, marked by anyone who knows its exact token (that is how a runner
-marks a goal on its policy sidecar's lease). A lease in use is not at its safe point.
+"""Uses: busy intervals on a lease, marked by any client that knows its exact token (that is how a
+runner marks a goal on its policy sidecar's lease). A lease in use is not at its safe point.
 
-A use that yields pauses: it stays known, but nobody waits for its end. Beginning it again resumes
-it, unless its holder was asked to leave meanwhile. Must not know why anybody is asked to leave
-(`eviction`).
+A use that yields pauses: it stays known, but no departure waits for its end. Beginning it again
+resumes it, unless its holder was asked to leave meanwhile. Must not know why a holder is asked to
+leave (`eviction`).
 
 What others than the holder mark outlives the daemon: the journal names one use of each such
-process, which is enough to know whom to wait for. It is written when a process begins to use a
-lease and when that use ends, not for what it does there at the same time.
+process, which is enough to know the processes to wait for. It is written when a process begins to
+use a lease and when that use ends, not for what it does there at the same time.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ FROM_JOURNAL: Final = ClientId("")
 
 
 def begin(core: Core, event: UseBegan) -> None:
-    """Mark a use, or resume one that pauses. Nobody may once the holder was asked to leave."""
+    """Mark a use, or resume one that pauses. Refused once the holder was asked to leave."""
     client = client_of(core, event.client)
     lease = lease_for(core, event.lease, event.token)
     key = (client.process, event.use)
@@ -132,7 +132,7 @@ def _safe_point(core: Core, lease: Lease) -> None:
 # -- after a restart
 def restore(core: Core, lease: Lease, users: Sequence[Sequence[Any]]) -> None:
     """Others used a recovered lease. It stays in use until they say so again (`begin`), end it or
-    die; whoever is silent for as long as a holder may be is not waited for any longer."""
+    die; a process that is silent for as long as a holder may be is not waited for any longer."""
     for pid, start_ticks, use_id, label in users:
         process = ProcessKey(int(pid), int(start_ticks))
         core.mark(lease, Use(UseId(str(use_id)), FROM_JOURNAL, process, str(label), core.now))
@@ -147,7 +147,7 @@ def await_users(core: Core, lease: Lease) -> None:
 
 
 def on_users_due(core: Core, lease_id: str) -> None:
-    """Who has not come back to its use by now has it no more."""
+    """Forget uses of processes that have not come back by now."""
     lease = core.leases[LeaseId(lease_id)]
     for use in [use for use in lease.uses.values() if use.client == FROM_JOURNAL]:
         end_use(core, lease, use, Why.USER_NOT_BACK)

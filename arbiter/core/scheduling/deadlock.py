@@ -2,14 +2,15 @@
 is kept, in a circle, by that use.
 
 Found by reduction. Suppose that everything leaves which is not pinned and not in use by a process
-that waits; serve whoever fits then; its process waits no more, so its uses will end and their
-leases leave too; repeat. Who is left over waits for ever, and among them is a circle. Nothing is
-guessed: somebody in use who will merely be asked later (priorities, residencies), or bytes that
+that waits; serve the waiters that fit then; its process waits no more, so its uses will end and
+their leases leave too; repeat. The waiters left over wait for ever, and among them is a circle.
+Nothing is
+guessed: a lease in use that will merely be asked later (priorities, residencies), or bytes that
 others keep (pins, residues, stowaways), are a wait and no deadlock. A wait that the process does
 not depend on says so (`independent`).
 
 Looked for only when a process that uses something begins to wait, or one that waits begins to use
-something. Changes nothing but the wait of the newest in the circle, before anybody is asked to
+something. Changes nothing but the wait of the newest in the circle, before a holder is asked to
 leave for it.
 """
 
@@ -71,7 +72,7 @@ def _is_looked_at(waits: list[Lease]) -> bool:
 
 
 class _Reduction:
-    """Who could be served if everything left that can."""
+    """Return the waiters that could be served if every lease left that can."""
 
     def __init__(self, core: Core) -> None:
         self.core = core
@@ -136,14 +137,14 @@ class _Reduction:
     def _passes(
         self, gpu: Gpu, head: Lease, waiter: Lease, everything: Mapping[LeaseId, int]
     ) -> bool:
-        """May it be served while somebody before it cannot be? As `grants` backfills."""
+        """May it be served while a waiter before it cannot be? As `grants` backfills."""
         if head.spec.exclusive or not self.core.settings.scheduling.backfill:
             return False
         spare = backfill.spare_beside_bytes(gpu, head, everything)
         return admission.added_bytes(gpu, waiter) <= spare
 
     def _blocked(self) -> frozenset[ProcessKey]:
-        """Processes in the middle of a use that wait for somebody who is not served."""
+        """Return processes in a use that wait for a request that is not served."""
         return frozenset(process for process in self.waits if self._left_of(process))
 
     def _left_of(self, process: ProcessKey) -> list[Lease]:

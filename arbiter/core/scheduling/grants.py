@@ -1,17 +1,17 @@
-"""Who gets a card next: one pass over the cards that changed.
+"""Grants: one pass over the GPUs that changed.
 
 Per card, in this order (the numbers stand in `_serve`):
   1. under pressure: ask idle holders to leave, grant nothing
   2. a feature keeps the GPU for its own requests: it grants them (`Feature.blocks`, `serve`)
-  3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, ask nobody
+  3. blocked (recovering, drained, reading unknown, a load under way): grant and revoke nothing
   4. nothing waits, or a feature owns the head: served by features alone
   5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
      head for which another card is being emptied is passed over from here on
   6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out
      already
-  7. backfill: the first waiter behind the head that fits, evicts nobody and cannot delay the head;
-     behind one that waits for bytes nobody can be asked for (a stowaway's), only who fits beside it
-     on the day that they are gone, and may be asked itself
+  7. backfill: the first waiter behind the head that fits without an eviction and cannot delay the
+     head; behind one that waits for bytes that no revoke brings (a stowaway's), only what fits
+     beside it on the day that they are gone, and may be asked itself
 """
 
 from collections.abc import Mapping
@@ -177,8 +177,8 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
 
 
 def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Who left for this lease, or for a waiter that has gone since; the rest stays on the card's
-    list.
+    """Collect the leases that left for this one, or for a waiter that has gone since; the rest
+    stays on the card's list.
     """
     mine = [
         e

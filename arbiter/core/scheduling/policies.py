@@ -35,9 +35,9 @@ SCHEDULING: Mapping[str, Scheduling] = MappingProxyType(
             "priority with ageing, conservative backfill, cheapest covering victims"
         ),
         "fifo": Scheduling(
-            "strictly as they came, nobody passes anybody", by_priority=False, backfill=False
+            "strictly as they came, without backfill", by_priority=False, backfill=False
         ),
-        "no_backfill": Scheduling("default, but nobody passes the head", backfill=False),
+        "no_backfill": Scheduling("default, but without backfill", backfill=False),
         "lru": Scheduling(
             "default, but the least recently used leave, whatever they hold", least_recent=True
         ),
