@@ -140,7 +140,9 @@ def _charges(gpu: Gpu) -> None:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
     for lease in residents.in_state(LeaseState.VERIFYING):
         if lease.id not in gpu.verifications:
-            raise InvariantViolation(4, f"{lease.id} waits for a verdict that nobody works on")
+            raise InvariantViolation(
+                4, f"{lease.id} waits for a verdict, but no verification is under way"
+            )
 
 
 def _tokens(core: Core) -> None:
@@ -185,4 +187,4 @@ def _head(core: Core, gpu: Gpu) -> None:
     if head.request.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
         raise InvariantViolation(6, f"{head.id} has a bound and no timer")
     if ("probe", gpu.info.id) not in core.timers:
-        raise InvariantViolation(6, f"nobody will read {gpu.info.id} again, and {head.id} waits")
+        raise InvariantViolation(6, f"no reading of {gpu.info.id} is planned, and {head.id} waits")

@@ -27,7 +27,7 @@ _PLAIN = (str, int, float, bool, NoneType)
 
 
 class CodecError(ValueError):
-    """A value that was written by another version, or by nobody of us; the message says which
+    """A value that another version, or another program, wrote; the message says which
     field."""
 
 

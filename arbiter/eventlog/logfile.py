@@ -143,7 +143,7 @@ def find_files(place: Path) -> list[Path]:
 
 
 def read_file(path: Path) -> LogFile:
-    """Raises LogError for a file that is no log, is of another format, or is broken before its last
+    """Raises LogError for a file that is not a log, is of another format, or is broken before its last
     line."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")

@@ -99,7 +99,7 @@ def _reducer(cls: type) -> _Reduce:
 def to_plain(arbiter: Arbiter) -> dict[str, Any]:
     """`{"objects": […], "root": n}`.
 
-    Raises CodecError for a state that holds what is no data (a function, a file).
+    Raises CodecError for a state that holds more than data (a function, a file).
     """
     graph = _Graph()
     root = graph.value(arbiter)

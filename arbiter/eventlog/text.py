@@ -36,7 +36,7 @@ def notices(found: Replayed) -> list[str]:
         for path in found.torn
     ]
     if not found.events:
-        lines.append("note: there is no event in it, so nothing was compared")
+        lines.append("note: the log has no events, so nothing was compared")
     if found.gaps:
         lines.append(
             f"note: the recording was interrupted; "

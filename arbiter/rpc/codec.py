@@ -33,7 +33,7 @@ _validate = (
 
 
 class Undecodable(Exception):
-    """A frame that is no request: the typed error to answer with, and the id to answer to if one
+    """A frame that is not a request: the typed error to answer with, and the id to answer to if one
     could be read."""
 
     def __init__(self, error: VramError, request_id: int | None) -> None:

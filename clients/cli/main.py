@@ -83,11 +83,10 @@ def run_main(argv: Sequence[str]) -> int:
             else:
                 running.code = _parse_and_run(name, module, rest)
             return int(running.code)
-    except ConfigError as error:
-        terminal.complain("vramctl", error)
-        return USAGE
     except VramError as error:
         complain(error.to_wire(), as_json=as_json)
+        if isinstance(error, ConfigError):
+            return USAGE
         unreachable = isinstance(error, ArbiterUnreachable | UntrustedServer)
         return UNREACHABLE if unreachable else NO
 

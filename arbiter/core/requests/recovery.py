@@ -402,8 +402,8 @@ def account_for_the_empty(core: Core, sample: MemorySampled) -> None:
     """The card is read as good as empty: no holder has to be waited for there.
 
     The holders that have not come back live, and they alone can say that a lease is over, or their
-    time: a model may sleep in host RAM, and a reading may lie. Their bytes stay charged, and nobody
-    asks them to leave before they are heard of.
+    time: a model may sleep in host RAM, and a reading may lie. Their bytes stay charged, and they
+    are not revoked before they are heard of.
     """
     gpu = core.gpus.get(sample.gpu)
     if gpu is None or gpu.sample is not sample:

@@ -66,7 +66,7 @@ class PidMap:
         if pid not in self._told:
             self._told.add(pid)
             log.warning(
-                "pid_unmapped: host pid %d (%s) is no process of this namespace",
+                "pid_unmapped: host pid %d (%s) is not a process of this namespace",
                 pid,
                 name or "unseen",
             )

@@ -142,14 +142,14 @@ def half_a_gang(b: Broken) -> None:
         (2, two_loads, "load at once"),
         (3, unloads_in_use, "with 2 uses"),
         (4, resident_without_charge, "not charged"),
-        (4, verifying_without_verification, "nobody works on"),
+        (4, verifying_without_verification, "no verification is under way"),
         (4, charged_for_ever, "for ever"),
         (5, token_shrinks, "token 1.1 after"),
         (6, waiter_in_no_queue, "are in queues"),
         (6, queue_without_waiter, "is the head"),
         (6, bound_without_timer, "no timer"),
         (7, half_a_gang, "is gathering"),
-        (6, no_next_reading, "nobody will read"),
+        (6, no_next_reading, "is planned"),
     ],
 )
 @pytest.mark.parametrize("check", [invariants.check, invariants.check_all])

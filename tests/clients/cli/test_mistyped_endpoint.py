@@ -1,5 +1,6 @@
 """An endpoint in a folder that is not there: every program says so, and none makes the folder."""
 
+import json
 import os
 import subprocess
 import sys
@@ -39,3 +40,21 @@ def test_a_mistyped_endpoint_makes_no_folders(command: list[str], short_folder: 
     (line,) = done.stderr.splitlines()
     assert "/runn" in line
     assert list(short_folder.iterdir()) == []
+
+
+def test_an_unusable_endpoint_is_json_where_json_was_asked_for() -> None:
+    """A script that parses `--json` got a bare line on stderr for errors of configuration."""
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "vram_arbiter.clients", "history", "--follow", "--json"),
+            *("--endpoint", "tcp://192.0.2.1:5"),
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["error"]["code"] == "config_error"
+    assert done.stderr == ""
