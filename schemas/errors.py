@@ -4,9 +4,9 @@ The type says who must act: `CallerError` (the program that asked), `OperatorErr
 `TransientError` (wait or retry), `InternalError` (us).
 """
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.errors import ErrorView
 
 
@@ -19,19 +19,17 @@ class VramError(Exception):
 
     code: ClassVar[str] = "internal"
 
-    def __init__(
-        self, message: str, *, hint: str = "", details: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, message: str, *, hint: str = "", details: JsonMap | None = None) -> None:
         super().__init__(f"{message} ({hint})" if hint else message)
         self.message = message
         self.hint = hint
-        self.details: dict[str, Any] = dict(details or {})
+        self.details: Message = dict(details or {})
 
     def view(self) -> ErrorView:
         """The `error` of a reply."""
         return ErrorView(self.code, self.message, self.hint, self.details)
 
-    def to_wire(self) -> dict[str, Any]:
+    def to_wire(self) -> Message:
         """The `error` map of a reply."""
         return {
             "code": self.code,
@@ -272,7 +270,7 @@ CODES: dict[str, type[VramError]] = {cls.code: cls for cls in _leaves(VramError)
 """Wire code → type."""
 
 
-def from_wire(error: Mapping[str, Any]) -> VramError:
+def from_wire(error: JsonMap) -> VramError:
     """Rebuild the typed error of a reply; an unknown code (a newer server) becomes InternalError
     with the code kept."""
     cls = CODES.get(str(error.get("code")), InternalError)

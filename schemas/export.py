@@ -17,7 +17,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from vram_arbiter import schemas
 from vram_arbiter.schemas import wire
-from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.plain import JsonObject
 
 ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
@@ -32,7 +32,7 @@ _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 def documents() -> dict[str, str]:
     """File name → text of every JSON Schema, the same on every machine."""
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, JsonObject] = {}
     for name, place in ROOTS.items():
         module, _, attribute = place.partition(":")
         model: type[BaseModel] = getattr(importlib.import_module(module), attribute)
@@ -63,14 +63,15 @@ def modules() -> list[str]:
 
 
 def public_models(module: ModuleType) -> list[type]:
-    """The models, typed dicts and messages that a module defines and does not hide behind an
-    underscore, by name."""
+    """The models, typed dicts and messages that a module defines, by name; not those behind an
+    underscore, and not bases of others."""
     return [
         value
         for name, value in sorted(vars(module).items())
         if isinstance(value, type)
         and not name.startswith("_")
         and value.__module__ == module.__name__
+        and not value.__subclasses__()
         and (
             issubclass(value, BaseModel)
             or is_typeddict(value)
@@ -79,7 +80,7 @@ def public_models(module: ModuleType) -> list[type]:
     ]
 
 
-def _of_module(module: ModuleType) -> dict[str, Any]:
+def _of_module(module: ModuleType) -> JsonObject:
     mode: Literal["validation"] = "validation"
     inputs: list[tuple[str, Literal["validation"], TypeAdapter[Any]]] = [
         (model.__name__, mode, TypeAdapter(model)) for model in public_models(module)
@@ -89,24 +90,22 @@ def _of_module(module: ModuleType) -> dict[str, Any]:
     for (name, _), schema in found.items():
         if schema != {"$ref": f"#/$defs/{name}"}:
             defs[name] = schema
-    for model in (Token, *public_models(module)):
+    for model in public_models(module):
         if model.__name__ in defs:
             _as_sent(model, defs[model.__name__])
     return defs
 
 
-def _as_sent(model: Any, schema: dict[str, Any]) -> None:
+def _as_sent(model: Any, schema: JsonObject) -> None:
     """Describe what `schemas.codec` makes of a dataclass: a list of its fields, or a map with its
     kind."""
-    if getattr(model, "COMPACT", False):
-        schema.clear()
-        schema.update(
-            type="array",
-            prefixItems=[{"title": field.name, "type": "integer"} for field in fields(model)],
-            minItems=len(fields(model)),
-            maxItems=len(fields(model)),
-        )
-    elif tag := getattr(model, "TAG", None):
+    for field in fields(model) if is_dataclass(model) else ():
+        if part := field.metadata.get("part"):
+            del schema["properties"][field.name]
+            schema["properties"][part] = {"type": "string", "title": part.capitalize()}
+            required = [part if name == field.name else name for name in schema.get("required", ())]
+            schema["required"] = sorted(required)
+    if tag := getattr(model, "TAG", None):
         key, value = tag
         schema["properties"] = {key: {"const": value}, **schema.get("properties", {})}
         schema["required"] = sorted([key, *schema.get("required", ())])

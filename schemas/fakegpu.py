@@ -25,13 +25,14 @@ comes back `release_lag_s` late, also that of a dead process; what does not fit 
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Literal, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import ConfigError, OutOfMemory
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.units import ByteSize, format_bytes
 
 CARD_FILE = "gpu.json"
@@ -119,7 +120,7 @@ class ProcessFile(_Frozen):
     leaked_bytes: ByteSize = 0
     returning: tuple[Returning, ...] = ()
     died_at_s: float | None = None  # when its death was first noticed
-    last: dict[str, Any] | None = None  # its newest LogLine
+    last: JsonObject | None = None  # its newest LogLine
 
     @property
     def key(self) -> ProcessKey:
@@ -256,7 +257,7 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
     return Change(card, steps)
 
 
-def _last_line(log_tail: str) -> Mapping[str, Any]:
+def _last_line(log_tail: str) -> JsonMap:
     for text in reversed(log_tail.split("\n")[:-1]):  # what follows the last newline is torn
         try:
             line = json.loads(text)
@@ -267,7 +268,7 @@ def _last_line(log_tail: str) -> Mapping[str, Any]:
     return {}
 
 
-def _dump(line: Mapping[str, Any]) -> str:
+def _dump(line: JsonMap) -> str:
     return json.dumps(line, separators=(",", ":")) + "\n"
 
 

@@ -6,12 +6,13 @@ Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": 
 `schemas.estop`.
 """
 
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Literal, NotRequired, TypedDict
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, TypeAdapter
 
+from vram_arbiter.schemas.limits import Name, Seconds
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
-from vram_arbiter.schemas.wire.requests import Name, Seconds
 
 
 class _Call(BaseModel):
@@ -29,7 +30,7 @@ class SendGoal(_Call):
     rskill_id: Name
     revision: str = ""
     prompt: Annotated[str, Field(max_length=2000)] = ""
-    goal_params: dict[str, Any] = Field(default_factory=dict)
+    goal_params: dict[str, JsonValue] = Field(default_factory=dict)
     deadline_s: Seconds = 0.0
     max_ticks: Annotated[int, Field(gt=0)] | None = (
         None  # of motion; then it has failed with `limit_exceeded`
@@ -105,9 +106,8 @@ class FrameReply(TypedDict):
     height: int
     stamp_monotonic_ns: int
     age_ms: float
-    camera_model: NotRequired[
-        dict[str, Any]
-    ]  # schemas.world.CameraModel: K, T_base_camera, support_plane_z
+    camera_model: NotRequired[Message]
+    """`schemas.world.CameraModel`: K, T_base_camera, support_plane_z."""
 
 
 class FeedbackPush(TypedDict):
@@ -126,4 +126,4 @@ class ResultPush(TypedDict):
     success: bool
     code: str  # "" or a code of schemas.errors
     message: str
-    data: dict[str, Any]
+    data: dict[str, JsonValue]

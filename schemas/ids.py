@@ -4,8 +4,7 @@ Standard library only: this is the one schema module that the sans-IO core may i
 `schemas.defaults`.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar, NewType, Self
+from typing import NamedTuple, NewType, Self
 
 LeaseId = NewType("LeaseId", str)
 """Names one lease for ever, e.g. `L3-17` (epoch 3, serial 17)."""
@@ -23,15 +22,12 @@ RequestId = NewType("RequestId", int)
 """Counts the requests of one connection; replies repeat it."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Token:
+class Token(NamedTuple):
     """Fencing token. Strictly increasing over all grants, also across restarts of the daemon.
 
     `epoch` counts starts of the daemon, `serial` counts grants within an epoch.
     Its plain form is `[epoch, serial]` (`schemas.codec`).
     """
-
-    COMPACT: ClassVar = True
 
     epoch: int
     serial: int
@@ -48,33 +44,15 @@ class Token:
         return cls(int(epoch), int(serial))
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class ProcessKey:
-    """One process for ever: a pid alone is reused, a pid with its start time is not.
+class ProcessKey(NamedTuple):
+    """One process forever: a pid alone is reused, a pid with its start time is not.
 
-    `start_ticks` is field 22 of /proc/PID/stat (clock ticks since boot).
+    `start_ticks` is field 22 of /proc/PID/stat (clock ticks since boot). A tuple, because tables
+    are keyed by processes everywhere.
     """
-
-    COMPACT: ClassVar = True
 
     pid: int
     start_ticks: int
 
-    def __hash__(self) -> int:
-        return (
-            self.pid
-        )  # tables are keyed by processes everywhere; hashing both fields costs four times as much
-
     def __str__(self) -> str:
         return f"{self.pid}@{self.start_ticks}"
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class ModelKey:
-    """What a lease is for: the same key can be reused without a reload."""
-
-    model_id: str
-    revision: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.model_id}@{self.revision}" if self.revision else self.model_id

@@ -20,12 +20,14 @@ that a caller can mark a use of its own on it at the arbiter: a goal that spans 
 calls is one use.
 """
 
-from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
+from typing import Annotated, Literal, NotRequired, Self, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
+from vram_arbiter.schemas.limits import Seconds
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
-from vram_arbiter.schemas.wire.requests import Seconds, TokenPair
+from vram_arbiter.schemas.wire.requests import TokenPair
 
 ImageBytes = Annotated[bytes, Field(min_length=8, max_length=16 * 1024 * 1024)]
 Question = Annotated[str, Field(min_length=1, max_length=2000)]
@@ -132,7 +134,7 @@ OP_REQUEST: TypeAdapter[OpRequest] = TypeAdapter(OpRequest)
 
 class EndpointCall(_Call):
     endpoint: Literal["ping", "load", "reset", "get_action", "unload", "shutdown"]
-    data: dict[str, Any] | None = None
+    data: Message | None = None
     api_token: str | None = None  # of the field's wire; not used on ipc
 
 

@@ -10,6 +10,8 @@ import json
 import math
 from typing import Any, NoReturn
 
+from vram_arbiter.schemas.plain import JsonObject
+
 DEPTH_MAX = 64
 TEXT_MAX_CHARS = 65_536
 
@@ -61,7 +63,7 @@ def _finite(text: str) -> float:
     return number
 
 
-def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _no_key_twice(pairs: list[tuple[str, Any]]) -> JsonObject:
     found = dict(pairs)
     if len(found) != len(pairs):
         names = [name for name, _ in pairs]

@@ -14,13 +14,14 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, TypedDict
 
 from pydantic import (
     AliasChoices,
     BaseModel,
     ConfigDict,
     Field,
+    JsonValue,
     TypeAdapter,
     ValidationError,
     field_validator,
@@ -28,6 +29,7 @@ from pydantic import (
 
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.errors import BadRequest, UnknownOp
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 PROGRESS_WINDOW_MAX_S = 60.0
 TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
@@ -99,9 +101,11 @@ class ExecuteRskill(_Tool):
         return text
 
     @property
-    def goal_params(self) -> dict[str, Any]:
+    def goal_params(self) -> dict[str, JsonValue]:
         """The structured parameters as a dict; empty if none were given."""
-        params: dict[str, Any] = json.loads(self.goal_params_json) if self.goal_params_json else {}
+        params: dict[str, JsonValue] = (
+            json.loads(self.goal_params_json) if self.goal_params_json else {}
+        )
         return params
 
 
@@ -208,7 +212,7 @@ TOOLS: dict[str, type[ToolCall]] = {
 TOOL_CALL: TypeAdapter[ToolCall] = TypeAdapter(Annotated[ToolCall, Field(discriminator="tool")])
 
 
-def read_arguments(name: str, arguments: str | Mapping[str, Any]) -> dict[str, Any]:
+def read_arguments(name: str, arguments: str | JsonMap) -> dict[str, JsonValue]:
     """A call's arguments, a JSON text (empty: none) or a mapping, as a dict. Raises BadRequest, see
     `schemas.strictjson`."""
     try:
@@ -221,7 +225,7 @@ def read_arguments(name: str, arguments: str | Mapping[str, Any]) -> dict[str, A
     return dict(value)
 
 
-def parse_tool_call(name: str, arguments: str | Mapping[str, Any]) -> ToolCall:
+def parse_tool_call(name: str, arguments: str | JsonMap) -> ToolCall:
     """Read a call as language models make it: the function's name and its arguments, a JSON text or
     a mapping.
 
@@ -267,9 +271,25 @@ def skill_tool_name(rskill_id: str) -> str:
 _PLAIN = "[A-Za-z0-9-]+(?:_[A-Za-z0-9-]+)*"
 
 
+class Function(TypedDict):
+    """A function as a language model is told of it."""
+
+    name: str
+    description: str
+    parameters: JsonObject
+    """A JSON Schema."""
+
+
+class FunctionTool(TypedDict):
+    """An entry of `tools` in a request of OpenAI's chat completions."""
+
+    type: Literal["function"]
+    function: Function
+
+
 def skill_function(
-    rskill_id: str, description: str, goal_params_schema: Mapping[str, Any] | None
-) -> dict[str, Any]:
+    rskill_id: str, description: str, goal_params_schema: JsonMap | None
+) -> FunctionTool:
     """The function description of one skill: `execute_rskill` without `rskill_id`, its parameters
     as the manifest describes them.
 
@@ -290,7 +310,7 @@ def skill_function(
     return function
 
 
-def parse_skill_call(rskill_id: str, arguments: str | Mapping[str, Any]) -> ExecuteRskill:
+def parse_skill_call(rskill_id: str, arguments: str | JsonMap) -> ExecuteRskill:
     """Read a call of a skill's own function. Raises BadRequest; whether the parameters fit the
     skill is the palette's to say."""
     name = skill_tool_name(rskill_id)
@@ -307,22 +327,19 @@ def parse_skill_call(rskill_id: str, arguments: str | Mapping[str, Any]) -> Exec
     return call
 
 
-def function_schema(tool: type[ToolCall]) -> dict[str, Any]:
-    """The OpenAI-style function description of a tool: `{"type": "function", "function": {name,
-    description, parameters}}`."""
+def function_schema(tool: type[ToolCall]) -> FunctionTool:
+    """The function description of a tool."""
     parameters = tool.model_json_schema(by_alias=False)
     name = parameters["properties"].pop("tool")["const"]
     description = " ".join(parameters.pop("description").split())
     parameters.pop("title", None)
     for field in parameters["properties"].values():
         field.pop("title", None)
-    return {
-        "type": "function",
-        "function": {"name": name, "description": description, "parameters": parameters},
-    }
+    function = Function(name=name, description=description, parameters=parameters)
+    return FunctionTool(type="function", function=function)
 
 
-def function_schemas(names: Iterable[str] | None = None) -> list[dict[str, Any]]:
+def function_schemas(names: Iterable[str] | None = None) -> list[FunctionTool]:
     """Function descriptions of the named tools, or of all. Raises KeyError for a name that is no
     tool."""
     return [function_schema(TOOLS[name]) for name in (TOOLS if names is None else names)]

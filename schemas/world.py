@@ -21,6 +21,7 @@ from pydantic import (
 )
 
 from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.schemas.plain import JsonObject
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 UnitInterval = Annotated[float, Field(ge=0, le=1)]
@@ -84,7 +85,7 @@ class SensorFrame(_Frozen):
     data: bytes | None = None
     topic: str | None = None
     handle: str | int | None = None
-    metadata: dict[str, Any] = {}
+    metadata: JsonObject = {}
 
     @field_validator("data", mode="before")
     @classmethod
@@ -273,8 +274,8 @@ class WorldState(_Frozen):
     detected_objects: tuple[DetectedObject, ...] = ()
     battery_pct: Annotated[float, Field(ge=0, le=100)] | None = None
     diagnostics: dict[str, Diagnostic] = {}
-    collision_primitives: tuple[dict[str, Any], ...] = ()
-    occupancy_grid: dict[str, Any] | None = None
+    collision_primitives: tuple[JsonObject, ...] = ()
+    occupancy_grid: JsonObject | None = None
 
     @property
     def stale(self) -> tuple[str, ...]:
@@ -322,7 +323,7 @@ class Action(_Frozen):
     cartesian_delta: Rows | None = None
     cartesian_twist: Rows | None = None
     body_twist: tuple[Twist, ...] | None = None
-    foot_placements: tuple[dict[str, Any], ...] | None = None
+    foot_placements: tuple[JsonObject, ...] | None = None
     gripper: tuple[UnitInterval, ...] | None = None
     dex_hand_joints: Rows | None = None
     composite_mode: tuple[Annotated[float, Field(ge=-1, le=1)], ...] | None = None
@@ -331,7 +332,7 @@ class Action(_Frozen):
     ee_name: str | None = None
     frame_id: str | None = None
     joint_names: tuple[str, ...] | None = None
-    safety_overrides: dict[str, Any] = {}
+    safety_overrides: JsonObject = {}
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -407,4 +408,4 @@ class RunResult(_Frozen):
     p99_tick_ms: Milliseconds = 0.0
     trace_id: str | None = None
     save_dir: str | None = None
-    metadata: dict[str, Any] = {}
+    metadata: JsonObject = {}

@@ -17,6 +17,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonMap
 
 Path = tuple[str | int, ...]
 """Keys and list positions from the top of a document to one value."""
@@ -315,7 +316,7 @@ def problems_of(
     return sorted(problems, key=lambda problem: problem.line)
 
 
-def only_counts_wrong_entries(finding: Mapping[str, Any]) -> bool:
+def only_counts_wrong_entries(finding: JsonMap) -> bool:
     """Whether a finding says "too short" of a list that is long enough: pydantic does not count
     wrong entries, which have findings of their own."""
     given = finding["input"]

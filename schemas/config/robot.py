@@ -9,9 +9,9 @@ by that adapter, before anything moves.
 
 from collections.abc import Collection, Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
 
 from vram_arbiter.schemas.body import Body, Capability
 from vram_arbiter.schemas.manifest.contracts import Quantization, SafetyEnvelope
@@ -45,7 +45,7 @@ class SensorReaderConfig(_Section):
     """Name under which its frames appear in the world state; a skill's manifest refers to it."""
     backend: SensorBackend = SensorBackend.OPENCV_THREAD
     """`holoscan` is reserved: it is refused when the runner starts."""
-    backend_params: dict[str, Any] = {}
+    backend_params: dict[str, JsonValue] = {}
     """What this backend needs: a device, a URL, a topic, a pipeline."""
     max_age_ms: Positive = MAX_AGE_MS
     """An older frame is stale: it is not shown to the skill."""
@@ -69,9 +69,9 @@ class HalConfig(_Section):
 
     adapter: Text
     """`so101_mujoco`, `so101_kinematic` or `lerobot:TYPE`."""
-    transport: dict[str, Any] = {}
+    transport: dict[str, JsonValue] = {}
     """Port, ids, calibration: how the hardware is reached."""
-    params: dict[str, Any] = {}
+    params: dict[str, JsonValue] = {}
 
 
 class TaskSpec(_Section):
@@ -82,7 +82,7 @@ class TaskSpec(_Section):
     instruction: Annotated[str, Field(max_length=2000)] = ""
     max_steps: Annotated[int, Field(gt=0)] | None = None
     success_key: str | None = None
-    metadata: dict[str, Any] = {}
+    metadata: dict[str, JsonValue] = {}
 
 
 class VlaSpec(_Section):
@@ -97,7 +97,7 @@ class VlaSpec(_Section):
     quantization: Quantization | None = None
     """A block as in the skill's manifest, or its `dtype` alone."""
     deterministic: bool = False
-    extra: dict[str, Any] = {}
+    extra: dict[str, JsonValue] = {}
 
     @field_validator("quantization", mode="before")
     @classmethod
@@ -135,7 +135,7 @@ class RobotEnvironment(_Section):
     max_ticks: Annotated[int, Field(gt=0)] | None = None
     save_dir: str | None = None
     """Folder of the recorded dataset; null: nothing is recorded."""
-    metadata: dict[str, Any] = {}
+    metadata: dict[str, JsonValue] = {}
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:

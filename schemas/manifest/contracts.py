@@ -6,9 +6,9 @@ across blocks are the manifest's.
 """
 
 import json
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, ControlMode
 from vram_arbiter.schemas.manifest.problems import Problem, raise_if
@@ -20,6 +20,7 @@ from vram_arbiter.schemas.manifest.vocabulary import (
     Modality,
     QuantizationBackend,
 )
+from vram_arbiter.schemas.plain import JsonObject
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 PositiveInt = Annotated[int, Field(gt=0)]
@@ -95,7 +96,7 @@ class SafetyEnvelope(Block):
 
     workspace_box_min_xyz: Vector3 | None = None
     workspace_box_max_xyz: Vector3 | None = None
-    no_go_zones: tuple[dict[str, Any], ...] = ()
+    no_go_zones: tuple[JsonObject, ...] = ()
     max_ee_speed_m_s: float = 0.5
     max_ee_accel_m_s2: float = 1.0
     max_joint_speed_factor: float = 0.7
@@ -123,7 +124,7 @@ class Quantization(Block):
     backend: QuantizationBackend = QuantizationBackend.PYTORCH
     per_channel: bool = False
     calibration_dataset: str | None = None
-    extra: dict[str, Any] = {}
+    extra: dict[str, JsonValue] = {}
 
 
 class LatencyBudget(Block):

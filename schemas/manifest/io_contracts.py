@@ -18,7 +18,8 @@ from vram_arbiter.schemas.manifest.vocabulary import (
 FileUri = Annotated[
     str,
     Field(
-        pattern=r"^(?:hf://[A-Za-z0-9][A-Za-z0-9._-]*/[A-Za-z0-9._-]+(?:@[A-Za-z0-9._-]+)?|local://[A-Za-z0-9._-]+)"
+        pattern=r"^(?:hf://[A-Za-z0-9][A-Za-z0-9._-]*/[A-Za-z0-9._-]+(?:@[A-Za-z0-9._-]+)?"
+        r"|local://[A-Za-z0-9._-]+)"
         r"/[A-Za-z0-9._/-]+\.[A-Za-z0-9]+$"
     ),
 ]

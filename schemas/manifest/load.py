@@ -6,7 +6,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -15,6 +14,7 @@ from vram_arbiter.schemas.manifest.kinds import KINDS, check_kind
 from vram_arbiter.schemas.manifest.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.problems import ManifestError, Problem, from_validation_error
 from vram_arbiter.schemas.manifest.vocabulary import Kind
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.yamltext import YamlText, parse_yaml, read_text
 
 
@@ -43,7 +43,7 @@ def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillM
         ) from error
 
 
-def _with_kind_rules(problems: list[Problem], data: Mapping[str, Any]) -> list[Problem]:
+def _with_kind_rules(problems: list[Problem], data: JsonMap) -> list[Problem]:
     """Add what the kind demands: pydantic stops before that rule as soon as any single field is
     wrong."""
     kind = data.get("kind")

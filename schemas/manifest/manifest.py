@@ -5,9 +5,9 @@ files (`load` does) and knows nothing of how a skill is run.
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import Field, JsonValue, StringConstraints, model_validator
 
 from vram_arbiter.schemas.manifest.contracts import (
     ActuatorRequirement,
@@ -126,7 +126,7 @@ class RSkillManifest(Block):
     scenes: tuple[str, ...] = ()
 
     envelope: SafetyEnvelope | None = None
-    policy_extras: dict[str, Any] = Field(default_factory=dict)
+    policy_extras: dict[str, JsonValue] = Field(default_factory=dict)
     processors: Processors | None = None
     image_preprocessing: ImagePreprocessing | None = None
     state_contract: StateContract | None = None
@@ -139,7 +139,7 @@ class RSkillManifest(Block):
     reward: RewardContract | None = None
     reward_rskill_name: NonEmpty | None = None
     playbook: PlaybookContract | None = None
-    goal_params_schema: dict[str, Any] | None = None
+    goal_params_schema: dict[str, JsonValue] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:

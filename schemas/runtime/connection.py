@@ -1,12 +1,12 @@
 """One connection of the router: framing, the bounds on its bytes, and when it is read.
 
-Must not know other connections: what concerns several is asked of its `Owner`, the router.
+Must not know other connections: what concerns several is asked of its router.
 """
 
 import asyncio
-from collections.abc import Callable
+import logging
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from vram_arbiter.schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
 from vram_arbiter.schemas.runtime.peercred import Peer
@@ -20,6 +20,11 @@ from vram_arbiter.schemas.runtime.zmtp import (
     ZmtpError,
     encode,
 )
+
+if TYPE_CHECKING:
+    from vram_arbiter.schemas.runtime.router import Router
+
+log = logging.getLogger(__name__)
 
 REST_S = 0.005
 """A connection that is over its rate is not read for this long; its sender's buffer then fills."""
@@ -86,36 +91,22 @@ class User:
     out_bytes: int = 0
 
 
-class Owner(Protocol):
-    """What a connection asks of the router that accepted it."""
-
-    limits: Limits
-    handler: Handler
-
-    def call_later(self, delay_s: float, callback: Callable[[], object]) -> object: ...
-    def admitted(self, connection: "Connection") -> None: ...
-    def readable(self, connection: "Connection") -> None: ...
-    def lost(self, connection: "Connection", reason: str) -> None: ...
-    def deliver(self, connection: "Connection", payload: bytes | bytearray | Oversize) -> bool: ...
-    def complain(self, what: str) -> None: ...
-
-
 class Connection(asyncio.Protocol):
     """One peer's connection. `serial` is unique within its router; a peer's own ZeroMQ identity is
     ignored.
     """
 
-    def __init__(self, owner: Owner, serial: int, peer: Peer, user: User, now: float) -> None:
+    def __init__(self, router: "Router", serial: int, peer: Peer, user: User, now: float) -> None:
         self.serial = serial
         self.peer = peer
         self.accepted_at = now
         self.admitted = False
         self.ready = False
         self.ended = False
-        self._owner = owner
+        self._router = router
         self._user = user
         self._transport: asyncio.Transport | None = None
-        limits = owner.limits
+        limits = router.limits
         self._wire = ServerConnection(
             WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes)
         )
@@ -123,6 +114,7 @@ class Connection(asyncio.Protocol):
         self._resting = False  # over its rate
         self._clogged = False  # bytes wait for the peer to read
         self._finishing = False  # nothing more is sent
+        self._paused = False  # not read for now
         self._in_bytes = 0
         self._out_bytes = 0
         self._out_messages = 0
@@ -137,9 +129,9 @@ class Connection(asyncio.Protocol):
         full size.
         """
         self.admitted = True
-        limits = self._owner.limits
+        limits = self._router.limits
         self._wire.limits = WireLimits(limits.message_max_bytes, limits.skip_max_bytes)
-        self._owner.admitted(self)
+        self._router.admitted(self)
 
     def send(self, payload: bytes) -> bool:
         """Queue one message, in the envelope of the last one received. False: the peer is gone or
@@ -170,7 +162,7 @@ class Connection(asyncio.Protocol):
         self._reason = reason
         self._finishing = True
         transport.close()
-        self._owner.call_later(self._owner.limits.handshake_s, transport.abort)
+        self._router.loop.call_later(self._router.limits.handshake_s, transport.abort)
 
     # -- asyncio.Protocol ------------------------------------------------------------------------
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -186,7 +178,7 @@ class Connection(asyncio.Protocol):
         if self._finishing:  # read on all the same: the peer's end of file ends the connection
             return
         self._wire.feed(data)
-        self._owner.readable(self)
+        self._router.readable(self)
 
     def pause_writing(self) -> None:
         self._clogged = True
@@ -197,19 +189,19 @@ class Connection(asyncio.Protocol):
         self._clogged = False
         self._out_messages = 0
         self._count_out()
-        self._owner.readable(self)  # requests wait until their sender has read the answers before
+        self._router.readable(self)  # requests wait until their sender has read the answers before
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
-        self._owner.lost(self, self._reason if exc is None else f"{exc}")
+        self._router.lost(self, self._reason if exc is None else f"{exc}")
 
-    # -- for the owner ---------------------------------------------------------------------------
+    # -- for the router --------------------------------------------------------------------------
     def cut(self, reason: str) -> None:
         """Hang up now; what is queued is lost."""
         self._reason = reason
         if self._transport is not None:
             self._transport.abort()
-        self._owner.lost(self, reason)
+        self._router.lost(self, reason)
 
     def half_close(self) -> None:
         """Flush, then tell the peer that nothing more comes; it hangs up when it has read
@@ -224,50 +216,49 @@ class Connection(asyncio.Protocol):
     def handle(self) -> bool:
         """Handle one event of what was read. True: more may be left, and the connection wants
         another turn.
+
+        1. The next event, unless the peer is over its rate or does not read. 2. Its handler; one
+        bad message must not cost the others their server. 3. Bytes kept, and reading on.
         """
-        event = None
+        wire, event, within_rate = self._wire, None, True
         try:
-            if not self._stopped and (event := self._wire.next_event()) is not None:
-                self._handle(event)
+            if not (self._resting or self._clogged or self._finishing):
+                event = wire.next_event()  # 1
         except ZmtpError as error:
             self._flush_wire()
-            self._owner.complain(f"process {self.peer.process} of uid {self.peer.uid}: {error}")
+            self._router.complain(f"process {self.peer.process} of uid {self.peer.uid}: {error}")
             self.cut(f"protocol error: {error}")
-        if self.ended:
             return False
-        self._flush_wire()
-        self._count_in()
-        self.update_reading()
-        more = event is not None and self._wire.unread_bytes > 0
-        return more and not self._stopped and not self.ended
-
-    @property
-    def _stopped(self) -> bool:
-        """Nothing is handled for now, or any more."""
-        return self._resting or self._clogged or self._finishing
-
-    def _handle(self, event: PeerReady | Heartbeat | Message | Oversize) -> None:
-        match event:
-            case Message():
-                self._delimiter = event.delimiter
-                within_rate = self._owner.deliver(self, event.payload)
-            case Oversize():
-                self._delimiter = event.delimiter
-                within_rate = self._owner.deliver(self, event)
-            case PeerReady():
-                self._flush_wire()
-                self.ready = within_rate = True
-                self._owner.handler.connected(self)
-            case Heartbeat():
-                within_rate = True
+        try:
+            match event:  # 2
+                case Message() | Oversize() if self._router.receiving:
+                    self._delimiter = event.delimiter
+                    payload = event.payload if isinstance(event, Message) else event
+                    within_rate = self._router.handler.received(self, payload)
+                case PeerReady():
+                    self._flush_wire()
+                    self.ready = True
+                    self._router.handler.connected(self)
+                case Heartbeat() | None:
+                    self._flush_wire()
+        except Exception:
+            log.exception("a message of %r could not be handled", self)
         if not within_rate:
             self._resting = True
-            self._owner.call_later(REST_S, self._rested)
+            self._router.loop.call_later(REST_S, self._rested)
+        if wire.kept_bytes != self._in_bytes:  # 3
+            self._count_in()
+        if self.ended:
+            return False
+        if self._paused or self._resting or self._clogged or wire.unread_bytes:
+            self.update_reading()
+        stopped = self._resting or self._clogged or self._finishing
+        return event is not None and wire.unread_bytes > 0 and not stopped
 
     def _rested(self) -> None:
         self._resting = False
         if not self.ended:
-            self._owner.readable(self)
+            self._router.readable(self)
 
     def _flush_wire(self) -> None:
         data = self._wire.outgoing()
@@ -278,14 +269,15 @@ class Connection(asyncio.Protocol):
         transport = self._transport
         if transport is None or transport.is_closing():
             return
-        full = self._stopped or self._wire.unread_bytes > READ_AHEAD_BYTES
-        if full and not self._finishing:
+        full = self._resting or self._clogged or self._wire.unread_bytes > READ_AHEAD_BYTES
+        self._paused = full and not self._finishing
+        if self._paused:
             transport.pause_reading()
         else:
             transport.resume_reading()
 
     def _may_queue(self, size: int) -> bool:
-        limits = self._owner.limits
+        limits = self._router.limits
         return (
             self._out_messages < OUT_MESSAGES_MAX
             and self._out_bytes + size <= limits.out_max_bytes
@@ -296,7 +288,7 @@ class Connection(asyncio.Protocol):
         kept = self._wire.kept_bytes
         self._user.in_bytes += kept - self._in_bytes
         self._in_bytes = kept
-        if self._user.in_bytes > self._owner.limits.user_in_max_bytes and not self.ended:
+        if self._user.in_bytes > self._router.limits.user_in_max_bytes and not self.ended:
             self.cut(f"incomplete messages of uid {self.peer.uid} exceed their limit")
 
     def _count_out(self) -> None:

@@ -3,8 +3,9 @@
 import logging
 import sys
 from types import TracebackType
-from typing import Any, Literal
+from typing import Literal
 
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime.printable import printable, printable_lines
 
 Form = Literal["human", "json"]
@@ -56,9 +57,9 @@ def _json(program: str | None) -> logging.Formatter:
     class Lines(JsonFormatter):
         def add_fields(
             self,
-            log_data: dict[str, Any],
+            log_data: JsonObject,
             record: logging.LogRecord,
-            message_dict: dict[str, Any],
+            message_dict: JsonObject,
         ) -> None:
             log_data["at_wall_s"] = round(record.created, 6)
             log_data["level"] = record.levelname.lower()

@@ -6,12 +6,12 @@ Pure: no sockets, no clock. Must not know what a message means.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import msgpack
 
 from vram_arbiter.schemas.defaults import LISTED_MAX, MESSAGE_MAX_BYTES, VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
+from vram_arbiter.schemas.plain import Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class UnpackLimits:
     by letter, 2 ms a MiB."""
 
 
-def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) -> dict[str, Any]:
+def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) -> Message:
     """Decode one message to a map with text keys.
 
     Raises:

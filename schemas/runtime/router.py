@@ -25,7 +25,6 @@ from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.connection import Connection, Handler, Limits, User
 from vram_arbiter.schemas.runtime.peercred import Peer, PeerGone, identify
 from vram_arbiter.schemas.runtime.turns import Turns
-from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +39,12 @@ SWEEP_S = 0.5
 TURN_S = 0.002
 """Longest work on waiting messages before the loop's other callbacks run."""
 DIRECT_SHARE = 0.5
-"""Share of the loop's time in which a message is handled as it arrives; beyond it messages wait for
+"""Share of the loop's time in which messages are handled as they arrive; beyond it they wait for
 their turn.
 """
+DIRECT_EVENTS = 4
+"""Messages of one connection handled as they arrive, such as a holder's `revoke_ack`, `unloading`
+and `release`; more of them wait for their turn."""
 
 
 @dataclass(slots=True)
@@ -68,8 +70,8 @@ class Router:
         self._direct_share = min(DIRECT_SHARE, self.limits.work_share)
         self._listener: socket.socket | None = None
         self._inode: tuple[int, int] | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._receiving = False
+        self.loop: asyncio.AbstractEventLoop  # from `start` on
+        self.receiving = False
         self._serial = 0
         self._connections_max = self.limits.connections_max
         self._connections: set[Connection] = set()
@@ -84,15 +86,6 @@ class Router:
         self._sweep: asyncio.TimerHandle | None = None
         self._opening: set[asyncio.Task[object]] = set()
         self._empty: asyncio.Future[None] | None = None
-
-    @property
-    def _loop_or_fail(self) -> asyncio.AbstractEventLoop:
-        assert self._loop is not None, "the router was not started"
-        return self._loop
-
-    def call_later(self, delay_s: float, callback: Callable[[], object]) -> asyncio.TimerHandle:
-        """Run `callback` on the loop after `delay_s`."""
-        return self._loop_or_fail.call_later(delay_s, callback)
 
     def __len__(self) -> int:
         """Number of open connections."""
@@ -134,23 +127,22 @@ class Router:
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         """Begin to accept and to read."""
         assert self._listener is not None, "bind() comes first"
-        self._loop = loop
+        self.loop = loop
         soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         # a connection takes its socket and, for the first one of a process, a pidfd
         self._connections_max = max(
             4, min(self.limits.connections_max, (soft - self.limits.descriptor_reserve) // 2)
         )
-        self._receiving = True
+        self.receiving = True
         self._credit_at = loop.time()
         loop.add_reader(self._listener.fileno(), self._accept)
         self._sweep = loop.call_later(SWEEP_S, self._sweep_once)
 
     def stop_receiving(self) -> None:
         """Shutdown, first half: nothing more is accepted or handled; answers can still be sent."""
-        self._receiving = False
-        if self._loop is not None and self._listener is not None:
-            self._loop.remove_reader(self._listener.fileno())
-        if self._sweep is not None:
+        self.receiving = False
+        if self._sweep is not None and self._listener is not None:
+            self.loop.remove_reader(self._listener.fileno())
             self._sweep.cancel()
             self._sweep = None
 
@@ -161,8 +153,8 @@ class Router:
         self.stop_receiving()
         for connection in list(self._connections):
             connection.half_close()
-        if self._connections and self._loop is not None:
-            self._empty = self._loop.create_future()
+        if self._connections:
+            self._empty = self.loop.create_future()
             await asyncio.wait([self._empty], timeout=flush_s)
         for connection in list(self._connections):
             connection.cut("the server ends")
@@ -187,7 +179,7 @@ class Router:
         shares. 4. Open the transport. Where more may wait: 5. Rest.
         """
         assert self._listener is not None
-        loop = self._loop_or_fail
+        loop = self.loop
         began = loop.time()
         for _ in range(ACCEPT_MAX):
             try:
@@ -232,14 +224,14 @@ class Router:
 
     def _pause_accept(self, error: OSError) -> None:
         log.error("accepting pauses for %g s: %s", ACCEPT_PAUSE_S, error.strerror)
-        loop = self._loop_or_fail
+        loop = self.loop
         assert self._listener is not None
         loop.remove_reader(self._listener.fileno())
         loop.call_later(ACCEPT_PAUSE_S, self._resume_accept)
 
     def _resume_accept(self) -> None:
-        if self._receiving and self._listener is not None:
-            self._loop_or_fail.add_reader(self._listener.fileno(), self._accept)
+        if self.receiving and self._listener is not None:
+            self.loop.add_reader(self._listener.fileno(), self._accept)
 
     def _make_room(self, peer: Peer) -> bool:
         """Whether a connection fits its shares; a stranger of the process with the most of them
@@ -274,14 +266,14 @@ class Router:
         if process is None:
             process = self._processes[peer.process] = _Process(peer.pidfd)
             if peer.pidfd >= 0:
-                self._loop_or_fail.add_reader(peer.pidfd, self._process_ended, peer.process)
+                self.loop.add_reader(peer.pidfd, self._process_ended, peer.process)
         else:
             _close(peer.pidfd)
             peer = Peer(peer.process, peer.uid, peer.gid, process.pidfd)
         user = self._users.setdefault(peer.uid, User())
         user.connections += 1
         self._serial += 1
-        connection = Connection(self, self._serial, peer, user, self._loop_or_fail.time())
+        connection = Connection(self, self._serial, peer, user, self.loop.time())
         process.connections.add(connection)
         self._connections.add(connection)
         self._strangers[connection] = None
@@ -290,7 +282,7 @@ class Router:
     def _process_ended(self, process: ProcessKey) -> None:
         """A child that inherited the connection must not speak for its parent."""
         known = self._processes[process]
-        self._loop_or_fail.remove_reader(known.pidfd)
+        self.loop.remove_reader(known.pidfd)
         for connection in list(known.connections):
             connection.cut("its process has ended")
 
@@ -316,7 +308,7 @@ class Router:
         if not process.connections:
             del self._processes[peer.process]
             if process.pidfd >= 0:
-                self._loop_or_fail.remove_reader(process.pidfd)
+                self.loop.remove_reader(process.pidfd)
                 _close(process.pidfd)
         if connection.ready:
             self.handler.disconnected(connection, reason)
@@ -331,15 +323,17 @@ class Router:
         if connection.ended:
             return
         more = True
-        if not self._turns:
-            now = self._loop_or_fail.time()
+        if not self._turn_scheduled:
+            now = self.loop.time()
             self._credit_s = min(
                 TURN_S, self._credit_s + (now - self._credit_at) * self._direct_share
             )
             self._credit_at = now
-            if self._credit_s > 0:
+            left = DIRECT_EVENTS
+            while more and left and self._credit_s > 0:
                 more = connection.handle()
-                self._credit_s -= self._loop_or_fail.time() - now
+                began, now, left = now, self.loop.time(), left - 1
+                self._credit_s -= now - began
         if more and not connection.ended:
             connection.update_reading()
             self._turns.add(connection, (connection.peer.uid, connection.peer.process))
@@ -349,13 +343,13 @@ class Router:
         if not self._turn_scheduled:
             self._turn_scheduled = True
             if after_s > 0:
-                self._loop_or_fail.call_later(after_s, self._take_turns)
+                self.loop.call_later(after_s, self._take_turns)
             else:
-                self._loop_or_fail.call_soon(self._take_turns)
+                self.loop.call_soon(self._take_turns)
 
     def _take_turns(self) -> None:
         self._turn_scheduled = False
-        loop = self._loop_or_fail
+        loop = self.loop
         began = loop.time()
         end = began + TURN_S
         while self._turns:
@@ -370,15 +364,6 @@ class Router:
     def _rest_s(self, worked_s: float) -> float:
         return worked_s * (1.0 / self.limits.work_share - 1.0)
 
-    def deliver(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
-        if not self._receiving:
-            return True
-        try:
-            return self.handler.received(connection, payload)
-        except Exception:  # outermost: one bad message must not cost the others their server
-            log.exception("a message of %r could not be handled", connection)
-            return True
-
     def complain(self, what: str) -> None:
         """Log what was refused, once per sweep: a flood must not fill the log."""
         self._complaints += 1
@@ -387,7 +372,7 @@ class Router:
 
     # -- watching
     def _sweep_once(self) -> None:
-        loop = self._loop_or_fail
+        loop = self.loop
         now = loop.time()
         if self._complaints > 1:
             log.warning("refused %d more connections within %g s", self._complaints - 1, SWEEP_S)
@@ -410,7 +395,7 @@ class Router:
         if os.path.lexists(self.path):
             log.error("another file is at %s: clients cannot reach this server", self.path)
             return
-        loop, old = self._loop_or_fail, self._listener
+        loop, old = self.loop, self._listener
         try:
             self.bind()
         except ConfigError as error:

@@ -99,6 +99,10 @@ class ServerConnection:
 
     def __init__(self, limits: WireLimits) -> None:
         self.limits = limits
+        self.unread_bytes = 0
+        """Bytes fed that `next_event` has not looked at."""
+        self.kept_bytes = 0
+        """Bytes held for this connection: unread ones, and the message under way."""
         self._data: bytes = b""
         self._at = 0
         self._outgoing = bytearray(GREETING)
@@ -115,21 +119,12 @@ class ServerConnection:
         self._delimiter = False
         self._payload: bytes | bytearray = b""
 
-    @property
-    def kept_bytes(self) -> int:
-        """Bytes held for this connection: fed and not parsed, and the message under way."""
-        body = 0 if self._body is None else len(self._body)
-        return len(self._data) - self._at + body + len(self._payload)
-
-    @property
-    def unread_bytes(self) -> int:
-        """Bytes fed that `next_event` has not looked at."""
-        return len(self._data) - self._at
-
     def feed(self, data: bytes) -> None:
         """Take bytes from the peer, behind those that are unread."""
         self._data = data if self._at == len(self._data) else self._data[self._at :] + data
         self._at = 0
+        self.unread_bytes = len(self._data)
+        self.kept_bytes += len(data)
 
     def outgoing(self) -> bytes:
         """Return the bytes to send to the peer, once."""
@@ -138,17 +133,32 @@ class ServerConnection:
         return data
 
     def next_event(self) -> Event | None:
-        """Return the next event; None where more bytes are needed. Raises ZmtpError."""
-        if not self._greeted and not self._read_greeting():
-            return None
-        while True:
-            if self._body is None and not self._read_header():
-                return None
-            if not self._read_body():
-                return None
-            event = self._end_frame()
-            if event is not None:
-                return event
+        """Return the next event; None where more bytes are needed. Raises ZmtpError.
+
+        1. The greeting, once. 2. The header of a frame, checked before a byte of its body is kept.
+        3. What is there of its body. 4. Its end: a command, or the last frame of a message.
+        """
+        event = None
+        if self._greeted or self._read_greeting():  # 1
+            while event is None and (self._body is not None or self._begin_frame()):  # 2
+                at = self._at
+                taken = min(self._missing, len(self._data) - at)  # 3
+                if not self._skipping or self._flags & COMMAND:
+                    if taken == self._missing and not self._body:  # all of it in one read, as usual
+                        self._body = self._data[at : at + taken]
+                    else:
+                        if not isinstance(self._body, bytearray):
+                            self._body = bytearray()
+                        self._body += memoryview(self._data)[at : at + taken]
+                self._at += taken
+                self._missing -= taken
+                if self._missing:
+                    break
+                event = self._end_frame()  # 4
+        self.unread_bytes = len(self._data) - self._at
+        body = 0 if self._body is None else len(self._body)
+        self.kept_bytes = self.unread_bytes + body + len(self._payload)
+        return event
 
     # -- greeting
     def _read_greeting(self) -> bool:
@@ -169,8 +179,8 @@ class ServerConnection:
         return True
 
     # -- frames
-    def _read_header(self) -> bool:
-        """Read flags and size of the next frame; check both before a byte of its body is kept."""
+    def _begin_frame(self) -> bool:
+        """Read flags and size of the next frame, and check both. False: more bytes are needed."""
         data, at = self._data, self._at
         if at >= len(data):
             return False
@@ -196,37 +206,19 @@ class ServerConnection:
         elif not self._ready:
             raise ZmtpError("a message before READY")
         else:
-            self._begin_message_frame(size)
+            self._frames += 1
+            self._size += size
+            if self._frames > FRAMES_MAX:
+                raise ZmtpError(f"a message of more than {FRAMES_MAX} frames")
+            if self._size > self.limits.skip_max_bytes:
+                raise ZmtpError(
+                    f"a message of {self._size} bytes or more, at most "
+                    f"{self.limits.skip_max_bytes} are read"
+                )
+            if self._size > self.limits.message_max_bytes:
+                self._skipping = True
+                self._payload = b""
         return True
-
-    def _begin_message_frame(self, size: int) -> None:
-        self._frames += 1
-        self._size += size
-        if self._frames > FRAMES_MAX:
-            raise ZmtpError(f"a message of more than {FRAMES_MAX} frames")
-        if self._size > self.limits.skip_max_bytes:
-            raise ZmtpError(
-                f"a message of {self._size} bytes or more, at most {self.limits.skip_max_bytes} "
-                "are read"
-            )
-        if self._size > self.limits.message_max_bytes:
-            self._skipping = True
-            self._payload = b""
-
-    def _read_body(self) -> bool:
-        """Move what is there of the body; True once it is complete."""
-        at = self._at
-        taken = min(self._missing, len(self._data) - at)
-        if not self._skipping or self._flags & COMMAND:
-            if taken == self._missing and not self._body:  # all of it in one read, as usual
-                self._body = self._data[at : at + taken]
-            else:
-                if not isinstance(self._body, bytearray):
-                    self._body = bytearray()
-                self._body += memoryview(self._data)[at : at + taken]
-        self._at += taken
-        self._missing -= taken
-        return self._missing == 0
 
     def _end_frame(self) -> Event | None:
         body = self._body

@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final, get_args
 
 from vram_arbiter.schemas.codec import from_map
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire import explained, pushes
 from vram_arbiter.schemas.wire import replies as r
 from vram_arbiter.schemas.wire.errors import ErrorView
@@ -54,20 +55,20 @@ PUSHES: Final[Mapping[str, type[Any]]] = MappingProxyType(
 """Kind → type of the push."""
 
 
-def decode_reply(op: str, message: Mapping[str, Any]) -> AnyReply:
+def decode_reply(op: str, message: JsonMap) -> AnyReply:
     """Return the typed reply to `op`; the envelope's fields are ignored. Raises CodecError, and
     KeyError for an unknown op."""
     reply: AnyReply = from_map(REPLIES[op], message)
     return reply
 
 
-def decode_push(message: Mapping[str, Any]) -> pushes.AnyPush | None:
+def decode_push(message: JsonMap) -> pushes.AnyPush | None:
     """Return the typed push; None for a kind that only a newer arbiter knows. Raises CodecError."""
     cls = PUSHES.get(str(message.get("push")))
     push: pushes.AnyPush | None = None if cls is None else from_map(cls, message)
     return push
 
 
-def decode_error(message: Mapping[str, Any]) -> ErrorView:
+def decode_error(message: JsonMap) -> ErrorView:
     """Return the error of a refusal. Raises CodecError."""
     return from_map(ErrorView, message.get("error") or {"code": "internal"})

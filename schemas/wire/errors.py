@@ -1,20 +1,26 @@
 """An error as it crosses the wire. Standard library only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar, dataclass_transform
+
+from vram_arbiter.schemas.plain import JsonMap
 
 
+@dataclass_transform(frozen_default=True)
 class Refusal:
     """Base of the values of one kind of refusal, as the engine makes them: typed fields and no
-    words.
+    words. A subclass is a frozen dataclass.
 
     `code` is the wire code. `arbiter.rpc.words` makes an `ErrorView` of it, with the fields as
     `details`.
     """
 
-    __slots__ = ()
     code: ClassVar[str]
+
+    def __init_subclass__(cls, *, code: str = "") -> None:
+        if code:
+            cls.code = code
+        dataclass(frozen=True)(cls)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, *_: object) -> dict[str, str]:
@@ -36,4 +42,4 @@ class ErrorView:
     code: str
     message: str = ""
     hint: str = ""
-    details: Mapping[str, Any] | Refusal = field(default_factory=dict)
+    details: JsonMap | Refusal = field(default_factory=dict)

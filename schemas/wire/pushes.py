@@ -1,11 +1,11 @@
 """What the arbiter sends unasked: `{"push": kind, "seq": n, "epoch": e, …}`. Standard
 library only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.codes import Order
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.views import LeaseView
@@ -81,7 +81,7 @@ class EventPush:
 
     TAG: ClassVar = ("push", "event")
 
-    event: Mapping[str, Any]
+    event: JsonMap
 
 
 type AnyPush = RevokePush | GrantedPush | DeniedPush | ResizedPush | LostPush | EventPush

@@ -1,10 +1,10 @@
 """Answers to requests: `{"re": n, "epoch": e, "ok": true, …}`, one class per shape. Standard
 library only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.views import GpuView, HostRamView, LeaseView, Totals
@@ -126,7 +126,7 @@ class StatusReply:
 class HistoryReply:
     """Events after a number, oldest first. `problem`: why older ones cannot be read, in words."""
 
-    events: tuple[Mapping[str, Any], ...]
+    events: tuple[JsonMap, ...]
     last_seq: int
     problem: str = ""
 

@@ -6,22 +6,20 @@ push `granted` → `ready` → `use_begin`/`use_end`… → push `revoke` → `r
 after its `release`: push `granted` (with a new token) when it is back, or `reacquire`.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.limits import Bytes, Name, Seconds
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-Name = Annotated[
-    str, Field(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")
-]
 LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
 TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
 Serial = Annotated[int, Field(ge=0, lt=1 << 63)]
-Seconds = Annotated[float, Field(ge=0, le=86_400 * 365, allow_inf_nan=False)]
 Reason = Annotated[str, Field(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
-Bytes = Annotated[int, Field(ge=0, le=1 << 50)]
 UseIds = Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX, fail_fast=True)]
 """Lists end at their first wrong item: a message with thousands of wrong ones must not cost an
 error for each."""
@@ -31,54 +29,9 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Footprint(_Frozen):
-    """Bytes that a model puts on a GPU: at the worst moment of loading, when resident, and after
-    unloading while its process lives."""
-
-    load_peak_bytes: Bytes
-    steady_bytes: Bytes
-    residue_bytes: Bytes = d.RESIDUE_BYTES
-
-
 class LeaseRef(_Frozen):
     lease_id: LeaseIdText
     token: TokenPair
-
-
-class Gang(_Frozen):
-    """Several leases, of whatever processes, that are granted together or not at all. One id for
-    each time."""
-
-    id: Name
-    size: Annotated[int, Field(ge=2, le=16)]
-
-
-class LeaseSpec(_Frozen):
-    """What a lease is to be. `evictable=False` pins it: it is never evicted."""
-
-    consumer: Name
-    model_id: Name
-    revision: Annotated[str, Field(max_length=d.NAME_MAX_CHARS)] = ""
-    gpu: Name = "any"  # uuid, index or `any`
-    mode: Literal["exclusive", "shared"] = "shared"
-    footprint: Footprint
-    priority: Annotated[int, Field(ge=0, le=d.PRIORITY_MAX)] = d.PRIORITY
-    evictable: bool = True
-    ttl_s: Annotated[float, Field(ge=0.5, le=3600)] = d.LEASE_TTL_S
-    min_residency_s: Seconds = d.MIN_RESIDENCY_S
-    on_deadline: Literal["wait", "deny"] = (
-        "wait"  # what a waiter gets when a holder outstays the ladder's deadline
-    )
-    on_overstay: Literal["wait", "terminate", "kill"] = (
-        "wait"  # what may be done to its own process if that outstays the deadline idle
-    )
-    standby: bool = False  # asked to leave, it comes back by itself when there is room
-    park_bytes: Bytes = (
-        0  # host RAM that keeps its weights while it is away; 0: it cannot be parked
-    )
-    gang: Gang | None = None
-    # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
-    independent: bool = False
 
 
 class _Request(_Frozen):
@@ -107,12 +60,14 @@ class Acquire(_Request):
     wait_timeout_s: Seconds | None = None  # None waits for ever
 
 
-class _OnLease(_Request):
+class OnLease(_Request):
+    """What a client says about a lease whose token it knows."""
+
     lease_id: LeaseIdText
     token: TokenPair
 
 
-class Ready(_OnLease):
+class Ready(OnLease):
     """The model is loaded; `measured_bytes` is what the holder sees of its own allocation (None: it
     cannot tell)."""
 
@@ -120,7 +75,7 @@ class Ready(_OnLease):
     measured_bytes: Bytes | None = None
 
 
-class UseBegin(_OnLease):
+class UseBegin(OnLease):
     """Begin a use. Any client that knows the token may; the use ends with that client's process at
     the latest."""
 
@@ -129,12 +84,12 @@ class UseBegin(_OnLease):
     label: Annotated[str, Field(max_length=d.NAME_MAX_CHARS)] = ""
 
 
-class UseEnd(_OnLease):
+class UseEnd(OnLease):
     op: Literal["use_end"]
     use_id: Name
 
 
-class Yield(_OnLease):
+class Yield(OnLease):
     """The use pauses: it no longer keeps the lease from being evicted. `use_begin` with the same id
     resumes it, if it may."""
 
@@ -149,7 +104,7 @@ class Renew(_Request):
     ]
 
 
-class RevokeAck(_OnLease):
+class RevokeAck(OnLease):
     """The holder heard `revoke`; `safe_point_eta_s` is its guess of when it will be
     between uses."""
 
@@ -157,11 +112,11 @@ class RevokeAck(_OnLease):
     safe_point_eta_s: Seconds | None = None
 
 
-class Unloading(_OnLease):
+class Unloading(OnLease):
     op: Literal["unloading"]
 
 
-class Release(_OnLease):
+class Release(OnLease):
     """The holder has let go of the bytes (its process lives on: residue) or is about to exit
     (`exiting`).
 
@@ -181,7 +136,7 @@ class Cancel(_Request):
     lease_id: LeaseIdText
 
 
-class Reacquire(_OnLease):
+class Reacquire(OnLease):
     """A lease that is away is wanted now: it waits like any other. `token` is the last one, so a
     late repeat asks for nothing."""
 
@@ -189,7 +144,7 @@ class Reacquire(_OnLease):
     wait_timeout_s: Seconds | None = None
 
 
-class Resize(_OnLease):
+class Resize(OnLease):
     """The holder freed bytes, or needs more. Reply state `held`, `shrinking` or `growing`; then
     push `resized`, or `denied` for a growth."""
 
@@ -219,12 +174,10 @@ class Reattach(_Request):
     ]
 
 
-class Oom(_Request):
+class Oom(OnLease):
     """The consumer's allocation failed. Raises the learnt footprint of its model."""
 
     op: Literal["oom"]
-    lease_id: LeaseIdText
-    token: TokenPair
     requested_bytes: Bytes
     allocated_bytes: Bytes | None = None
 
@@ -261,27 +214,27 @@ class _ByHand(_Request):
     reason: Reason
 
 
-class _ByHandOn(_ByHand):
+class ByHandOn(_ByHand):
     target: Name  # a lease id, or a consumer that has exactly one lease
 
 
-class Evict(_ByHandOn):
+class Evict(ByHandOn):
     """Ask a holder to leave. In use it finishes first; a pinned one is refused."""
 
     op: Literal["evict"]
 
 
-class Pin(_ByHandOn):
+class Pin(ByHandOn):
     """Protect the lease from eviction until it is unpinned."""
 
     op: Literal["pin"]
 
 
-class Unpin(_ByHandOn):
+class Unpin(ByHandOn):
     op: Literal["unpin"]
 
 
-class ReleaseDead(_ByHandOn):
+class ReleaseDead(ByHandOn):
     """Give up the lease of a holder that is not heard of, before its ttl is over. Refused in use,
     and for a holder that lives."""
 
@@ -340,10 +293,14 @@ Request = Annotated[
     Field(discriminator="op"),
 ]
 REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
-OPS: tuple[str, ...] = (
-    "hello", "acquire", "ready", "use_begin", "use_end", "yield", "renew", "revoke_ack",
-    "unloading", "release", "cancel",
-    "reacquire", "resize", "reattach", "oom", "status", "why", "history", "subscribe", "evict",
-    "pin", "unpin", "release_dead", "drain", "resume",
-    "ping", "bye",
-)  # fmt: skip
+OPS: tuple[str, ...] = tuple(
+    get_args(request.model_fields["op"].annotation)[0] for request in get_args(get_args(Request)[0])
+)
+
+
+_SPEC = TypeAdapter(LeaseSpec)
+
+
+def checked_spec(fields: Mapping[str, object]) -> LeaseSpec:
+    """Return the spec with these fields, within its limits. Raises pydantic's ValidationError."""
+    return _SPEC.validate_python(fields)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         WaitTimeout,
         WouldDeadlock,
     )
-    from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+    from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 __all__ = [
     "ArbiterUnreachable",
@@ -93,11 +93,11 @@ _HOME = {
     "AsyncUse": "clients.lease",
     "Client": "clients.sync",
     "Eviction": "clients._protocol.records",
-    "Footprint": "schemas.wire.requests",
+    "Footprint": "schemas.wire.spec",
     "ForeignUse": "clients.sync",
     "Handlers": "clients.handlers",
     "Lease": "clients.sync",
-    "LeaseSpec": "schemas.wire.requests",
+    "LeaseSpec": "schemas.wire.spec",
     "Use": "clients.sync",
 }
 """Where a name is defined; the others are errors."""

@@ -1,0 +1,32 @@
+"""Limits of a field, stated with its type: `Annotated[int, Limits(ge=0)]`.
+
+pydantic applies them where a plain value becomes a message; a dataclass that carries them stays
+free of pydantic, so that the sans-IO core may hold it. Standard library only.
+"""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from vram_arbiter.schemas import defaults as d
+
+type _Schema = dict[str, object]
+
+
+class Limits:
+    """Limits by the names of pydantic's core schemas: ge, gt, le, lt, min_length, max_length,
+    pattern, allow_inf_nan."""
+
+    def __init__(self, **limits: float | str | bool) -> None:
+        self._limits = limits
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: Callable[[object], _Schema]
+    ) -> _Schema:
+        return {**handler(source), **self._limits}
+
+
+Name = Annotated[
+    str, Limits(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
+Bytes = Annotated[int, Limits(ge=0, le=1 << 50)]
+Seconds = Annotated[float, Limits(ge=0, le=86_400 * 365, allow_inf_nan=False)]
