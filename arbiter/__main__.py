@@ -31,18 +31,18 @@ exit codes:
   0   stopped by SIGTERM or SIGINT (leases stay with their holders), or --check-config found nothing
   2   wrong flags or configuration
   3   another arbiter serves this socket or uses this state folder
-  4   no GPU: no NVIDIA driver or no card (--gpu fake:8GiB simulates one)
+  4   no GPU: no NVIDIA driver, or none that it drives (--gpu fake:8GiB simulates one)
   5   the disk of the state folder is full, failing or read-only: worth another try
   74  the output cannot be written (a full disk behind a redirection)
   70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
 
 environment:
   VRAM_ARBITER_ENDPOINT   endpoint, if neither --endpoint nor wire.endpoint is given
-  VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated card (else RUNTIME_DIRECTORY,
+  VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated GPU (else RUNTIME_DIRECTORY,
                           XDG_RUNTIME_DIR/vram-arbiter, /run/user/UID/vram-arbiter,
                           for root /run/vram-arbiter)
-  OTEL_EXPORTER_OTLP_ENDPOINT, OTEL_METRICS_EXPORTER=prometheus and the other standard OTEL_ variables switch
-                          telemetry on (docs/operating.md)
+  OTEL_EXPORTER_OTLP_ENDPOINT, OTEL_METRICS_EXPORTER=prometheus and the other standard OTEL_
+                          variables switch telemetry on (docs/operating.md)
 """
 
 
@@ -64,8 +64,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--gpu",
         metavar="SOURCE",
-        help="auto (default), nvml: the NVIDIA cards, unified: Jetson and GB10; fake:8GiB: a "
-        "simulated card in the runtime folder; fake:FOLDER: that one",
+        help="auto (default), nvml: the NVIDIA GPUs, unified: Jetson and GB10; fake:8GiB: a "
+        "simulated GPU in the runtime folder; fake:FOLDER: that one",
     )
     made.add_argument("--endpoint", metavar="URL", help="where to listen, ipc:///absolute/path")
     made.add_argument("--state-dir", metavar="DIR", help="folder of journal and history")
@@ -157,13 +157,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         flags.config = flags.config or config_of_service(os.environ)
         config = effective_config(flags)
-        from vram_arbiter.arbiter.daemon import (  # late: --help and --version need none of it
-            Daemon,
-            find_places,
-        )
-        from vram_arbiter.arbiter.host.loop import new_loop
-        from vram_arbiter.arbiter.host.memory import give_back_freed_memory
-        from vram_arbiter.arbiter.log import set_up_logging
+        # late: --help and --version need none of it
+        from vram_arbiter.arbiter.daemon import Daemon
+        from vram_arbiter.arbiter.host.process import give_back_freed_memory, new_loop
+        from vram_arbiter.arbiter.log import set_up_logging, write_in_thread
+        from vram_arbiter.arbiter.places import find_places
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:
@@ -187,8 +185,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         async def serve() -> int:
             return await Daemon(config, os.environ, version()).run()
 
-        with asyncio.Runner(loop_factory=new_loop) as runner:
-            return runner.run(serve())
+        close_log = write_in_thread()
+        try:
+            with asyncio.Runner(loop_factory=new_loop) as runner:
+                return runner.run(serve())
+        finally:
+            close_log()
     except VramError as error:
         terminal.complain("vram-arbiter", error)
         return exit_code_of(error)

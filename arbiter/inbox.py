@@ -1,10 +1,11 @@
-"""The one place that owns the core: events in, one after the other, effects out to the executor,
+"""The one place that owns the engine: events in, one after the other, effects out to the executor,
 one timer for time.
 
 All of it runs on the thread of the event loop; other threads post through
-`loop.call_soon_threadsafe(inbox.post, event)`. Nothing else may touch the core, except its reads:
-`status`, `why`, and the owners when a probe's reading is handed on. `now` is `time.monotonic()`:
-the clock of the event loop's timers and of the probes' time stamps.
+`loop.call_soon_threadsafe(inbox.post, event)`. Nothing else calls the engine, except for its
+reads. `now` is `time.monotonic()`: the clock of the event loop's timers and of the readings' time
+stamps. That clock stands still while the machine is suspended, so nothing expires over night, and
+`SuspendWatch` notices that the night was there.
 """
 
 import asyncio
@@ -14,8 +15,9 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from functools import partial
 
+from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event, Resumed, Tick
 from vram_arbiter.schemas.codec import to_map
@@ -26,9 +28,11 @@ from vram_arbiter.schemas.wire.replies import StatusReply
 
 log = logging.getLogger(__name__)
 
+NOTICED_S = 1.0
+"""A shorter sleep of the machine changes nothing that a reading of the GPU would show."""
 HELD_UP_S = 1.0
 """A daemon that wakes up so late did not run meanwhile (stopped, swapped out, a paused virtual
-machine). It heard no client, so no client's silence counts: the core is told that it slept."""
+machine). It heard no client, so no client's silence counts: the engine is told that it slept."""
 TIMER_FLOOR_S = 0.0002
 """A deadline that has passed is served this soon, and not in a busy loop."""
 
@@ -41,35 +45,35 @@ QUESTIONS_MAX = 1024
 is."""
 NO_READER = ProcessKey(0, 0)
 """Reader of a status that goes to the log: it may see no token."""
+_DUE = Tick()
+"""The timer's own event."""
+_boottime = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
 _TOKEN = re.compile(r"Token\(epoch=(\d+), serial=\d+\)")
 
 
-class Core(Protocol):
-    """`arbiter.core.arbiter.Arbiter`, as the inbox needs it."""
+class SuspendWatch:
+    """`slept_s()` gives the seconds slept since it was last asked, each sleep once; 0.0 if there
+    was none. CLOCK_BOOTTIME runs on while the machine sleeps, CLOCK_MONOTONIC does not."""
 
-    def handle(self, event: Event, now: float) -> list[Effect]: ...
-
-    def next_deadline(self) -> float | None: ...
-
-    def status(
+    def __init__(
         self,
-        now: float,
-        reader: ProcessKey | None = None,
-        after: tuple[int, float, int] | None = None,
-        limit: int | None = None,
-    ) -> StatusReply: ...
+        boottime: Callable[[], float] = _boottime,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._boottime = boottime
+        self._monotonic = monotonic
+        self._lead_s = boottime() - monotonic()
 
-    def why(self, consumer: str, now: float) -> WhyReply: ...
-
-    def concerns(self, client: ClientId) -> bool: ...
-
-    def stale(self, now: float) -> list[GpuId]: ...
-
-    def figures(self) -> dict[str, Any]: ...
-
-    def learnt(self) -> dict[str, dict[str, float]]: ...
-
-    def footprints(self) -> dict[str, dict[str, list[int]]]: ...
+    def slept_s(self) -> float:
+        # a thread that is held up between the two readings sees less of the lead, never more: no
+        # sleep is made up
+        boottime = self._boottime()
+        lead_s = boottime - self._monotonic()
+        slept_s = lead_s - self._lead_s
+        if slept_s < NOTICED_S:
+            return 0.0
+        self._lead_s = lead_s
+        return slept_s
 
 
 def without_tokens(event: Event) -> str:
@@ -79,20 +83,20 @@ def without_tokens(event: Event) -> str:
 
 
 class Inbox:
-    """Owns the core.
+    """Owns the engine.
 
     `perform` runs the effects of one event; it may post events, which are handled after it
-    returned. `failed` is called once with the exception if the core raises: its state can no longer
-    be trusted, so nothing is handled after that. `slept_s` tells for how long the machine was
-    suspended since it was last asked; the core hears of it, and of a stop of this process alone,
-    before any other event. `record` is told of every event and what came of it (None: the core
-    raised), before anything is performed. `sample` begins a reading of a GPU, which ends in an
-    event (`MemorySampled` or `ProbeFailed`).
+    returned. `failed` is called once with the exception if the engine raises: its state can no
+    longer be trusted, so nothing is handled after that. `slept_s` tells for how long the machine
+    was suspended since it was last asked; the engine hears of it, and of a stop of this process
+    alone, before any other event. `record` is told of every event and what came of it (None: the
+    engine raised), before anything is performed. `sample` begins a reading of a GPU, which ends in
+    an event (`MemorySampled` or `ProbeFailed`).
     """
 
     def __init__(
         self,
-        core: Core,
+        core: Arbiter,
         perform: Callable[[Sequence[Effect]], None],
         failed: Callable[[BaseException], None],
         clock: Callable[[], float] = time.monotonic,
@@ -101,34 +105,40 @@ class Inbox:
         sample: Callable[[GpuId], None] = lambda gpu: None,
     ) -> None:
         self._core = core
-        self._perform = perform
+        self.perform = perform
+        self.sample = sample
         self._failed = failed
         self._clock = clock
         self._slept_s = slept_s
         self._record = record
         self._queue: deque[Event] = deque()
         self._busy = False
-        self._closed = False
+        self.closed = False
         self._timer: asyncio.TimerHandle | None = None
         self._deadline: float | None = None
         self._wakes_at: float | None = None  # when the timer is to fire
         self._handled = 0
-        self._sample = sample
         self._questions: list[Callable[[], None]] = []  # answered after the next reading
         self._questions_timer: asyncio.TimerHandle | None = None
 
     def post(self, event: Event) -> None:
         """Handle an event now, or right after the one that is being handled."""
-        if self._closed:
+        if self.closed:
             return
+        if event is _DUE:
+            self._timer = None
         self._queue.append(event)
         if self._busy:
             return
         self._busy = True
         try:
-            while self._queue and not self._closed:
+            while self._queue and not self.closed:
                 # before anything is decided on what was known yesterday
-                if slept_s := max(self._slept_s(), self._held_up_s()):
+                slept_s = self._slept_s()
+                late_s = 0.0 if self._wakes_at is None else self._clock() - self._wakes_at
+                if late_s >= HELD_UP_S:
+                    self._wakes_at, slept_s = None, max(slept_s, late_s)  # said once
+                if slept_s:
                     self._queue.appendleft(Resumed(slept_s))
                 self._handle(self._queue.popleft())
         finally:
@@ -144,7 +154,7 @@ class Inbox:
         An idle daemon reads its GPUs seldom: without this, `status` shows what was there minutes
         ago as the present.
         """
-        stale = [] if self._closed else self._core.stale(self._clock())
+        stale = [] if self.closed else self._core.stale(self._clock())
         if not stale or len(self._questions) >= QUESTIONS_MAX:
             answer()
             return
@@ -152,7 +162,7 @@ class Inbox:
         if len(self._questions) == 1:  # later questions wait for the same readings
             self._questions_timer = asyncio.get_running_loop().call_later(FRESH_S, self._answer)
             for gpu in stale:
-                self._sample(gpu)
+                self.sample(gpu)
 
     def status(
         self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
@@ -166,31 +176,18 @@ class Inbox:
     def concerns(self, client: ClientId) -> bool:
         return self._core.concerns(client)
 
-    def figures(self) -> dict[str, Any]:
-        return self._core.figures()
-
-    def learnt(self) -> dict[str, dict[str, float]]:
-        return self._core.learnt()
-
-    def footprints(self) -> dict[str, dict[str, list[int]]]:
-        return self._core.footprints()
-
     def pulse(self) -> bool:
-        """Send an event through the core and have its effects performed: True only if both came
-        back. What feeds the watchdog: a core, a journal or a loop that is stuck never gets here,
+        """Send an event through the engine and have its effects performed: True only if both came
+        back. What feeds the watchdog: an engine, a journal or a loop that is stuck never gets here,
         and one that failed answers False.
         """
         before = self._handled
         self.post(Tick())
         return self._handled > before
 
-    @property
-    def closed(self) -> bool:
-        return self._closed
-
     def close(self) -> None:
         """Nothing is handled from here on; what was granted stays granted in the journal."""
-        self._closed = True
+        self.closed = True
         self._queue.clear()
         if self._timer is not None:
             self._timer.cancel()
@@ -203,9 +200,9 @@ class Inbox:
             effects = self._core.handle(event, now)
             if self._record is not None:
                 self._record(now, event, effects)
-            self._perform(effects)
+            self.perform(effects)
             self._handled += 1
-        except Exception as error:  # outermost: a core that raised has an unknown state
+        except Exception as error:  # outermost: an engine that raised has an unknown state
             log.critical("the core failed on %s: %s", without_tokens(event), error, exc_info=error)
             log.critical("state of the core: %s", self._state())
             self.close()
@@ -239,8 +236,8 @@ class Inbox:
             return f"unreadable: {error!r}"
 
     def _arm(self) -> None:
-        """One timer for the core's next deadline; armed again only when that has changed."""
-        if self._closed:
+        """One timer for the engine's next deadline; armed again only when that has changed."""
+        if self.closed:
             return
         deadline = self._core.next_deadline()
         if deadline == self._deadline and (self._timer is not None or deadline is None):
@@ -253,16 +250,4 @@ class Inbox:
             loop = asyncio.get_running_loop()
             wait_s = max(TIMER_FLOOR_S, deadline - self._clock())
             self._wakes_at = self._clock() + wait_s
-            self._timer = loop.call_later(wait_s, self._tick)
-
-    def _held_up_s(self) -> float:
-        """By how much the timer is late, said once; 0.0 for what a busy loop may cost."""
-        late_s = 0.0 if self._wakes_at is None else self._clock() - self._wakes_at
-        if late_s < HELD_UP_S:
-            return 0.0
-        self._wakes_at = None
-        return late_s
-
-    def _tick(self) -> None:
-        self._timer = None
-        self.post(Tick())
+            self._timer = loop.call_later(wait_s, self.post, _DUE)

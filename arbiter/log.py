@@ -1,12 +1,17 @@
-"""The daemon's log: one line per fact, for people or as JSON, on stderr. Must not know where the
-facts come from."""
+"""The daemon's log: one line per fact, for people or as JSON, on stderr.
+
+Lines are worded and written by a thread of their own (`write_in_thread`): the event loop waits
+neither for words nor for a reader of stderr. Must not know where the facts come from.
+"""
 
 import json
 import logging
+import queue
+import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
 
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.logging import Form, PrintableFormatter, set_up
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.units import format_bytes
@@ -14,24 +19,22 @@ from vram_arbiter.schemas.units import format_bytes
 events_log = logging.getLogger("arbiter.events")
 refusals_log = logging.getLogger("arbiter.refusals")
 
-_WARNINGS = frozenset(
-    {
-        "probe_failed",
-        "pressure",
-        "stowaway",
-        "oom",
-        "lost",
-        "expired",
-        "deadline_passed",
-        "journal_put_aside",
-        "record_stopped",
-    }
-)
-_DETAILS = frozenset(
-    {"use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok", "refused"}
-)
-"""`refused`: `RefusalLog` says it, with the client's name and user."""
-
+_WARNINGS = (
+    "probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed",
+    "journal_put_aside", "record_stopped",
+)  # fmt: skip
+_DETAILS = (
+    "use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok",
+    "refused",  # `RefusalLog` says it, with the client's name and user
+)  # fmt: skip
+_LEVELS = {
+    **dict.fromkeys(_WARNINGS, logging.WARNING),
+    **dict.fromkeys(_DETAILS, logging.DEBUG),
+}
+LINES_MAX = 10_000
+"""Lines that wait for a reader of stderr. Those left out are counted, and the next line says how
+many."""
+CLOSE_S = 1.0
 
 REFUSALS_BURST = 50
 REFUSALS_PER_S = 5.0
@@ -69,22 +72,65 @@ def set_up_logging(form: Form, level: str) -> None:
     set_up(None, level, form, _Human())
 
 
-def level_of(kind: str) -> int:
-    """How loud an event of the history is in the log."""
-    if kind in _WARNINGS:
-        return logging.WARNING
-    return logging.DEBUG if kind in _DETAILS else logging.INFO
+class _Waiting(logging.Handler):
+    """Lines that the log's thread has still to write."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: queue.SimpleQueue[logging.LogRecord | None] = queue.SimpleQueue()
+        self._left_out = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self.lines.qsize() >= LINES_MAX:
+            self._left_out += 1
+            return
+        if self._left_out:
+            told = f"{self._left_out} lines are left out: the log was not read"
+            facts = {"name": __name__, "levelno": 30, "levelname": "WARNING", "msg": told}
+            self.lines.put(logging.makeLogRecord(facts))
+            self._left_out = 0
+        self.lines.put(record)
 
 
-def log_event(event: Mapping[str, Any], trace: Mapping[str, str] | None = None) -> None:
+def write_in_thread() -> Callable[[], None]:
+    """Let a thread write the log from here on. Call what is returned to write what is left, and
+    from then on in the caller's thread again."""
+    root, waiting = logging.getLogger(), _Waiting()
+    before = list(root.handlers)
+
+    def write() -> None:
+        while (record := waiting.lines.get()) is not None:
+            for handler in before:
+                handler.handle(record)
+
+    def close() -> None:
+        root.handlers = before
+        waiting.lines.put(None)
+        thread.join(CLOSE_S)
+
+    thread = threading.Thread(target=write, name="log", daemon=True)
+    thread.start()
+    root.handlers = [waiting]
+    return close
+
+
+class _Event(dict[str, object]):
+    """An event of the history, in words where its line is written."""
+
+    def __str__(self) -> str:
+        return sentence(self)
+
+
+def log_event(event: JsonMap, trace: Mapping[str, str] | None = None) -> None:
     """One event of the history as one line of the log; as JSON with `trace_id` and `span_id` of its
     span, if it has one."""
-    level = level_of(str(event["kind"]))
+    level = _LEVELS.get(event["kind"], logging.INFO)
     if events_log.isEnabledFor(level):
-        events_log.log(level, "%s", sentence(event), extra={"event": dict(event), "trace": trace})
+        said = _Event(event)
+        events_log.log(level, "%s", said, extra={"event": said, "trace": trace})
 
 
-def sentence(event: Mapping[str, Any]) -> str:
+def sentence(event: JsonMap) -> str:
     """`granted L1-4 (detector): reason="fits", needed=4.94 GiB`"""
     skip = {"seq", "at_wall_s", "kind", "lease_id", "consumer"}
     parts = [

@@ -1,12 +1,13 @@
 """Everything that the core can ask of the world, as imperatives. Performed in order by
 `host.executor`. Plain values only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
+from vram_arbiter.arbiter.core.model.records import AnyRecord
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.notes import About, AnyNote
 from vram_arbiter.schemas.wire.pushes import AnyPush
 from vram_arbiter.schemas.wire.replies import AnyReply
 
@@ -45,8 +46,8 @@ class JournalPut:
     names the same key's lease is dropped.
     """
 
-    key: str  # "lease:L3-17" or "residue:PID@START:GPU"
-    record: Mapping[str, Any]
+    key: str
+    record: AnyRecord
     gates: bool = False
 
 
@@ -57,7 +58,7 @@ class JournalDelete:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Read a card now; posts MemorySampled or ProbeFailed. A second Sample while one is under way
+    """Read a GPU now; posts MemorySampled or ProbeFailed. A second Sample while one is under way
     is merged into a fresh one after it."""
 
     gpu: GpuId
@@ -65,11 +66,16 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A fact for history, subscribers, telemetry and the log. `kind` is one of
-    `core.explain.NOTE_KINDS`."""
+    """A fact for history, subscribers, telemetry and the log, and the lease that it is about."""
 
-    kind: str
-    data: Mapping[str, Any]
+    body: AnyNote
+    about: About | None = None
+
+    @property
+    def kind(self) -> str:
+        """The kind of its event."""
+        kind: str = self.body.TAG[1]
+        return kind
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,22 +3,25 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
+from vram_arbiter.arbiter.core.model.records import AnyRecord
 from vram_arbiter.schemas.ids import (
     ClientId,
     GpuId,
     LeaseId,
-    ModelKey,
     ProcessKey,
     RequestId,
     Token,
     UseId,
 )
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 DOUBT_KEY: Final = "doubt"
 """Key of a journal record that says why leases may be missing among the others. It outlives
 restarts until the core deletes it, once each holder had its time to reattach."""
+DRAIN_KEY: Final = "drain"
+"""Key of the journal record of an operator's drain: it is in force after a restart too."""
 BYE: Final = "bye"
 """`ClientLeft.reason` of a connection that took its leave: only then are its resident leases
 released."""
@@ -53,32 +56,25 @@ class ProcessDied:
 
 # -- requests
 @dataclass(frozen=True, slots=True)
-class LeaseSpec:
-    """A lease as asked for, validated (`schemas.wire.requests.LeaseSpec`)."""
+class ClientRequest:
+    """A message that gets one answer."""
 
-    consumer: str
-    key: ModelKey
-    gpu: str
-    exclusive: bool
-    load_peak_bytes: int
-    steady_bytes: int
-    residue_bytes: int
-    priority: int
-    evictable: bool
-    ttl_s: float
-    min_residency_s: float
-    deny_on_deadline: bool
-    standby: bool = False
-    park_bytes: int = 0
-    on_overstay: str = "wait"  # or "terminate", "kill"
-    independent: bool = False
-    gang: tuple[str, int] | None = None  # (id, size)
+    client: ClientId
+    request: RequestId
 
 
 @dataclass(frozen=True, slots=True)
-class AcquireRequested:
-    client: ClientId
-    request: RequestId
+class LeaseRequest(ClientRequest):
+    """One about a granted lease, which it names by its exact token."""
+
+    lease: LeaseId
+    token: Token
+
+
+@dataclass(frozen=True, slots=True)
+class AcquireRequested(ClientRequest):
+    """A lease is wanted; a repeat with the same nonce is the same request."""
+
     nonce: str
     spec: LeaseSpec
     wait_timeout_s: float | None
@@ -86,110 +82,81 @@ class AcquireRequested:
 
 
 @dataclass(frozen=True, slots=True)
-class ReadyReported:
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
+class ReadyReported(LeaseRequest):
+    """The model is loaded."""
+
     measured_bytes: int | None
 
 
 @dataclass(frozen=True, slots=True)
-class UseBegan:
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
+class UseBegan(LeaseRequest):
+    """A busy interval begins."""
+
     use: UseId
     label: str
 
 
 @dataclass(frozen=True, slots=True)
-class UseEnded:
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
+class UseEnded(LeaseRequest):
+    """A busy interval is over."""
+
     use: UseId
 
 
 @dataclass(frozen=True, slots=True)
-class UseYielded:
+class UseYielded(LeaseRequest):
     """A use pauses: until it is begun again it prevents no eviction."""
 
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
     use: UseId
 
 
 @dataclass(frozen=True, slots=True)
-class Renewed:
-    client: ClientId
-    request: RequestId
+class Renewed(ClientRequest):
+    """The holder lives."""
+
     leases: tuple[tuple[LeaseId, Token], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class RevokeAcknowledged:
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
+class RevokeAcknowledged(LeaseRequest):
+    """The holder heard that it is revoked."""
+
     safe_point_eta_s: float | None
 
 
 @dataclass(frozen=True, slots=True)
-class UnloadStarted:
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
+class UnloadStarted(LeaseRequest):
+    """The holder is at its safe point and unloads."""
 
 
 @dataclass(frozen=True, slots=True)
-class ReleaseReported:
-    """The holder let go. `exiting`: its process will end, so even the residue must come back."""
+class ReleaseReported(LeaseRequest):
+    """The holder freed its memory. `exiting`: its process will end, so nothing may stay."""
 
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
     exiting: bool
     parked: bool = False  # its weights are in host RAM
 
 
 @dataclass(frozen=True, slots=True)
-class CancelRequested:
-    client: ClientId
-    request: RequestId
+class CancelRequested(ClientRequest):
+    """A queued lease is not wanted any more."""
+
     lease: LeaseId
 
 
 @dataclass(frozen=True, slots=True)
-class Reacquired:
+class Reacquired(LeaseRequest):
     """A lease that is away is wanted now: from here on it is a waiter like any other."""
 
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
     wait_timeout_s: float | None
     traceparent: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class ResizeAsked:
+class ResizeAsked(LeaseRequest):
     """The holder gave bytes back, or needs more. `wait_timeout_s` bounds a growth's wait."""
 
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
-    load_peak_bytes: int
-    steady_bytes: int
-    residue_bytes: int
+    footprint: Footprint
     wait_timeout_s: float | None
 
 
@@ -198,39 +165,33 @@ class ReattachedLease:
     lease: LeaseId
     token: Token
     spec: LeaseSpec
-    held: bool  # False: still loading
+    state: Literal["loading", "held", "standby", "parked"]
     measured_bytes: int | None
     uses: tuple[UseId, ...]
-    away: bool = False  # on standby or parked
-    parked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Reattached:
-    client: ClientId
-    request: RequestId
+class Reattached(ClientRequest):
+    """A client says after a restart what it still holds."""
+
     leases: tuple[ReattachedLease, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class OomReported:
-    client: ClientId
-    request: RequestId
-    lease: LeaseId
-    token: Token
+class OomReported(LeaseRequest):
+    """An allocation of the holder failed."""
+
     requested_bytes: int
     allocated_bytes: int | None
 
 
 @dataclass(frozen=True, slots=True)
-class OperatorAsked:
+class OperatorAsked(ClientRequest):
     """An operator wants something done by hand.
 
     `target` is a lease or a consumer ("" for drain and resume).
     """
 
-    client: ClientId
-    request: RequestId
     action: Literal["evict", "pin", "unpin", "drain", "resume", "release_dead"]
     target: str
     by: str
@@ -252,11 +213,6 @@ class ProcessUse:
         """Bytes shown; 0 where the driver does not say."""
         return self.used_bytes or 0
 
-    def is_of(self, process: ProcessKey) -> bool:
-        """Whether this entry is of that process, as far as the source can tell."""
-        listed = self.process
-        return listed == process or (listed.start_ticks == 0 and listed.pid == process.pid)
-
 
 @dataclass(frozen=True, slots=True)
 class MemorySampled:
@@ -272,46 +228,31 @@ class MemorySampled:
     total_bytes: int
     processes: tuple[ProcessUse, ...] | None  # None: this source cannot list processes
 
-    @property
-    def lists_processes(self) -> bool:
-        return self.processes is not None
+    def listed_bytes(self) -> int | None:
+        """Return the bytes of all listed processes; None: there is no list with all their bytes."""
+        if self.processes is None:
+            return None
+        total = 0
+        for use in self.processes:
+            if use.used_bytes is None:
+                return None
+            total += use.used_bytes
+        return total
 
-    @property
-    def lists_bytes(self) -> bool:
-        """Whether there is a list with the bytes of each process in it."""
-        return self.processes is not None and all(
-            use.used_bytes is not None for use in self.processes
-        )
-
-    @property
-    def listed(self) -> tuple[ProcessUse, ...]:
-        return self.processes or ()
-
-    def bytes_of(self, process: ProcessKey) -> int | None:
-        """Return the bytes of a process: 0 if the list omits it, None if the reading cannot tell.
+    def bytes_of(self, process: ProcessKey, *, omitted: int | None = 0) -> int | None:
+        """Return the bytes of a process; None: the reading cannot tell.
 
         An omitted process may hold bytes: it may live in a container that the driver cannot name,
         or be dying.
+
+        Args:
+            omitted: What to return for a process that the list omits.
         """
-        if self.processes is None:
-            return None
-        use = self._use_of(process)
-        return 0 if use is None else use.used_bytes
-
-    def shows(self, process: ProcessKey) -> bool:
-        """Whether the process is listed with its bytes."""
-        use = self._use_of(process)
-        return use is not None and use.used_bytes is not None
-
-    def omits(self, process: ProcessKey) -> bool:
-        """Whether there is a list without this process."""
-        return self.processes is not None and self._use_of(process) is None
-
-    def _use_of(self, process: ProcessKey) -> ProcessUse | None:
-        for use in self.listed:
-            if use.is_of(process):
-                return use
-        return None
+        for use in self.processes or ():
+            listed = use.process
+            if listed == process or (listed.start_ticks == 0 and listed.pid == process.pid):
+                return use.used_bytes
+        return None if self.processes is None else omitted
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,7 +279,7 @@ class Recovered:
     """First event after a restart on the same boot: the journal's records, by key. Empty journal:
     no such event."""
 
-    records: Mapping[str, Mapping[str, Any]]
+    records: Mapping[str, AnyRecord]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,16 +1,16 @@
-"""What the core is told at its construction: the cards and the constants of the configuration."""
+"""What the engine is told at its construction: GPUs, scheduling policy and constants."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
-from vram_arbiter.arbiter.core.scheduling.policies import DEFAULT, SCHEDULING, Scheduling
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId
 
 
 @dataclass(frozen=True, slots=True)
 class GpuInfo:
-    """One card. `capacity_bytes` is the budget: what the card has, or less where the operator caps
-    it."""
+    """One GPU. `capacity_bytes`: all that it has, or less if an operator caps it."""
 
     id: GpuId
     index: int
@@ -20,6 +20,43 @@ class GpuInfo:
     source: str = ""  # what reads it: nvml, unified, fake
     noise_bytes: int = 0  # by how much its readings move when nothing happens
     total_bytes: int = 0  # what its readings call all of it; 0: not known before the first one
+
+
+DEFAULT = "default"
+
+
+@dataclass(frozen=True, slots=True)
+class Scheduling:
+    """One policy. The defaults are the policy `default`."""
+
+    summary: str
+    by_priority: bool = True
+    """Waiters by priority with ageing; False: strictly as they came."""
+    backfill: bool = True
+    """A small waiter may pass the head if that cannot delay it."""
+    least_recent: bool = False
+    """Victims by least recent use alone, until enough is covered; False: the cheapest set that
+    covers the need.
+    """
+    alone: bool = False
+    """Every lease is exclusive: one model at a time per GPU."""
+
+
+SCHEDULING: Mapping[str, Scheduling] = MappingProxyType(
+    {
+        DEFAULT: Scheduling(
+            "priority with ageing, conservative backfill, cheapest covering victims"
+        ),
+        "fifo": Scheduling(
+            "strictly as they came, without backfill", by_priority=False, backfill=False
+        ),
+        "no_backfill": Scheduling("default, but without backfill", backfill=False),
+        "lru": Scheduling(
+            "default, but the least recently used leave, whatever they hold", least_recent=True
+        ),
+        "one_model": Scheduling("default, but one model at a time per GPU", alone=True),
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +94,9 @@ class Settings:
     host_ram_budget_bytes: int = 0
     """Host RAM for the weights of parked leases; 0: no parking."""
     policy: str = DEFAULT
-    """A name of `core.scheduling.SCHEDULING`."""
+    """A name of `SCHEDULING`; KeyError at the engine's construction for another one."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Durations learnt by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s",
-    "load_s"}; basis of ETAs."""
+    """Durations learned by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s",
+    "load_s"}."""
     footprints: dict[str, dict[str, list[int]]] = field(default_factory=dict)
-    """Footprints measured by earlier runs, as `core.footprints.Footprints.kept` gave them."""
-
-    @property
-    def scheduling(self) -> Scheduling:
-        """Raises KeyError for a name that the table does not have."""
-        return SCHEDULING[self.policy]
+    """Footprints measured by earlier runs, as `Footprints.kept` gave them."""

@@ -15,7 +15,7 @@ and nothing else.
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import blake2b
@@ -26,16 +26,11 @@ from vram_arbiter.arbiter import core
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event
 from vram_arbiter.arbiter.core.settings import Settings
-from vram_arbiter.arbiter.eventlog.codec import (
-    CodecError,
-    decode,
-    decode_event,
-    digest,
-    summary,
-    to_json,
-)
+from vram_arbiter.arbiter.eventlog.codec import decode_event, digest, summary, to_json
 from vram_arbiter.schemas import defaults, ids
+from vram_arbiter.schemas.codec import CodecError, from_map, to_map
 from vram_arbiter.schemas.errors import OperatorError
+from vram_arbiter.schemas.plain import JsonMap
 
 FORMAT = 1
 SUFFIX = ".jsonl"
@@ -61,7 +56,7 @@ class Header:
     at_wall_s: float
     now: float
     settings: Settings
-    state: Mapping[str, Any] | None
+    state: JsonMap | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,12 +94,12 @@ def engine_id() -> str:
 
 def file_name(started_wall_s: float, epoch: int, segment: int) -> str:
     """Sorted by name is sorted by time."""
-    return f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime(started_wall_s))}-{epoch:06d}-{segment:04d}{SUFFIX}"
+    started = time.strftime("%Y%m%dT%H%M%S", time.gmtime(started_wall_s))
+    return f"{started}-{epoch:06d}-{segment:04d}{SUFFIX}"
 
 
 def header_line(header: Header) -> str:
-    fields = {name: getattr(header, name) for name in Header.__dataclass_fields__}
-    return to_json({"log": FORMAT, **fields}) + "\n"
+    return to_json({"log": FORMAT, **to_map(header)}) + "\n"
 
 
 def entry_line(now: float, event: Event, effects: Sequence[Effect] | None) -> str:
@@ -143,8 +138,8 @@ def find_files(place: Path) -> list[Path]:
 
 
 def read_file(path: Path) -> LogFile:
-    """Raises LogError for a file that is not a log, is of another format, or is broken before its last
-    line."""
+    """Raises LogError for a file that is not a log, is of another format, or is broken before its
+    last line."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -174,7 +169,7 @@ def _header(path: Path, line: str) -> Header:
             hint="replay it with its own",
         )
     try:
-        return decode(Header, data)
+        return from_map(Header, data, strict=True)
     except CodecError as error:
         raise _foreign(path, 1, error, str(data.get("version"))) from error
 

@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
@@ -25,6 +24,7 @@ from vram_arbiter.arbiter.eventlog.logfile import (
     read_file,
 )
 from vram_arbiter.arbiter.eventlog.snapshot import from_plain
+from vram_arbiter.schemas.plain import JsonObject
 
 CONTEXT = 5
 """Events shown before a divergence."""
@@ -156,9 +156,9 @@ def _handle(arbiter: Arbiter, entry: Entry) -> tuple[Sequence[Effect], str]:
 
 
 # -- for programs
-def report(found: Replayed) -> dict[str, Any]:
+def report(found: Replayed) -> JsonObject:
     """What `--json` prints."""
-    shown: dict[str, Any] = {
+    shown: JsonObject = {
         "events": found.events,
         "identical": found.identical,
         "seconds": found.ended_at - found.began_at,

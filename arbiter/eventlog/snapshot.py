@@ -19,7 +19,8 @@ from operator import attrgetter
 from typing import Any, cast
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
-from vram_arbiter.arbiter.eventlog.codec import CodecError
+from vram_arbiter.schemas.codec import CodecError
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 _HOMES = ("vram_arbiter.arbiter.core.", "vram_arbiter.schemas.ids", "vram_arbiter.schemas.wire.")
 
@@ -40,7 +41,8 @@ def freeze(arbiter: Arbiter) -> bytes:
 
 
 def thaw(frozen: bytes) -> Arbiter:
-    """Only for bytes that `freeze` made in this process: files hold JSON, nothing that could run."""
+    """Only for bytes that `freeze` made in this process: files hold JSON, nothing that could
+    run."""
     return cast(Arbiter, pickle.loads(frozen))
 
 
@@ -66,7 +68,8 @@ def _reducers() -> dict[type, _Reduce]:
 
 
 def _is_frozen(cls: type) -> bool:
-    return bool(getattr(cls, "__dataclass_params__").frozen)  # noqa: B009 - the stub of dataclasses does not have it
+    found: Any = cls  # the stub of dataclasses lacks the attribute
+    return bool(found.__dataclass_params__.frozen)
 
 
 def _is_map(cls: object) -> bool:
@@ -81,7 +84,7 @@ def _new(cls: Any) -> Any:
     return cls.__new__(cls)
 
 
-def _set_map(made: Any, state: tuple[Mapping[Any, Any], Mapping[str, Any]]) -> None:
+def _set_map(made: Any, state: tuple[Mapping[Any, Any], JsonMap]) -> None:
     dict.update(made, state[0])
     for name, value in state[1].items():
         object.__setattr__(made, name, value)
@@ -96,7 +99,7 @@ def _reducer(cls: type) -> _Reduce:
 
 
 # -- state → JSON ----------------------------------------------------------------------------------
-def to_plain(arbiter: Arbiter) -> dict[str, Any]:
+def to_plain(arbiter: Arbiter) -> JsonObject:
     """`{"objects": […], "root": n}`.
 
     Raises CodecError for a state that holds more than data (a function, a file).
@@ -142,6 +145,8 @@ class _Graph:
         name = f"{kind.__module__}:{kind.__qualname__}"
         if isinstance(value, Enum):
             return ["enum", name, value.value]
+        if isinstance(value, tuple):
+            return ["named", name, [self.value(item) for item in value]]
         attributes = {key: self.value(item) for key, item in _attributes(value)}
         if isinstance(value, dict):
             pairs = [[self.value(key), self.value(item)] for key, item in dict.items(value)]
@@ -158,7 +163,7 @@ def _attributes(value: Any) -> Iterable[tuple[str, Any]]:
 
 
 # -- JSON → state ----------------------------------------------------------------------------------
-def from_plain(data: Mapping[str, Any]) -> Arbiter:
+def from_plain(data: JsonMap) -> Arbiter:
     """The engine as it was.
 
     Raises CodecError if this version's classes are others, or the data is nothing of ours.
@@ -208,6 +213,8 @@ class _Builder:
                 return frozenset(self._value(item) for item in items)
             case ["enum", name, value]:
                 return _class(name)(value)
+            case ["named", name, items] if issubclass(cls := _class(name), tuple):
+                return cls(*[self._value(item) for item in items])
             case ["object", name, attributes] if _keylike(cls := _class(name)):
                 made = object.__new__(cls)
                 self._set(made, cls, attributes)
@@ -245,7 +252,7 @@ class _Builder:
             case _:
                 self._set(made, type(made), entry[2])
 
-    def _set(self, made: Any, cls: type, attributes: Mapping[str, Any]) -> None:
+    def _set(self, made: Any, cls: type, attributes: JsonMap) -> None:
         if is_dataclass(cls):
             names = {field.name for field in fields(cls)}
             if names != attributes.keys():

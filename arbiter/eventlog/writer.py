@@ -10,10 +10,9 @@ import asyncio
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
@@ -30,6 +29,7 @@ from vram_arbiter.arbiter.eventlog.logfile import (
 )
 from vram_arbiter.arbiter.eventlog.snapshot import freeze, thaw, to_plain
 from vram_arbiter.arbiter.host.disk_writer import DiskFailed, DiskWriter
+from vram_arbiter.schemas.plain import JsonMap
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ PIECE = 16
 """Events encoded before the thread lets others run."""
 PAUSE_S = 0.0002
 
-type Told = Callable[[str, Mapping[str, Any]], object]
+type Told = Callable[[str, JsonMap], object]
 """Where notes go: kind and facts, as `History.append`."""
 
 
@@ -114,12 +114,8 @@ class Recorder:
                 self._begin_anew("resumed", now)
                 self._disk.confirm()
             return
-        if self._disk.full:
-            self._stopped(f"more than {BUFFER_MAX} events wait for the disk")
-            return
-        self._disk.put((now, event, effects))
-        rotate = self._files.full_segment == self._segment - 1 and effects is not None
-        if rotate and not self._disk.full:
+        kept = self._put((now, event, effects))
+        if kept and effects is not None and self._files.full_segment == self._segment - 1:
             self._begin_anew("size", now)
 
     def flush(self) -> None:
@@ -138,8 +134,15 @@ class Recorder:
             self._begin(cause, frozen, now)
 
     def _begin(self, cause: str, frozen: bytes | None, now: float) -> None:
-        self._disk.put(_Begin(self._segment, cause, now, self._wall(), frozen))
         self._segment += 1
+        self._put(_Begin(self._segment - 1, cause, now, self._wall(), frozen))
+
+    def _put(self, item: _Item) -> bool:
+        """Keep an item, or stop: a log must not lack one in its middle."""
+        if self._disk.put(item):
+            return True
+        self._stopped(f"more than {BUFFER_MAX} events wait for the disk")
+        return False
 
     def _disk_told(self, failure: DiskFailed | None) -> None:
         if failure is not None:

@@ -84,19 +84,17 @@ class DiskWriter[Item]:
         return self._thread is not None
 
     @property
-    def full(self) -> bool:
-        """Whether the next `put` drops an item."""
-        return len(self._waiting) >= self._items_max
-
-    @property
     def behind(self) -> int:
         """Items with the thread that are neither written nor given up yet."""
         return self._handed - self._written
 
-    def put(self, item: Item) -> None:
-        """Accept an item for the next batch."""
+    def put(self, item: Item) -> bool:
+        """Accept an item for the next batch. Return False if the oldest was dropped for it."""
+        room = len(self._waiting) < self._items_max
         self._waiting.append(item)
-        self._arm()
+        if self._timer is None:
+            self._arm()
+        return room
 
     def clear(self) -> None:
         """Drop the items that the thread does not have yet."""

@@ -8,13 +8,15 @@ are behind the protocols below.
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Protocol
 
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView, Refusal
 from vram_arbiter.schemas.wire.pushes import AnyPush
 from vram_arbiter.schemas.wire.replies import AnyReply
@@ -34,19 +36,19 @@ class Outbox(Protocol):
 
     def push(self, client: ClientId, body: AnyPush) -> None: ...
 
-    def broadcast(self, event: Mapping[str, Any]) -> None: ...
+    def broadcast(self, event: JsonMap) -> None: ...
 
 
 class Records(Protocol):
     """The journal. `apply` writes all changes or none; None deletes. Raises JournalUnavailable."""
 
-    def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None: ...
+    def apply(self, changes: Sequence[tuple[str, JsonMap | None]]) -> None: ...
 
 
 class Chronicle(Protocol):
     """The history: gives a fact its number and time, and keeps it."""
 
-    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]: ...
+    def append(self, kind: str, data: JsonMap) -> JsonMap: ...
 
 
 class Traces(Protocol):
@@ -56,6 +58,8 @@ class Traces(Protocol):
 
     def revoke(self, body: AnyPush) -> AnyPush: ...
 
+    def observe(self, note: fx.Note, event: JsonMap) -> Mapping[str, str]: ...
+
     def wrote(self, seconds: float, *, failed: bool) -> None: ...
 
 
@@ -64,7 +68,7 @@ class Words(Protocol):
 
     def error_view(self, refusal: Refusal) -> ErrorView: ...
 
-    def event(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]: ...
+    def event(self, note: fx.Note) -> JsonMap: ...
 
 
 class Executor:
@@ -77,7 +81,7 @@ class Executor:
         history: Chronicle,
         sample: Callable[[GpuId], None],
         post: Callable[[ev.Event], None],
-        log_event: Callable[[Mapping[str, Any]], None],
+        log_event: Callable[[JsonMap, Mapping[str, str] | None], None],
         signal: Callable[[ProcessKey, str], None],
         words: Words,
         traces: Traces | None = None,
@@ -105,47 +109,49 @@ class Executor:
         """
         if self._traces is not None:
             self._traces.outgoing(effects)
+        some: Iterable[fx.Effect] = effects
         records = [effect for effect in effects if isinstance(effect, _RECORDS)]
-        failed = self._write(records) if records else _NOTHING
-        refused: dict[str, JournalUnavailable] = {}  # lease id → why
+        if records and (failed := self._write(records)):
+            some = self._without(failed, effects)
         notes: list[fx.Note] = []
         samples: list[fx.Sample] = []
-        for effect in effects:
-            if failed:
-                if (
-                    isinstance(effect, fx.JournalPut)
-                    and (why := failed.get(effect.key)) is not None
-                ):
-                    refused[effect.key.removeprefix("lease:")] = why
-                if (why := refused.get(_lease_of(effect) or "")) is not None:
-                    if isinstance(effect, fx.Reply):
-                        self._outbox.refuse(effect.client, effect.request, why.view())
-                    continue
-            if isinstance(effect, fx.Note):
-                notes.append(effect)
-            elif isinstance(effect, fx.Sample):
-                samples.append(effect)
-            elif not isinstance(effect, _RECORDS):
-                self._say(effect)
+        for effect in some:
+            match effect:
+                case fx.Note():
+                    notes.append(effect)
+                case fx.Reply():
+                    self._outbox.reply(effect.client, effect.request, effect.body)
+                case fx.Push(body=body):
+                    told = body if self._traces is None else self._traces.revoke(body)
+                    self._outbox.push(effect.client, told)
+                case fx.Sample():
+                    samples.append(effect)
+                case fx.Refuse(refusal=refusal):
+                    error = self._words.error_view(refusal)
+                    self._outbox.refuse(effect.client, effect.request, error)
+                case fx.Signal():
+                    self._signal(effect.process, effect.kind)
         for note in notes:
-            event = self._history.append(note.kind, self._words.event(note.kind, note.data))
-            self._log_event(event)
+            event = self._history.append(note.body.TAG[1], self._words.event(note))
+            span = None if self._traces is None else self._traces.observe(note, event)
+            self._log_event(event, span)
             self._outbox.broadcast(event)
         for sample in samples:
             self._sample(sample.gpu)
 
-    def _say(self, effect: fx.Effect) -> None:
-        match effect:
-            case fx.Reply(client, request, body):
-                self._outbox.reply(client, request, body)
-            case fx.Push(client, body):
-                self._outbox.push(
-                    client, body if self._traces is None else self._traces.revoke(body)
-                )
-            case fx.Signal(process, kind):
-                self._signal(process, kind)
-            case fx.Refuse(client, request, refusal):
-                self._outbox.refuse(client, request, self._words.error_view(refusal))
+    def _without(
+        self, failed: Mapping[str, JournalUnavailable], effects: Sequence[fx.Effect]
+    ) -> Iterator[fx.Effect]:
+        """Yield what may be said although grants could not be written. A reply that says more is
+        refused in its place."""
+        refused: dict[str, JournalUnavailable] = {}  # lease id → why
+        for effect in effects:
+            if isinstance(effect, fx.JournalPut) and effect.key in failed:
+                refused[effect.key.removeprefix("lease:")] = failed[effect.key]
+            if (why := refused.get(_lease_of(effect) or "")) is None:
+                yield effect
+            elif isinstance(effect, fx.Reply):
+                self._outbox.refuse(effect.client, effect.request, why.view())
 
     def settle(self) -> None:
         """Try again to delete what could not be deleted, if anything is left of that."""
@@ -157,35 +163,34 @@ class Executor:
     ) -> Mapping[str, JournalUnavailable]:
         """Write records, and delete what is owed. Keys of grants that could not be written, with
         the reason."""
-        changes = [(e.key, e.record if isinstance(e, fx.JournalPut) else None) for e in records]
-        owed: list[tuple[str, Mapping[str, Any] | None]] = []
+        changes: list[tuple[str, JsonMap | None]] = [
+            (e.key, to_map(e.record) if isinstance(e, fx.JournalPut) else None) for e in records
+        ]
         if self.owed:
             named = {key for key, _ in changes}
-            owed = [(key, None) for key in self.owed if key not in named]
-        began = time.monotonic()
+            changes = [*((key, None) for key in self.owed if key not in named), *changes]
+        began, failure = time.monotonic(), None
         try:
-            self._journal.apply([*owed, *changes])
-            self._count_write(began, failed=False)
+            self._journal.apply(changes)
+        except JournalUnavailable as error:
+            failure = error
+        if self._traces is not None:
+            self._traces.wrote(time.monotonic() - began, failed=failure is not None)
+        if failure is None:
             self.owed.clear()
             return _NOTHING
-        except JournalUnavailable as error:
-            self._count_write(began, failed=True)
-            log.error("journal: %s", error)
-            failed: dict[str, JournalUnavailable] = {}
-            gates = {e.key for e in records if isinstance(e, fx.JournalPut) and e.gates}
-            for key, record in changes:
-                if record is None:
-                    self.owed[key] = None
-                    continue
-                self.owed.pop(key, None)
-                if key in gates:
-                    failed[key] = error
-                self._post(ev.JournalFailed(key, error.message, key in gates))
-            return failed
-
-    def _count_write(self, began: float, *, failed: bool) -> None:
-        if self._traces is not None:
-            self._traces.wrote(time.monotonic() - began, failed=failed)
+        log.error("journal: %s", failure)
+        failed: dict[str, JournalUnavailable] = {}
+        gates = {e.key for e in records if isinstance(e, fx.JournalPut) and e.gates}
+        for key, record in changes:
+            if record is None:
+                self.owed[key] = None
+                continue
+            self.owed.pop(key, None)
+            if key in gates:
+                failed[key] = failure
+            self._post(ev.JournalFailed(key, failure.message, key in gates))
+        return failed
 
 
 def _lease_of(effect: fx.Effect) -> str | None:
@@ -194,8 +199,8 @@ def _lease_of(effect: fx.Effect) -> str | None:
         case fx.Reply(_, _, body) | fx.Push(_, body):
             lease = getattr(body, "lease", None)
             found = getattr(body, "lease_id", None) if lease is None else lease.lease_id
-        case fx.Note(_, data):
-            found = data.get("lease_id")
+        case fx.Note(_, about):
+            found = None if about is None else about.lease_id
         case _:
             return None
     return found if isinstance(found, str) else None

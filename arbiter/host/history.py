@@ -14,13 +14,14 @@ import sqlite3
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from vram_arbiter.arbiter.host.disk_writer import DiskBehind, DiskFailed, DiskWriter
 from vram_arbiter.arbiter.host.journal_files import is_corruption, put_aside
 from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.replies import HistoryReply
 
 log = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ CLEAN_END = "stopped"
 """Kind of the last event of an orderly stop."""
 
 Done = Callable[[HistoryReply], None]
-Event = Mapping[str, Any]
+Event = JsonMap
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS events
@@ -77,7 +78,7 @@ class History:
             self.problem = ""
             self._disk = DiskWriter(
                 "history",
-                _Owed(store),
+                store,
                 self._told,
                 items_max=BUFFER_MAX,
                 questions_max=QUESTIONS_MAX,
@@ -110,7 +111,7 @@ class History:
     def last_seq(self) -> int:
         return self._last_seq
 
-    def append(self, kind: str, data: Mapping[str, Any]) -> Event:
+    def append(self, kind: str, data: JsonMap) -> Event:
         """Give a fact its number and wall time, keep it, and return the event."""
         self._last_seq += 1
         event = {"seq": self._last_seq, "at_wall_s": self._wall(), "kind": kind, **data}
@@ -165,22 +166,6 @@ class History:
             self.problem = f"history cannot be written ({failure}): events are in memory only"
 
 
-class _Owed:
-    """The table behind the writer's thread. Events of a failed write are written with the next."""
-
-    def __init__(self, store: "_Store") -> None:
-        self._store = store
-        self._owed: deque[Event] = deque(maxlen=BUFFER_MAX)
-
-    def write(self, items: Sequence[Event]) -> None:
-        self._owed.extend(items)
-        self._store.add(tuple(self._owed))
-        self._owed.clear()
-
-    def close(self) -> None:
-        self._store.close()
-
-
 def _event(seq: int, at_wall_s: object, text: str) -> Event:
     """Return the event of one row; a damaged one keeps its number, so that paging goes on."""
     with contextlib.suppress(ValueError, TypeError):
@@ -206,7 +191,8 @@ def _is_damage(error: sqlite3.DatabaseError | OSError) -> bool:
 
 
 class _Store:
-    """The table. Made by the main thread, then used by the writer's thread alone."""
+    """The table. Made by the main thread, then used by the writer's thread alone. Events of a
+    failed write are written with the next."""
 
     def __init__(self, path: Path, max_events: int, days: float, wall: Callable[[], float]) -> None:
         self._wall = wall
@@ -214,6 +200,7 @@ class _Store:
         self._max_events = max_events
         self._days = days
         self._since_prune = 0
+        self._owed: deque[Event] = deque(maxlen=BUFFER_MAX)
         self._earlier = 0  # the last number of earlier runs
         self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
         try:
@@ -248,10 +235,11 @@ class _Store:
             self._earlier = int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
         return self._earlier
 
-    def add(self, events: Sequence[Event]) -> None:
+    def write(self, items: Sequence[Event]) -> None:
+        self._owed.extend(items)
         rows = [
             (e["seq"], e["at_wall_s"], e["kind"], json.dumps(e, separators=(",", ":"), default=str))
-            for e in events
+            for e in self._owed
         ]
         with self._db:
             self._db.execute("BEGIN IMMEDIATE")
@@ -259,6 +247,7 @@ class _Store:
             self._since_prune += len(rows)
             if self._since_prune >= PRUNE_EVERY_EVENTS:
                 self.prune(self._wall())
+        self._owed.clear()
 
     def prune(self, wall_s: float) -> None:
         """Drop events beyond the number or the age.

@@ -10,6 +10,7 @@ before. Damage is put aside and reported, never repaired by guessing. Must not k
 records mean: `check` tells whether one can be read.
 """
 
+import contextlib
 import errno
 import json
 import logging
@@ -17,8 +18,9 @@ import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Self
+from typing import Literal, NoReturn, Self
 
+from pydantic import TypeAdapter
 from pydantic_core import to_json
 
 from vram_arbiter.arbiter.core.events import DOUBT_KEY
@@ -34,6 +36,7 @@ from vram_arbiter.arbiter.host.journal_files import (
 )
 from vram_arbiter.arbiter.host.seal import LastStart, Seal, digest, fresh_epoch, write_last_start
 from vram_arbiter.schemas.errors import ConfigError, JournalUnavailable
+from vram_arbiter.schemas.plain import JsonMap
 
 log = logging.getLogger(__name__)
 
@@ -53,11 +56,13 @@ _DELETE = [
         for n in range(1, AT_ONCE_MAX + 1)
     ),
 ]
+_LEARNT = TypeAdapter(dict[str, dict[str, float]])
+_FOOTPRINTS = TypeAdapter(dict[str, dict[str, list[int]]])
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PASSING = frozenset((*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM))
 
 
-Change = tuple[str, Mapping[str, Any] | None]
+Change = tuple[str, JsonMap | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +75,7 @@ class Opened:
     """
 
     epoch: int
-    records: Mapping[str, Mapping[str, Any]]
+    records: Mapping[str, JsonMap]
     witness: str = ""
     put_aside: Path | None = None
     problem: str = ""
@@ -167,8 +172,8 @@ class Journal:
             doubt,
             tuple(found.problems),
             voided or 0,
-            _learnt(found.meta),
-            _footprints(found.meta),
+            _kept(found.meta, "learnt", _LEARNT),
+            _kept(found.meta, "footprints", _FOOTPRINTS),
         )
         return cls(folder / "journal.sqlite", boot_id, connection, seal, digests, opened)
 
@@ -219,7 +224,7 @@ class Journal:
                 rows.append((key, None, b""))
                 own = 0
             else:
-                text = _text(record)
+                text = to_json(record).decode()
                 raw = digest(key, text)
                 rows.append((key, text, raw))
                 own = int.from_bytes(raw)
@@ -287,9 +292,7 @@ class Journal:
         else:
             self._connection.execute(_PUT[len(rows)], [value for row in rows for value in row])
 
-    def keep(
-        self, name: Literal["learnt", "footprints"], learnt: Mapping[str, Mapping[str, Any]]
-    ) -> None:
+    def keep(self, name: Literal["learnt", "footprints"], learnt: Mapping[str, JsonMap]) -> None:
         """Keep what was learnt for the next start. Losing it costs estimates only: a failure is
         logged."""
         text = json.dumps(learnt, separators=(",", ":"))
@@ -307,11 +310,11 @@ class Journal:
         self._seal.close()
 
 
-def _text(record: Mapping[str, Any]) -> str:
+def _text(record: JsonMap) -> str:
     return to_json(record).decode()
 
 
-def _digests_of(records: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+def _digests_of(records: Mapping[str, JsonMap]) -> dict[str, int]:
     return {key: int.from_bytes(digest(key, _text(record))) for key, record in records.items()}
 
 
@@ -319,7 +322,7 @@ def _begin(
     connection: sqlite3.Connection,
     boot_id: str,
     epoch: int,
-    records: Mapping[str, Mapping[str, Any]] | None,
+    records: Mapping[str, JsonMap] | None,
 ) -> None:
     """Write what names this start. `records` replace those that are there; None leaves them."""
     with connection:
@@ -333,38 +336,15 @@ def _begin(
         connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
 
 
-def _kept(meta: Mapping[str, str], name: str) -> Any:
-    """What `keep` wrote. Raises ValueError for damage."""
+def _kept[T](
+    meta: Mapping[str, str], name: str, adapter: TypeAdapter[dict[str, T]]
+) -> dict[str, T]:
+    """What `keep` wrote; damage counts as nothing learnt."""
     told, _, text = meta.get(name, "").partition(" ")
-    if text and told != digest(name, text).hex():
-        raise ValueError("its digest is not that of its text")
-    return json.loads(text or "{}")
-
-
-def _learnt(meta: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """Durations that `keep` wrote; anything else counts as nothing learnt."""
-    try:
-        found = _kept(meta, "learnt")
-        return {
-            str(who): {str(what): float(s) for what, s in each.items()}
-            for who, each in found.items()
-        }
-    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-        return {}
-
-
-def _footprints(meta: Mapping[str, str]) -> dict[str, dict[str, list[int]]]:
-    """Byte counts that `keep` wrote; anything else counts as nothing learnt."""
-    try:
-        found = _kept(meta, "footprints")
-        return {
-            str(model): {
-                str(part): [int(count) for count in counts] for part, counts in parts.items()
-            }
-            for model, parts in found.items()
-        }
-    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-        return {}
+    if text and told == digest(name, text).hex():
+        with contextlib.suppress(ValueError):
+            return adapter.validate_json(text)
+    return {}
 
 
 def may_pass(error: BaseException) -> bool:

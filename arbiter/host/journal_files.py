@@ -13,7 +13,6 @@ import sqlite3
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from vram_arbiter.arbiter.host.seal import (
     EPOCH_MAX,
@@ -25,6 +24,7 @@ from vram_arbiter.arbiter.host.seal import (
     read_last_start,
 )
 from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 log = logging.getLogger(__name__)
 
@@ -32,13 +32,14 @@ SCHEMA_VERSION = 2
 """1: rows without a digest."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, json TEXT NOT NULL, digest BLOB) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS records
+    (key TEXT PRIMARY KEY, json TEXT NOT NULL, digest BLOB) WITHOUT ROWID;
 """
 RECORD_MAX_CHARS = 1 << 25
 """A lease with every use that a configuration may allow has 13 MB."""
 
-Check = Callable[[str, str], None]
-"""(key, text of a record) → ValueError that says why it cannot be read."""
+Check = Callable[[str, JsonMap], object]
+"""(key, record) → ValueError that says why it cannot be read."""
 
 
 @dataclass(slots=True)
@@ -48,7 +49,7 @@ class Found:
 
     connection: sqlite3.Connection
     meta: dict[str, str] = field(default_factory=dict)
-    records: dict[str, dict[str, Any]] = field(default_factory=dict)
+    records: dict[str, JsonObject] = field(default_factory=dict)
     digests: dict[str, int] = field(default_factory=dict)
     total: int = 0  # of the rows as they are, damaged ones too
     damaged: dict[bytes, str] = field(
@@ -183,7 +184,7 @@ def _take(
     if not isinstance(record, dict):
         raise ValueError("not a map")
     if check is not None:
-        check(key, text)
+        check(key, record)
     found.records[key] = record
     found.digests[key] = int.from_bytes(own)
 

@@ -1,7 +1,7 @@
-"""Readings of the cards without ever blocking the loop: one thread per card, each reading with a
+"""Readings of the GPUs without ever blocking the loop: one thread per GPU, each reading with a
 deadline.
 
-A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the card stays
+A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the GPU stays
 unknown and no further reading is started until it returns. Requests are merged, except that one
 that comes after a reading began is answered by a fresh one: a verification must never be fed with a
 reading from before its question. Bytes of children are booked on the ancestor that holds the lease
@@ -13,12 +13,12 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Literal
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.host.gpu.probe import GpuProbe, Reading
-from vram_arbiter.arbiter.host.process_tree import Known, Lineage, Lineages, on_owners
+from vram_arbiter.arbiter.host.process_tree import Lineage, Lineages, on_owners
 from vram_arbiter.schemas.errors import ProbeFailed
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
@@ -31,7 +31,8 @@ class Prober:
     """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or
     for several merged ones.
 
-    `known(gpu)` is called on the loop's thread.
+    `owners(gpu)` and `clients()` are processes with an account on the GPU, and with a connection.
+    They are called on the loop's thread.
     """
 
     def __init__(
@@ -41,130 +42,131 @@ class Prober:
         deadline_s: float,
         loop: asyncio.AbstractEventLoop,
         post: Callable[[ev.Event], None],
-        known: Callable[[GpuId], Known],
+        owners: Callable[[GpuId], Set[ProcessKey]],
+        clients: Callable[[], Set[ProcessKey]],
     ) -> None:
-        self._probe = probe
-        self._readers = {gpu: _Reader(probe, gpu, deadline_s, loop, post, known) for gpu in gpus}
+        self.probe = probe
+        self.deadline_s = deadline_s
+        self.loop = loop
+        self.post = post
+        self.owners = owners
+        self.clients = clients
+        self._readers = {gpu: _Reader(self, gpu) for gpu in gpus}
 
     def sample(self, gpu: GpuId) -> None:
-        self._readers[gpu].request()
+        """Read a GPU now, or again after the reading under way, which began before this
+        question."""
+        reader = self._readers[gpu]
+        match reader.state:
+            case "idle":
+                reader.begin()
+            case "reading":
+                reader.again = True
+            case "stuck":
+                reader.tell_again()
+            case "closed":
+                pass
 
     def close(self) -> None:
         """Ends the threads. A call that hangs in its driver is not waited for: it dies with the
         process (daemon threads)."""
         for reader in self._readers.values():
             reader.close()
-        closing = threading.Thread(target=self._probe.close, name="probe-close", daemon=True)
+        closing = threading.Thread(target=self.probe.close, name="probe-close", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
 
 
 class _Reader:
-    """One card: idle → reading → idle, or reading → stuck → idle when the hung call returns at
+    """One GPU: idle → reading → idle, or reading → stuck → idle when the hung call returns at
     last."""
 
-    def __init__(
-        self,
-        probe: GpuProbe,
-        gpu: GpuId,
-        deadline_s: float,
-        loop: asyncio.AbstractEventLoop,
-        post: Callable[[ev.Event], None],
-        known: Callable[[GpuId], Known],
-    ) -> None:
-        self._probe = probe
+    def __init__(self, prober: Prober, gpu: GpuId) -> None:
+        self._prober = prober
+        self._loop = prober.loop
         self._gpu = gpu
-        self._deadline_s = deadline_s
-        self._loop = loop
-        self._post = post
-        self._known = known
         self._lineages = Lineages()  # the thread's
-        self._state: Literal["idle", "reading", "stuck", "closed"] = "idle"
-        self._again = False
+        self.state: Literal["idle", "reading", "stuck", "closed"] = "idle"
+        self.again = False
+        """A question came after the reading under way began."""
         self._timer: asyncio.TimerHandle | None = None
         self._began_at = 0.0
         self._work: queue.SimpleQueue[bool] = queue.SimpleQueue()  # True: read, False: end
         self._thread: threading.Thread | None = None
 
-    def request(self) -> None:
-        match self._state:
-            case "idle":
-                self._begin()
-            case "reading":
-                self._again = True  # the reading under way began before this question
-            case "stuck":
-                self._again = True
-                if self._timer is None:  # no busy loop of questions and refusals
-                    self._timer = self._loop.call_later(self._deadline_s, self._still_stuck)
-            case "closed":
-                pass
+    def tell_again(self) -> None:
+        """Say once more that the reading hangs, after a while: no busy loop of questions and
+        refusals."""
+        self.again = True
+        if self._timer is None:
+            self._timer = self._loop.call_later(self._prober.deadline_s, self._still_stuck)
 
     def close(self) -> None:
-        self._state = "closed"
+        self.state = "closed"
         if self._timer is not None:
             self._timer.cancel()
         self._work.put(False)
 
-    def _begin(self) -> None:
+    def begin(self) -> None:
         if self._thread is None:
             self._thread = threading.Thread(
                 target=self._run, name=f"probe-{self._gpu}", daemon=True
             )
             self._thread.start()
-        self._state, self._again = "reading", False
+        self.state, self.again = "reading", False
         self._began_at = time.monotonic()
-        self._timer = self._loop.call_later(self._deadline_s, self._expired)
+        self._timer = self._loop.call_later(self._prober.deadline_s, self._expired)
         self._work.put(True)
 
     def _expired(self) -> None:
         self._timer = None
-        self._state = "stuck"
-        log.error(
-            "%s: no answer within %g s; unknown until the reading returns",
-            self._gpu,
-            self._deadline_s,
-        )
-        self._fail(f"no answer within {self._deadline_s:g} s")
+        self.state = "stuck"
+        late = f"no answer within {self._prober.deadline_s:g} s"
+        log.error("%s: %s; unknown until the reading returns", self._gpu, late)
+        self._fail(late)
 
     def _still_stuck(self) -> None:
         self._timer = None
         self._fail(f"the reading hangs since {time.monotonic() - self._began_at:.1f} s")
 
     def _fail(self, reason: str) -> None:
-        self._post(ev.ProbeFailed(self._gpu, time.monotonic(), reason))
+        self._prober.post(ev.ProbeFailed(self._gpu, time.monotonic(), reason))
 
     def _done(
         self, taken_at: float, outcome: Reading | str, lineages: Mapping[ProcessKey, Lineage]
     ) -> None:
         """Back on the loop's thread. A late answer is not used: it is as old as its question, and a
         fresh one costs nothing."""
-        if self._state == "closed":
+        if self.state == "closed":
             return
-        was_stuck = self._state == "stuck"
+        was_stuck = self.state == "stuck"
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._state = "idle"
+        self.state = "idle"
         if was_stuck:
             log.warning(
                 "%s: answers again after %.1f s", self._gpu, time.monotonic() - self._began_at
             )
-            self._begin()  # whether it answers is known from a fresh reading only
+            self.begin()  # whether it answers is known from a fresh reading only
             return
         if isinstance(outcome, Reading):
             processes = outcome.processes
-            if processes is not None:
-                processes = on_owners(processes, lineages, self._known(self._gpu))
-            self._post(
+            if processes:
+                owners = self._prober.owners(self._gpu)
+                named = {use.process for use in processes}
+                if named - owners or len(named) < len(processes):
+                    processes = on_owners(processes, lineages, owners, self._prober.clients())
+            self._prober.post(
                 ev.MemorySampled(
                     self._gpu, taken_at, outcome.used_bytes, outcome.total_bytes, processes
                 )
             )
         else:
             self._fail(outcome)
-        if self._again and self._state == "idle":
+        if self.again and self.state == "idle":
             # else the handler of this answer asked again, and that reading serves all
-            self._begin()
+            self.begin()
 
     # -- the thread
     def _run(self) -> None:
@@ -173,11 +175,11 @@ class _Reader:
             outcome: Reading | str
             lineages: Mapping[ProcessKey, Lineage] = {}
             try:
-                outcome = self._probe.sample(self._gpu)
+                outcome = self._prober.probe.sample(self._gpu)
                 lineages = self._lineages.trace(outcome.processes or ())
             except ProbeFailed as error:
                 outcome = error.message
-            except Exception as error:  # outermost loop of a thread: a defect is an unknown card
+            except Exception as error:  # outermost loop of a thread: a defect is an unknown GPU
                 log.exception("%s: the probe failed", self._gpu)
                 outcome = f"{type(error).__name__}: {error}"
             try:

@@ -6,7 +6,7 @@ attributes by the holders of that very moment (the loop's thread). Must not deci
 leases: it only says which process a reading's bytes belong to.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 from vram_arbiter.arbiter.core.events import ProcessUse
@@ -32,22 +32,6 @@ Lineage = tuple[Kin, ...]
 """A process's ancestors, its parent first."""
 
 
-@dataclass(frozen=True, slots=True)
-class Known:
-    """Processes that the arbiter knows: with an account on the GPU, and with a connection."""
-
-    owners: Set[ProcessKey]
-    clients: Set[ProcessKey]
-
-    def independent(self, process: ProcessKey) -> bool:
-        """Whether a process keeps its own bytes. Start time 0 matches any process with that pid."""
-        if process in self.owners or process in self.clients:
-            return True
-        return process.start_ticks == 0 and any(
-            known.pid == process.pid for some in (self.owners, self.clients) for known in some
-        )
-
-
 def read_kin(pid: int) -> Kin | None:
     """Return a process and its parent; None if it has ended or cannot be seen from here."""
     stat = procfs.read_stat(pid)
@@ -57,7 +41,7 @@ def read_kin(pid: int) -> Kin | None:
 
 
 class Lineages:
-    """Ancestors of the processes of one card's readings. Remembers the last reading's, for a
+    """Ancestors of the processes of one GPU's readings. Remembers the last reading's, for a
     process that dies before it is traced."""
 
     def __init__(self, read: Reader = read_kin) -> None:
@@ -98,40 +82,41 @@ class Lineages:
 
 
 def on_owners(
-    processes: Iterable[ProcessUse], lineages: Mapping[ProcessKey, Lineage], known: Known
+    processes: Sequence[ProcessUse],
+    lineages: Mapping[ProcessKey, Lineage],
+    owners: Set[ProcessKey],
+    clients: Set[ProcessKey],
 ) -> tuple[ProcessUse, ...]:
     """The reading's processes with the bytes of children booked on their nearest ancestor that has
     an account.
 
-    A process with an account or a connection of its own keeps its own bytes; one without such an
-    ancestor stays a stowaway. Bytes that the driver does not say (None) make the sum unknown.
+    A process with an account (`owners`) or a connection (`clients`) keeps its own bytes; one
+    without such an ancestor stays a stowaway. A start time of 0 matches any process with that pid.
+    Bytes that the driver does not say (None) make the sum unknown.
     """
+    pids = {known.pid for some in (owners, clients) for known in some}
     booked: dict[ProcessKey, ProcessUse] = {}
     children: dict[ProcessKey, list[str]] = {}
     for use in processes:
-        owner = None
-        if not known.independent(use.process):
-            owner = next(
-                (kin for kin in lineages.get(use.process, ()) if kin.process in known.owners), None
-            )
-        target = use if owner is None else ProcessUse(owner.process, owner.name, use.used_bytes)
-        if owner is not None:
-            names = children.setdefault(owner.process, [])
-            if use.name and use.name not in names:  # a dying one has no name any more
-                names.append(use.name)
-        there = booked.get(target.process)
-        if there is None:
-            booked[target.process] = target
-            continue
-        name = use.name if owner is None else there.name  # what the probe calls the owner says more
-        both_known = there.used_bytes is not None and use.used_bytes is not None
-        total = (there.used_bytes or 0) + (use.used_bytes or 0) if both_known else None
-        booked[target.process] = ProcessUse(target.process, name, total)
-    return tuple(_named(use, children.get(use.process, [])) for use in booked.values())
-
-
-def _named(use: ProcessUse, children: list[str]) -> ProcessUse:
-    """Return `vramctl (python)`: the owner, and the child that is charged to it."""
-    if not children:
-        return use
-    return replace(use, name=f"{use.name} ({', '.join(children)})"[:NAME_MAX])
+        process, target = use.process, use
+        has_own = process in owners or process in clients
+        if not has_own and not (process.start_ticks == 0 and process.pid in pids):
+            for kin in lineages.get(process, ()):
+                if kin.process in owners:
+                    target = ProcessUse(kin.process, kin.name, use.used_bytes)
+                    names = children.setdefault(kin.process, [])
+                    if use.name and use.name not in names:  # a dying one has no name any more
+                        names.append(use.name)
+                    break
+        if (there := booked.get(target.process)) is not None:
+            # what the probe calls the owner says more
+            name = use.name if target is use else there.name
+            both_known = there.used_bytes is not None and use.used_bytes is not None
+            total = (there.used_bytes or 0) + (use.used_bytes or 0) if both_known else None
+            target = ProcessUse(target.process, name, total)
+        booked[target.process] = target
+    for process, names in children.items():
+        if names:  # `vramctl (python)`: the owner, and the child that is charged to it
+            named = f"{booked[process].name} ({', '.join(names)})"[:NAME_MAX]
+            booked[process] = replace(booked[process], name=named)
+    return tuple(booked.values())

@@ -7,6 +7,7 @@ after the pidfd is opened (`add`). Must not know clients or leases.
 """
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -41,16 +42,17 @@ class ProcessWatch:
         """
         if process in self._fds:
             return
-        try:
+        fd: int | None = None
+        with contextlib.suppress(ProcessLookupError):
             fd = os.pidfd_open(process.pid)
-        except ProcessLookupError:
-            self._gone(process)
-            return
-        if process.start_ticks != 0 and self._start_ticks(process.pid) != process.start_ticks:
-            os.close(fd)  # another process has this pid now
-            self._gone(process)
-            return
-        self._watch(process, fd)
+            if process.start_ticks not in (0, self._start_ticks(process.pid)):
+                os.close(fd)  # another process has this pid now
+                fd = None
+        self._fds[process] = fd
+        if fd is None:
+            self._loop.call_soon(self._ended, process)
+        else:
+            self._loop.add_reader(fd, self._ended, process)
 
     def take(self, process: ProcessKey, pidfd: int) -> bool:
         """Watch the process of a connection by a copy of the pidfd that was opened when it was
@@ -60,13 +62,13 @@ class ProcessWatch:
         """
         if process in self._fds:
             return False
-        self._watch(process, os.dup(pidfd))
+        fd = self._fds[process] = os.dup(pidfd)
+        self._loop.add_reader(fd, self._ended, process)
         return True
 
     def drop(self, process: ProcessKey) -> None:
         """Watch a process no longer: its death concerns nothing."""
-        fd = self._fds.pop(process, None)
-        if fd is not None:
+        if (fd := self._fds.pop(process, None)) is not None:
             self._loop.remove_reader(fd)
             os.close(fd)
 
@@ -88,26 +90,10 @@ class ProcessWatch:
         return len(self._fds)
 
     def close(self) -> None:
-        for fd in self._fds.values():
-            if fd is not None:
-                self._loop.remove_reader(fd)
-                os.close(fd)
-        self._fds.clear()
+        for process in list(self._fds):
+            self.drop(process)
 
-    def _watch(self, process: ProcessKey, fd: int) -> None:
-        self._fds[process] = fd
-        self._loop.add_reader(fd, self._readable, process, fd)
-
-    def _gone(self, process: ProcessKey) -> None:
-        self._fds[process] = None
-        self._loop.call_soon(self._report, process)
-
-    def _readable(self, process: ProcessKey, fd: int) -> None:
-        self._loop.remove_reader(fd)
-        os.close(fd)
-        self._report(process)
-
-    def _report(self, process: ProcessKey) -> None:
-        if process in self._fds:  # not closed meanwhile
-            del self._fds[process]
+    def _ended(self, process: ProcessKey) -> None:
+        if process in self._fds:  # not dropped meanwhile
+            self.drop(process)
             self._died(process)

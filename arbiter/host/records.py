@@ -1,111 +1,73 @@
-"""What a record of the journal may say: types and ranges of what `Core.record_lease` and its
-neighbors write.
+"""Records of the journal from their plain form, checked.
 
-A record outside of them would end every start in a traceback, or every answer of the daemon: a pid
-that no kernel gives, a token that no wire carries. Unknown fields pass, within the limits of
-`schemas.strictjson`: an engine may write more than is read here.
+A record outside its limits would end every start in a traceback, or every answer of the daemon: a
+pid that no kernel gives, a token that no wire carries. Unknown fields pass, within the limits of
+`schemas.strictjson`: another version may write more than is read here.
 """
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_json
 
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.arbiter.core.events import DOUBT_KEY, DRAIN_KEY
+from vram_arbiter.arbiter.core.model.records import (
+    AnyRecord,
+    DoubtRecord,
+    DrainRecord,
+    LeaseRecord,
+    ResidueRecord,
+)
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-Pid = Annotated[int, Field(ge=1, le=1 << 30)]
-Ticks = Annotated[int, Field(ge=0, lt=1 << 62)]
-Count = Annotated[int, Field(ge=0, lt=1 << 62)]
-Bytes = Annotated[int, Field(ge=0, le=1 << 53)]
-Text = Annotated[str, Field(max_length=4 * d.REASON_MAX_CHARS)]
-Id = Annotated[str, Field(min_length=1, max_length=d.NAME_MAX_CHARS)]
-Seconds = Annotated[float, Field(ge=0, le=1e10, allow_inf_nan=False)]
-Order = tuple[Text, Text]
-
-
-class _Record(BaseModel):
-    model_config = ConfigDict(strict=True, extra="ignore")
-
-
-class _Spec(_Record):
-    consumer: Id
-    model_id: Id
-    revision: Text
-    gpu: Id
-    exclusive: bool
-    load_peak_bytes: Bytes
-    steady_bytes: Bytes
-    residue_bytes: Bytes
-    priority: Annotated[int, Field(ge=0, le=d.PRIORITY_MAX)]
-    evictable: bool
-    ttl_s: Annotated[Seconds, Field(gt=0)]
-    min_residency_s: Seconds
-    deny_on_deadline: bool
-    standby: bool = False
-    on_overstay: Literal["wait", "terminate", "kill"] = "wait"
-    park_bytes: Bytes = 0
-    independent: bool = False
-    gang: tuple[Id, Annotated[int, Field(ge=2, le=16)]] | None = None
+_ADAPTERS: Final[Mapping[str, TypeAdapter[Any]]] = {
+    "lease": TypeAdapter(LeaseRecord),
+    "residue": TypeAdapter(ResidueRecord),
+    DRAIN_KEY: TypeAdapter(DrainRecord),
+    DOUBT_KEY: TypeAdapter(DoubtRecord),
+}
+_SPEC = frozenset(field.name for field in fields(LeaseSpec))
+_SIZES = tuple(field.name for field in fields(Footprint))
 
 
-class LeaseRecord(_Record):
-    lease_id: Id
-    token: tuple[Count, Count]
-    state: Literal[
-        "loading", "held", "revoking", "unloading", "verifying", "parked", "standby", "debt"
-    ]
-    gpu: Id | None
-    pid: Pid
-    start_ticks: Ticks
-    nonce: Id
-    charge_bytes: Bytes
-    load_peak_bytes: Bytes
-    measured_bytes: Bytes | None
-    exiting: bool
-    gang: tuple[Id, Annotated[int, Field(ge=1, le=16)]] | None = None
-    pinned: Order | None = None
-    comes_back: bool = False
-    parks: bool = False
-    parked_bytes: Bytes = 0
-    left_for: Text = ""
-    dismissed: bool = False
-    held_from: Seconds = 0.0  # on the monotonic clock
-    users: Annotated[list[tuple[Pid, Ticks, Id, Text]], Field(max_length=1 << 17)] = []
-    spec: _Spec
-
-
-class ResidueRecord(_Record):
-    pid: Pid
-    start_ticks: Ticks
-    gpu: Id
-    residue_bytes: Bytes
-    floor_bytes: Bytes = 0
-
-
-class DrainRecord(_Record):
-    by: Text
-    reason: Text
-
-
-class DoubtRecord(_Record):
-    why: str
-
-
-def check_record(key: str, text: str) -> None:
-    """Raises ValueError that says what is wrong with the record of `key`, in one line."""
-    model: type[BaseModel]
-    if key.startswith("lease:"):
-        model = LeaseRecord
-    elif key.startswith("residue:"):
-        model = ResidueRecord
-    elif key in ("drain", "doubt"):
-        model = DrainRecord if key == "drain" else DoubtRecord
-    else:
+def record_of(key: str, data: JsonMap) -> AnyRecord:
+    """Return the record of `key`. Raises ValueError that says what is wrong with it, in one
+    line."""
+    adapter = _ADAPTERS.get(key.partition(":")[0])
+    if adapter is None:
         raise ValueError("no part of the daemon writes such a record")
+    if isinstance(spec := data.get("spec"), dict):
+        data = {**data, "spec": _spec(spec)}
     try:
-        found: Any = model.model_validate_json(text)
+        found: AnyRecord = adapter.validate_json(to_json(data), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise ValueError(f"{where}: {first['msg']}" if where else first["msg"]) from None
     if isinstance(found, LeaseRecord) and key != f"lease:{found.lease_id}":
         raise ValueError(f"lease_id: it is the record of {found.lease_id}")
+    return found
+
+
+def records_of(data: Mapping[str, JsonMap]) -> dict[str, AnyRecord]:
+    """Return the records by their keys. Raises ValueError."""
+    return {key: record_of(key, record) for key, record in data.items()}
+
+
+def _spec(data: JsonObject) -> JsonObject:
+    """Return a spec as it is written now: version 0.1 wrote it flat."""
+    if "footprint" not in data:
+        gang = data.get("gang")
+        if isinstance(gang, list | tuple):
+            gang = dict(zip(("id", "size"), gang, strict=False))
+        data = {
+            **data,
+            "footprint": {name: data[name] for name in _SIZES if name in data},
+            "mode": "exclusive" if data.get("exclusive") else "shared",
+            "on_deadline": "deny" if data.get("deny_on_deadline") else "wait",
+            "gang": gang,
+        }
+    return {name: value for name, value in data.items() if name in _SPEC}

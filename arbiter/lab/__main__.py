@@ -9,15 +9,16 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from vram_arbiter.arbiter.core.scheduling.policies import DEFAULT, SCHEDULING
+from vram_arbiter.arbiter.core.settings import DEFAULT, SCHEDULING
 from vram_arbiter.arbiter.eventlog import text as replay_text
 from vram_arbiter.arbiter.eventlog.codec import to_json
 from vram_arbiter.arbiter.eventlog.replay import load
-from vram_arbiter.arbiter.lab import compare, text
+from vram_arbiter.arbiter.lab import compare
 from vram_arbiter.arbiter.lab.outcome import Outcome, as_plain
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.version import add_version
 
@@ -169,22 +170,20 @@ def simulate(path: Path, policies: Sequence[str], timeline: int | None, *, as_js
     print(f"{scenario.about} ({scenario.seconds:g} s, seed {scenario.seed})")
     for outcome in outcomes:
         if shown:
-            print("\n".join(["", *text.timeline_lines(outcome.policy, outcome.timeline, shown)]))
+            print("\n".join(["", *compare.timeline_lines(outcome.policy, outcome.timeline, shown)]))
     print("\n".join(["", *compare.total_lines(outcomes), "", *compare.consumer_lines(outcomes)]))
 
 
-def _timeline(outcome: Outcome, limit: int) -> dict[str, Any]:
-    decided = [(at, kind, data) for at, kind, data in outcome.timeline if kind in text.DECISIONS][
+def _timeline(outcome: Outcome, limit: int) -> JsonObject:
+    decided = [(at, note) for at, note in outcome.timeline if note.kind in compare.DECISIONS][
         :limit
     ]
     return (
-        {"timeline": [{"at_s": at, "kind": kind, **data} for at, kind, data in decided]}
-        if limit
-        else {}
+        {"timeline": [{"at_s": at, **words.event(note)} for at, note in decided]} if limit else {}
     )
 
 
-def _print_json(shown: dict[str, Any]) -> None:
+def _print_json(shown: JsonObject) -> None:
     print(json.dumps(json.loads(to_json(shown)), indent=2))
 
 

@@ -211,9 +211,7 @@ class Actor:
         work = self._using.pop(use, None)
         if work is None or turn != self._round:
             return
-        self._stage.post(
-            UseEnded(self.client, self._stage.next_request(), self._lease, self._token, use)
-        )
+        self._say(UseEnded, use)
         self._over(work)
 
     def _over(self, work: _Work) -> None:
@@ -323,7 +321,7 @@ class Actor:
         self._round += 1
         turn = self._round
         if not self._stage.cards[self._gpu].set(
-            self._process, self._job.spec.load_peak_bytes, self._stage.now
+            self._process, self._job.spec.footprint.load_peak_bytes, self._stage.now
         ):
             self._tally.ooms += 1
             self._stage.at(self._stage.now, lambda: self._out_of_memory(turn))
@@ -347,13 +345,12 @@ class Actor:
         if turn != self._round or self._state != "loading" or self._job is None:
             return
         job = self._job
-        count = job.spec.steady_bytes if job.measured_bytes is None else job.measured_bytes
+        count = (
+            job.spec.footprint.steady_bytes if job.measured_bytes is None else job.measured_bytes
+        )
         self._stage.cards[self._gpu].set(self._process, count, self._stage.now)
         self._state, self._held_at = "held", self._stage.now
-        request = self._stage.next_request()
-        self._stage.post(
-            ReadyReported(self.client, request, self._lease, self._token, job.measured_bytes)
-        )
+        self._say(ReadyReported, job.measured_bytes)
         if self._revoked:
             self._leave(self._plan.heed_s)
         self._go()
@@ -362,11 +359,7 @@ class Actor:
         if self._revoked:
             return
         self._revoked = True
-        self._stage.post(
-            RevokeAcknowledged(
-                self.client, self._stage.next_request(), self._lease, self._token, None
-            )
-        )
+        self._say(RevokeAcknowledged, None)
         for use in reversed(list(self._settling)):
             self._pending.appendleft(self._settling.pop(use))
         if not self._using and self._state == "held":
@@ -383,15 +376,13 @@ class Actor:
     def _unload(self, turn: int) -> None:
         if turn != self._round or self._job is None:
             return
-        self._stage.post(
-            UnloadStarted(self.client, self._stage.next_request(), self._lease, self._token)
-        )
+        self._say(UnloadStarted)
         self._stage.at(self._stage.now + self._job.unload_s, lambda: self._unloaded(turn))
 
     def _unloaded(self, turn: int) -> None:
         if turn != self._round or self._job is None:
             return
-        kept = 0 if self._stage.holders_exit else self._job.spec.residue_bytes
+        kept = 0 if self._stage.holders_exit else self._job.spec.footprint.residue_bytes
         self._stage.cards[self._gpu].set(self._process, kept, self._stage.now)
         self._release()
         self._state = "none"
@@ -403,11 +394,12 @@ class Actor:
         self._round += 1
         self._revoked = False
         self._settling.clear()
-        self._stage.post(
-            ReleaseReported(
-                self.client, self._stage.next_request(), self._lease, self._token, False
-            )
-        )
+        self._say(ReleaseReported, False)
+
+    def _say(self, event: Callable[..., Event], *rest: object) -> None:
+        """Post an event about the lease."""
+        request = self._stage.next_request()
+        self._stage.post(event(self.client, request, self._lease, self._token, *rest))
 
 
 def _later[*T](call: Callable[[*T], None], *arguments: *T) -> Callable[[], None]:

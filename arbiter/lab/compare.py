@@ -4,20 +4,40 @@ The policies are the engine's own and the ports of other programs' rules.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
-from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.effects import Note
+from vram_arbiter.arbiter.core.settings import SCHEDULING, Settings
+from vram_arbiter.arbiter.eventlog.text import cut
+from vram_arbiter.arbiter.lab.actors import START_S
 from vram_arbiter.arbiter.lab.outcome import Outcome, Tally
 from vram_arbiter.arbiter.lab.rules import RULES
-from vram_arbiter.arbiter.lab.simulator import Engine, Scheduler, simulate
-from vram_arbiter.arbiter.lab.text import table
+from vram_arbiter.arbiter.lab.simulator import simulate
 from vram_arbiter.arbiter.lab.workload import Workload
+from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.errors import CallerError
+from vram_arbiter.schemas.runtime.printable import makes_printable, printable
 from vram_arbiter.schemas.sizes import format_bytes
 
 POLICIES = (*SCHEDULING, *RULES)
 """Every name that `--policy` takes: first the engine's, then the ports."""
+DECISIONS = frozenset(
+    {
+        "queued",
+        "granted",
+        "ready",
+        "revoke_asked",
+        "deadline_passed",
+        "verified",
+        "denied",
+        "pressure",
+        "standby",
+        "parked",
+    }
+)
+"""Kinds of notes that a timeline shows."""
 STARVED_S = 60.0
 """A job that waits longer than this counts as starved."""
 
@@ -29,12 +49,10 @@ class UnknownPolicy(CallerError):
 def under(workload: Workload, settings: Settings, policy: str) -> Outcome:
     """Simulate a workload under one policy. Raises UnknownPolicy."""
     if policy in SCHEDULING:
-        scheduler: Scheduler = Engine.under(settings, policy)
-    elif policy in RULES:
-        scheduler = RULES[policy](workload.cards)
-    else:
-        raise UnknownPolicy(f"unknown policy {policy!r}", hint=f"known: {', '.join(POLICIES)}")
-    return simulate(workload, scheduler, policy)
+        return simulate(workload, Arbiter(replace(settings, policy=policy), START_S), policy)
+    if policy in RULES:
+        return simulate(workload, RULES[policy](workload.cards), policy, holders_exit=True)
+    raise UnknownPolicy(f"unknown policy {policy!r}", hint=f"known: {', '.join(POLICIES)}")
 
 
 def starved(tally: Tally) -> int:
@@ -119,3 +137,32 @@ def _cells(tally: Tally) -> tuple[Any, ...]:
         tally.ooms,
     )
     return (tally.jobs, tally.unserved, *waits, *counts)
+
+
+# -- lines ----------------------------------------------------------------------------------------
+@makes_printable
+def timeline_lines(policy: str, timeline: Sequence[tuple[float, Note]], limit: int) -> list[str]:
+    """Return the first decisions of a run, each with its reason."""
+    decided = [(at, note) for at, note in timeline if note.kind in DECISIONS]
+    lines = [f"decisions under {policy} (the first {min(limit, len(decided))} of {len(decided)})"]
+    for at, note in decided[:limit]:
+        event = words.event(note)
+        why = event.get("reason") or event.get("verdict") or ""
+        lines.append(
+            cut(f"{at:9.3f} s  {note.kind:<12}  {event.get('consumer', ''):<12}  {why}".rstrip())
+        )
+    return lines
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> list[str]:
+    """Return rows in columns as wide as their longest cell, all but the first `left` to
+    the right."""
+    cells = [[printable(cell) for cell in row] for row in [columns, *rows]]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
+    return [
+        "  ".join(
+            cell.ljust(width) if i < left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]

@@ -6,16 +6,14 @@ decisions do not change is taken over: arrivals, durations of loads, uses and un
 voluntary releases and their times.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import Any
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Refuse, Reply
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
-    LeaseSpec,
     MemorySampled,
     ProbeFailed,
     ProcessDied,
@@ -28,7 +26,9 @@ from vram_arbiter.arbiter.eventlog.replay import Replayed, replay
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan, Workload
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire import notes
 from vram_arbiter.schemas.wire.replies import AcquireReply
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 POLLING_S = 0.05
 """Duration of a verification on a GPU without lag: two readings that agree."""
@@ -139,12 +139,7 @@ class _Reader:
                 self._inherit(lease, entry.now)
         for effect in effects:
             if isinstance(effect, Note):
-                self._hear(
-                    LeaseId(str(effect.data.get("lease_id", ""))),
-                    effect.kind,
-                    effect.data,
-                    entry.now,
-                )
+                self._hear(effect, entry.now)
 
     def _inherit(self, lease: Lease, now: float) -> None:
         """Note a lease that was recovered, or resident when the log began."""
@@ -153,14 +148,17 @@ class _Reader:
             known.granted_at = known.ready_at = now
             known.measured_bytes = lease.observed.reported_bytes
 
-    def _hear(self, lease: LeaseId, kind: str, data: Mapping[str, Any], now: float) -> None:
-        if kind == "granted" and lease in self._away:
+    def _hear(self, note: Note, now: float) -> None:
+        lease = None if note.about is None else note.about.lease_id
+        if lease is None:
+            return
+        if isinstance(note.body, notes.GrantedNote) and lease in self._away:
             self._back(lease, now)
             self._stories[lease].by_itself = True
         if (story := self._stories.get(lease)) is None:
             return
-        self._noted(story, kind, data, now)
-        if kind in ("standby", "parked"):
+        self._noted(story, note.body, now)
+        if isinstance(note.body, notes.StandbyNote | notes.ParkedNote):
             story.ended_at = story.ended_at or now
             self._away[lease] = self._stories.pop(lease)
             self._stories[LeaseId(f"{lease} until {now}")] = story
@@ -191,32 +189,33 @@ class _Reader:
                 case _:
                     pass
 
-    def _noted(self, story: _Story, kind: str, data: Mapping[str, Any], now: float) -> None:
-        match kind:
-            case "granted":
+    def _noted(self, story: _Story, body: notes.AnyNote, now: float) -> None:
+        match body:
+            case notes.GrantedNote():
                 story.granted_at = now
-            case "ready":
-                story.ready_at, story.measured_bytes = now, data.get("measured_bytes")
-            case "use_began":
-                story.running[str(data["use_id"])] = use = _Use(now)
+            case notes.ReadyNote(measured_bytes=measured_bytes):
+                story.ready_at, story.measured_bytes = now, measured_bytes
+            case notes.UseBeganNote(use_id):
+                story.running[use_id] = use = _Use(now)
                 story.uses.append(use)
-            case "use_ended" if (
-                ending := story.running.pop(str(data["use_id"]), None)
-            ) is not None:
-                ending.ended_at = now
-            case "revoke_asked":
+            case notes.UseEndedNote(use_id):
+                if (ending := story.running.pop(use_id, None)) is not None:
+                    ending.ended_at = now
+            case notes.RevokeAskedNote():
                 story.asked_at = now
-            case "unloading":
+            case notes.UnloadingNote():
                 story.unloading_at = now
-            case "released":
+            case notes.ReleasedNote():
                 story.released_at = now
                 story.unloading_at = story.unloading_at or now
-            case "verified" if data.get("resolved"):
-                self._verified_s.append(float(data["ms"]) / 1e3)
+            case notes.VerifiedNote(resolved=True, ms=ms):
+                self._verified_s.append(ms / 1e3)
                 story.ended_at = story.ended_at or now
-            case "denied" | "cancelled" | "expired" | "lost":
+            case (
+                notes.DeniedNote() | notes.CancelledNote() | notes.ExpiredNote() | notes.LostNote()
+            ):
                 story.ended_at = now
-                story.gave_up = kind == "cancelled"
+                story.gave_up = isinstance(body, notes.CancelledNote)
             case _:
                 pass
 
@@ -230,8 +229,8 @@ class _Reader:
         if gpu is None:
             return
         seen = {
-            f"{s.name or 'pid'} {s.process.pid}": s.used_bytes
-            for s in gpu.ledger.strangers.values()
+            f"{s.name or 'pid'} {s.process.pid}": s.held_bytes
+            for s in gpu.ledger.stowaways.values()
         }
         before = self._now_others.get(event.gpu, {})
         changes = self._others.setdefault(event.gpu, [])

@@ -3,11 +3,12 @@
 It counts and decides nothing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from vram_arbiter.arbiter.core.effects import Effect, Note
+from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.wire.notes import DeniedNote, GrantedNote, RevokeAskedNote, SwitchNote
 
 
 @dataclass(slots=True)
@@ -42,7 +43,7 @@ class Outcome:
     consumers: dict[str, Tally] = field(default_factory=dict)
     switches: int = 0
     peak_bytes: int = 0
-    timeline: list[tuple[float, str, Mapping[str, Any]]] = field(default_factory=list)
+    timeline: list[tuple[float, Note]] = field(default_factory=list)
 
     def of(self, consumer: str) -> Tally:
         return self.consumers.setdefault(consumer, Tally())
@@ -52,18 +53,17 @@ class Outcome:
         for effect in effects:
             if not isinstance(effect, Note):
                 continue
-            data = effect.data
-            self.timeline.append((at_s, effect.kind, data))
-            consumer = str(data.get("consumer", ""))
-            match effect.kind:
-                case "granted":
+            self.timeline.append((at_s, effect))
+            consumer = "" if effect.about is None else effect.about.consumer
+            match effect.body:
+                case GrantedNote(charge_bytes=charge_bytes):
                     self.of(consumer).loads += 1
-                    self.of(consumer).loaded_bytes += int(data["charge_bytes"])
-                case "revoke_asked":
+                    self.of(consumer).loaded_bytes += charge_bytes
+                case RevokeAskedNote():
                     self.of(consumer).evicted += 1
-                case "denied":
+                case DeniedNote():
                     self.of(consumer).denied += 1
-                case "switch" if data["switched"]:
+                case SwitchNote(switched=True):
                     self.switches += 1
 
     # -- of all consumers
@@ -77,7 +77,7 @@ class Outcome:
         return every
 
 
-def as_plain(outcome: Outcome) -> dict[str, Any]:
+def as_plain(outcome: Outcome) -> JsonObject:
     """Return the outcome for `--json`, without the timeline."""
     return {
         "policy": outcome.policy,
@@ -91,7 +91,7 @@ def as_plain(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _plain_tally(tally: Tally) -> dict[str, Any]:
+def _plain_tally(tally: Tally) -> JsonObject:
     return {
         "jobs": tally.jobs,
         "unserved": tally.unserved,

@@ -18,14 +18,12 @@ priorities, pins or load peaks.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     ClientConnected,
     Event,
-    LeaseSpec,
     MemorySampled,
     ProcessDied,
     ReadyReported,
@@ -39,8 +37,10 @@ from vram_arbiter.arbiter.core.model.refusals import Revoked, TooLarge
 from vram_arbiter.arbiter.lab.workload import CardPlan
 from vram_arbiter.schemas.errors import CallerError
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, Token
+from vram_arbiter.schemas.wire.notes import About, AnyNote, GrantedNote, RevokeAskedNote, SwitchNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush, RevokePush
 from vram_arbiter.schemas.wire.replies import AcquireReply, DoneReply
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
 
 OLLAMA_MODELS = 3
@@ -73,8 +73,6 @@ class _Model:
 class Rules(ABC):
     """Bookkeeping that the ports share; `_serve` decides."""
 
-    holders_exit = True
-
     def __init__(self, cards: Sequence[CardPlan]) -> None:
         if len(cards) != 1:
             raise OneCardOnly(
@@ -104,7 +102,7 @@ class Rules(ABC):
                 model = self._models[lease]
                 model.state = "held"
                 self._out.append(Reply(client, request, DoneReply()))
-                self._note("switch", model, switched=bool(model.evicted))
+                self._note(self._switch(model), model)
             case UseBegan(client, request, lease, _, use, _):
                 if self._models[lease].state == "leaving":
                     self._out.append(
@@ -142,8 +140,8 @@ class Rules(ABC):
     def _asked(self, event: AcquireRequested) -> None:
         self._serial += 1
         model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
-        if event.spec.steady_bytes > self._card.total_bytes:
-            size, total = event.spec.steady_bytes, self._card.total_bytes
+        if event.spec.footprint.steady_bytes > self._card.total_bytes:
+            size, total = event.spec.footprint.steady_bytes, self._card.total_bytes
             refusal = TooLarge(event.spec.consumer, size, size, total, 0)
             self._out.append(Refuse(event.client, event.request, refusal))
             return
@@ -158,35 +156,43 @@ class Rules(ABC):
             token=Token(1, self._serial),
             state="queued" if model.state == "queued" else "loading",
             consumer=spec.consumer,
-            model=str(spec.key),
+            model=spec.model,
             gpu=self._card.info.id,
             mode="shared",
             priority=spec.priority,
             evictable=spec.evictable,
-            charge_bytes=spec.load_peak_bytes,
+            charge_bytes=spec.footprint.load_peak_bytes,
             uses=len(model.uses),
             pid=0,
             since_s=0.0,
         )
 
-    def _note(self, kind: str, model: _Model, **facts: Any) -> None:
-        self._out.append(
-            Note(kind, {"lease_id": model.id, "consumer": model.spec.consumer, **facts})
-        )
+    def _note(self, body: AnyNote, model: _Model) -> None:
+        about = About(LeaseId(model.id), model.spec.consumer, self._card.info.id)
+        self._out.append(Note(body, about))
 
-    def _load(self, model: _Model, reason: str) -> None:
+    def _switch(self, model: _Model) -> SwitchNote:
+        """Only the total is known: these programs do not tell phases apart."""
+        total_ms = (self._now - model.arrived_at) * 1e3
+        return SwitchNote(bool(model.evicted), (), False, 0.0, 0.0, 0.0, 0.0, 0.0, total_ms)
+
+    def _load(self, model: _Model) -> None:
         self._queue.remove(model)
         self._models[model.id] = model
         model.state = "loading"
-        facts: Mapping[str, Any] = {"charge_bytes": model.spec.load_peak_bytes, "reason": reason}
-        self._note("granted", model, waited_ms=(self._now - model.arrived_at) * 1e3, **facts)
+        waited_ms = (self._now - model.arrived_at) * 1e3
+        evicted = tuple(model.evicted)
+        self._note(GrantedNote(model.spec.footprint.load_peak_bytes, waited_ms, evicted), model)
         self._out.append(Push(model.client, GrantedPush(self._view(model))))
 
     def _ask(self, model: _Model, wanted_by: _Model) -> None:
         """Unload when its requests are served, including the one that it was loaded for."""
         if model.spec.consumer not in wanted_by.evicted:
             wanted_by.evicted.append(model.spec.consumer)
-        self._note("revoke_asked", model, wanted_by=wanted_by.spec.consumer, uses=len(model.uses))
+        asked = RevokeAskedNote(
+            wanted_by.spec.consumer, LeaseId(wanted_by.id), len(model.uses), "waiter"
+        )
+        self._note(asked, model)
         if model.owed:
             model.wanted_by = wanted_by
         else:
@@ -215,7 +221,7 @@ class Unmanaged(Rules):
 
     def _serve(self) -> None:
         for model in list(self._queue):
-            self._load(model, "no model is revoked")
+            self._load(model)
 
 
 class OllamaRules(Rules):
@@ -241,12 +247,13 @@ class OllamaRules(Rules):
         if any(model.state == "loading" for model in self._models.values()):
             return  # loads are not mixed; the end of this one returns here
         free = self._card.total_bytes - max(
-            self._used_bytes, sum(model.spec.steady_bytes for model in self._models.values())
+            self._used_bytes,
+            sum(model.spec.footprint.steady_bytes for model in self._models.values()),
         )
         if not self._models or (
-            len(self._models) < OLLAMA_MODELS and head.spec.steady_bytes <= free
+            len(self._models) < OLLAMA_MODELS and head.spec.footprint.steady_bytes <= free
         ):
-            self._load(head, "fits into free memory" if self._models else "nothing else is loaded")
+            self._load(head)
             self._out.append(Sample(self._card.info.id))
             return
         idle = [model for model in self._models.values() if not model.uses and not model.owed]
@@ -259,7 +266,10 @@ class OllamaRules(Rules):
         second."""
         if self._released_at is None:
             return False
-        enough = self._used_before - self._used_bytes > OLLAMA_RECOVERED * model.spec.steady_bytes
+        enough = (
+            self._used_before - self._used_bytes
+            > OLLAMA_RECOVERED * model.spec.footprint.steady_bytes
+        )
         if enough or self._now - self._released_at >= OLLAMA_PATIENCE_S:
             self._leaving = None
             return True
@@ -276,7 +286,7 @@ class LlamaSwapRules(Rules):
         if not self._queue:
             return
         if not self._models:
-            self._load(self._queue[0], "nothing else is loaded")
+            self._load(self._queue[0])
             return
         present = next(iter(self._models.values()))
         if present.state == "held" and not self._queue[0].evicted:

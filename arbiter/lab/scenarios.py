@@ -6,11 +6,11 @@ Every arrival and every duration is drawn beforehand, so that all policies get t
 from collections.abc import Iterator
 from random import Random
 
-from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.lab.workload import CardPlan, Follower, Job, Plan, Workload
 from vram_arbiter.schemas.config.scenario import JOBS_MAX, Scenario, ScenarioConsumer
-from vram_arbiter.schemas.ids import GpuId, ModelKey
+from vram_arbiter.schemas.ids import GpuId
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 
 def settings_of(scenario: Scenario) -> Settings:
@@ -88,17 +88,13 @@ def _job(name: str, consumer: ScenarioConsumer, due_s: float, random: Random) ->
     steady = consumer.load_peak if consumer.steady is None else consumer.steady
     spec = LeaseSpec(
         consumer=name,
-        key=ModelKey(name),
+        model_id=name,
         gpu=consumer.gpu,
-        exclusive=consumer.exclusive,
-        load_peak_bytes=consumer.load_peak,
-        steady_bytes=steady,
-        residue_bytes=consumer.residue,
+        mode="exclusive" if consumer.exclusive else "shared",
+        footprint=Footprint(consumer.load_peak, steady, consumer.residue),
         priority=consumer.priority,
         evictable=consumer.evictable,
-        ttl_s=10.0,
         min_residency_s=consumer.min_residency_s,
-        deny_on_deadline=False,
         standby=consumer.standby,
     )
     return Job(

@@ -7,14 +7,11 @@ one heap; the same workload and scheduler give the same outcome. No clock, no th
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from typing import Protocol
 
-from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import Event, MemorySampled, Tick
-from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.lab.actors import START_S, Actor, Card
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.workload import Workload
@@ -29,9 +26,6 @@ EVENTS_MAX = 5_000_000
 class Scheduler(Protocol):
     """Interface of a scheduler: the engine, or a port of another program's rules."""
 
-    holders_exit: bool
-    """Whether models are processes that end when they are unloaded: nothing stays on the GPU."""
-
     def handle(self, event: Event, now: float) -> Sequence[Effect]: ...
 
     def next_deadline(self) -> float | None: ...
@@ -41,27 +35,12 @@ class Circling(Exception):
     """The simulation does not end."""
 
 
-@dataclass(slots=True)
-class Engine:
-    """The engine under one of its policies."""
-
-    arbiter: Arbiter
-    holders_exit: bool = False
-
-    @classmethod
-    def under(cls, settings: Settings, policy: str) -> "Engine":
-        return cls(Arbiter(replace(settings, policy=policy), START_S))
-
-    def handle(self, event: Event, now: float) -> Sequence[Effect]:
-        return self.arbiter.handle(event, now)
-
-    def next_deadline(self) -> float | None:
-        return self.arbiter.next_deadline()
-
-
-def simulate(workload: Workload, scheduler: Scheduler, policy: str) -> Outcome:
-    """Run a simulation to its end. Raises Circling for one that has none."""
-    world = _World(workload, scheduler, Outcome(policy, workload.seconds))
+def simulate(
+    workload: Workload, scheduler: Scheduler, policy: str, *, holders_exit: bool = False
+) -> Outcome:
+    """Run a simulation to its end. `holders_exit`: models are processes that end when they are
+    unloaded, so nothing stays on the GPU. Raises Circling for one that has no end."""
+    world = _World(workload, scheduler, Outcome(policy, workload.seconds), holders_exit)
     world.run()
     return world.outcome
 
@@ -69,9 +48,11 @@ def simulate(workload: Workload, scheduler: Scheduler, policy: str) -> Outcome:
 class _World:
     """Time, GPUs and consumers of one run."""
 
-    def __init__(self, workload: Workload, scheduler: Scheduler, outcome: Outcome) -> None:
+    def __init__(
+        self, workload: Workload, scheduler: Scheduler, outcome: Outcome, holders_exit: bool
+    ) -> None:
         self.scheduler = scheduler
-        self.holders_exit = scheduler.holders_exit
+        self.holders_exit = holders_exit
         self.outcome = outcome
         self.now = START_S
         self.cards = {plan.info.id: Card(plan) for plan in workload.cards}

@@ -6,8 +6,8 @@ Data only.
 
 from dataclasses import dataclass, field
 
-from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.settings import GpuInfo
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Answers to `why`, and blocked GPUs, in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -29,7 +29,7 @@ WAIT: Final[Mapping[Wait, str]] = {
 def worded(told: Explanation) -> Explanation:
     """Return an explanation with its words."""
     blockers = tuple(replace(one, text=condition(one)) for one in told.blockers)
-    plan = tuple(replace(step, text=_step(step)) for step in told.plan)
+    plan = tuple(replace(step, text=step_words(step)) for step in told.plan)
     told = replace(told, blockers=blockers, plan=plan)
     then = _resident(told) if told.state != "queued" else _waiter(told)
     head = told.consumer if told.state != "queued" else _needs(told)
@@ -45,25 +45,22 @@ def worded_gpu(gpu: GpuView) -> GpuView:
 
 def block(why: BlockView) -> str:
     """Why nothing is granted on a GPU."""
-    first = why.names[0] if why.names else ""
-    match why.code:
-        case Block.RECOVERING:
-            names = _listed(why.names, why.more) or "holders that the journal may not name"
-            return f"recovering after a restart: {names} must come back first"
-        case Block.DRAINED:
-            return f"drained by {why.problem}"
-        case Block.UNREADABLE:
-            return f"the GPU cannot be read: {why.problem}"
-        case Block.UNREAD:
-            return "the GPU has not been read yet"
-        case Block.LOADING:
-            return f"{first} is loading"
-        case Block.GANG:
-            return f"gang {first} is loading"
-        case Block.PRESSURE:
-            return f"pressure: {why.bytes} bytes more than the budget are held"
-        case _:
-            return WAIT[Wait.NOT_FREE]
+    names = ", ".join(why.names) + (f" and {why.more} more" if why.more else "")
+    if why.code is Block.RECOVERING and not names:
+        names = "holders that the journal may not name"
+    return _BLOCKS[why.code].format(why=why, names=names)
+
+
+_BLOCKS: Final[Mapping[Block, str]] = {
+    Block.RECOVERING: "recovering after a restart: {names} must come back first",
+    Block.DRAINED: "drained by {why.problem}",
+    Block.UNREADABLE: "the GPU cannot be read: {why.problem}",
+    Block.UNREAD: "the GPU has not been read yet",
+    Block.LOADING: "{names} is loading",
+    Block.GANG: "gang {names} is loading",
+    Block.PRESSURE: "pressure: {why.bytes} bytes more than the budget are held",
+    Block.NOT_FREE: WAIT[Wait.NOT_FREE],
+}
 
 
 def wait_for(why: BlockView | None) -> str:
@@ -153,32 +150,40 @@ def _leaving(one: Blocker) -> str:
 
 def condition(one: Blocker) -> str:
     """The condition on which a blocker's bytes come free."""
-    seconds = one.seconds or 0.0
-    return {
-        Condition.LOADING: _loading(one),
-        Condition.REVOKED: f"was asked to leave {seconds:.1f} s ago, {_uses(one)}",
-        Condition.UNLOADING: "is unloading",
-        Condition.HANGING: f"is unloading for {seconds:.0f} s and may hang: end its process (pid "
-        f"{one.pid})",
-        Condition.MEASURED: "let go, its bytes are being measured",
-        Condition.NOT_BACK: f"has not come back since the restart, is given up in {seconds:.1f} s",
-        Condition.GANG: f"belongs to gang {one.by}, which is not complete",
-        Condition.PINNED: f"is pinned by {one.by}" if one.by else "is pinned",
-        Condition.RESIDENCY: f"may stay {seconds:.1f} s more (minimum residency)",
-        Condition.THRASHING: f"may stay {seconds:.1f} s more (they keep throwing each other out)",
-        Condition.PRIORITY: f"is in use and has priority {one.priority}, the waiter "
-        f"{one.waiter_priority}",
-        Condition.IN_USE: "is in use",
-        Condition.IDLE: "is idle and may be asked",
-        Condition.CONTEXT: "keeps its context until it exits",
-        Condition.RETAINED: f"keeps more than its context until its process (pid {one.pid}) gives "
-        "it back or ends",
-        Condition.DEBT: "is over, its bytes are being measured",
-        Condition.DEBT_KEPT: f"is over, and its process (pid {one.pid}) keeps its bytes until it "
-        "frees them or ends",
-        Condition.STOWAWAY: "holds bytes without a lease",
-        Condition.TURN: f"has its bytes kept for its turn in gang {one.by}",
-    }[one.condition]
+    match one.condition:
+        case Condition.LOADING:
+            return _loading(one)
+        case Condition.REVOKED:
+            return f"was asked to leave {one.seconds or 0.0:.1f} s ago, {_uses(one)}"
+        case Condition.PINNED if one.by:
+            return f"is pinned by {one.by}"
+        case _:
+            return _CONDITIONS[one.condition].format(one=one, seconds=one.seconds or 0.0)
+
+
+_CONDITIONS: Final[Mapping[Condition, str]] = {
+    Condition.UNLOADING: "is unloading",
+    Condition.HANGING: "is unloading for {seconds:.0f} s and may hang: end its process (pid "
+    "{one.pid})",
+    Condition.MEASURED: "let go, its bytes are being measured",
+    Condition.NOT_BACK: "has not come back since the restart, is given up in {seconds:.1f} s",
+    Condition.GANG: "belongs to gang {one.by}, which is not complete",
+    Condition.PINNED: "is pinned",
+    Condition.RESIDENCY: "may stay {seconds:.1f} s more (minimum residency)",
+    Condition.THRASHING: "may stay {seconds:.1f} s more (they keep throwing each other out)",
+    Condition.PRIORITY: "is in use and has priority {one.priority}, the waiter "
+    "{one.waiter_priority}",
+    Condition.IN_USE: "is in use",
+    Condition.IDLE: "is idle and may be asked",
+    Condition.CONTEXT: "keeps its context until it exits",
+    Condition.RETAINED: "keeps more than its context until its process (pid {one.pid}) gives it "
+    "back or ends",
+    Condition.DEBT: "is over, its bytes are being measured",
+    Condition.DEBT_KEPT: "is over, and its process (pid {one.pid}) keeps its bytes until it frees "
+    "them or ends",
+    Condition.STOWAWAY: "holds bytes without a lease",
+    Condition.TURN: "has its bytes kept for its turn in gang {one.by}",
+}
 
 
 def _loading(one: Blocker) -> str:
@@ -251,59 +256,58 @@ def _away(told: Explanation) -> str:
 
 
 # -- steps
-def _step(step: Step) -> str:
+def step_words(step: Step) -> str:
+    """What happens next, when, and why then."""
     when = ""
     if step.in_s is not None:
         more = step.action is NextAction.DEADLINE
         when = f" for {step.in_s:.1f} s more" if more else f" in {step.in_s:.1f} s"
-    return f"{_action(step)}{when}, {_because(step)}"
-
-
-def _action(step: Step) -> str:
+    action = _ACTIONS[step.action]
     if step.action is NextAction.WAIT:
-        return {
-            Because.NO_VICTIM: "asks no holder",
-            Because.NOT_BACK: f"gives {step.consumer} up",
-        }.get(step.because, f"waits for {step.consumer} to let go")
-    return {
-        NextAction.ASK: f"asks {step.consumer}",
-        NextAction.LOADED: f"lets {step.consumer} finish loading",
-        NextAction.READ: "reads the GPU again",
-        NextAction.MEASURE: f"measures {step.consumer}'s bytes again",
-        NextAction.DEADLINE: f"waits for {step.consumer} to let go",
-        NextAction.SERVE: "grants again",
-        NextAction.BREAK: f"gives gang {step.gang} up",
-        NextAction.GIVE_UP: "gives up",
-    }[step.action]
+        action = _WAITS.get(step.because, action)
+    text = f"{action}{{when}}, {_BECAUSE[step.because]}"
+    return text.format(step=step, when=when, latest_s=step.latest_s or 0.0)
 
 
-def _because(step: Step) -> str:
-    return {
-        Because.NEXT_READING: "as soon as the GPU is looked at again",
-        Because.RESIDENCY: "when its minimum residency ends",
-        Because.AGEING: "when the waiter's priority has aged to its own",
-        Because.TOGETHER: "when enough may be asked together",
-        Because.ONE_LOAD: "one loads at a time",
-        Because.KEPT: "its bytes are kept for it, the GPU has to show them",
-        Because.UNREADABLE: "nothing is granted on a GPU that cannot be read",
-        Because.MEASUREMENT: "the ledger has room, the GPU has to show it",
-        Because.ACCOUNTED: "when every holder has come back or its time is over",
-        Because.INCOMPLETE: "if the rest has not come back",
-        Because.SHORT: "if its memory is not free then",
-        Because.NOT_BACK: "unless it comes back before that",
-        Because.NO_VICTIM: "those that could make room are pinned or in use above its priority",
-        Because.VERDICT: f"a verdict comes in {step.latest_s or 0.0:.1f} s at the latest",
-        Because.MEASURED_GONE: "until its bytes are measured gone",
-        Because.HANGING: "its unloading may hang",
-        Because.LEAVING: "it is on its way out",
-        Because.DENIED: f"after that {step.waiter} is denied",
-        Because.WAITS_ON: f"after that {step.waiter} waits on, and the holder's own rule applies",
-        Because.TIMEOUT: "when its wait timeout is over",
-    }[step.because]
+_ACTIONS: Final[Mapping[NextAction, str]] = {
+    NextAction.ASK: "asks {step.consumer}",
+    NextAction.LOADED: "lets {step.consumer} finish loading",
+    NextAction.READ: "reads the GPU again",
+    NextAction.MEASURE: "measures {step.consumer}'s bytes again",
+    NextAction.DEADLINE: "waits for {step.consumer} to let go",
+    NextAction.WAIT: "waits for {step.consumer} to let go",
+    NextAction.SERVE: "grants again",
+    NextAction.BREAK: "gives gang {step.gang} up",
+    NextAction.GIVE_UP: "gives up",
+}
 
+_WAITS: Final[Mapping[Because, str]] = {
+    Because.NO_VICTIM: "asks no holder",
+    Because.NOT_BACK: "gives {step.consumer} up",
+}
 
-def _listed(names: Sequence[str], more: int) -> str:
-    return ", ".join(names) + (f" and {more} more" if more else "")
+_BECAUSE: Final[Mapping[Because, str]] = {
+    Because.NEXT_READING: "as soon as the GPU is looked at again",
+    Because.RESIDENCY: "when its minimum residency ends",
+    Because.AGEING: "when the waiter's priority has aged to its own",
+    Because.TOGETHER: "when enough may be asked together",
+    Because.ONE_LOAD: "one loads at a time",
+    Because.KEPT: "its bytes are kept for it, the GPU has to show them",
+    Because.UNREADABLE: "nothing is granted on a GPU that cannot be read",
+    Because.MEASUREMENT: "the ledger has room, the GPU has to show it",
+    Because.ACCOUNTED: "when every holder has come back or its time is over",
+    Because.INCOMPLETE: "if the rest has not come back",
+    Because.SHORT: "if its memory is not free then",
+    Because.NOT_BACK: "unless it comes back before that",
+    Because.NO_VICTIM: "those that could make room are pinned or in use above its priority",
+    Because.VERDICT: "a verdict comes in {latest_s:.1f} s at the latest",
+    Because.MEASURED_GONE: "until its bytes are measured gone",
+    Because.HANGING: "its unloading may hang",
+    Because.LEAVING: "it is on its way out",
+    Because.DENIED: "after that {step.waiter} is denied",
+    Because.WAITS_ON: "after that {step.waiter} waits on, and the holder's own rule applies",
+    Because.TIMEOUT: "when its wait timeout is over",
+}
 
 
 def gib(count: int) -> str:

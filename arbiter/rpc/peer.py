@@ -9,7 +9,7 @@ import os
 import pwd
 from typing import Literal
 
-from vram_arbiter.schemas.errors import NotPermitted
+from vram_arbiter.schemas.errors import ConfigError, NotPermitted
 from vram_arbiter.schemas.runtime.peercred import Peer
 
 Role = Literal["client", "observer", "operator"]
@@ -59,9 +59,13 @@ def how_to_operate(operators_gid: int | None) -> str:
     )
 
 
-def group_id(name: str) -> int | None:
-    """Number of a Unix group; None if there is none of that name."""
+def group_id(key: str, name: str | None) -> int | None:
+    """Number of the Unix group that the configuration names under `key`. Raises ConfigError."""
+    if name is None:
+        return None
     try:
         return grp.getgrnam(name).gr_gid
     except KeyError:
-        return None
+        raise ConfigError(
+            f"{key}: no group {name!r} on this machine", hint=f"groupadd --system {name}"
+        ) from None

@@ -7,11 +7,14 @@ to `why`.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
+from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.model import refusals as r
 from vram_arbiter.arbiter.rpc import explained
 from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.wire import notes
 from vram_arbiter.schemas.wire.codes import RevokeCause, Why
 from vram_arbiter.schemas.wire.errors import ErrorView, Refusal
 from vram_arbiter.schemas.wire.explained import WhyReply
@@ -40,10 +43,6 @@ WHY: Final[Mapping[Why, str]] = {
     Why.RESIZED: "another size is asked for",
 }
 
-_ACQUIRE = "unload, then acquire again"
-_UNPIN = "unpin it first"
-_PINNED = "end its program: a pinned holder is never made to leave"
-
 
 # -- errors
 def error_view(refusal: Refusal) -> ErrorView:
@@ -53,15 +52,111 @@ def error_view(refusal: Refusal) -> ErrorView:
     if isinstance(refusal, r.TargetOver):
         ended = error_view(refusal.ended)
         return replace(ended, hint="it is over; its story is in `vramctl history`")
-    message, hint = _ERRORS[type(refusal)](refusal)
+    words = _ERRORS[type(refusal)]
+    message, hint = words(refusal) if callable(words) else _filled(words, refusal)
     return ErrorView(refusal.code, message, hint, to_map(refusal))
 
 
-def _unknown_gpu(no: r.UnknownGpu) -> tuple[str, str]:
-    return f"there is no GPU {no.gpu!r}", "give a UUID, an index or `any`"
+type _Words = tuple[str, str]
+"""What is wrong, and what to do."""
+
+_ACQUIRE = "unload, then acquire again"
+_AGAIN = "ask for all of it again"
+_LOOK = "see `vramctl status`"
+_END_PINNED = "end its program: a pinned holder is never made to leave"
+
+_MISFITS: Final[Mapping[r.Misfit, str]] = {
+    r.Misfit.STILL_QUEUED: "it is still queued",
+    r.Misfit.NOT_AWAY: "only a lease that is away, or being measured on its way there, is called "
+    "back",
+    r.Misfit.GRANTED: "it is granted already, release it",
+    r.Misfit.NOT_LOADING: "only a loading lease becomes ready",
+    r.Misfit.NOT_HELD: "only a held lease can be used",
+    r.Misfit.NOT_UNLOADABLE: "only a held lease is unloaded; a loading one is released",
+    r.Misfit.NOT_RESIZABLE: "only a held lease is resized",
+    r.Misfit.IN_USE: "{no.uses} uses still run; wait for the `revoke` that says 0 uses",
+    r.Misfit.EXITS: "it cannot be parked: a process that exits keeps nothing",
+    r.Misfit.NO_PARK_BYTES: "it cannot be parked: its spec has no park_bytes",
+    r.Misfit.HOLDS_NOTHING: "it holds nothing",
+    r.Misfit.NO_SUCH_USE: "it has no use {no.use_id} of yours to yield",
+}
+
+_IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
+    r.Impractical.NOT_RESIDENT: (
+        "{no.lease_id} is {no.state}: only a resident lease can be evicted", _LOOK
+    ),
+    r.Impractical.LEAVING: ("{no.lease_id} is {no.state}: it was asked to leave already", _LOOK),
+    r.Impractical.NOT_HELD: ("{no.lease_id} is {no.state}: it has no holder", _LOOK),
+    r.Impractical.IN_USE: (
+        "{no.lease_id} is {no.state}: it is in use; a holder in use is never given up", _LOOK
+    ),
+    r.Impractical.PINNED_BY_OPERATOR: (
+        "{no.lease_id} is pinned: an operator pinned it", "unpin it first"
+    ),
+    r.Impractical.PINNED_BY_HOLDER: (
+        "{no.lease_id} is pinned: its holder asked never to be evicted", _END_PINNED
+    ),
+    r.Impractical.NOT_PINNED: ("no operator pinned {no.lease_id}", "nothing to undo"),
+    r.Impractical.HOLDER_LIVES: (
+        "the holder of {no.lease_id} was heard of {no.silent_s:.1f} s ago: it is not dead",
+        "evict it instead",
+    ),
+}  # fmt: skip
+
+_PINNED_HINTS: Final[Mapping[r.Impractical, str]] = {
+    r.Impractical.NOT_PINNED: "its holder asked never to be evicted; that is its own to change",
+    r.Impractical.HOLDER_LIVES: "end its program: it is pinned",
+}
+"""Hints that differ for a lease that is never evicted."""
+
+_LIMITS: Final[Mapping[r.Limit, _Words]] = {
+    "waiters_max": (
+        "requests wait", "let some of them be answered first, or raise limits.waiters_max"
+    ),
+    "leases_per_client_max": (
+        "leases are held or asked for", "release some, or raise limits.leases_per_client_max"
+    ),
+    "uses_per_lease_max": (
+        "uses of {no.lease_id} run or pause", "end some, or raise limits.uses_per_lease_max"
+    ),
+}  # fmt: skip
+
+_SHARES: Final[Mapping[r.Share, str]] = {
+    r.Share.CONNECTION: "by this connection",
+    r.Share.PROCESS: "of this process",
+    r.Share.USER: "of uid {no.uid}",
+    r.Share.ALL: "of all users",
+    r.Share.HOLDER: "of its holder",
+    r.Share.OTHERS: "of others than its holder",
+}
+
+_GANG_ENDS: Final[Mapping[r.GangEnd, str]] = {
+    r.GangEnd.REFUSED: "a member was refused",
+    r.GangEnd.FALLEN: "{no.consumer} ({no.lease_id}) is {no.state}",
+    r.GangEnd.INCOMPLETE: "not all of it came back after the restart",
+    r.GangEnd.MEMBER_TOO_LARGE: "a member holds more than it declared, the rest no longer fits",
+    r.GangEnd.OTHERS_TOO_LARGE: "others hold more than they were granted, the rest no longer fits",
+    r.GangEnd.NOT_FREED: "measured memory did not come back, the rest no longer fits",
+}
 
 
-def _too_large(no: r.TooLarge) -> tuple[str, str]:
+def _filled(words: _Words, refusal: Refusal) -> _Words:
+    """Return templates with the values of a refusal. No value is read as a template."""
+    return words[0].format(no=refusal), words[1].format(no=refusal)
+
+
+def _bad_lease_state(no: r.BadLeaseState) -> _Words:
+    return _filled(
+        ("{no.lease_id} is {no.state}: " + _MISFITS[no.misfit], "see the lease's story"), no
+    )
+
+
+def _bad_target_state(no: r.BadTargetState) -> _Words:
+    message, hint = _IMPRACTICAL[no.problem]
+    return _filled((message, hint if no.evictable else _PINNED_HINTS.get(no.problem, hint)), no)
+
+
+def _too_large(no: r.TooLarge) -> _Words:
     raised = no.needed_bytes > no.declared_bytes
     learned = f" ({no.declared_bytes} declared, more was measured)" if raised else ""
     return (
@@ -71,129 +166,26 @@ def _too_large(no: r.TooLarge) -> tuple[str, str]:
     )
 
 
-def _growth_too_large(no: r.GrowthTooLarge) -> tuple[str, str]:
-    told = (
-        f"{no.consumer} would need {no.needed_bytes} bytes; alone on its GPU it can have "
-        f"{no.room_bytes}"
-    )
-    return told, "stay smaller"
-
-
-def _bad_lease_state(no: r.BadLeaseState) -> tuple[str, str]:
-    told = {
-        r.Misfit.STILL_QUEUED: "it is still queued",
-        r.Misfit.NOT_AWAY: "only a lease that is away, or being measured on its way there, is "
-        "called back",
-        r.Misfit.GRANTED: "it is granted already, release it",
-        r.Misfit.NOT_LOADING: "only a loading lease becomes ready",
-        r.Misfit.NOT_HELD: "only a held lease can be used",
-        r.Misfit.NOT_UNLOADABLE: "only a held lease is unloaded; a loading one is released",
-        r.Misfit.NOT_RESIZABLE: "only a held lease is resized",
-        r.Misfit.IN_USE: f"{no.uses} uses still run; wait for the `revoke` that says 0 uses",
-        r.Misfit.EXITS: "it cannot be parked: a process that exits keeps nothing",
-        r.Misfit.NO_PARK_BYTES: "it cannot be parked: its spec has no park_bytes",
-        r.Misfit.HOLDS_NOTHING: "it holds nothing",
-        r.Misfit.NO_SUCH_USE: f"it has no use {no.use_id} of yours to yield",
-    }[no.misfit]
-    return f"{no.lease_id} is {no.state}: {told}", "see the lease's story"
-
-
-def _bad_target_state(no: r.BadTargetState) -> tuple[str, str]:
-    lease, is_in = no.lease_id, f"{no.lease_id} is {no.state}"
-    look = "see `vramctl status`"
-    undo = "nothing to undo"
-    if not no.evictable:
-        undo = "its holder asked never to be evicted; that is its own to change"
-    heard = f"the holder of {lease} was heard of {no.silent_s or 0.0:.1f} s ago: it is not dead"
-    instead = "evict it instead" if no.evictable else "end its program: it is pinned"
-    return {
-        r.Impractical.NOT_RESIDENT: (f"{is_in}: only a resident lease can be evicted", look),
-        r.Impractical.LEAVING: (f"{is_in}: it was asked to leave already", look),
-        r.Impractical.NOT_HELD: (f"{is_in}: it has no holder", look),
-        r.Impractical.IN_USE: (f"{is_in}: it is in use; a holder in use is never given up", look),
-        r.Impractical.PINNED_BY_OPERATOR: (f"{lease} is pinned: an operator pinned it", _UNPIN),
-        r.Impractical.PINNED_BY_HOLDER: (
-            f"{lease} is pinned: its holder asked never to be evicted",
-            _PINNED,
-        ),
-        r.Impractical.NOT_PINNED: (f"no operator pinned {lease}", undo),
-        r.Impractical.HOLDER_LIVES: (heard, instead),
-    }[no.problem]
-
-
-def _lease_over(no: r.LeaseOver) -> tuple[str, str]:
+def _revoked(no: r.Revoked) -> _Words:
     told = "" if no.revoked is None else f": {cause(no.revoked)}"
-    return f"{no.lease_id} is {no.state}{told}", _ACQUIRE
-
-
-def _revoked(no: r.Revoked) -> tuple[str, str]:
-    told = "" if no.revoked is None else f": {cause(no.revoked)}"
-    hint = {
-        "use": "wait until it is granted again",
-        "resize": "leave; ask for the new size when it is granted again",
-    }[no.wanted]
+    leave = "leave; ask for the new size when it is granted again"
+    hint = leave if no.wanted == "resize" else "wait until it is granted again"
     return f"{no.consumer} was asked to leave{told}", hint
 
 
-def _limit(no: r.LimitReached) -> tuple[str, str]:
-    what, hint = {
-        "waiters_max": (
-            "requests wait",
-            "let some of them be answered first, or raise limits.waiters_max",
-        ),
-        "leases_per_client_max": (
-            "leases are held or asked for",
-            "release some, or raise limits.leases_per_client_max",
-        ),
-        "uses_per_lease_max": (
-            f"uses of {no.lease_id} run or pause",
-            "end some, or raise limits.uses_per_lease_max",
-        ),
-    }[no.limit]
-    whose = {
-        r.Share.CONNECTION: "by this connection",
-        r.Share.PROCESS: "of this process",
-        r.Share.USER: f"of uid {no.uid}",
-        r.Share.ALL: "of all users",
-        r.Share.HOLDER: "of its holder",
-        r.Share.OTHERS: "of others than its holder",
-    }[no.share]
-    return f"{no.count} {what} {whose}, the limit is {no.value}", hint
+def _limit(no: r.LimitReached) -> _Words:
+    what, hint = _LIMITS[no.limit]
+    message = f"{{no.count}} {what} {_SHARES[no.share]}, the limit is {{no.value}}"
+    return _filled((message, hint), no)
 
 
-def _load_fails(no: r.LoadFails) -> tuple[str, str]:
-    return (
-        f"{no.consumer} failed {no.failures} times in a row to load {no.model}: {_why(no.cause)}",
-        f"no holder is made to leave for it for {no.retry_in_s:.0f} s more; look at its own log",
-    )
-
-
-def _ambiguous(no: r.Ambiguous) -> tuple[str, str]:
-    names = ", ".join(no.leases)
-    return f"{no.target} has {len(no.leases)} leases", f"name one of them: {names}"
-
-
-def _no_host_ram(no: r.NoHostRam) -> tuple[str, str]:
-    return (
-        f"{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} "
-        f"{no.booked_bytes} are booked",
-        "release without parking, or raise host.park_budget_bytes",
-    )
-
-
-def _timed_out(no: r.TimedOut) -> tuple[str, str]:
-    told = f"{no.consumer} waited {no.waited_s:.1f} s: {no.why.text}"
-    return told, "wait longer, or make room"
-
-
-def _expired(no: r.Expired) -> tuple[str, str]:
-    told = f"was not renewed for {no.ttl_s:g} s"
-    if no.why is Why.GIVEN_UP:
-        told = f"was given up by {no.order}"
+def _expired(no: r.Expired) -> _Words:
+    given_up = no.why is Why.GIVEN_UP
+    told = f"was given up by {no.order}" if given_up else f"was not renewed for {no.ttl_s:g} s"
     return f"{no.lease_id} {told}", _ACQUIRE
 
 
-def _lost(no: r.Lost) -> tuple[str, str]:
+def _lost(no: r.Lost) -> _Words:
     match no.why:
         case Why.PROCESS_DIED:
             return f"{no.lease_id}: process {no.pid} died", "acquire again"
@@ -207,36 +199,19 @@ def _lost(no: r.Lost) -> tuple[str, str]:
             return f"{no.lease_id}: {_why(no.why)}", "acquire again"
 
 
-def _mismatch(no: r.GangMismatch) -> tuple[str, str]:
+def _mismatch(no: r.GangMismatch) -> _Words:
     if no.size != no.asked:
         return f"gang {no.gang} has {no.size} members, not {no.asked}", "agree on one size"
     told = f"all {no.size} members of gang {no.gang} have come"
     return told, "use an id of its own for each gang"
 
 
-def _gang_too_large(no: r.GangTooLarge) -> tuple[str, str]:
-    told = (
-        f"gang {no.gang}: its {no.members} members need {no.needed_bytes} bytes together, "
-        "more than the GPUs can ever hold"
-    )
-    return told, "ask for all of it again"
+def _broken_gang(no: r.BrokenGang) -> _Words:
+    because = " ({no.because})" if no.because else ""
+    return _filled((f"gang {{no.gang}}: {_GANG_ENDS[no.why]}{because}", _AGAIN), no)
 
 
-def _broken_gang(no: r.BrokenGang) -> tuple[str, str]:
-    because = f" ({no.because})" if no.because else ""
-    told = {
-        r.GangEnd.REFUSED: f"a member was refused{because}",
-        r.GangEnd.FALLEN: f"{no.consumer} ({no.lease_id}) is {no.state}{because}",
-        r.GangEnd.INCOMPLETE: "not all of it came back after the restart",
-        r.GangEnd.MEMBER_TOO_LARGE: "a member holds more than it declared, the rest no longer fits",
-        r.GangEnd.OTHERS_TOO_LARGE: "others hold more than they were granted, the rest no longer "
-        "fits",
-        r.GangEnd.NOT_FREED: "measured memory did not come back, the rest no longer fits",
-    }[no.why]
-    return f"gang {no.gang}: {told}", "ask for all of it again"
-
-
-def _deadlock(no: r.Deadlock) -> tuple[str, str]:
+def _deadlock(no: r.Deadlock) -> _Words:
     def names(leases: tuple[r.NamedLease, ...]) -> str:
         return " and ".join(f"{one.consumer} ({one.lease_id})" for one in leases)
 
@@ -249,42 +224,66 @@ def _deadlock(no: r.Deadlock) -> tuple[str, str]:
     return f"this wait would never end: {story}", hint
 
 
-_ERRORS: Final[Mapping[type[Refusal], Callable[[Any], tuple[str, str]]]] = {
-    r.NoSession: lambda no: ("this connection has not said hello", "say hello, then re-attach"),
-    r.NoLease: lambda no: (f"there is no lease {no.lease_id}",
-    "acquire one; after a restart: re-attach"),
-    r.WrongToken: lambda no: (f"{no.token} is not the token of {no.lease_id}",
-    "use the token that came with the grant"),
-    r.NotHolder: lambda no: (f"{no.lease_id} belongs to process {no.pid}", "ask as its holder"),
+_ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
+    r.NoSession: ("this connection has not said hello", "say hello, then re-attach"),
+    r.NoLease: (
+        "there is no lease {no.lease_id}", "acquire one; after a restart: re-attach"
+    ),
+    r.WrongToken: (
+        "{no.token} is not the token of {no.lease_id}", "use the token that came with the grant"
+    ),
+    r.NotHolder: ("{no.lease_id} belongs to process {no.pid}", "ask as its holder"),
     r.BadLeaseState: _bad_lease_state,
     r.BadTargetState: _bad_target_state,
-    r.Ambiguous: _ambiguous,
-    r.NoTarget: lambda no: (f"there is no lease or consumer {no.target!r}", "see `vramctl status`"),
-    r.LeaseOver: _lease_over,
+    r.Ambiguous: lambda no: (
+        f"{no.target} has {len(no.leases)} leases", f"name one of them: {', '.join(no.leases)}"
+    ),
+    r.NoTarget: ("there is no lease or consumer {no.target!r}", _LOOK),
+    r.LeaseOver: lambda no: (
+        f"{no.lease_id} is {no.state}" + (f": {cause(no.revoked)}" if no.revoked else ""), _ACQUIRE
+    ),
     r.Revoked: _revoked,
-    r.UnknownGpu: _unknown_gpu,
+    r.UnknownGpu: ("there is no GPU {no.gpu!r}", "give a UUID, an index or `any`"),
     r.TooLarge: _too_large,
-    r.GrowthTooLarge: _growth_too_large,
-    r.NoHostRam: _no_host_ram,
+    r.GrowthTooLarge: (
+        "{no.consumer} would need {no.needed_bytes} bytes; alone on its GPU it can have "
+        "{no.room_bytes}",
+        "stay smaller",
+    ),
+    r.NoHostRam: (
+        "{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} "
+        "{no.booked_bytes} are booked",
+        "release without parking, or raise host.park_budget_bytes",
+    ),
     r.LimitReached: _limit,
-    r.LoadFails: _load_fails,
+    r.LoadFails: lambda no: (
+        f"{no.consumer} failed {no.failures} times in a row to load {no.model}: {_why(no.cause)}",
+        f"no holder is made to leave for it for {no.retry_in_s:.0f} s more; look at its own log",
+    ),
     r.CancelledRequest: lambda no: (f"{no.lease_id}: {_why(no.why, no.by)}", "acquire again"),
-    r.TimedOut: _timed_out,
-    r.HolderOutstays: lambda no: (
-        f"{no.consumer} did not leave within {no.deadline_s:g} s",
-        "try again later, or wait: on_deadline=wait"
+    r.TimedOut: (
+        "{no.consumer} waited {no.waited_s:.1f} s: {no.why.text}", "wait longer, or make room"
+    ),
+    r.HolderOutstays: (
+        "{no.consumer} did not leave within {no.deadline_s:g} s",
+        "try again later, or wait: on_deadline=wait",
     ),
     r.Expired: _expired,
     r.Lost: _lost,
-    r.NotJournaled: lambda no: (
-        f"the grant of {no.lease_id} could not be written: {no.problem}",
-        "look at the daemon's log and its disk"
+    r.NotJournaled: (
+        "the grant of {no.lease_id} could not be written: {no.problem}",
+        "look at the daemon's log and its disk",
     ),
     r.GangMismatch: _mismatch,
-    r.GangTooLarge: _gang_too_large,
+    r.GangTooLarge: (
+        "gang {no.gang}: its {no.members} members need {no.needed_bytes} bytes together, more than "
+        "the GPUs can ever hold",
+        _AGAIN,
+    ),
     r.BrokenGang: _broken_gang,
     r.Deadlock: _deadlock,
 }  # fmt: skip
+"""Templates with the refusal as `no`, or what makes the words of a class with variants."""
 
 
 def _worded(error: ErrorView) -> ErrorView:
@@ -318,18 +317,13 @@ def push(body: AnyPush) -> AnyPush:
         case DeniedPush(error=error) | LostPush(error=error):
             return replace(body, error=_worded(error))
         case RevokePush():
-            why = RevokeCause(_cause(body.cause), body.wanted_by, body.gang, body.order)
-            return replace(body, reason=cause(why))
+            return replace(body, reason=cause(body))
         case _:
             return body
 
 
-def _cause(code: str) -> Literal["waiter", "pressure", "operator"]:
-    return "operator" if code == "operator" else "pressure" if code == "pressure" else "waiter"
-
-
-def cause(why: RevokeCause) -> str:
-    """Why a holder is revoked."""
+def cause(why: RevokeCause | RevokePush) -> str:
+    """Return why a holder is revoked."""
     if why.order is not None:
         return f"evicted by {why.order}"
     if why.cause == "pressure":
@@ -344,105 +338,70 @@ def _why(code: str, by: str = "") -> str:
 
 
 # -- events
-def event(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the facts of a note as history keeps them: plain values, and `reason` in words."""
-    plain = {key: _plain(value) for key, value in data.items() if key != "refusal"}
-    refusal = data.get("refusal")
-    reason = error_view(refusal).message if isinstance(refusal, Refusal) else _reason(kind, data)
-    if reason and "reason" not in plain:
+def event(note: Note) -> JsonObject:
+    """Return the event of a note as history keeps it: plain values, and `reason` in words."""
+    body, about = note.body, note.about
+    plain = {**({} if about is None else to_map(about)), **to_map(body)}
+    if "reason" not in plain and (reason := _reason(body, about)):
         plain["reason"] = reason
     return plain
 
 
-def _plain(value: Any) -> Any:
-    return to_map(value) if hasattr(value, "__dataclass_fields__") else value
-
-
-def _reason(kind: str, data: Mapping[str, Any]) -> str:
-    if (make := _REASONS.get(kind)) is not None:
-        return make(data)
-    why = data.get("why")
-    return _why(why, data.get("by", "")) if why else ""
-
-
-def _granted(data: Mapping[str, Any]) -> str:
-    if data.get("by_itself"):
-        return "back from standby: there is room and nothing waits"
-    if evicted := data["evicted"]:
-        return f"fits after {', '.join(evicted)} left"
-    return "fits"
-
-
-def _queued(data: Mapping[str, Any]) -> str:
-    if data.get("grows"):
-        return f"{data['grows']} grows by {data['more_bytes']}"
-    if data.get("behind"):
-        return f"waits behind {data['behind']} as number {data['position']}"
-    return (
-        explained.WAIT[data["wait"]] if data.get("wait") else explained.wait_for(data.get("block"))
-    )
-
-
-def _gang(data: Mapping[str, Any]) -> str:
-    return {"loading": "all fit", "complete": "all are held"}.get(data["phase"], "")
-
-
-def _resized(data: Mapping[str, Any]) -> str:
-    changed = data["changed_bytes"]
-    if not changed:
-        return "the bytes did not come back in time"
-    return "grown" if changed > 0 else "shrunk"
-
-
-def _away(data: Mapping[str, Any]) -> str:
-    by_itself = "by itself when there is room"
-    return f"comes back {by_itself if data['comes_back'] else 'when its holder asks'}"
-
-
-def _oom(data: Mapping[str, Any]) -> str:
-    learned = data["learnt_load_peak_bytes"] is not None
-    return (
-        "it needs more than it declared" if learned else "another process holds what it was granted"
-    )
-
-
-def _drift(data: Mapping[str, Any]) -> str:
-    side = "above" if data["drift_bytes"] > 0 else "below"
-    return f"its {data['part'].replace('_', ' ')} is {side} what it declared"
-
-
-def _signalled(data: Mapping[str, Any]) -> str:
-    return (
-        f"asked {data['asked_s']:.1f} s ago, idle, and its lease says "
-        f"on_overstay={data['on_overstay']}"
-    )
-
-
-def _expired_note(data: Mapping[str, Any]) -> str:
-    if data["why"] is Why.NOT_RENEWED:
-        return f"{data['lease_id']} was not renewed for {data['ttl_s']:g} s"
-    return _why(data["why"])
-
-
-_REASONS: Final[Mapping[str, Callable[[Mapping[str, Any]], str]]] = {
-    "granted": _granted,
-    "queued": _queued,
-    "gang": _gang,
-    "resized": _resized,
-    "standby": _away,
-    "parked": _away,
-    "oom": _oom,
-    "drift": _drift,
-    "signalled": _signalled,
-    "expired": _expired_note,
-    "revoke_asked": lambda data: cause(
-        RevokeCause(data["cause"], data["wanted_by"], data.get("gang", ""), data.get("order"))
-    ),
-    "pressure": lambda data: (
-        "more is held than the budget" if data["pressure_bytes"] else "pressure is over"
-    ),
-    "stowaway": lambda data: "holds bytes without a lease; charged as reserve",
-    "lost": lambda data: (
-        f"{data['lease_id']}: process {data['pid']} died" if data.get("pid") else _why(data["why"])
-    ),
-}
+def _reason(body: notes.AnyNote, about: notes.About | None) -> str:
+    """Why it happened, in words; "" where the kind says it."""
+    lease_id = "" if about is None else about.lease_id
+    match body:
+        case notes.GrantedNote(by_itself=True):
+            return "back from standby: there is room and nothing waits"
+        case notes.GrantedNote(evicted=evicted):
+            return f"fits after {', '.join(evicted)} left" if evicted else "fits"
+        case notes.ReleasedNote(why=why):
+            return WHY.get(why, why)
+        case notes.QueuedNote(grows=grows, more_bytes=more_bytes) if grows:
+            return f"{grows} grows by {more_bytes}"
+        case notes.QueuedNote(behind=behind, position=position) if behind:
+            return f"waits behind {behind} as number {position}"
+        case notes.QueuedNote(wait=wait, block=block):
+            return explained.wait_for(block) if wait is None else explained.WAIT[wait]
+        case notes.DeniedNote(refusal) | notes.RefusedNote(_, refusal):
+            return error_view(refusal).message
+        case notes.GangNote(phase=phase, refusal=refusal):
+            if refusal is not None:
+                return error_view(refusal).message
+            return {"loading": "all fit", "complete": "all are held"}.get(phase, "")
+        case notes.RevokeAskedNote(wanted_by, _, _, why, gang, order):
+            return cause(RevokeCause(why, wanted_by, gang, order))
+        case notes.SignalledNote(asked_s=asked_s, on_overstay=on_overstay):
+            return f"asked {asked_s:.1f} s ago, idle, and its lease says on_overstay={on_overstay}"
+        case notes.ExpiredNote(Why.NOT_RENEWED, ttl_s):
+            return f"{lease_id} was not renewed for {ttl_s:g} s"
+        case notes.LostNote(pid=int(pid)):
+            return f"{lease_id}: process {pid} died"
+        case notes.StandbyNote(comes_back=by_itself) | notes.ParkedNote(comes_back=by_itself):
+            back = "by itself when there is room" if by_itself else "when its holder asks"
+            return f"comes back {back}"
+        case notes.ResizedNote(changed_bytes=0):
+            return "the bytes did not come back in time"
+        case notes.ResizedNote(changed_bytes=changed):
+            return "grown" if changed > 0 else "shrunk"
+        case notes.OomNote(learnt_load_peak_bytes=None):
+            return "another process holds what it was granted"
+        case notes.OomNote():
+            return "it needs more than it declared"
+        case notes.DriftNote(part, drift_bytes=drift):
+            side = "above" if drift > 0 else "below"
+            return f"its {part.replace('_', ' ')} is {side} what it declared"
+        case notes.PressureNote(pressure_bytes=over):
+            return "more is held than the budget" if over else "pressure is over"
+        case notes.StowawayNote():
+            return "holds bytes without a lease; charged as reserve"
+        case (
+            notes.CancelledNote(why=why)
+            | notes.UseEndedNote(why=why)
+            | notes.ExpiredNote(why=why)
+            | notes.LostNote(why=why)
+        ):
+            by = getattr(body, "by", "")
+            return f"{WHY.get(why, why)}: {by}" if by else WHY.get(why, why)
+        case _:
+            return ""

@@ -1,1 +1,1 @@
-"""Learned footprints, durations and crash backoff."""
+"""Learned footprints (`footprints`), durations, returns, switches and failed loads (`costs`)."""

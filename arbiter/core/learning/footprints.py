@@ -1,16 +1,33 @@
-"""What models really took: measured load peaks, steady bytes and residues per consumer and key, as
-far as the last 64 loads go.
+"""Footprints: what models really take, learned from readings and from their holders' words.
 
 Declared footprints are estimates, and estimates are wrong by gigabytes. A request is charged the
-larger of what it declares and the 95th percentile of what was measured. An out-of-memory report
-counts for the next loads whatever they measure. Knows nothing of leases or cards.
+larger of what it declares and the 95th percentile of what was measured; an out-of-memory report
+counts for the next loads whatever they measure. A footprint changes no charge: it counts from the
+next acquire on. In the order of a lease's life:
+
+1. `expected_bytes`: what a request is charged.
+2. `on_evidence`: a reading shows a lease. While it loads, its GPU is read often (`load_probe_s`),
+   so that the peak between two readings is short; a sampled peak is a lower bound all the same, so
+   only one above the declared is drift. A resident is followed until it leaves. A process with
+   several leases on one GPU shows one sum, of which nothing is learned.
+3. `on_ready`, `on_leaving`, `on_verdict`: load peak, steady bytes and retained bytes of one life.
+4. `drift_bytes`, `footprint`: declared beside measured, for `status` and `why`.
 """
 
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Verification
+from vram_arbiter.schemas.wire.explained import FootprintView
+from vram_arbiter.schemas.wire.notes import DriftNote
+from vram_arbiter.schemas.wire.spec import LeaseSpec
+
+if TYPE_CHECKING:  # the state has a table of footprints
+    from vram_arbiter.arbiter.core.model.gpu import Gpu
+    from vram_arbiter.arbiter.core.model.state import Core
 
 HISTORY_MAX = 64
 """Measurements remembered per model and part."""
@@ -19,11 +36,13 @@ MODELS_MAX = 256
 OOM_LOADS = 20
 """An out-of-memory report holds for so many loads; with fewer measurements the 95th percentile is
 their maximum anyway."""
+_RESIDENT = frozenset({LeaseState.HELD, LeaseState.REVOKING})
 
 type Part = Literal["load_peak", "steady", "residue"]
 PARTS: tuple[Part, ...] = ("load_peak", "steady", "residue")
 
 
+# -- the table -------------------------------------------------------------------------------------
 @dataclass(slots=True)
 class Measured:
     """One model's measurements in bytes, oldest first."""
@@ -35,23 +54,20 @@ class Measured:
     oom_bytes: int = 0  # it needed at least this when an allocation failed
     oom_loads: int = 0  # loads for which that still holds
 
-    def add(self, part: Part, counts: list[int]) -> None:
-        seen = self.seen[part]
-        seen.extend(counts)
-        if seen:
-            self.p95[part] = sorted(seen)[ceil(0.95 * len(seen)) - 1]
-
 
 class Footprints:
-    """Measured footprints by model name (`consumer key`)."""
+    """Measured footprints by model name (`model_name`). Knows nothing of leases or GPUs."""
 
     def __init__(self) -> None:
         self._models: dict[str, Measured] = {}
 
-    def measured(self, name: str, part: Part, count: int) -> None:
-        """One load's (or one life's) figure."""
+    def measured(self, name: str, part: Part, *counts: int) -> None:
+        """Add the figures of loads, or of whole lives, oldest first."""
         model = self._model(name)
-        model.add(part, [count])
+        seen = model.seen[part]
+        seen.extend(counts)
+        if seen:
+            model.p95[part] = sorted(seen)[ceil(0.95 * len(seen)) - 1]
         if part == "load_peak" and model.oom_loads:
             model.oom_loads -= 1
             if not model.oom_loads:
@@ -64,8 +80,8 @@ class Footprints:
         model.oom_loads = OOM_LOADS
 
     def p95_bytes(self, name: str, part: Part) -> int:
-        """95th percentile (nearest rank) of what was measured, at least what an out-of-memory
-        report asked for; 0: never seen."""
+        """Return the 95th percentile (nearest rank) of what was measured, at least what an
+        out-of-memory report asked for; 0: never seen."""
         model = self._models.get(name)
         if model is None:
             return 0
@@ -73,7 +89,7 @@ class Footprints:
         return max(found, model.oom_bytes) if part == "load_peak" else found
 
     def kept(self) -> dict[str, dict[str, list[int]]]:
-        """Everything as plain values, for `restore` after a restart."""
+        """Return everything as plain values, for `restore` after a restart."""
         return {
             name: {
                 **{part: list(seen) for part, seen in model.seen.items() if seen},
@@ -83,14 +99,14 @@ class Footprints:
         }
 
     def restore(self, kept: Mapping[str, Mapping[str, Any]]) -> None:
-        """What `kept` gave, perhaps long ago and by another version: what is not understood is left
-        out."""
+        """Take what `kept` gave, perhaps long ago and by another version: what is not understood is
+        left out."""
         for name, parts in kept.items():
-            model = self._model(name)
             for part in PARTS:
-                model.add(part, _counts(parts.get(part)))
+                self.measured(name, part, *_counts(parts.get(part)))
             match _counts(parts.get("oom")):
                 case [count, loads]:
+                    model = self._model(name)
                     model.oom_bytes, model.oom_loads = count, min(loads, OOM_LOADS)
                 case _:
                     pass
@@ -107,3 +123,124 @@ def _counts(value: object) -> list[int]:
     if not isinstance(value, list):
         return []
     return [count for count in value if isinstance(count, int) and count > 0]
+
+
+# -- 1. what a request is charged ------------------------------------------------------------------
+def model_name(spec: LeaseSpec) -> str:
+    """Return the name under which a footprint is learned: another consumer of the same model may
+    load it in another way.
+    """
+    return f"{spec.consumer} {spec.model}"
+
+
+def expected_bytes(core: "Core", spec: LeaseSpec) -> tuple[int, int]:
+    """Return (load peak, steady): the larger of declared and learned.
+
+    Learned bytes alone never exceed the largest GPU's budget.
+    """
+    name = model_name(spec)
+    steady_learned = core.footprints.p95_bytes(name, "steady")
+    peak_learned = core.footprints.p95_bytes(name, "load_peak")
+    if steady_learned or peak_learned:
+        most = max(gpu.ledger.budget_bytes for gpu in core.gpus.values())
+        steady_learned, peak_learned = min(steady_learned, most), min(peak_learned, most)
+    steady = max(spec.footprint.steady_bytes, spec.footprint.residue_bytes, steady_learned)
+    return max(spec.footprint.load_peak_bytes, steady, peak_learned), steady
+
+
+# -- 2. what a reading shows -----------------------------------------------------------------------
+def on_evidence(core: "Core", gpu: "Gpu") -> None:
+    """Follow the leases that the newest reading shows; the ledger has taken its evidence."""
+    for account in gpu.ledger.accounts.values():
+        held = account.measured_bytes
+        lease = (
+            gpu.residents.get(next(iter(account.charges))) if len(account.charges) == 1 else None
+        )
+        if lease is None or not held:
+            continue
+        observed = lease.observed
+        if lease.state is LeaseState.LOADING:
+            if held > observed.peak_bytes:
+                observed.peak_bytes, observed.grew_at = held, core.now
+        elif lease.state in _RESIDENT and not observed.shrinks:
+            observed.steady_bytes = max(observed.steady_bytes, held)
+            if held > lease.spec.footprint.steady_bytes:
+                _note_drift(core, lease, "steady", held)
+
+
+# -- 3. one life -----------------------------------------------------------------------------------
+def on_ready(core: "Core", lease: Lease, measured_bytes: int | None) -> None:
+    """Learn the load peak. `measured_bytes` is the holder's own word, as good as a reading."""
+    lease.observed.steady_bytes = measured_bytes or 0
+    peak = max(lease.observed.peak_bytes, measured_bytes or 0)
+    if peak:
+        core.footprints.measured(model_name(lease.spec), "load_peak", peak)
+    if peak > lease.spec.footprint.load_peak_bytes:
+        _note_drift(core, lease, "load_peak", peak)
+    if measured_bytes:
+        _note_drift(core, lease, "steady", measured_bytes)
+
+
+def on_leaving(core: "Core", lease: Lease) -> None:
+    """Learn the most that a lease took while it was resident. A load that was cut off says only
+    that it was too much."""
+    observed = lease.observed
+    if observed.steady_bytes:
+        core.footprints.measured(model_name(lease.spec), "steady", observed.steady_bytes)
+        _note_drift(core, lease, "steady", observed.steady_bytes)
+    elif observed.peak_bytes > lease.request.load_peak_bytes:
+        core.footprints.measured(model_name(lease.spec), "load_peak", observed.peak_bytes)
+        _note_drift(core, lease, "load_peak", observed.peak_bytes)
+    observed.peak_bytes = observed.steady_bytes = 0  # it may return from standby and load again
+
+
+def on_verdict(core: "Core", gpu: "Gpu", verification: Verification) -> None:
+    """Learn what a living process retains. Called before the charge of its lease is dropped."""
+    account = gpu.ledger.accounts[verification.process]
+    if verification.vanishes or gpu.sample is None or len(account.charges) > 1:
+        return
+    held = gpu.sample.bytes_of(verification.process)
+    if held:
+        core.footprints.measured(verification.model, "residue", held)
+
+
+def _note_drift(core: "Core", lease: Lease, part: Part, measured_bytes: int) -> None:
+    """Note a drift beyond the tolerance once per lease and part."""
+    sizes = lease.spec.footprint
+    declared = sizes.load_peak_bytes if part == "load_peak" else sizes.steady_bytes
+    drift = measured_bytes - declared
+    if part in lease.observed.drifted or abs(drift) <= core.settings.verify_tolerance_bytes:
+        return
+    lease.observed.drifted.add(part)
+    core.note(DriftNote(part, declared, measured_bytes, drift), lease)
+
+
+# -- 4. declared beside measured -------------------------------------------------------------------
+def held_bytes(gpu: "Gpu", lease: Lease) -> int:
+    """Return what the newest reading shows of a lease, else the holder's word; 0: unknown."""
+    account = gpu.ledger.accounts[lease.process]
+    shown_bytes = account.measured_bytes if len(account.charges) == 1 else 0
+    return shown_bytes or lease.observed.reported_bytes or 0
+
+
+def drift_bytes(core: "Core", gpu: "Gpu", lease: Lease) -> int:
+    """Return how far a resident lease is above (below: negative) what it declared; 0 within the
+    tolerance and where it is unknown."""
+    if lease.state not in _RESIDENT or lease.observed.shrinks:
+        return 0
+    declared = lease.spec.footprint.steady_bytes
+    drift = (held_bytes(gpu, lease) or declared) - declared
+    return drift if abs(drift) > core.settings.verify_tolerance_bytes else 0
+
+
+def footprint(core: "Core", lease: Lease) -> FootprintView:
+    """Return bytes per part, declared and learned, for `why`; learned 0: never measured."""
+    spec = lease.spec
+    declared = {
+        "load_peak": spec.footprint.load_peak_bytes,
+        "steady": spec.footprint.steady_bytes,
+        "residue": spec.footprint.residue_bytes,
+    }
+    learned = {str(part): core.footprints.p95_bytes(model_name(spec), part) for part in PARTS}
+    held = 0 if lease.gpu is None else held_bytes(core.gpu_of(lease), lease)
+    return FootprintView(declared, learned, held or None)

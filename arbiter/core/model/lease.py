@@ -1,29 +1,34 @@
-"""One lease: its states, the one table of legal moves, and its story.
+"""One lease: its states, the one table of its legal moves, and its records from the request to the
+verdict.
 
-Knows nothing of bytes on a card (`ledger`), of order (`queue`) or of clients beyond their ids.
+In the order of a life: `Request`, `Lease` (`Uses`, `Observed`), `Departure` (`Eviction`), and
+`Verification`.
+Knows nothing of charges (`ledger`), of order (`gpu`) or of clients beyond their ids.
 """
 
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import inf
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from vram_arbiter.arbiter.core.events import LeaseSpec, MemorySampled
+from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
-from vram_arbiter.schemas.wire.codes import Cause, Order, RevokeCause, Wait
+from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Wait
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 if TYPE_CHECKING:
-    from vram_arbiter.arbiter.core.hooks import Feature
+    from vram_arbiter.arbiter.core.hooks import Feature, Group
+    from vram_arbiter.arbiter.core.model.gpu import Residents
 
 
 class LeaseState(StrEnum):
     """Where a lease is. The words are those of the wire."""
 
-    __hash__ = (
-        str.__hash__
-    )  # Enum's own is written in Python, and states are looked up all the time
+    # Enum's own is written in Python, and states are looked up all the time
+    __hash__ = str.__hash__
 
     QUEUED = "queued"
     LOADING = "loading"
@@ -64,7 +69,7 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
 )
 """State → states that may follow. Everything else is illegal."""
 
-LEAVING = frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING})
+LEAVING = (_S.REVOKING, _S.UNLOADING, _S.VERIFYING)
 AWAY = frozenset({_S.PARKED, _S.STANDBY})
 """States of a lease that lives on without bytes on a GPU: it needs no renewal, and waits for
 nothing with a bound.
@@ -105,13 +110,11 @@ class Eviction:
     lease: LeaseId
     consumer: str
     charge_bytes: int
-    wanted_by: LeaseId | None  # None: the GPU is under pressure
-    wanted_consumer: str
-    cause: Cause
+    wanted_by: LeaseId | None  # the waiter
+    why: RevokeCause
     asked_at: float
     next_push_at: float
     acked_at: float | None = None
-    safe_point_eta_s: float | None = None
     reminded: bool = False
     overdue: bool = False  # the ladder's deadline has passed
     signalled: str = ""  # what was sent to its process: "", "term" or "kill"
@@ -119,32 +122,7 @@ class Eviction:
     released_at: float | None = None
     verdict_at: float | None = None
     verdict: str = ""
-    gang: str = ""  # of the waiter
-    order: Order | None = None  # an operator wanted it
-    # of the waiter: goes with every `revoke`, so that the unloading is seen where it is waited
-    # for
-    traceparent: str | None = None
-
-    @property
-    def why(self) -> RevokeCause:
-        """Why the holder is revoked."""
-        cause = "operator" if self.order else self.cause
-        return RevokeCause(cause, self.wanted_consumer, self.gang, self.order)
-
-
-@dataclass(frozen=True, slots=True)
-class Failures:
-    """Loads of one consumer with one model that failed in a row (`crashes`)."""
-
-    count: int
-    last_at: float
-    cause: str  # of the last
-
-
-class Roster(Protocol):
-    """A table that is kept by state (`residents`)."""
-
-    def moved(self, lease: "Lease", before: LeaseState) -> None: ...
+    traceparent: str | None = None  # of the waiter, whose trace shows the unloading
 
 
 @dataclass(slots=True)
@@ -166,6 +144,7 @@ class Request:
     planned_gpu: GpuId | None = None  # where holders were revoked for it
     extends: LeaseId | None = None  # a request for more bytes of that resident lease
     rank: float | None = None  # a place in the queues that a feature gave it
+    group: "Group | None" = field(default=None, repr=False, compare=False)  # granted with others
     needs: Mapping[ProcessKey, int] | None = None  # of a group of requests that count as one
     evicted: list[Eviction] = field(default_factory=list)  # made room for it
     earlier_nonces: deque[str] = field(default_factory=lambda: deque(maxlen=NONCES_MAX))
@@ -184,13 +163,15 @@ class Departure:
 
 @dataclass(slots=True)
 class Observed:
-    """Bytes of a lease by its holder's word and by readings (`learning.drift`)."""
+    """Bytes of a lease by its holder's word and by readings (`learning.footprints`)."""
 
     reported_bytes: int | None = None  # by the holder
     peak_bytes: int = 0  # largest reading while it loaded
     grew_at: float = 0.0  # when that last rose
     steady_bytes: int = 0  # largest reading or report since it is ready
     drifted: set[str] = field(default_factory=set)  # parts of the footprint that were noted
+    enlarged_at: float = -inf  # when it was last granted more bytes
+    shrinks: bool = False  # readings may show bytes that its holder has freed already
 
 
 class Uses(dict[tuple[ProcessKey, UseId], Use]):
@@ -202,6 +183,8 @@ class Uses(dict[tuple[ProcessKey, UseId], Use]):
         """Uses that yielded: no departure waits for their end."""
         self.last_at = 0.0
         """When a use last began, ended or paused, or the lease became ready."""
+        self.unclaimed = False
+        """The lease came back by itself and was not used since: it has no minimum residency."""
 
 
 RECOVERED = frozenset({_S.LOADING, _S.HELD, _S.UNLOADING, _S.VERIFYING, *AWAY})
@@ -230,7 +213,7 @@ class Lease:
     departure: Departure = field(default_factory=Departure)
     observed: Observed = field(default_factory=Observed)
     story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # last STORY_MAX steps
-    roster: Roster | None = field(default=None, repr=False, compare=False)  # of its GPU
+    roster: "Residents | None" = field(default=None, repr=False, compare=False)  # of its GPU
     features: tuple["Feature", ...] = field(default=(), repr=False, compare=False)  # concerned
 
     @classmethod
@@ -279,11 +262,6 @@ class Lease:
             max(0.0, now - self.request.arrived_at) / ageing_s_per_point
         )
 
-    @property
-    def in_use(self) -> bool:
-        """Whether a use is in flight."""
-        return bool(self.uses)
-
     def users(self) -> list[Use]:
         """Return the oldest in-flight use of each process but the holder: what the journal keeps.
 
@@ -307,4 +285,42 @@ class Lease:
     @property
     def residue_bytes(self) -> int:
         """What its process is expected to keep after unloading."""
-        return 0 if self.departure.exiting else self.spec.residue_bytes
+        return 0 if self.departure.exiting else self.spec.footprint.residue_bytes
+
+
+# -- after the release
+class Verdict(StrEnum):
+    """Outcome of a verification, in the words of the wire."""
+
+    VERIFIED = "verified"
+    RESIDUE = "residue"
+    CONTESTED = "contested"
+    STALE = "stale"
+    UNVERIFIABLE = "unverifiable"
+
+
+@dataclass(slots=True)
+class Verification:
+    """A lease, or retained bytes of a dead process, under measurement. Times are monotonic."""
+
+    key: str
+    process: ProcessKey
+    lease: LeaseId | None  # None: retained bytes of a dead process
+    consumer: str
+    model: str  # name under which its footprint is learned
+    retained_bytes: int  # may stay; 0 once the process is dead
+    baseline: MemorySampled | None  # newest reading in which the bytes were still there
+    baseline_comparable: bool  # the lease was resident and ready when the baseline was taken
+    confirmed_at: float  # only readings that began later count
+    not_before: float  # no verdict earlier: a lost holder may load until it fences itself
+    # the clock: since when the memory may return (polls are dense first, then rarer), and how long
+    paced_from: float = 0.0
+    deadline_at: float = 0.0
+    next_poll_at: float = 0.0
+    alive: bool = True
+    vanishes: bool = False  # the process is dead or about to exit, so that nothing may stay
+    exclusive: bool = False  # no grant before these bytes are gone, even if it would fit
+    fenced_at: float = 0.0  # until then a living holder may use its lease
+    last_used_bytes: int | None = None  # of the newest counting reading
+    verdict: Verdict | None = None  # announced, but not resolved
+    overdue: bool = False

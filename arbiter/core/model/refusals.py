@@ -7,7 +7,7 @@ changes no decision and no replay. The fields are the `details` of the error on 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Literal
+from typing import Literal
 
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Why
 from vram_arbiter.schemas.wire.errors import Refusal
@@ -23,37 +23,25 @@ class Refused(Exception):
 
 
 # -- sessions and tokens
-@dataclass(frozen=True, slots=True)
-class NoSession(Refusal):
+class NoSession(Refusal, code="unknown_session"):
     """The connection has not said hello."""
 
-    code: ClassVar = "unknown_session"
 
-
-@dataclass(frozen=True, slots=True)
-class NoLease(Refusal):
+class NoLease(Refusal, code="unknown_lease"):
     """No lease has this id."""
-
-    code: ClassVar = "unknown_lease"
 
     lease_id: str
 
 
-@dataclass(frozen=True, slots=True)
-class WrongToken(Refusal):
+class WrongToken(Refusal, code="stale_token"):
     """`token` is what the request named, never the right one."""
-
-    code: ClassVar = "stale_token"
 
     lease_id: str
     token: str
 
 
-@dataclass(frozen=True, slots=True)
-class NotHolder(Refusal):
+class NotHolder(Refusal, code="not_permitted"):
     """The lease belongs to another process."""
-
-    code: ClassVar = "not_permitted"
 
     lease_id: str
     pid: int
@@ -77,11 +65,8 @@ class Misfit(StrEnum):
     NO_SUCH_USE = "no_such_use"
 
 
-@dataclass(frozen=True, slots=True)
-class BadLeaseState(Refusal):
+class BadLeaseState(Refusal, code="bad_state"):
     """A holder's request does not fit the state of its lease; `story` lists its last steps."""
-
-    code: ClassVar = "bad_state"
 
     lease_id: str
     state: str
@@ -104,11 +89,8 @@ class Impractical(StrEnum):
     HOLDER_LIVES = "holder_lives"
 
 
-@dataclass(frozen=True, slots=True)
-class BadTargetState(Refusal):
+class BadTargetState(Refusal, code="bad_state"):
     """An operator's action does not fit the lease; `silent_s`: since its holder was heard."""
-
-    code: ClassVar = "bad_state"
 
     lease_id: str
     state: str
@@ -117,37 +99,27 @@ class BadTargetState(Refusal):
     silent_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Ambiguous(Refusal):
+class Ambiguous(Refusal, code="bad_request"):
     """An operator named a consumer without a lease, or with several."""
-
-    code: ClassVar = "bad_request"
 
     target: str
     leases: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class NoTarget(Refusal):
+class NoTarget(Refusal, code="unknown_lease"):
     """No lease and no consumer has this name."""
-
-    code: ClassVar = "unknown_lease"
 
     target: str
 
 
-@dataclass(frozen=True, slots=True)
-class LeaseOver(Refusal):
+class LeaseOver(Refusal, code="bad_state"):
     """A late message on a lease that ended in order; `revoked`: it was evicted."""
-
-    code: ClassVar = "bad_state"
 
     lease_id: str
     state: str
     revoked: RevokeCause | None = None
 
 
-@dataclass(frozen=True, slots=True)
 class TargetOver(Refusal):
     """An operator named a lease that is over: the refusal that its holder would get, with `code` of
     that."""
@@ -161,11 +133,8 @@ class TargetOver(Refusal):
         return cls(ended.code, ended)
 
 
-@dataclass(frozen=True, slots=True)
-class Revoked(Refusal):
+class Revoked(Refusal, code="lease_revoking"):
     """The holder was asked to leave, so no use begins (`use`) and no size changes (`resize`)."""
-
-    code: ClassVar = "lease_revoking"
 
     consumer: str
     state: str
@@ -174,22 +143,16 @@ class Revoked(Refusal):
 
 
 # -- bytes and places
-@dataclass(frozen=True, slots=True)
-class UnknownGpu(Refusal):
+class UnknownGpu(Refusal, code="unknown_gpu"):
     """The selector names no GPU."""
-
-    code: ClassVar = "unknown_gpu"
 
     gpu: str
     known: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class TooLarge(Refusal):
+class TooLarge(Refusal, code="vram_insufficient"):
     """A request can never fit. `needed_bytes` exceeds `declared_bytes` where more was measured
     before."""
-
-    code: ClassVar = "vram_insufficient"
 
     consumer: str
     needed_bytes: int
@@ -198,11 +161,8 @@ class TooLarge(Refusal):
     reserve_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class GrowthTooLarge(Refusal):
+class GrowthTooLarge(Refusal, code="vram_insufficient"):
     """A lease can never grow so far; `room_bytes`: what it can have alone on its GPU."""
-
-    code: ClassVar = "vram_insufficient"
 
     consumer: str
     needed_bytes: int
@@ -211,11 +171,8 @@ class GrowthTooLarge(Refusal):
     reserve_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class NoHostRam(Refusal):
+class NoHostRam(Refusal, code="host_ram_insufficient"):
     """No room in host RAM for parked weights."""
-
-    code: ClassVar = "host_ram_insufficient"
 
     needed_bytes: int
     budget_bytes: int
@@ -236,11 +193,8 @@ class Share(StrEnum):
     OTHERS = "others"  # than the holder
 
 
-@dataclass(frozen=True, slots=True)
-class LimitReached(Refusal):
+class LimitReached(Refusal, code="limit_exceeded"):
     """`count` places of a share are used, `value` are allowed; `uid` for the share of a user."""
-
-    code: ClassVar = "limit_exceeded"
 
     limit: Limit
     value: int
@@ -250,12 +204,9 @@ class LimitReached(Refusal):
     uid: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class LoadFails(Refusal):
+class LoadFails(Refusal, code="load_failing"):
     """The model died in its load `failures` times in a row; no holder is revoked for it for
     `retry_in_s`."""
-
-    code: ClassVar = "load_failing"
 
     consumer: str
     model: str
@@ -265,33 +216,24 @@ class LoadFails(Refusal):
 
 
 # -- ends
-@dataclass(frozen=True, slots=True)
-class CancelledRequest(Refusal):
+class CancelledRequest(Refusal, code="cancelled"):
     """A request ended because of its own client. `by` is the reason of a client that left."""
-
-    code: ClassVar = "cancelled"
 
     lease_id: str
     why: Why
     by: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class TimedOut(Refusal):
+class TimedOut(Refusal, code="wait_timeout"):
     """A request waited as long as it wanted to."""
-
-    code: ClassVar = "wait_timeout"
 
     consumer: str
     waited_s: float
     why: Explanation
 
 
-@dataclass(frozen=True, slots=True)
-class HolderOutstays(Refusal):
+class HolderOutstays(Refusal, code="holder_busy"):
     """A holder did not leave in time, and the waiter did not want to wait longer."""
-
-    code: ClassVar = "holder_busy"
 
     lease_id: str
     consumer: str
@@ -299,11 +241,8 @@ class HolderOutstays(Refusal):
     deadline_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Expired(Refusal):
+class Expired(Refusal, code="lease_expired"):
     """The lease was not renewed in time, or an operator gave its silent holder up."""
-
-    code: ClassVar = "lease_expired"
 
     lease_id: str
     ttl_s: float
@@ -311,11 +250,8 @@ class Expired(Refusal):
     order: Order | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Lost(Refusal):
+class Lost(Refusal, code="lease_lost"):
     """The lease is over, and its holder did not end it."""
-
-    code: ClassVar = "lease_lost"
 
     lease_id: str
     why: Why
@@ -327,11 +263,8 @@ type End = Lost | CancelledRequest
 """Why a lease without bytes ended."""
 
 
-@dataclass(frozen=True, slots=True)
-class NotJournaled(Refusal):
+class NotJournaled(Refusal, code="journal_unavailable"):
     """The grant could not be written, so it does not take place."""
-
-    code: ClassVar = "journal_unavailable"
 
     lease_id: str
     key: str
@@ -339,22 +272,16 @@ class NotJournaled(Refusal):
 
 
 # -- gangs
-@dataclass(frozen=True, slots=True)
-class GangMismatch(Refusal):
+class GangMismatch(Refusal, code="bad_request"):
     """A member does not fit its gang: another size (`asked`), or all members have asked already."""
-
-    code: ClassVar = "bad_request"
 
     gang: str
     size: int
     asked: int
 
 
-@dataclass(frozen=True, slots=True)
-class GangTooLarge(Refusal):
+class GangTooLarge(Refusal, code="vram_insufficient"):
     """All members together can never fit."""
-
-    code: ClassVar = "vram_insufficient"
 
     gang: str
     members: int
@@ -373,12 +300,9 @@ class GangEnd(StrEnum):
     NOT_FREED = "not_freed"  # measured memory did not come back
 
 
-@dataclass(frozen=True, slots=True)
-class BrokenGang(Refusal):
+class BrokenGang(Refusal, code="gang_broken"):
     """The gang will not be granted. `consumer`, `lease_id`, `state`: the fallen member; `because`:
     its refusal."""
-
-    code: ClassVar = "gang_broken"
 
     gang: str
     why: GangEnd
@@ -409,10 +333,7 @@ class CycleLink:
     holds: tuple[NamedLease, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Deadlock(Refusal):
+class Deadlock(Refusal, code="would_deadlock"):
     """The wait would never end."""
-
-    code: ClassVar = "would_deadlock"
 
     cycle: tuple[CycleLink, ...]

@@ -1,16 +1,19 @@
-"""The whole state of the engine and the small verbs that every step uses: note, refuse, push, wake.
+"""The whole state of the engine (`Core`), its timers, and what the steps of one event tell each
+other (`Turn`).
 
-Data and bookkeeping only: no decision is taken here.
+Data and bookkeeping only: no decision is taken here. What an event changes goes through the verbs
+of `Core`, in this order: effects (`note`, `reply`, `push`), readings, numbers, clients, leases,
+uses, waits, the end of a lease, and the journal.
 """
 
-from collections import Counter, OrderedDict, deque
-from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from collections import OrderedDict
+from dataclasses import dataclass, field
 from hashlib import blake2b
-from statistics import median
-from typing import Any
+from heapq import heapify, heappop, heappush
+from math import inf
 
 from vram_arbiter.arbiter.core.effects import (
+    Effect,
     JournalDelete,
     JournalPut,
     Note,
@@ -19,44 +22,40 @@ from vram_arbiter.arbiter.core.effects import (
     Reply,
     Sample,
 )
-from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.hooks import HOOKS, Feature, overriding
+from vram_arbiter.arbiter.core.hooks import Feature
+from vram_arbiter.arbiter.core.learning.costs import Costs
 from vram_arbiter.arbiter.core.learning.footprints import Footprints
-from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
-from vram_arbiter.arbiter.core.ledger.pending_free import PendingFree
+from vram_arbiter.arbiter.core.ledger import GpuLedger
+from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
 from vram_arbiter.arbiter.core.model.lease import (
-    LEAVING,
-    Eviction,
-    Failures,
     Lease,
     LeaseState,
     Use,
 )
-from vram_arbiter.arbiter.core.model.residents import Residents
-from vram_arbiter.arbiter.core.model.turn import Turn
-from vram_arbiter.arbiter.core.model.verification import Verification
-from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
-from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
-from vram_arbiter.arbiter.core.timers import Timers
+from vram_arbiter.arbiter.core.model.records import AnyRecord, LeaseRecord, ResidueRecord
+from vram_arbiter.arbiter.core.settings import SCHEDULING, Settings
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
-from vram_arbiter.schemas.wire.codes import Block, Order, RevokeCause
+from vram_arbiter.schemas.wire.codes import Order, RevokeCause
 from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.notes import About, AnyNote
 from vram_arbiter.schemas.wire.pushes import AnyPush
 from vram_arbiter.schemas.wire.replies import AnyReply
 
 ENDED_REMEMBERED = 1024
-LEARNT_REMEMBERED = 32
-CONSUMERS_REMEMBERED = 1024
 TOKEN_STEP_BYTES = 4
 """Tokens are apart by up to 2^32: 2^31 grants of one epoch stay below 2^63."""
-NOT_COUNTED = (-1, -1)
-_LOADING = frozenset({LeaseState.LOADING})
-_MOVING = LEAVING | _LOADING
-IDLE_PROBE_S = 10.0  # how long after the last client a card is still read in the background
+TIMERS_SLACK = 256
+"""Entries of cleared timers that stay in the heap however few are set."""
+
+type TimerKey = tuple[str, str]
+"""(kind, subject), e.g. ("ttl", "L3-17")."""
+type _UseKey = tuple[LeaseId, UseId]
 
 
 @dataclass(frozen=True, slots=True)
 class Client:
+    """One connection that said hello. `instance` names the client object behind it."""
+
     id: ClientId
     process: ProcessKey
     name: str
@@ -79,18 +78,6 @@ class Ended:
 
 
 @dataclass(slots=True)
-class Reuse:
-    """Departures of one consumer: was it wanted again soon?"""
-
-    left_at: float | None = None
-    soon: deque[bool] = field(default_factory=lambda: deque(maxlen=LEARNT_REMEMBERED))
-
-    def chance(self) -> float:
-        """Half for one that is not known, nearer to what was seen with every departure."""
-        return (1 + sum(self.soon)) / (2 + len(self.soon))
-
-
-@dataclass(slots=True)
 class Refusals:
     """Notes of one process's refused requests (`refusals`): how many lately, and how many were left
     out."""
@@ -100,47 +87,69 @@ class Refusals:
     left_out: int = 0
 
 
-LEFT_KEPT = 64  # more verdicts than can fall between a baseline and its own
+class Timers(dict[TimerKey, float]):
+    """Deadlines by name, in a heap. A later deadline is cheap, as renewals set one all the time:
+    the entry of the earlier one is corrected when it comes up."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._heap: list[tuple[float, TimerKey]] = []
+
+    def set(self, key: TimerKey, at: float) -> None:
+        """Set a deadline, or move it."""
+        before = self.get(key)
+        self[key] = at
+        if before is None or at < before:
+            heappush(self._heap, (at, key))
+
+    def cancel(self, key: TimerKey) -> None:
+        """Forget a deadline, if it is set."""
+        self.pop(key, None)
+        if len(self._heap) > TIMERS_SLACK + 2 * len(self):
+            # waits of a day that are given up after a second must not stay here for the day
+            self._heap = [(at, timer) for timer, at in self.items()]
+            heapify(self._heap)
+
+    def next_at(self) -> float | None:
+        """When the earliest timer is due."""
+        while self._heap:
+            at, key = self._heap[0]
+            due = self.get(key)
+            if due == at:
+                return at
+            heappop(self._heap)
+            if due is not None and due > at:
+                heappush(self._heap, (due, key))
+        return None
+
+    def pop_due(self, now: float) -> TimerKey | None:
+        """Take the earliest timer that is due, or None."""
+        at = self.next_at()
+        if at is None or at > now:
+            return None
+        _, key = heappop(self._heap)
+        del self[key]
+        return key
 
 
 @dataclass(slots=True)
-class Gpu:
-    """One GPU: its ledger, residents, queue and readings."""
+class Turn:
+    """What the steps of one event tell the next ones; nothing of it outlives the event."""
 
-    info: GpuInfo
-    ledger: GpuLedger
-    queue: WaitQueue
-    residents: Residents = field(default_factory=Residents)
-    verifications: dict[str, Verification] = field(default_factory=dict)
-    evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
-    pending_free: PendingFree = field(default_factory=PendingFree)
-    # when the newest verdicts fell, and how many bytes left by each
-    left: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LEFT_KEPT))
-    sample: MemorySampled | None = None
-    before_sleep: MemorySampled | None = None  # says nothing of now, but what was there then
-    reading_s: float = 0.0  # how long the newest reading took
-    failed_at: float | None = None  # last failed reading, None after a good one
-    failure: str = ""
-    read_from: float = 0.0  # no reading that began earlier counts (resume from suspend)
-    asked_at: float | None = None  # last Sample asked for, None if its answer is here
-    changed_at: float = 0.0  # last grant, ready or verdict
-    blocked: Block | None = None
-    keeper: Feature | None = None  # keeps it from the requests of all others
-    pressed: bool = False  # a pressure note is out
-
-    debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
-
-    def in_state(self, *states: LeaseState) -> list[Lease]:
-        return self.residents.in_state(*states)
-
-    def sees_loads(self) -> bool:
-        """Whether a lease loads, and readings can tell how much it takes."""
-        listed = self.sample is not None and self.sample.lists_processes
-        return listed and self.residents.any_in(_LOADING)
-
-    def quiet(self) -> bool:
-        """Whether no lease loads or unloads, so that unattributed bytes mean something."""
-        return not self.verifications and not self.residents.any_in(_MOVING)
+    effects: list[Effect] = field(default_factory=list)
+    """To be performed, in this order."""
+    dirty: dict[int, Gpu] = field(default_factory=dict)
+    """GPUs by index whose queue must be served."""
+    touched: dict[int, Gpu] = field(default_factory=dict)
+    """GPUs by index whose records may have changed: their next reading is planned, their invariants
+    are checked.
+    """
+    suspects: set[ProcessKey] = field(default_factory=set)
+    """Processes that use and wait since this event: they may be in a circle (`deadlock`)."""
+    unanswered: list[Lease] = field(default_factory=list)
+    """Leases of this event's acquire; one that is not granted at once is answered `queued`."""
+    granted: list[tuple[Token, GpuId]] = field(default_factory=list)
+    """Grants, for the invariants."""
 
 
 class Core:
@@ -148,58 +157,46 @@ class Core:
 
     def __init__(self, settings: Settings, now: float, features: tuple[Feature, ...]) -> None:
         self.settings = settings
+        self.policy = SCHEDULING[settings.policy]
         self.features = features
-        self.hooked = {hook: overriding(features, hook) for hook in HOOKS}
         self.started_at = now
         self.now = now
         self.turn = Turn()
-        ageing_s = settings.ageing_s_per_point if settings.scheduling.by_priority else 0.0
+        ageing_s = settings.ageing_s_per_point if self.policy.by_priority else 0.0
         self.gpus: dict[GpuId, Gpu] = {
             info.id: Gpu(
                 info, GpuLedger(info, settings.verify_tolerance_bytes), WaitQueue(ageing_s)
             )
             for info in sorted(settings.gpus, key=lambda info: info.index)
         }
+        self.timers = Timers()
+        # leases, and who asks for them
         self.leases: dict[LeaseId, Lease] = {}
         self._of_process: dict[ProcessKey, dict[LeaseId, Lease]] = {}
-        self._of_client: dict[ClientId, dict[LeaseId, Lease]] = {}
-        self.waiting: dict[LeaseId, Lease] = {}
-        self._waiting_by: dict[
-            ProcessKey | int, int
-        ] = {}  # waiters of each process and of each uid
-        self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
+        self.of_client: dict[ClientId, dict[LeaseId, Lease]] = {}  # leases that it speaks for
         self.clients: dict[ClientId, Client] = {}
-        self.connected: dict[ProcessKey, int] = {}  # connections of each process
-        self.instances: dict[
-            tuple[ProcessKey, str], ClientId
-        ] = {}  # the connection of each client object
-        self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
-        self.timers = Timers()
-        self.serial = 0
-        self.token_offset = 0  # tokens are ahead of `serial` by so much
-        self.arrivals = 0
-        self.last_token = Token(settings.epoch, 0)
-        self.users: dict[
-            ProcessKey, dict[tuple[LeaseId, UseId], Lease]
-        ] = {}  # whose busy uses are where
-        self.counted = (
-            NOT_COUNTED  # waiters in queues, and all, when the invariants counted them last
-        )
+        self.connected: dict[ProcessKey, dict[ClientId, Client]] = {}  # clients by process
         self.last_client_at = now
-        self.drain: Order | None = None  # an operator wants no new grants
-        # None: serving; else the leases still to be accounted for
-        self.recovering: set[LeaseId] | None = None
+        self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
+        self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
+        self.refusals: dict[ProcessKey, Refusals] = {}  # the latest last
+        # waits and uses
+        self.waiting: dict[LeaseId, Lease] = {}
+        self.unqueued: dict[LeaseId, Lease] = {}  # waiters that a feature keeps out of the queues
+        self.waiters_of: dict[ProcessKey | int, int] = {}  # how many, by process and by uid
+        self.users: dict[ProcessKey, dict[_UseKey, Lease]] = {}  # leases that a process uses
+        self.pausing: dict[ProcessKey, dict[_UseKey, Lease]] = {}  # those where its uses pause
+        # numbers: tokens are ahead of `serial` by `token_offset`
+        self.serial = self.token_offset = self.arrivals = 0
+        self.last_token = Token(settings.epoch, 0)
+        # what grants wait for: an operator, and after a restart leases to be accounted for
+        self.drain: Order | None = None
+        self.serving = True
+        self.recovering: set[LeaseId] = set()
+        # what was learned
         self.footprints = Footprints()
         self.footprints.restore(settings.footprints)
-        self.refusals: dict[ProcessKey, Refusals] = {}  # the latest last
-        self.reuse: dict[str, Reuse] = {}  # by consumer
-        self.crashes: dict[str, Failures] = {}  # by model, the latest last
-        # (consumer that left, consumer it left for) → when last
-        self.switches: dict[tuple[str, str], float] = {}
-        self.durations: dict[str, dict[str, deque[float]]] = {}
-        for consumer, medians in sorted(settings.learnt.items()):
-            for phase, seconds in sorted(medians.items()):
-                self.learn(consumer, phase, seconds)
+        self.costs = Costs(settings.learnt, settings.thrash_window_s)
         for gpu in self.gpus.values():
             self.wake(gpu)
 
@@ -211,17 +208,18 @@ class Core:
         self.turn.effects.append(Refuse(client, request, refusal))
 
     def push(self, lease: Lease, body: AnyPush) -> None:
-        self.turn.effects.append(Push(self.voice_of(lease), body))
+        """Push to the client of a lease, or to another living connection of its process."""
+        living = self.connected.get(lease.process, {})
+        to = lease.client if lease.client in living or not living else min(living)
+        self.turn.effects.append(Push(to, body))
 
-    def note(self, kind: str, lease: Lease | None = None, **data: Any) -> None:
-        facts: dict[str, Any] = {}
+    def note(self, body: AnyNote, lease: Lease | None = None) -> None:
+        about = None
         if lease is not None:
-            facts = {"lease_id": lease.id, "consumer": lease.spec.consumer, "gpu": lease.gpu}
-            if lease.request.traceparent is not None:
-                facts["traceparent"] = lease.request.traceparent
-        self.turn.effects.append(Note(kind, {**facts, **data}))
+            about = About(lease.id, lease.spec.consumer, lease.gpu, lease.request.traceparent)
+        self.turn.effects.append(Note(body, about))
 
-    def journal(self, key: str, record: Mapping[str, Any], *, gates: bool = False) -> None:
+    def journal(self, key: str, record: AnyRecord, *, gates: bool = False) -> None:
         self.turn.effects.append(JournalPut(key, record, gates))
 
     def forget(self, key: str) -> None:
@@ -236,21 +234,11 @@ class Core:
 
     def read_again(self, gpu: Gpu, after_s: float) -> None:
         """The next background reading comes in `after_s` at the latest."""
-        key = ("probe", gpu.info.id)
-        planned, due = self.timers.due(key), self.now + after_s
-        if planned is None or due < planned:
-            self.timers.set(key, due)
+        key, due_at = ("probe", gpu.info.id), self.now + after_s
+        if self.timers.get(key, inf) > due_at:
+            self.timers.set(key, due_at)
 
     # -- bookkeeping
-    def voice_of(self, lease: Lease) -> ClientId:
-        """Where pushes about a lease go: its client, or another living connection of the same
-        process."""
-        client = self.clients.get(lease.client)
-        if client is not None and client.process == lease.process:
-            return lease.client
-        others = sorted(c.id for c in self.clients.values() if c.process == lease.process)
-        return others[0] if others else lease.client
-
     def next_lease_id(self) -> LeaseId:
         self.serial += 1
         return LeaseId(f"L{self.settings.epoch}-{self.serial}")
@@ -272,84 +260,35 @@ class Core:
         return self.arrivals
 
     def gpu_of(self, lease: Lease) -> Gpu:
-        """The card of a resident lease."""
-        assert lease.gpu is not None, f"{lease.id} has no card"
+        """Return the GPU of a resident lease."""
+        assert lease.gpu is not None, f"{lease.id} has no GPU"
         return self.gpus[lease.gpu]
 
     def wake(self, gpu: Gpu) -> None:
         """Serve the queue of a GPU in this turn: something changed that a waiter there may wait
         for."""
-        self.turn.dirty[gpu.info.index] = gpu
-        self.turn.touch(gpu)
+        self.turn.dirty[gpu.info.index] = self.turn.touched[gpu.info.index] = gpu
 
     def join(self, client: Client) -> None:
         """A connection begins."""
         self.clients[client.id] = client
-        self.connected[client.process] = self.connected.get(client.process, 0) + 1
+        self.connected.setdefault(client.process, {})[client.id] = client
 
     def part(self, client: ClientId) -> None:
         """A connection is over."""
-        process = self.clients.pop(client).process
-        self.connected[process] -= 1
-        if not self.connected[process]:
-            del self.connected[process]
+        _take_out(self.connected, self.clients.pop(client).process, client)
 
     def add(self, lease: Lease) -> None:
         """A lease begins to live."""
         self.leases[lease.id] = lease
         self._of_process.setdefault(lease.process, {})[lease.id] = lease
-        self._of_client.setdefault(lease.client, {})[lease.id] = lease
+        self.of_client.setdefault(lease.client, {})[lease.id] = lease
 
     def hand_to(self, lease: Lease, client: ClientId) -> None:
         """Another connection of its process speaks for a lease from now on."""
-        _take_out(self._of_client, lease.client, lease.id)
+        _take_out(self.of_client, lease.client, lease.id)
         lease.client = client
-        self._of_client.setdefault(client, {})[lease.id] = lease
-
-    def leases_of_client(self, client: ClientId) -> list[Lease]:
-        """Live leases that a connection speaks for."""
-        return list(self._of_client.get(client, {}).values())
-
-    def count_of_client(self, client: ClientId) -> int:
-        return len(self._of_client.get(client, {}))
-
-    def waiting_by(self, process: ProcessKey, uid: int) -> tuple[int, int]:
-        """Waiters of a process, and of a user."""
-        return self._waiting_by.get(process, 0), self._waiting_by.get(uid, 0)
-
-    def disagreement(self) -> str:
-        """Where the tables of owners and the leases disagree; "" if nowhere. Looks at everybody:
-        for tests."""
-        by_process = {
-            lease_id: owner for owner, some in self._of_process.items() for lease_id in some
-        }
-        by_client = {
-            lease_id: owner for owner, some in self._of_client.items() for lease_id in some
-        }
-        for lease in self.leases.values():
-            if (by_process.pop(lease.id, None), by_client.pop(lease.id, None)) != (
-                lease.process,
-                lease.client,
-            ):
-                return f"{lease.id} is not listed under its process and its client"
-        if by_process or by_client:
-            return f"{sorted({**by_process, **by_client})} are listed and gone"
-        busy = {(*use, lease.id) for lease in self.leases.values() for use in lease.uses}
-        if odd := busy ^ {
-            (who, use, lease) for who, mine in self.users.items() for lease, use in mine
-        }:
-            return f"{sorted(odd)}: uses are listed otherwise than they are"
-        owners = Counter(
-            owner for lease in self.waiting.values() for owner in (lease.process, lease.request.uid)
-        )
-        if owners != self._waiting_by:
-            return f"waiters are {owners}, kept as {self._waiting_by}"
-        counted = Counter(client.process for client in self.clients.values())
-        return (
-            ""
-            if counted == self.connected
-            else f"{counted} are connected, kept as {self.connected}"
-        )
+        self.of_client.setdefault(client, {})[lease.id] = lease
 
     def leases_of(self, process: ProcessKey) -> list[Lease]:
         """Live leases of a process, oldest first."""
@@ -357,20 +296,31 @@ class Core:
 
     def mark(self, lease: Lease, use: Use) -> None:
         """A use is busy from now on."""
-        lease.uses.paused.pop((use.process, use.id), None)
+        if (use.process, use.id) in lease.uses.paused:
+            self.unmark(lease, use)
         lease.uses[use.process, use.id] = use
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
-        self.turn.suspects.add(use.process)
-        for feature in lease.features:
-            feature.on_used(lease)
+        lease.uses.unclaimed = False
+        if use.process in self.waiters_of:
+            self.turn.suspects.add(use.process)
+
+    def pause(self, lease: Lease, use: Use) -> None:
+        """A busy use pauses."""
+        self.unmark(lease, use)
+        lease.uses.paused[use.process, use.id] = use
+        self.pausing.setdefault(use.process, {})[lease.id, use.id] = lease
 
     def unmark(self, lease: Lease, use: Use) -> None:
-        """A busy use ends or pauses."""
-        del lease.uses[use.process, use.id]
-        mine = self.users[use.process]
-        del mine[lease.id, use.id]
-        if not mine:
-            del self.users[use.process]
+        """A use ends, busy or paused."""
+        key = (use.process, use.id)
+        busy = key in lease.uses
+        del (lease.uses if busy else lease.uses.paused)[key]
+        _take_out(self.users if busy else self.pausing, use.process, (lease.id, use.id))
+
+    def used_by(self, process: ProcessKey) -> list[Lease]:
+        """Return the live leases with a use of a process, busy or paused; some twice."""
+        tables = (self.users.get(process, {}), self.pausing.get(process, {}))
+        return [lease for table in tables for lease in table.values()]
 
     def move(self, lease: Lease, to: LeaseState, why: str) -> None:
         """Move a lease to another state and tell its features. Raises IllegalTransition."""
@@ -386,31 +336,34 @@ class Core:
                 return state
         return None
 
-    def enqueue(self, lease: Lease) -> None:
-        """A lease begins to wait, on every card that it may be placed on."""
-        self.hold_back(lease)
-        for gpu_id in lease.request.gpus:
+    def enqueue(self, lease: Lease, *, hold_back: bool = False) -> None:
+        """A request waits in the queue of every candidate GPU; held back, it waits in none yet."""
+        request = lease.request
+        if lease.id not in self.waiting:
+            self.waiting[lease.id] = lease
+            for owner in (lease.process, request.uid):
+                self.waiters_of[owner] = self.waiters_of.get(owner, 0) + 1
+            if lease.process in self.users:
+                self.turn.suspects.add(lease.process)
+            if request.wait_timeout_s is not None:
+                self.timers.set(("wait", lease.id), request.arrived_at + request.wait_timeout_s)
+        if hold_back:
+            self.unqueued[lease.id] = lease
+            return
+        self.unqueued.pop(lease.id, None)
+        for gpu_id in request.gpus:
             self.gpus[gpu_id].queue.add(lease)
             self.wake(self.gpus[gpu_id])
 
-    def hold_back(self, lease: Lease) -> None:
-        """It waits, but in no queue yet."""
-        self.waiting[lease.id] = lease
-        for owner in (lease.process, lease.request.uid):
-            self._waiting_by[owner] = self._waiting_by.get(owner, 0) + 1
-        self.turn.suspects.add(lease.process)
-        if lease.request.wait_timeout_s is not None:
-            self.timers.set(
-                ("wait", lease.id), lease.request.arrived_at + lease.request.wait_timeout_s
-            )
-
     def dequeue(self, lease: Lease) -> None:
+        """A request waits no more."""
+        self.unqueued.pop(lease.id, None)
         if self.waiting.pop(lease.id, None) is not None:
             for owner in (lease.process, lease.request.uid):
-                self._waiting_by[owner] -= 1
-                if not self._waiting_by[owner]:
-                    del self._waiting_by[owner]
-        self.timers.clear(("wait", lease.id))
+                self.waiters_of[owner] -= 1
+                if not self.waiters_of[owner]:
+                    del self.waiters_of[owner]
+        self.timers.cancel(("wait", lease.id))
         for gpu_id in lease.request.gpus:
             self.gpus[gpu_id].queue.discard(lease)
             self.wake(self.gpus[gpu_id])
@@ -419,114 +372,59 @@ class Core:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
-        _take_out(self._of_client, lease.client, lease.id)
+        _take_out(self.of_client, lease.client, lease.id)
         for kind in ("ttl", "revoke", "overstay", "users"):
-            self.timers.clear((kind, lease.id))
+            self.timers.cancel((kind, lease.id))
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
-            gpu.residents.pop(lease.id, None)
+            gpu.residents.remove(lease)
             self.wake(gpu)
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")
-        earlier = tuple(lease.request.earlier_nonces)
-        revoked = None if lease.departure.eviction is None else lease.departure.eviction.why
-        ended = Ended(
-            lease.id,
-            lease.process,
-            lease.request.nonce,
-            lease.token,
-            lease.state,
-            error,
-            earlier,
-            revoked,
-        )
-        self.remember(ended)
+        request, eviction = lease.request, lease.departure.eviction
+        known = (lease.id, lease.process, request.nonce, lease.token, lease.state, error)
+        revoked = None if eviction is None else eviction.why
+        self.remember(Ended(*known, tuple(request.earlier_nonces), revoked))
 
     def remember(self, ended: Ended) -> None:
+        """Remember a lease that is over; the oldest such is forgotten."""
         self.ended[ended.lease] = ended
         while len(self.ended) > ENDED_REMEMBERED:
             _, oldest = self.ended.popitem(last=False)
             for nonce in (oldest.nonce, *oldest.earlier_nonces):
                 self.nonces.pop((oldest.process, nonce), None)
 
-    def learn(self, consumer: str, phase: str, seconds: float) -> None:
-        """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took for a
-        consumer."""
-        phases = self.durations.pop(consumer, {})
-        self.durations[consumer] = phases  # the newest last
-        _forget_oldest(self.durations)
-        phases.setdefault(phase, deque(maxlen=LEARNT_REMEMBERED)).append(max(0.0, seconds))
-
-    def seen_leaving(self, consumer: str) -> None:
-        """A consumer's bytes are gone: whether it is wanted again soon is learnt from now on."""
-        seen = self.reuse.pop(consumer, None) or Reuse()
-        self.reuse[consumer] = seen
-        seen.left_at = self.now
-        _forget_oldest(self.reuse)
-
-    def learnt_s(self, consumer: str, phase: str) -> float | None:
-        """Median of what was learnt; None: never seen."""
-        seen = self.durations.get(consumer, {}).get(phase)
-        return median(seen) if seen else None
-
     def record_lease(self, lease: Lease, *, debt: bool = False, gates: bool = False) -> None:
         """Write a lease that is resident (or its debt) or away to the journal. `gates`: it is a
         grant, which does not take place unless its record is written. Whatever else is recorded has
         happened; a stale record makes a later recovery more careful.
         """
-        spec = lease.spec
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
         assert lease.token is not None, f"{lease.id} is recorded without a token"
-        asked = (
-            lease.departure.revoked_before and lease.state is LeaseState.HELD
-        )  # and not by this daemon yet
-        features = {
-            key: value
-            for feature in lease.features
-            for key, value in feature.to_record(lease).items()
-        }
-        users = [[*astuple(use.process), use.id, use.label] for use in lease.users()]
-        self.journal(
-            f"lease:{lease.id}",
-            {
-                "lease_id": lease.id,
-                "token": [lease.token.epoch, lease.token.serial],
-                "state": "debt" if debt else str(LeaseState.REVOKING if asked else lease.state),
-                "gpu": lease.gpu,
-                "pid": lease.process.pid,
-                "start_ticks": lease.process.start_ticks,
-                "nonce": lease.request.nonce,
-                "held_from": lease.held_from,
-                "charge_bytes": charge_bytes,
-                "load_peak_bytes": lease.request.load_peak_bytes,
-                "measured_bytes": lease.observed.reported_bytes,
-                "exiting": lease.departure.exiting,
-                "pinned": None if lease.pinned is None else [lease.pinned.by, lease.pinned.reason],
-                **({"users": users} if users else {}),
-                **features,
-                "spec": {
-                    "consumer": spec.consumer,
-                    "model_id": spec.key.model_id,
-                    "revision": spec.key.revision,
-                    "gpu": spec.gpu,
-                    "exclusive": spec.exclusive,
-                    "load_peak_bytes": spec.load_peak_bytes,
-                    "steady_bytes": spec.steady_bytes,
-                    "residue_bytes": spec.residue_bytes,
-                    "priority": spec.priority,
-                    "evictable": spec.evictable,
-                    "ttl_s": spec.ttl_s,
-                    "min_residency_s": spec.min_residency_s,
-                    "deny_on_deadline": spec.deny_on_deadline,
-                    "standby": spec.standby,
-                    "on_overstay": spec.on_overstay,
-                    "park_bytes": spec.park_bytes,
-                    "independent": spec.independent,
-                    "gang": None if spec.gang is None else [*spec.gang],
-                },
-            },
-            gates=gates,
+        state = "debt" if debt else lease.state.value
+        if not debt and lease.departure.revoked_before and lease.state is LeaseState.HELD:
+            state = "revoking"  # and not by this daemon yet
+        pinned, users = lease.pinned, lease.users()
+        record = LeaseRecord(
+            lease_id=lease.id,
+            token=(lease.token.epoch, lease.token.serial),
+            state=state,
+            gpu=lease.gpu,
+            pid=lease.process.pid,
+            start_ticks=lease.process.start_ticks,
+            nonce=lease.request.nonce,
+            charge_bytes=charge_bytes,
+            load_peak_bytes=lease.request.load_peak_bytes,
+            measured_bytes=lease.observed.reported_bytes,
+            exiting=lease.departure.exiting,
+            spec=lease.spec,
+            held_from=lease.held_from,
+            pinned=None if pinned is None else (pinned.by, pinned.reason),
+            users=tuple([(*u.process, u.id, u.label) for u in users]) if users else (),
         )
+        for feature in lease.features:
+            record = feature.to_record(lease, record)
+        self.journal(f"lease:{lease.id}", record, gates=gates)
 
     def record_residue(self, gpu: Gpu, process: ProcessKey, residue_bytes: int) -> None:
         """Write (or, with 0, delete) what a process keeps."""
@@ -534,38 +432,16 @@ class Core:
         if not residue_bytes:
             self.forget(key)
             return
-        self.journal(
-            key,
-            {
-                "pid": process.pid,
-                "start_ticks": process.start_ticks,
-                "gpu": gpu.info.id,
-                "residue_bytes": residue_bytes,
-                "floor_bytes": gpu.ledger.accounts[process].residue_floor_bytes,
-            },
+        floor_bytes = gpu.ledger.accounts[process].retained_floor_bytes
+        record = ResidueRecord(
+            process.pid, process.start_ticks, gpu.info.id, residue_bytes, floor_bytes
         )
-
-    def active(self, gpu: Gpu) -> bool:
-        """Whether a client, a lease or a waiter concerns this GPU."""
-        return bool(
-            self.clients
-            or gpu.residents
-            or gpu.verifications
-            or len(gpu.queue)
-            or self.recovering
-            or self.now - self.last_client_at <= IDLE_PROBE_S
-        )
+        self.journal(key, record)
 
 
-def _forget_oldest[T](by_consumer: dict[str, T]) -> None:
-    """Names are free: what is remembered by them has a bound."""
-    while len(by_consumer) > CONSUMERS_REMEMBERED:
-        del by_consumer[next(iter(by_consumer))]
-
-
-def _take_out[K](table: dict[K, dict[LeaseId, Lease]], owner: K, lease_id: LeaseId) -> None:
-    """An owner without leases has no entry."""
+def _take_out[K, I, T](table: dict[K, dict[I, T]], owner: K, item: I) -> None:
+    """An owner without items has no entry."""
     some = table[owner]
-    del some[lease_id]
+    del some[item]
     if not some:
         del table[owner]

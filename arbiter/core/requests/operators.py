@@ -3,56 +3,52 @@ dead holder.
 
 Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does,
 and a lease in use is never given up. Every action is a note with the operator and the reason; a pin
-and a drain are journalled, so they outlive the daemon. The role was checked where the request came
+and a drain are journaled, so they outlive the daemon. The role was checked where the request came
 in.
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Final
 
-from vram_arbiter.arbiter.core.events import OperatorAsked
-from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core import eviction
+from vram_arbiter.arbiter.core.events import DRAIN_KEY, OperatorAsked
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.records import DrainRecord
 from vram_arbiter.arbiter.core.model.refusals import Impractical, Refused
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.arbiter.core.report import explain
-from vram_arbiter.arbiter.core.requests.expiry import expire
-from vram_arbiter.arbiter.core.requests.requests import client_of, ended_error
+from vram_arbiter.arbiter.core.report import status
+from vram_arbiter.arbiter.core.requests.requests import over
+from vram_arbiter.arbiter.core.requests.sessions import expire
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Order
+from vram_arbiter.schemas.wire.notes import OperatorNote
 from vram_arbiter.schemas.wire.replies import DrainReply, OperatorReply
 
-DRAIN_KEY = "drain"
-"""Journal key of a drain."""
 SILENT_SHARE = 2 / 3
 """A holder that has not been heard of for this share of its ttl has missed a renewal, and may be
 declared dead."""
 
 
 def on_operator(core: Core, event: OperatorAsked) -> None:
-    """Do it, note it, answer. Raises Refused, and then nothing has changed."""
-    client_of(core, event.client)
+    """Do what an operator orders, note it and answer. Raises Refused, and then nothing has
+    changed."""
     order = Order(event.by, event.reason)
-    match event.action:
-        case "drain":
-            drain(core, order)
-        case "resume":
-            resume(core, order)
-        case _:
-            lease = find(core, event.target)
-            {"evict": evict, "pin": pin, "unpin": unpin, "release_dead": release_dead}[
-                event.action
-            ](core, lease, order)
-            view = explain.view(core, lease) if lease.id in core.leases else None
-            core.reply(event.client, event.request, OperatorReply(lease.state, view))
-            return
-    core.reply(event.client, event.request, DrainReply(drained(core)))
+    if event.action in _TO_ALL:
+        _TO_ALL[event.action](core, order)
+        drained = "" if core.drain is None else str(core.drain)
+        core.reply(event.client, event.request, DrainReply(drained))
+        return
+    lease = find(core, event.target)
+    _TO_LEASE[event.action](core, lease, order)
+    view = status.view(core, lease) if lease.id in core.leases else None
+    core.reply(event.client, event.request, OperatorReply(lease.state, view))
 
 
 def find(core: Core, target: str) -> Lease:
-    """A live lease by its id, or by its consumer's name if that has exactly one. Refuses what names
-    none or several."""
+    """Return a live lease by its id, or by its consumer's name if that has exactly one. Raises
+    Refused."""
     lease = core.leases.get(LeaseId(target))
     if lease is not None:
         return lease
@@ -62,68 +58,70 @@ def find(core: Core, target: str) -> Lease:
         return resident[0]
     if resident:
         raise Refused(no.Ambiguous(target, tuple(lease.id for lease in resident)))
-    ended = core.ended.get(LeaseId(target))
-    if ended is None:
-        raise Refused(no.NoTarget(target))
-    raise Refused(no.TargetOver.of(ended_error(ended).refusal))
+    if target in core.ended:
+        raise Refused(no.TargetOver.of(over(core, LeaseId(target)).refusal))
+    raise Refused(no.NoTarget(target))
 
 
 def evict(core: Core, lease: Lease, order: Order) -> None:
     """Ask a holder to leave, as the engine would for a waiter. In use, it finishes first. Asking
     twice is fine.
 
-    What an operator sends away does not come back by itself: a lease on standby ends with it, a
-    parked one waits for its holder.
+    What an operator evicts does not come back by itself: a lease on standby ends with it, a parked
+    one waits for its holder.
     """
     if lease.state in AWAY:
-        _note(core, "evict", order, lease)
+        core.note(OperatorNote("evict", order.by, order.reason), lease)
         _dismiss(core, lease, order)
         return
     if lease.state in LEAVING:
         _dismiss(core, lease, order)
-        if lease.state is LeaseState.REVOKING and lease.departure.eviction is not None:
-            # A holder may let a waiter wait that it would not keep an operator waiting for.
-            eviction.push_revoke(core, lease, lease.departure.eviction)
-        _note(core, "evict", order, lease, repeated=True)
+        # A holder may let a waiter wait that it would not keep an operator waiting for.
+        eviction.push_revoke(core, lease, extra=True)
+        core.note(OperatorNote("evict", order.by, order.reason, repeated=True), lease)
         return
     if lease.state is not LeaseState.HELD:
         raise _impractical(lease, Impractical.NOT_RESIDENT)
+    if lease.pinned is not None:
+        raise _impractical(lease, Impractical.PINNED_BY_OPERATOR)
     if not lease.evictable:
-        by_operator = lease.pinned is not None
-        raise _impractical(
-            lease,
-            Impractical.PINNED_BY_OPERATOR if by_operator else Impractical.PINNED_BY_HOLDER,
-        )
-    gpu = core.gpu_of(lease)
-    eviction.ask(core, gpu, lease, None, order=order)
+        raise _impractical(lease, Impractical.PINNED_BY_HOLDER)
+    eviction.ask(core, core.gpu_of(lease), lease, None, order=order)
     _dismiss(core, lease, order)
-    _note(core, "evict", order, lease, uses=len(lease.uses))
+    core.note(OperatorNote("evict", order.by, order.reason, uses=len(lease.uses)), lease)
 
 
 def _dismiss(core: Core, lease: Lease, order: Order) -> None:
-    if lease.departure.eviction is not None:
-        lease.departure.eviction.order = order
+    asked = lease.departure.eviction
+    if asked is not None:
+        asked.why = replace(asked.why, cause="operator", order=order)
     for feature in lease.features:
         feature.on_dismissed(core, lease, order)
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:
-    """Protect a lease from eviction until it is unpinned. A waiter may be pinned too: it holds from
-    its grant on."""
+    """Protect a lease from eviction until it is unpinned. A waiter may be pinned too: the pin holds
+    from its grant on."""
     if lease.state in LEAVING:
         raise _impractical(lease, Impractical.LEAVING)
-    lease.pinned = order
-    _pins_changed(core, lease)
-    _note(core, "pin", order, lease)
+    _set_pin(core, lease, order)
+    core.note(OperatorNote("pin", order.by, order.reason), lease)
 
 
 def unpin(core: Core, lease: Lease, order: Order) -> None:
     """Undo an operator's pin. What the holder itself asked for stands."""
     if lease.pinned is None:
         raise _impractical(lease, Impractical.NOT_PINNED)
-    lease.pinned = None
-    _pins_changed(core, lease)
-    _note(core, "unpin", order, lease)
+    _set_pin(core, lease, None)
+    core.note(OperatorNote("unpin", order.by, order.reason), lease)
+
+
+def _set_pin(core: Core, lease: Lease, pinned: Order | None) -> None:
+    lease.pinned = pinned
+    if lease.gpu is not None:
+        core.wake(core.gpu_of(lease))
+    if lease.gpu is not None or lease.state in AWAY:
+        core.record_lease(lease)
 
 
 def release_dead(core: Core, lease: Lease, order: Order) -> None:
@@ -136,16 +134,18 @@ def release_dead(core: Core, lease: Lease, order: Order) -> None:
     silent_s = core.now - (lease.expires_at - lease.spec.ttl_s)
     if lease.attached and silent_s < lease.spec.ttl_s * SILENT_SHARE:
         raise _impractical(lease, Impractical.HOLDER_LIVES, silent_s)
-    _note(core, "release_dead", order, lease, silent_s=silent_s)
-    expire(core, lease, order)
+    note = OperatorNote("release_dead", order.by, order.reason, silent_s=silent_s)
+    core.note(note, lease)
+    expire(core, lease.id, order)
 
 
 def drain(core: Core, order: Order) -> None:
-    """No new grants; what is held is kept, waiters wait. A second drain replaces the reason."""
+    """Grant nothing more; what is held is kept, waiters wait. A second drain replaces the
+    reason."""
     core.drain = order
-    core.journal(DRAIN_KEY, {"by": order.by, "reason": order.reason})
+    core.journal(DRAIN_KEY, DrainRecord(order.by, order.reason))
     _wake_all(core)
-    _note(core, "drain", order)
+    core.note(OperatorNote("drain", order.by, order.reason))
 
 
 def resume(core: Core, order: Order) -> None:
@@ -154,27 +154,7 @@ def resume(core: Core, order: Order) -> None:
         core.drain = None
         core.forget(DRAIN_KEY)
         _wake_all(core)
-    _note(core, "resume", order)
-
-
-def restore_drain(core: Core, record: Mapping[str, Any]) -> None:
-    """A drain that was in force when the daemon ended still is."""
-    core.drain = Order(str(record["by"]), str(record["reason"]))
-
-
-def drained(core: Core) -> str:
-    """Return the operator that drained the arbiter and the reason; "" while it grants."""
-    return "" if core.drain is None else str(core.drain)
-
-
-def _pins_changed(core: Core, lease: Lease) -> None:
-    if lease.state in AWAY:
-        core.record_lease(lease)
-    if lease.gpu is None:
-        return
-    core.gpu_of(lease).residents.refresh(lease)
-    core.record_lease(lease)
-    core.wake(core.gpu_of(lease))
+    core.note(OperatorNote("resume", order.by, order.reason))
 
 
 def _wake_all(core: Core) -> None:
@@ -182,10 +162,15 @@ def _wake_all(core: Core) -> None:
         core.wake(gpu)
 
 
-def _note(core: Core, action: str, order: Order, lease: Lease | None = None, **facts: Any) -> None:
-    core.note("operator", lease, action=action, by=order.by, reason=order.reason, **facts)
-
-
 def _impractical(lease: Lease, problem: Impractical, silent_s: float | None = None) -> Refused:
     evictable = lease.spec.evictable if problem is Impractical.NOT_PINNED else lease.evictable
     return Refused(no.BadTargetState(lease.id, lease.state, problem, evictable, silent_s))
+
+
+_TO_LEASE: Final[Mapping[str, Callable[[Core, Lease, Order], None]]] = {
+    "evict": evict,
+    "pin": pin,
+    "unpin": unpin,
+    "release_dead": release_dead,
+}
+_TO_ALL: Final[Mapping[str, Callable[[Core, Order], None]]] = {"drain": drain, "resume": resume}

@@ -1,24 +1,72 @@
-"""Admission: whether a request fits on a GPU, by the ledger and by the newest reading.
+"""Admission: on which GPUs a request may ever be granted, and whether one can grant it now.
 
-Public: `blocked`, `leaving`, `room_is_coming`, `residue_under_measurement`, `joining`, `fits`,
-`added_bytes`, `largest_growth_bytes` (ledger); `measured_room_bytes`, `measured_need_bytes`,
-`sample_is_behind` (reading). Changes nothing.
+A grant passes two gates: the ledger (`fits`), and the newest reading (`measured_room_bytes`,
+`measured_need_bytes`). Changes nothing.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Set
 
-from vram_arbiter.arbiter.core.ledger.ledger import NOTHING
-from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.arbiter.core.ledger import NOTHING
+from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.refusals import Refused
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-_LEAVING = (LeaseState.REVOKING, LeaseState.UNLOADING, LeaseState.VERIFYING)  # in a fixed order
+
+# -- which GPUs
+def selected(core: Core, spec: LeaseSpec) -> list[Gpu]:
+    """Return the GPUs that a selector names: `any`, a UUID or an index."""
+    return [
+        gpu for gpu in core.gpus.values() if spec.gpu in ("any", gpu.info.id, str(gpu.info.index))
+    ]
 
 
+def places(core: Core, spec: LeaseSpec, load_peak: int) -> tuple[GpuId, ...]:
+    """Return the candidate GPUs of a request. Raises Refused if none could ever hold it.
+
+    Pinned holders do not count: they end one day, and the request may wait as long as its timeout
+    allows.
+    """
+    gpus = selected(core, spec)
+    if not gpus:
+        raise Refused(no.UnknownGpu(spec.gpu, tuple(gpu.info.id for gpu in core.gpus.values())))
+    able = [gpu.info.id for gpu in gpus if load_peak <= gpu.ledger.budget_bytes]
+    if able:
+        return tuple(able)
+    largest = max(gpus, key=lambda gpu: (gpu.ledger.budget_bytes, -gpu.info.index))
+    info = largest.info
+    sizes = (load_peak, spec.footprint.load_peak_bytes, info.capacity_bytes, info.reserve_bytes)
+    raise Refused(no.TooLarge(spec.consumer, *sizes))
+
+
+def front(core: Core, gpu: Gpu) -> Lease | None:
+    """Return the request that a GPU serves: its head, or the first for which no other GPU is being
+    emptied.
+
+    A GPU is no longer emptied for a request once its last holder there is past the deadline, or has
+    left and that was not enough.
+    """
+    head = gpu.queue.head
+    if head is None or head.request.planned_gpu in (None, gpu.info.id) or fits(gpu, head):
+        return head
+    for lease in gpu.queue:
+        there = lease.request.planned_gpu
+        if there is None or there == gpu.info.id:
+            return lease
+        asked = [one for one in core.gpus[there].evictions if one.wanted_by == lease.id]
+        if all(one.verdict or one.overdue for one in asked):
+            return lease
+    return None
+
+
+# -- what a GPU can grant
 def blocked(core: Core, gpu: Gpu) -> Block | None:
-    """Return why nothing can be granted on a GPU now, for any request; None if grants are possible."""
-    if core.recovering is not None:
+    """Return why nothing can be granted on a GPU now, for any request; None: it can be."""
+    if not core.serving:
         return Block.RECOVERING
     if core.drain is not None:
         return Block.DRAINED
@@ -26,78 +74,65 @@ def blocked(core: Core, gpu: Gpu) -> Block | None:
         return Block.UNREADABLE
     if gpu.sample is None:
         return Block.UNREAD
-    if gpu.in_state(LeaseState.LOADING):
+    if gpu.residents.by_state[LeaseState.LOADING]:
         return Block.LOADING
     if gpu.keeper is not None:
         return Block.GANG
     return Block.PRESSURE if gpu.pressed else None
 
 
-def kept_by(gpu: Gpu) -> str:
-    """Return the name of the group that a feature keeps a GPU for; "" if none does."""
-    return "" if gpu.keeper is None else gpu.keeper.blocks(gpu)
-
-
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:
-    """Return leases whose bytes are pending free, with what each retains; not those that are late."""
+    """Return leases whose bytes are pending free, with what each retains; not the late ones."""
     going: dict[LeaseId, int] = {}
-    for lease in gpu.in_state(*_LEAVING):
-        verification = gpu.verifications.get(lease.id)
-        overdue = lease.departure.hangs or bool(
-            lease.departure.eviction and lease.departure.eviction.overdue
-        )
-        late = verification.overdue if verification else overdue
+    by_state = gpu.residents.by_state
+    for lease in [lease for state in LEAVING for lease in by_state[state].values()]:
+        departure, verification = lease.departure, gpu.verifications.get(lease.id)
+        if verification is not None:
+            late = verification.overdue
+        else:
+            late = departure.hangs or bool(departure.eviction and departure.eviction.overdue)
         if not late:
             going[lease.id] = lease.residue_bytes
-    for verification in gpu.verifications.values():  # debts
-        if (
-            verification.lease is not None
-            and verification.lease not in gpu.residents
-            and not verification.overdue
-        ):
-            going[verification.lease] = verification.retained_bytes
+    for debt in gpu.verifications.values():
+        if debt.lease is not None and debt.lease not in gpu.residents and not debt.overdue:
+            going[debt.lease] = debt.retained_bytes
     return going
 
 
-def room_is_coming(gpu: Gpu) -> bool:
-    """Return whether a lease unloads or is verified, and is not late with it."""
-    for lease in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING):
-        verification = gpu.verifications.get(lease.id)
-        if not (verification.overdue if verification else lease.departure.hangs):
-            return True
-    return False
-
-
 def residue_under_measurement(gpu: Gpu) -> bool:
-    """Return whether a dead process's retained bytes are measured: no holder is revoked meanwhile."""
-    return any(v.lease is None and not v.overdue for v in gpu.verifications.values())
+    """Return whether a dead process's retained bytes are measured: nothing is revoked meanwhile."""
+    return any(one.lease is None and not one.overdue for one in gpu.verifications.values())
 
 
-def joining(lease: Lease) -> Mapping[ProcessKey, int]:
-    """What a grant charges, by process: one lease's load peak, or what the leases of a group need
-    together.
-    """
-    return (
-        {lease.process: lease.request.load_peak_bytes}
-        if lease.request.needs is None
-        else lease.request.needs
-    )
+# -- the ledger's gate
+def joining(lease: Lease) -> Collection[tuple[ProcessKey, int]]:
+    """Return what a grant charges by process: a load peak, or what a group needs together."""
+    if lease.request.needs is not None:
+        return lease.request.needs.items()
+    return ((lease.process, lease.request.load_peak_bytes),)
 
 
 def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool:
-    """Return whether the ledger holds this request at its load peak, once leases in `going` left."""
-    if lease.spec.exclusive:
-        if any(other not in going for other in gpu.ledger.leases()):
-            return False
-    elif gpu.residents.exclusive and any(
-        other not in going and other != lease.request.extends for other in gpu.residents.exclusive
-    ):
+    """Return whether the ledger holds a request at its load peak, once leases in `going` left.
+
+    An exclusive request needs the GPU for itself. Any other waits for exclusive leases, also for
+    one that is over and not measured gone yet.
+    """
+    if lease.spec.mode == "exclusive":
+        apart: Set[LeaseId | None] = gpu.ledger.charges.keys()
+    else:
+        apart = {
+            *(gpu.residents.exclusive.keys() - {lease.request.extends}),
+            *[one.lease for one in gpu.verifications.values() if one.exclusive],
+        }
+    if not apart <= going.keys():
         return False
-    elif gpu.verifications and any(
-        v.exclusive and v.lease not in going for v in gpu.verifications.values()
-    ):
-        return False  # an exclusive lease is over, and not measured gone yet
     return gpu.ledger.total_if(going, joining(lease)) <= gpu.ledger.budget_bytes
+
+
+def added_bytes(gpu: Gpu, lease: Lease) -> int:
+    """Return what a grant adds to the ledger: the load peak less the retained bytes it replaces."""
+    return gpu.ledger.total_if(joining=joining(lease)) - gpu.ledger.total_bytes()
 
 
 def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
@@ -106,57 +141,44 @@ def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
     return gpu.ledger.budget_bytes - gpu.ledger.total_if(going)
 
 
-def added_bytes(gpu: Gpu, lease: Lease) -> int:
-    """Return what a grant adds to the ledger: the load peak less the retained bytes it replaces."""
-    return gpu.ledger.total_if(joining=joining(lease)) - gpu.ledger.total_bytes()
-
-
+# -- the reading's gate
 def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
-    """Free bytes by the newest reading, less the leases that it cannot have seen. None: no reading
-    young enough.
+    """Return free bytes by the newest reading, less the leases that it cannot have seen; None: no
+    reading is young enough.
 
     A lease that became ready since counts with its load peak: what it freed at the end of its load
-    may not be back yet.
+    may not be back yet. A lease that was granted and lost since may still be there, with its load
+    peak too.
     """
     sample = gpu.sample
-    if (
-        sample is None
-        or gpu.failed_at is not None
-        or core.now - sample.taken_at > core.settings.sample_max_age_s
-    ):
+    if sample is None or gpu.failed_at is not None:
         return None
-    if any(
-        debt.confirmed_at > sample.taken_at and not debt.baseline_comparable
-        for debt in gpu.verifications.values()
-        if debt.lease not in gpu.residents
-    ):
-        return None  # a lease granted and lost since may still be there, with its load peak
-    unseen = sum(
-        max(gpu.ledger.charge_bytes(lease.id), lease.request.load_peak_bytes)
-        for lease in gpu.residents.unseen(sample.taken_at)
-    )
-    return min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes - unseen
+    if core.now - sample.taken_at > core.settings.sample_max_age_s:
+        return None
+    for debt in gpu.verifications.values():
+        unseen = debt.lease not in gpu.residents and debt.confirmed_at > sample.taken_at
+        if unseen and not debt.baseline_comparable:
+            return None
+    room = min(gpu.info.capacity_bytes, sample.total_bytes) - sample.used_bytes
+    for lease in gpu.residents.unseen(sample.taken_at):
+        room -= max(gpu.ledger.charge_bytes(lease.id), lease.request.load_peak_bytes)
+    return room
 
 
 def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
-    """What the reading must have free: what a grant charges, less what the processes already hold
-    (their contexts).
+    """Return what the reading must show as free: what a grant charges, less what its processes hold
+    already beside their leases (contexts).
+
+    Bytes that are reserved for a lease are not held by its process yet.
     """
-    if lease.request.needs is None:
-        return _unheld_bytes(gpu, lease.process, lease.request.load_peak_bytes)
-    return sum(_unheld_bytes(gpu, process, count) for process, count in lease.request.needs.items())
-
-
-def _unheld_bytes(gpu: Gpu, process: ProcessKey, count: int) -> int:
-    account = gpu.ledger.accounts.get(process)
-    if account is not None and any(lease not in gpu.ledger.reserved for lease in account.charges):
-        return count  # what it holds is of its leases; reserved bytes are not held by anyone yet
-    own = None if gpu.sample is None else gpu.sample.bytes_of(process)
-    if own is None:
-        own = account.residue_bytes if account is not None else 0
-    return max(0, count - own)
-
-
-def sample_is_behind(gpu: Gpu) -> bool:
-    """Return whether a grant, a `ready` or a verdict came after the newest reading began."""
-    return gpu.sample is None or gpu.sample.taken_at < gpu.changed_at
+    needed = 0
+    for process, count in joining(lease):
+        account = gpu.ledger.accounts.get(process)
+        if account is not None and not account.charges.keys() <= gpu.ledger.reserved:
+            needed += count
+            continue
+        own = None if gpu.sample is None else gpu.sample.bytes_of(process)
+        if own is None:
+            own = 0 if account is None else account.retained_bytes
+        needed += max(0, count - own)
+    return needed

@@ -1,26 +1,27 @@
 """Waits that can never end: a process that is in the middle of a use waits for a lease whose room
 is kept, in a circle, by that use.
 
-Found by reduction. Suppose that everything leaves which is not pinned and not in use by a process
-that waits; serve the waiters that fit then; its process waits no more, so its uses will end and
-their leases leave too; repeat. The waiters left over wait for ever, and among them is a circle.
-Nothing is
-guessed: a lease in use that will merely be asked later (priorities, residencies), or bytes that
-others keep (pins, residues, stowaways), are a wait and no deadlock. A wait that the process does
-not depend on says so (`independent`).
+Found by reduction. Suppose that everything leaves that is not pinned and not in use by a process
+that waits; serve the waiters that fit then; their processes wait no more, so their uses will end
+and these leases leave too; repeat. The waiters left over wait forever, and among them is a circle.
+Nothing is guessed: a lease in use that is revoked later (priorities, residencies), or bytes that
+others keep (pins, retained bytes, stowaways), are a wait and no deadlock. A wait that the process
+does not depend on says so (`independent`).
 
-Looked for only when a process that uses something begins to wait, or one that waits begins to use
-something. Changes nothing but the wait of the newest in the circle, before a holder is asked to
-leave for it.
+Runs only when a process that uses something begins to wait, or one that waits begins to use
+something (`Turn.suspects`). Ends the wait of the newest waiter in the circle, before a holder is
+revoked for it.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from math import inf
 
-from vram_arbiter.arbiter.core.eviction import eviction
+from vram_arbiter.arbiter.core import eviction
 from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.scheduling import admission, backfill
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 WAITS_MAX = 64
@@ -30,24 +31,24 @@ all of them.
 
 
 def resolve(core: Core) -> None:
-    """Deny waiters until no circle is left.
+    """Deny waiters until no circle is left, the newest of a circle first.
 
     Each is answered like any request that is refused, or by push if it waited already.
     """
     suspects = core.turn.suspects
-    while any(
-        core.users.get(process) and _is_looked_at(_waits_of(core, process)) for process in suspects
-    ):
+    while any(process in core.users and _waits_of(core, process) for process in suspects):
         cycle = find(core)
         if not cycle:
             return
         users = [waiter for waiter in cycle if waiter.process in core.users]
-        _deny(core, max(users, key=lambda waiter: waiter.request.arrival), cycle)
+        newest = max(users, key=lambda waiter: waiter.request.arrival)
+        links = (_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle))
+        eviction.deny(core, newest, no.Deadlock(tuple(links)))
 
 
 def find(core: Core) -> list[Lease]:
-    """The circle that the newest possible waiter is in, in its order; [] if everybody can be served
-    some day.
+    """Return the circle of the newest waiter that is in one, in its order; [] if every waiter can
+    be served some day.
     """
     state = _Reduction(core)
     left = state.run()
@@ -60,28 +61,24 @@ def find(core: Core) -> list[Lease]:
 
 
 def _waits_of(core: Core, process: ProcessKey) -> list[Lease]:
-    return [
+    """Return the leases that a process depends on and waits for; [] if they are too many."""
+    waits = [
         lease
         for lease in core.leases_of(process)
         if lease.state is LeaseState.QUEUED and not lease.spec.independent
     ]
-
-
-def _is_looked_at(waits: list[Lease]) -> bool:
-    return 0 < len(waits) <= WAITS_MAX
+    return waits if len(waits) <= WAITS_MAX else []
 
 
 class _Reduction:
-    """Return the waiters that could be served if every lease left that can."""
+    """The waiters that could be served if every lease left that can."""
 
     def __init__(self, core: Core) -> None:
         self.core = core
         waits = {process: _waits_of(core, process) for process in core.users}
-        self.waits = {process: mine for process, mine in waits.items() if _is_looked_at(mine)}
+        self.waits = {process: mine for process, mine in waits.items() if mine}
         # a request in no queue waits for others of its feature, not for bytes
-        self.served: set[LeaseId] = {
-            lease.id for feature in core.hooked["unplaced"] for lease in feature.unplaced()
-        }
+        self.served: set[LeaseId] = set(core.unqueued)
 
     def run(self) -> list[Lease]:
         """Waiters that are left over, by arrival."""
@@ -108,16 +105,18 @@ class _Reduction:
         return list(found.values())
 
     def _serve(self, gpu: Gpu) -> None:
-        """One pass over a card's queue."""
+        """Pass once over a GPU's queue."""
+        ledger = gpu.ledger
         going = self._going(gpu, self._blocked())
         everything = self._going(gpu, frozenset())
         head: Lease | None = None
+        spare = -inf
         known: dict[tuple[int, bool], bool] = {}  # crowds ask for the same, again and again
         for waiter in gpu.queue:
             if waiter.id in self.served or (head is not None and waiter.process not in self.waits):
                 continue  # no wait depends on a request behind a head that uses nothing
             wish = (waiter.request.load_peak_bytes, waiter.spec.exclusive)
-            alike = waiter.process not in gpu.ledger.accounts and not gpu.ledger.strangers
+            alike = waiter.process not in ledger.accounts and not ledger.stowaways
             possible = known.get(wish) if alike else None
             if possible is None:
                 # one that could not be served even if every use ended waits for something else, and
@@ -128,20 +127,14 @@ class _Reduction:
                 if alike:
                     known[wish] = possible
             if head is not None:
-                possible = possible and self._passes(gpu, head, waiter, everything)
+                possible = possible and admission.added_bytes(gpu, waiter) <= spare
             if possible:
                 self.served.add(waiter.id)
             elif head is None:
                 head = waiter
-
-    def _passes(
-        self, gpu: Gpu, head: Lease, waiter: Lease, everything: Mapping[LeaseId, int]
-    ) -> bool:
-        """May it be served while a waiter before it cannot be? As `grants` backfills."""
-        if head.spec.exclusive or not self.core.settings.scheduling.backfill:
-            return False
-        spare = backfill.spare_beside_bytes(gpu, head, everything)
-        return admission.added_bytes(gpu, waiter) <= spare
+                if self.core.policy.backfill and not head.spec.exclusive:
+                    after = ledger.total_if(everything, admission.joining(head))
+                    spare = ledger.budget_bytes - after  # as `grants` backfills
 
     def _blocked(self) -> frozenset[ProcessKey]:
         """Return processes in a use that wait for a request that is not served."""
@@ -177,14 +170,13 @@ class _Reduction:
             for lease in self.core.users[process].values()
             if lease.gpu == gpu.info.id
         }
-        kept.update(gpu.residents.pinned)
         going: dict[LeaseId, int] = {
             lease.id: lease.residue_bytes
             for lease in gpu.residents.values()
-            if lease.id not in kept
+            if lease.id not in kept and lease.evictable
         }
         going.update(
-            (lease, 0) for lease in gpu.ledger.leases() if lease not in gpu.residents
+            (lease, 0) for lease in gpu.ledger.charges if lease not in gpu.residents
         )  # debts
         return going
 
@@ -207,24 +199,19 @@ def _way_back(start: Lease, waits_for: Callable[[Lease], list[Lease]]) -> list[L
     return []
 
 
-# -- telling ---------------------------------------------------------------------------------------
-def _deny(core: Core, waiter: Lease, cycle: list[Lease]) -> None:
-    links = (_link(core, one, cycle[(n + 1) % len(cycle)]) for n, one in enumerate(cycle))
-    eviction.deny(core, waiter, no.Deadlock(tuple(links)))
-
-
 def _link(core: Core, waiter: Lease, following: Lease) -> no.CycleLink:
+    """Return what a waiter of a circle holds, and what it waits for."""
+
+    def named(leases: Iterable[Lease]) -> tuple[no.NamedLease, ...]:
+        known = {one.id: no.NamedLease(one.id, one.spec.consumer, one.state) for one in leases}
+        return tuple(known.values())
+
     used = core.users.get(following.process, {}).values()
-    theirs = {lease.id: lease for lease in used if lease.gpu in waiter.request.gpus}
-    held = {lease.id: lease for lease in core.users.get(waiter.process, {}).values()}
+    in_the_way = [lease for lease in used if lease.gpu in waiter.request.gpus]
     return no.CycleLink(
         pid=waiter.process.pid,
         consumer=waiter.spec.consumer,
         lease_id=waiter.id,
-        waits_for=tuple(map(_named, theirs.values())) or (_named(following),),
-        holds=tuple(map(_named, held.values())),
+        waits_for=named(in_the_way or [following]),
+        holds=named(core.users.get(waiter.process, {}).values()),
     )
-
-
-def _named(lease: Lease) -> no.NamedLease:
-    return no.NamedLease(lease.id, lease.spec.consumer, lease.state)

@@ -1,43 +1,45 @@
 """Grants: one pass over the GPUs that changed.
 
-Per card, in this order (the numbers stand in `_serve`):
-  1. under pressure: ask idle holders to leave, grant nothing
-  2. a feature keeps the GPU for its own requests: it grants them (`Feature.blocks`, `serve`)
+Per GPU, in this order (the numbers stand in `_serve`):
+  1. under pressure: revoke idle holders, grant nothing
+  2. a group of requests loads on the GPU: its feature grants the next one (`Feature.serve`)
   3. blocked (recovering, drained, reading unknown, a load under way): grant and revoke nothing
-  4. nothing waits, or a feature owns the head: served by features alone
-  5. the head fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
-     head for which another card is being emptied is passed over from here on
-  6. the head does not fit: ask the cheapest victims that cover it, unless enough is on its way out
-     already
-  7. backfill: the first waiter behind the head that fits without an eviction and cannot delay the
+  4. nothing waits, or the request to serve is one of a group: served by features alone
+  5. the request fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
+     head for which another GPU is being emptied is passed over from here on
+  6. it does not fit: revoke the cheapest victims that cover it, unless enough bytes are pending
+     free
+  7. backfill: the first request behind the head that fits without an eviction and cannot delay the
      head; behind one that waits for bytes that no revoke brings (a stowaway's), only what fits
-     beside it on the day that they are gone, and may be asked itself
+     beside it on the day that they are gone, and may be revoked itself
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from itertools import islice
+from typing import Literal
 
-from vram_arbiter.arbiter.core.eviction import eviction
-from vram_arbiter.arbiter.core.hooks import owner_of
-from vram_arbiter.arbiter.core.learning import costs
-from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core, Gpu
-from vram_arbiter.arbiter.core.report import explain
-from vram_arbiter.arbiter.core.scheduling import admission, backfill, placement, victims
-from vram_arbiter.arbiter.core.verification.evidence import note_pressure
+from vram_arbiter.arbiter.core import eviction
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.report import status
+from vram_arbiter.arbiter.core.scheduling import admission, victims
+from vram_arbiter.arbiter.core.verification.judge import note_pressure
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
+from vram_arbiter.schemas.wire.notes import GrantedNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 def schedule(core: Core) -> None:
-    """Serve every dirty GPU.
-
-    A grant on one may free a waiter's place on another, so until none is dirty.
+    """Serve every dirty GPU, in turn, until none is dirty: a grant on one may free a waiter's place
+    on another.
     """
-    gpu: Gpu | None = None
-    while (gpu := core.turn.next_dirty(gpu)) is not None:
-        _serve(core, gpu)
+    dirty, last = core.turn.dirty, -1
+    while dirty:
+        last = min([index for index in dirty if index > last] or dirty)
+        _serve(core, dirty.pop(last))
 
 
 def on_plan_due(core: Core, gpu_id: str) -> None:
@@ -48,145 +50,243 @@ def on_plan_due(core: Core, gpu_id: str) -> None:
 
 
 def _serve(core: Core, gpu: Gpu) -> None:
-    note_pressure(core, gpu)
+    if gpu.pressed or gpu.ledger.pressure_bytes():
+        note_pressure(core, gpu)
     gpu.blocked = admission.blocked(core, gpu)
-    if gpu.pressed and core.recovering is None:  # 1
+    if gpu.pressed and core.serving:  # 1
         _relieve(core, gpu)
         return
     if gpu.keeper is not None:  # 2
-        gpu.keeper.serve(core, gpu, None)
+        gpu.keeper.feature.serve(core, gpu, gpu.keeper)
         return
     if gpu.blocked:  # 3
         return
-    if not len(gpu.queue):  # 4
-        for feature in core.hooked["serve"]:
-            feature.serve(core, gpu, None)
+    if gpu.queue.head is None:  # 4
+        for feature in core.features:
+            if feature.live:
+                feature.on_idle(core, gpu)
         return
-    head = placement.front(core, gpu)
+    head = admission.front(core, gpu)
     if head is None:
         return
-    owner = owner_of(head)
-    if owner is not None:  # 4
-        owner.serve(core, gpu, head)
+    group = head.request.group
+    if group is not None:  # 4
+        group.feature.serve(core, gpu, group)
         return
     if admission.fits(gpu, head):  # 5
         grant_if_measured(core, gpu, head)
         return
-    leaving = admission.leaving(gpu)
-    planned = admission.fits(gpu, head, leaving)
-    if planned:
-        head.request.reason = Wait.MAKING_ROOM
-    elif _ask_victims(core, gpu, head, leaving):  # 6
-        leaving, planned = admission.leaving(gpu), True
-    later = backfill.choose(core, gpu, head, leaving, planned=planned)  # 7
-    if later is not None:
-        grant_if_measured(core, gpu, later)
+    planned = _make_room(core, gpu, head)  # 6
+    if len(gpu.queue.by_arrival) > 1:  # 7
+        later = choose_later(core, gpu, head, planned=planned)
+        if later is not None:
+            grant_if_measured(core, gpu, later)
 
 
 def _relieve(core: Core, gpu: Gpu) -> None:
     leaving = admission.leaving(gpu)
     over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
-    if over <= 0:
-        return
-    for victim in victims.choose_relief(core, gpu, leaving, over):
-        eviction.ask(core, gpu, victim, None)
-    victims.wake_when_evictable(core, gpu, None)
+    if over > 0:
+        for victim in victims.choose_relief(core, gpu, leaving, over):
+            eviction.ask(core, gpu, victim, None)
+        victims.wake_when_evictable(core, gpu, None)
 
 
-def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Grant a lease that fits by the ledger, once a reading shows its bytes as free too."""
-    room = admission.measured_room_bytes(core, gpu)
-    need = admission.measured_need_bytes(gpu, lease)
-    if room is None or (room < need and admission.sample_is_behind(gpu)):
-        lease.request.reason = Wait.READING
-        core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
-        return
-    if room < need:
-        lease.request.reason = Wait.NOT_FREE
-        gpu.blocked = Block.NOT_FREE
-        return
-    grant(core, gpu, lease)
-
-
-def _ask_victims(core: Core, gpu: Gpu, head: Lease, leaving: Mapping[LeaseId, int]) -> bool:
-    if admission.residue_under_measurement(gpu):
-        head.request.reason = Wait.RESIDUE
+def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
+    """Revoke the cheapest victims, if that is needed now and best done here. Return whether the
+    head fits once all that leave have left.
+    """
+    request, leaving = head.request, admission.leaving(gpu)
+    if leaving and admission.fits(gpu, head, leaving):
+        request.reason = Wait.MAKING_ROOM
+        return True
+    if gpu.verifications and admission.residue_under_measurement(gpu):
+        request.reason = Wait.RESIDUE
         return False
     plan = victims.choose_victims(core, gpu, head, leaving)
     if plan is None:
-        head.request.reason = Wait.NO_VICTIM
+        request.reason = Wait.NO_VICTIM
         victims.wake_when_evictable(core, gpu, head)
         return False
-    if len(head.request.gpus) > 1 and not placement.is_best_place(core, gpu, head, plan):
+    if len(request.gpus) > 1 and not victims.is_best_place(core, gpu, head, plan):
         return False
-    head.request.planned_gpu = gpu.info.id
-    head.request.reason = Wait.MAKING_ROOM
+    request.reason, request.planned_gpu = Wait.MAKING_ROOM, gpu.info.id
     for victim in plan:
         eviction.ask(core, gpu, victim, head)
-    for gpu_id in head.request.gpus:
-        core.wake(core.gpus[gpu_id])  # those behind it there are no longer behind it
+    for gpu_id in request.gpus:
+        core.wake(core.gpus[gpu_id])  # requests behind `head` on its other GPUs may now proceed
     return True
 
 
+# -- granting
+def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
+    """Grant a lease that fits by the ledger, once a reading shows its bytes as free too."""
+    wait = measured_wait(core, gpu, lease)
+    if wait is None:
+        grant(core, gpu, lease)
+        return
+    lease.request.reason = wait
+    if wait is Wait.NOT_FREE:
+        gpu.blocked = Block.NOT_FREE
+
+
+def measured_wait(
+    core: Core, gpu: Gpu, lease: Lease, *, crowded: bool = False
+) -> Literal[Wait.READING, Wait.NOT_FREE] | None:
+    """Return what a lease that fits by the ledger waits for; None: a reading shows its bytes free.
+
+    A reading that is too old, or began before the last grant, `ready` or verdict, cannot deny: a
+    newer one is asked for.
+
+    Args:
+        crowded: Whether the ledger says that the bytes cannot be free yet, whatever is shown.
+    """
+    room = admission.measured_room_bytes(core, gpu)
+    if not crowded and room is not None and room >= admission.measured_need_bytes(gpu, lease):
+        return None
+    if room is not None and gpu.sample is not None and gpu.sample.taken_at >= gpu.changed_at:
+        return Wait.NOT_FREE
+    core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
+    return Wait.READING
+
+
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Give the lease its card and its token.
+    """Give a lease its GPU and its token.
 
     The record goes to the journal before the holder hears of it.
     """
-    _collect_evictions(core, gpu, lease)
-    if any(feature.grant(core, gpu, lease) for feature in lease.features):
-        return
+    request = lease.request
+    request.evicted = _take_evictions(core, gpu, lease)
+    for feature in lease.features:
+        if feature.grant(core, gpu, lease):
+            return
     core.dequeue(lease)
     by_itself = lease.state is not LeaseState.QUEUED
-    token = core.next_token()
-    lease.token = token
+    lease.token = token = core.next_token()
     lease.gpu = gpu.info.id
     core.move(lease, LeaseState.LOADING, Why.RETURNED if by_itself else Why.GRANTED)
-    lease.granted_at = lease.held_from = core.now
-    lease.request.reason = None
-    gpu.residents[lease.id] = lease
-    gpu.ledger.charge(
-        lease.id,
-        lease.process,
-        lease.request.load_peak_bytes,
-        lease.request.load_peak_bytes,
-        core.now,
-    )
-    gpu.changed_at = core.now
+    lease.granted_at = lease.held_from = gpu.changed_at = core.now
+    lease.uses.unclaimed = by_itself
+    request.reason = None
+    gpu.residents.add(lease)
+    peak = request.load_peak_bytes
+    gpu.ledger.charge(lease.id, lease.process, peak, peak, core.now)
     core.turn.granted.append((token, gpu.info.id))
     lease.expires_at = core.now + lease.spec.ttl_s
     core.timers.set(("ttl", lease.id), lease.expires_at)
     core.record_lease(lease, gates=True)
-    if lease.request.answered:
-        core.push(lease, GrantedPush(explain.view(core, lease)))
-        lease.request.id = None
+    view = status.view(core, lease)
+    if request.answered:
+        core.push(lease, GrantedPush(view))
+        request.id = None
     else:
-        assert lease.request.id is not None, f"{lease.id} was never asked for"
-        view = explain.view(core, lease)
-        core.reply(lease.client, lease.request.id, AcquireReply("loading", view))
-        lease.request.answered = True
-    core.note(
-        "granted",
-        lease,
-        charge_bytes=lease.request.load_peak_bytes,
-        waited_ms=(core.now - lease.request.arrived_at) * 1e3,
-        evicted=[e.consumer for e in lease.request.evicted],
-        **({"by_itself": True} if by_itself else {}),
+        assert request.id is not None, f"{lease.id} was never asked for"
+        core.reply(lease.client, request.id, AcquireReply("loading", view))
+        request.answered = True
+    note = GrantedNote(
+        charge_bytes=peak,
+        waited_ms=(core.now - request.arrived_at) * 1e3,
+        evicted=tuple([e.consumer for e in request.evicted]),
+        by_itself=by_itself,
     )
-    gpu.blocked = admission.blocked(core, gpu)
+    core.note(note, lease)
 
 
-def _collect_evictions(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Collect the leases that left for this one, or for a waiter that has gone since; the rest
-    stays on the card's list.
+def _take_evictions(core: Core, gpu: Gpu, lease: Lease) -> list[Eviction]:
+    """Take the evictions that were for a lease, or for a waiter that has gone since, off the GPU's
+    list. Return those that came to a verdict: they made its room.
     """
-    mine = [
-        e
-        for e in gpu.evictions
-        if e.wanted_by == lease.id
-        or (e.verdict and (e.wanted_by is None or e.wanted_by not in core.waiting))
-    ]
-    lease.request.evicted = [e for e in mine if e.verdict]
-    gpu.evictions = [e for e in gpu.evictions if e not in mine]
-    for gone in lease.request.evicted:
-        costs.switched(core, gone.consumer, lease.spec.consumer)
+    kept: list[Eviction] = []
+    made_room: list[Eviction] = []
+    for one in gpu.evictions:
+        if one.wanted_by != lease.id and (not one.verdict or one.wanted_by in core.waiting):
+            kept.append(one)
+        elif one.verdict:
+            made_room.append(one)
+            core.costs.switched(one.consumer, lease.spec.consumer, core.now)
+    gpu.evictions = kept
+    return made_room
+
+
+# -- backfill
+def choose_later(core: Core, gpu: Gpu, head: Lease, *, planned: bool) -> Lease | None:
+    """Return the first request behind the queue's first that fits, evicts no holder and cannot
+    delay `head`; None: there is none.
+
+    `planned`: with the leases gone whose bytes are pending free, `head` fits.
+    """
+    ledger, queue = gpu.ledger, gpu.queue
+    if head.spec.exclusive or not core.policy.backfill:
+        return None
+    fold = _largest_fold_bytes(gpu)
+    smallest, free = queue.smallest_need_bytes() - fold, ledger.budget_bytes - ledger.total_bytes()
+    if smallest > free or _room_is_coming(gpu):
+        return None  # a load now would only be in the way of the head's room
+    going, stuck = admission.leaving(gpu), False
+    if planned:
+        spare = ledger.budget_bytes - ledger.total_if(going, admission.joining(head))
+    else:
+        spare, stuck = spare_unplanned_bytes(gpu, head, going, lambda one: _passed(gpu, one, head))
+    if smallest > spare or (stuck and admission.residue_under_measurement(gpu)):
+        return None
+    most = min(free, spare) + fold
+    alone = not ledger.charges
+    for lease in islice(queue, 1, None):
+        if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
+            continue  # seen at a glance: thousands may wait
+        if lease is head or lease.request.group:
+            continue
+        extends = lease.request.extends
+        if stuck and not (lease if extends is None else core.leases[extends]).evictable:
+            continue  # the head may need its bytes once a stowaway leaves
+        if admission.added_bytes(gpu, lease) <= spare and admission.fits(gpu, lease):
+            return lease
+    return None
+
+
+def _largest_fold_bytes(gpu: Gpu) -> int:
+    """Return the most by which a need may shrink through what its process already holds here."""
+    accounts, stowaways = gpu.ledger.accounts.values(), gpu.ledger.stowaways.values()
+    folded = [account.retained_bytes + account.measured_bytes for account in accounts]
+    return max([*folded, *(stowaway.held_bytes for stowaway in stowaways)], default=0)
+
+
+def _room_is_coming(gpu: Gpu) -> bool:
+    """Return whether a lease unloads or is verified, and is not late with it."""
+    for lease in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING):
+        verification = gpu.verifications.get(lease.id)
+        if not (verification.overdue if verification else lease.departure.hangs):
+            return True
+    return False
+
+
+def _passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
+    """Return whether a lease was granted or grew while `head` waited before it."""
+    arrived_at, rank = head.request.arrived_at, gpu.queue.rank
+    overtook = lease.granted_at >= arrived_at and rank(head) < rank(lease)
+    return overtook or lease.observed.enlarged_at >= arrived_at
+
+
+def spare_unplanned_bytes(
+    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool]
+) -> tuple[int, bool]:
+    """Return what a later request may take without delaying a head without a plan, and whether the
+    head waits for bytes of no holder.
+
+    Every lease may leave some day, except those that took their room while the head waited before
+    them (`stays`). If the head would not fit even then, it is served when stowaways leave, and else
+    when processes with retained bytes end. Only what remains beside it on that day may be taken
+    now.
+    """
+    ledger, joins = gpu.ledger, admission.joining(head)
+    others = [one for one in gpu.residents.values() if one.id != head.request.extends]
+    everything = {**{one.id: one.residue_bytes for one in others}, **going}
+    movable = {**{one.id: one.residue_bytes for one in others if not stays(one)}, **going}
+    day = ledger.total_if(everything, joins)
+    stay_bytes = ledger.total_if(movable, joins) - day
+    stuck = day > ledger.budget_bytes
+    if stuck:
+        day = ledger.total_if(everything, joins, stowaways=False)
+    if day > ledger.budget_bytes:
+        day = sum(count for _, count in joins)
+    return ledger.budget_bytes - day - stay_bytes, stuck

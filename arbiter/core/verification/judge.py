@@ -1,34 +1,134 @@
-"""Verdict on a release from one reading. Pure: it starts nothing and changes nothing.
+"""What a reading of a GPU says: whose bytes it shows (evidence), and whether a release is verified.
+
+Evidence names stowaways, shrinks retained bytes and shows pressure. It never frees a charge: only a
+verdict does (`schedule`). What a source can tell beside the total is derived in
+`events.MemorySampled` alone (`listed_bytes`, `bytes_of`).
 
 A released lease stays charged until a verdict. A reading is on target if all that can be checked
 holds:
 
-1. ledger bound: the GPU shows no more than everything else is charged;
-2. delta bound: it shows less than the baseline by what the lease held;
-3. process: the reading shows no more of the process than it may retain.
+1. process: the reading shows no more of the process than it may retain;
+2. ledger bound: the GPU shows no more than everything else is charged;
+3. delta bound: it shows less than the baseline by what the lease held.
 
 Two such readings in a row verify the release. The device total decides; bytes per process are
 evidence and name the culprit. Where a list omits a living process, what the total misses is charged
-to that process.
+to that process. The verdict is pure: it starts nothing and changes nothing.
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
-from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
-from vram_arbiter.arbiter.core.model.verification import Verdict, Verification
+from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
+from vram_arbiter.arbiter.core.learning import footprints
+from vram_arbiter.arbiter.core.ledger import Account, GpuLedger
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import LEAVING, LeaseState, Verdict, Verification
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.wire.notes import Culprit, OverHolder, PressureNote, StowawayNote
 
 DYING_S = 60.0
 """Longer than any driver takes to free the memory of a dead process. Bytes still there then belong
 to a process that cannot be listed."""
 
-type Culprit = tuple[int, str, int]
-"""(pid, name, bytes)"""
+
+# -- evidence --------------------------------------------------------------------------------------
+def impossible(gpu: Gpu, reading: MemorySampled, tolerance_bytes: int) -> str:
+    """Say why a reading cannot be true; "" if it can. Nonsense means unknown, never free."""
+    used, total, info = reading.used_bytes, reading.total_bytes, gpu.info
+    if info.total_bytes and abs(total - info.total_bytes) > tolerance_bytes:
+        return (
+            f"impossible reading: {total} bytes of memory, {info.total_bytes} at the start; "
+            "if that is so now, restart the arbiter"
+        )
+    if total < info.capacity_bytes - tolerance_bytes:
+        return f"impossible reading: {total} bytes of memory, {info.capacity_bytes} are leased out"
+    if not 0 <= used <= total + tolerance_bytes:
+        return f"impossible reading: {used} of {total} bytes are used"
+    for use in reading.processes or ():
+        if not 0 <= use.held_bytes <= total + tolerance_bytes:
+            return (
+                f"impossible reading: process {use.process.pid} holds {use.held_bytes} "
+                f"of {total} bytes"
+            )
+    return ""
 
 
+def take(core: Core, gpu: Gpu, reading: MemorySampled) -> None:
+    """Make a reading the newest of its GPU, and take its evidence into the ledger."""
+    ledger, known = gpu.ledger, gpu.ledger.stowaways
+    tolerance_bytes = core.settings.verify_tolerance_bytes
+    # 1. what processes gave up since the reading before; those that leave are measured anyway
+    verified = {verification.process for verification in gpu.verifications.values()}
+    unloading = {lease.process for lease in gpu.in_state(LeaseState.UNLOADING)}
+    gpu.pending_free.watch(gpu.sample, reading, verified | unloading, ledger.charged_to)
+    # 2. the newest reading
+    gpu.sample = reading
+    gpu.residents.seen(reading.taken_at)
+    moving = gpu.verifications or gpu.in_state(LeaseState.LOADING, *LEAVING)
+    ledger.observe(
+        reading,
+        quiet=not moving and reading.taken_at > gpu.changed_at,
+        pending_bytes=gpu.pending_free.since(reading.taken_at - core.settings.verify_timeout_s),
+    )
+    if reading.processes is None:
+        return
+    # 3. bytes per process: footprints, stowaways that are new or have grown, retained bytes
+    footprints.on_evidence(core, gpu)
+    for use in ledger.stowaways.values():
+        before = known.get(use.process)
+        if before is None or use.held_bytes > before.held_bytes + tolerance_bytes:
+            core.note(StowawayNote(gpu.info.id, use.process.pid, use.name, use.held_bytes))
+    for account in list(ledger.accounts.values()):
+        if account.charges or account.process in verified:
+            continue
+        lives = account.process in core.connected or not core.serving
+        least_bytes = max(account.measured_bytes, account.retained_floor_bytes if lives else 0)
+        shows_less = least_bytes + tolerance_bytes < account.retained_bytes
+        if shows_less and reading.taken_at > account.changed_at:
+            _shrink_retained(core, gpu, account, reading)
+
+
+def _shrink_retained(core: Core, gpu: Gpu, account: Account, reading: MemorySampled) -> None:
+    """Lower retained bytes of a process without leases to the most that a list leaves it."""
+    process, floor_bytes = account.process, account.retained_floor_bytes
+    held_bytes = account.measured_bytes
+    if reading.bytes_of(process) is None:  # listed without its bytes
+        held_bytes = reading.used_bytes
+    else:
+        if not held_bytes and process not in core.connected and core.serving:
+            floor_bytes = 0
+        if reading.bytes_of(process, omitted=None) is None:  # not listed
+            unlisted_bytes = gpu.ledger.unlisted_bytes(reading)
+            held_bytes = account.retained_bytes if unlisted_bytes is None else unlisted_bytes
+    retained_bytes = max(floor_bytes, held_bytes)
+    if retained_bytes + core.settings.verify_tolerance_bytes < account.retained_bytes:
+        gpu.ledger.retain(process, retained_bytes, core.now)
+        core.record_residue(gpu, process, retained_bytes)
+
+
+def note_pressure(core: Core, gpu: Gpu) -> None:
+    """Note the begin and the end of pressure."""
+    pressure_bytes = gpu.ledger.pressure_bytes()
+    if bool(pressure_bytes) == gpu.pressed:
+        return
+    gpu.pressed = bool(pressure_bytes)
+    over = [(a.process, a.held_bytes - a.charged_bytes) for a in gpu.ledger.accounts.values()]
+    tolerance = core.settings.verify_tolerance_bytes
+    holders = tuple(OverHolder(p.pid, count) for p, count in over if count > tolerance)
+    stowaway_bytes = gpu.ledger.stowaway_bytes
+    core.note(PressureNote(gpu.info.id, pressure_bytes, stowaway_bytes, holders))
+
+
+# -- other processes -------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Others:
-    """What other processes on the GPU may account for (`evidence.others_since`)."""
+    """What other processes on the GPU may account for since the baseline.
+
+    A total includes every process and names none. What others may have taken must not count as
+    missing, and what they may have freed must not count as the lease's.
+    """
 
     grown_bytes: int = 0
     """Others may have taken this since the baseline, up to what they are charged."""
@@ -38,22 +138,91 @@ class Others:
     """Charged for loads in progress and not yet seen. 0 where lists tell which process grew."""
 
 
+def others_since(
+    gpu: Gpu, verification: Verification, reading: MemorySampled, pending_s: float
+) -> Others:
+    """Return what others may account for. Bytes given up may be pending free for `pending_s`."""
+    baseline, process = verification.baseline, verification.process
+    lists = baseline is not None and None not in (baseline.processes, reading.processes)
+    loading_bytes = 0 if lists else _loading_bytes(gpu, reading)
+    if baseline is None:
+        return Others(loading_bytes=loading_bytes)
+    # 1. leaving holders, verdicts since the baseline, and what is pending free
+    leaving = {other.process for other in gpu.verifications.values()} - {process}
+    accounts = gpu.ledger.accounts
+    left_bytes = sum(accounts[other].granted_bytes for other in leaving if other in accounts)
+    left_bytes += sum(left for at, left in gpu.left if at > baseline.taken_at)
+    left_bytes += gpu.pending_free.since(baseline.taken_at - pending_s)
+    # 2. charges of loads that began since the baseline
+    loaded: Counter[ProcessKey] = Counter()
+    for lease in gpu.residents.filling(baseline.taken_at):
+        loaded[lease.process] += gpu.ledger.charge_bytes(lease.id)
+    if not lists:
+        return Others(loaded.total() - loaded[process], left_bytes, loading_bytes)
+    grown_bytes, shrunk_bytes = _between_lists(gpu.ledger, process, baseline, reading, loaded)
+    return Others(grown_bytes, left_bytes + shrunk_bytes)
+
+
+def _between_lists(
+    ledger: GpuLedger,
+    process: ProcessKey,
+    baseline: MemorySampled,
+    reading: MemorySampled,
+    loaded: Counter[ProcessKey],
+) -> tuple[int, int]:
+    """Return how much the other holders grew between two lists, up to their charges, and by how
+    much the other listed processes shrank."""
+    held_now = {use.process: use.held_bytes for use in reading.processes or ()}
+    shrunk_bytes = sum(
+        max(0, use.held_bytes - held_now.get(use.process, 0))
+        for use in baseline.processes or ()
+        if use.process.pid != process.pid
+    )
+    then = {use.process.pid: use.held_bytes for use in baseline.processes or ()}
+    now = {use.process.pid: use.held_bytes for use in reading.processes or ()}
+    grown_bytes = 0
+    for other, account in ledger.accounts.items():
+        if other == process:
+            continue
+        if other.pid in now:
+            before = then.get(other.pid)
+            if before is None:  # it may have held bytes that the list omitted
+                hidden_bytes = ledger.unlisted_bytes(baseline) or 0
+                before = 0 if other in loaded else min(account.charged_bytes, hidden_bytes)
+            grown_bytes += max(0, min(now[other.pid], account.charged_bytes) - before)
+        elif other.pid not in then:
+            grown_bytes += loaded[other]
+    return grown_bytes, shrunk_bytes
+
+
+def _loading_bytes(gpu: Gpu, reading: MemorySampled) -> int:
+    """Return what is charged for loads in progress and not seen yet.
+
+    A total cannot tell bytes that arrive from bytes that have not gone.
+    """
+    count = 0
+    # a lease that became ready after the reading began may have loaded during it
+    for lease in (*gpu.in_state(LeaseState.LOADING), *gpu.residents.ready_since(reading.taken_at)):
+        account = gpu.ledger.accounts[lease.process]
+        other_charges = account.leased_bytes - gpu.ledger.charge_bytes(lease.id)
+        shown_bytes = reading.bytes_of(lease.process) or 0
+        held = max(other_charges, account.retained_bytes, shown_bytes)
+        count += max(0, account.charged_bytes - held)
+    return count
+
+
+# -- the verdict -----------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """A verdict. If resolved, the charge goes except for `residue_bytes`; otherwise polls go on."""
+    """A verdict. If resolved, the charge goes except for `residue_bytes`; otherwise polls go on.
+
+    `VERIFIED` and not resolved: the reading is on target, and one more has to agree.
+    """
 
     verdict: Verdict
     resolved: bool
     residue_bytes: int
     culprits: tuple[Culprit, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Opinion:
-    """What one reading says of one verification."""
-
-    settling: bool  # on target, and early enough: one more reading has to agree
-    judgement: Judgement | None  # None: not yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,27 +235,20 @@ class _Case:
     tolerance_bytes: int
     allowed_bytes: int  # the most that the process may still hold
     held_bytes: int | None  # what the reading shows of the process; None: it cannot tell
-    ledger_bound_bytes: int
-    delta_bound_bytes: int | None  # None: no baseline to compare with
+    limit_bytes: int  # what is above it is too much for the process
+    over_ledger_bytes: int  # bytes by which the total exceeds the ledger bound
+    over_baseline_bytes: int | None  # the delta bound; None: no baseline to compare with
 
-    def over_ledger_bytes(self) -> int:
-        """Bytes by which the total exceeds the ledger bound."""
-        return self.reading.used_bytes - self.ledger_bound_bytes
+    def others(self) -> list[ProcessUse]:
+        """The listed processes other than the one that released."""
+        pid = self.verification.process.pid
+        return [use for use in self.reading.processes or () if use.process.pid != pid]
 
     def missing_bytes(self, taken_bytes: int = 0) -> int:
         """Bytes that did not return, less `taken_bytes` of the delta; negative: more returned."""
-        over = self.over_ledger_bytes()
-        if self.delta_bound_bytes is None:
-            return over
-        return max(over, self.reading.used_bytes - self.delta_bound_bytes - taken_bytes)
-
-    def holds_too_much(self, held_bytes: int) -> bool:
-        return held_bytes > self.allowed_bytes + self.tolerance_bytes
-
-    def on_target(self) -> bool:
-        if self.held_bytes is not None and self.holds_too_much(self.held_bytes):
-            return False
-        return self.missing_bytes() <= self.tolerance_bytes
+        if self.over_baseline_bytes is None:
+            return self.over_ledger_bytes
+        return max(self.over_ledger_bytes, self.over_baseline_bytes - taken_bytes)
 
 
 def judge(
@@ -95,19 +257,19 @@ def judge(
     reading: MemorySampled,
     others: Others,
     tolerance_bytes: int,
-) -> Opinion:
-    """Judge a reading that began after the release."""
+) -> Judgement | None:
+    """Judge a reading that began after the release. Return None where it says nothing yet."""
     case = _compare(verification, ledger, reading, others, tolerance_bytes)
-    if not case.on_target():
-        return Opinion(False, _late(case) if verification.overdue else None)
-    settling = reading.taken_at >= verification.not_before
+    held = case.held_bytes
+    if (held is not None and held > case.limit_bytes) or case.missing_bytes() > tolerance_bytes:
+        return _late(case) if verification.overdue else None
+    if reading.taken_at < verification.not_before:
+        return None
     last = verification.last_used_bytes
     agrees = last is not None and abs(reading.used_bytes - last) <= tolerance_bytes
-    verified = Judgement(Verdict.VERIFIED, True, verification.retained_bytes)
-    return Opinion(settling, verified if settling and agrees else None)
+    return Judgement(Verdict.VERIFIED, agrees, verification.retained_bytes)
 
 
-# -- bounds --------------------------------------------------------------------------------------
 def _compare(
     verification: Verification,
     ledger: GpuLedger,
@@ -116,97 +278,94 @@ def _compare(
     tolerance_bytes: int,
 ) -> _Case:
     """Compute the bounds. Neither allows for loads in progress, whose bytes may not be there."""
-    process, leaving = verification.process, verification.leaving()
-    dead = verification.vanishes
-    allowed = ledger.process_after_bytes(process, leaving, dead=dead)
-    ledger_bound = ledger.total_after_bytes(process, leaving, dead=dead) + ledger.driver_bytes()
-    ledger_bound -= others.loading_bytes
-    if not verification.overdue:
+    process, baseline, used_bytes = verification.process, verification.baseline, reading.used_bytes
+    # 1. process
+    going = {} if verification.lease is None else {verification.lease: verification.retained_bytes}
+    allowed_bytes, total_bytes = ledger.after_bytes(process, going, dead=verification.vanishes)
+    # 2. ledger bound
+    ledger_bound = total_bytes + ledger.driver_bytes - others.loading_bytes
+    if ledger.stowaway_bytes and not verification.overdue:
+        returning_bytes = others.left_bytes - allowed_bytes
         ledger_bound -= _doubtful_bytes(
-            verification, ledger, reading, allowed, others.left_bytes, tolerance_bytes
+            verification, ledger, reading, returning_bytes, tolerance_bytes
         )
-    delta_bound = _delta_bound(verification, ledger, allowed)
-    if delta_bound is not None:
-        delta_bound += others.grown_bytes - others.loading_bytes
+    # 3. delta bound: the baseline's total less what the process must have freed
+    over_baseline = None
+    held_before = None if baseline is None else baseline.bytes_of(process, omitted=None)
+    if baseline is not None and held_before is None and verification.baseline_comparable:
+        held_before = _may_hold_bytes(verification, ledger, baseline)
+    if baseline is not None and held_before is not None:
+        delta_bound = baseline.used_bytes - (held_before - allowed_bytes)
+        over_baseline = used_bytes - delta_bound - others.grown_bytes + others.loading_bytes
     return _Case(
         verification,
         ledger,
         reading,
         tolerance_bytes,
-        allowed,
+        allowed_bytes,
         reading.bytes_of(process),
-        ledger_bound,
-        delta_bound,
+        allowed_bytes + tolerance_bytes,
+        used_bytes - ledger_bound,
+        over_baseline,
     )
-
-
-def _delta_bound(verification: Verification, ledger: GpuLedger, allowed_bytes: int) -> int | None:
-    """Return the baseline's total less what the process must have freed; None: it cannot tell."""
-    baseline = verification.baseline
-    if baseline is None:
-        return None
-    if baseline.shows(verification.process):
-        held_bytes = baseline.bytes_of(verification.process) or 0
-    elif verification.baseline_comparable:
-        held_bytes = _may_hold_bytes(verification, ledger, baseline)
-    else:
-        return None
-    return baseline.used_bytes - (held_bytes - allowed_bytes)
 
 
 def _doubtful_bytes(
     verification: Verification,
     ledger: GpuLedger,
     reading: MemorySampled,
-    allowed_bytes: int,
-    left_bytes: int,
+    returning_bytes: int,
     tolerance_bytes: int,
 ) -> int:
     """Return unattributed bytes in the ledger that may have left in place of the lease's.
 
-    If more is gone than the leaving processes account for, an unlisted process freed memory too,
-    and the room may be hidden bytes of the lease. A total tells only once all unattributed bytes
-    are gone. Without a list, stowaways of the last list may have left as well.
+    If more is gone than the leaving processes account for (`returning_bytes` and what the process
+    held), an unlisted process freed memory too, and the room may be hidden bytes of the lease. A
+    total tells only once all unattributed bytes are gone. Without a list, stowaways of the last
+    list may have left as well.
     """
-    unseen_bytes = ledger.stowaway_bytes() - ledger.unnamed_bytes
-    if reading.lists_processes:
-        unseen_bytes = 0
-    baseline = verification.baseline
+    unattributed_bytes, baseline = ledger.unattributed_bytes, verification.baseline
+    unseen_bytes = (
+        0 if reading.processes is not None else ledger.stowaway_bytes - unattributed_bytes
+    )
     if baseline is None:
         return unseen_bytes
-    expected_bytes = _may_hold_bytes(verification, ledger, baseline) - allowed_bytes + left_bytes
+    expected_bytes = _may_hold_bytes(verification, ledger, baseline) + returning_bytes
     excess_bytes = baseline.used_bytes - reading.used_bytes - expected_bytes
-    doubtful = tolerance_bytes < excess_bytes < ledger.unnamed_bytes - tolerance_bytes
-    return unseen_bytes + (ledger.unnamed_bytes if doubtful else 0)
+    doubtful = tolerance_bytes < excess_bytes < unattributed_bytes - tolerance_bytes
+    return unseen_bytes + (unattributed_bytes if doubtful else 0)
 
 
 def _may_hold_bytes(verification: Verification, ledger: GpuLedger, reading: MemorySampled) -> int:
     """Return the most that a process may hold which the reading does not show."""
     unlisted = ledger.unlisted_bytes(reading)
     most = reading.used_bytes if unlisted is None else unlisted
-    return min(ledger.filled_bytes(verification.process), most)
+    account = ledger.accounts.get(verification.process)
+    return 0 if account is None else min(account.granted_bytes, most)
 
 
-# -- after the deadline --------------------------------------------------------------------------
+# -- after the deadline ----------------------------------------------------------------------------
 def _late(case: _Case) -> Judgement:
     """Name the holder of the missing bytes, as far as the source can tell."""
-    verification, held = case.verification, case.held_bytes
+    verification, reading, held = case.verification, case.reading, case.held_bytes
     if held is None:
         return _late_by_total(case)
-    if case.holds_too_much(held):
-        culprits = ((verification.process.pid, _name_of(case), held),)
+    process = verification.process
+    if held > case.limit_bytes:
+        own = (use.name for use in reading.processes or () if use.process.pid == process.pid)
+        culprits = (Culprit(process.pid, next(own, verification.consumer), held),)
         if verification.alive:
             return _residue(case, held, culprits)
         return Judgement(Verdict.CONTESTED, False, held, culprits)
     missing = case.missing_bytes(_taken_bytes(case))
-    if verification.alive and not case.reading.shows(verification.process):
-        stays = _may_hold_bytes(verification, case.ledger, case.reading)
-        if case.delta_bound_bytes is not None:
+    if verification.alive and reading.bytes_of(process, omitted=None) is None:
+        stays = _may_hold_bytes(verification, case.ledger, reading)
+        if case.over_baseline_bytes is not None:
             stays = min(stays, case.allowed_bytes + missing)
-        if case.holds_too_much(stays):
+        if stays > case.limit_bytes:
             return _residue(case, stays)
     # a driver may omit a dying process before it has freed its memory
-    dying = not verification.alive and case.reading.taken_at < verification.deadline_at + DYING_S
+    dying = not verification.alive and reading.taken_at < verification.deadline_at + DYING_S
     resolved = not dying or missing <= case.tolerance_bytes
     return Judgement(Verdict.CONTESTED, resolved, verification.retained_bytes, _grown(case))
 
@@ -214,12 +373,12 @@ def _late(case: _Case) -> Judgement:
 def _late_by_total(case: _Case) -> Judgement:
     """Judge by the total alone: the reading does not tell what the process holds."""
     verification = case.verification
-    if case.delta_bound_bytes is None:
+    if case.over_baseline_bytes is None:
         return Judgement(Verdict.UNVERIFIABLE, False, verification.retained_bytes)
     if verification.alive:
         return _residue(case, case.allowed_bytes + case.missing_bytes())
     # a dead process frees everything: if the ledger explains the total, the rest is of others
-    return Judgement(Verdict.CONTESTED, case.over_ledger_bytes() <= case.tolerance_bytes, 0)
+    return Judgement(Verdict.CONTESTED, case.over_ledger_bytes <= case.tolerance_bytes, 0)
 
 
 def _residue(case: _Case, stays_bytes: int, culprits: tuple[Culprit, ...] = ()) -> Judgement:
@@ -228,22 +387,15 @@ def _residue(case: _Case, stays_bytes: int, culprits: tuple[Culprit, ...] = ()) 
     return Judgement(Verdict.RESIDUE, fenced, stays_bytes, culprits)
 
 
-def _name_of(case: _Case) -> str:
-    pid = case.verification.process.pid
-    uses = (use for use in case.reading.listed if use.process.pid == pid)
-    return next((use.name for use in uses), case.verification.consumer)
-
-
 def _taken_bytes(case: _Case) -> int:
     """Return what others visibly took since the baseline beyond their charges."""
     baseline = case.verification.baseline
     if baseline is None:
         return 0
     taken = 0
-    for use in case.reading.listed:
-        if use.process.pid != case.verification.process.pid:
-            explained = max(baseline.bytes_of(use.process) or 0, case.ledger.booked_by(use.process))
-            taken += max(0, use.held_bytes - explained)
+    for use in case.others():
+        explained = max(baseline.bytes_of(use.process) or 0, case.ledger.charged_to(use.process))
+        taken += max(0, use.held_bytes - explained)
     return taken
 
 
@@ -254,12 +406,10 @@ def _grown(case: _Case) -> tuple[Culprit, ...]:
     """
     baseline = case.verification.baseline
     grown: list[Culprit] = []
-    for use in case.reading.listed:
-        if use.process.pid == case.verification.process.pid:
-            continue
-        if baseline is None and use.process not in case.ledger.strangers:
+    for use in case.others():
+        if baseline is None and use.process not in case.ledger.stowaways:
             continue
         before = 0 if baseline is None else baseline.bytes_of(use.process) or 0
         if use.held_bytes > before:
-            grown.append((use.process.pid, use.name, use.held_bytes - before))
-    return tuple(sorted(grown, key=lambda item: (-item[2], item[0])))
+            grown.append(Culprit(use.process.pid, use.name, use.held_bytes - before))
+    return tuple(sorted(grown, key=lambda culprit: (-culprit.bytes, culprit.pid)))

@@ -1,7 +1,7 @@
-"""Reader of simulated cards (`schemas.fakegpu`): what NVML is to a real one. It also makes a card's
+"""Reader of simulated GPUs (`schemas.fakegpu`): what NVML is to a real one. It also makes a GPU's
 folder.
 
-Reading lets time pass on the card: a death is noticed, and what is due comes back. It never
+Reading lets time pass on the GPU: a death is noticed, and what is due comes back. It never
 allocates.
 """
 
@@ -24,7 +24,7 @@ _HANG_POLL_S = 0.05  # how soon a simulated hang notices that it was switched of
 
 
 class FakeProbe:
-    """`GpuProbe` over card folders. Raises NoGpu for a folder that holds no card."""
+    """`GpuProbe` over GPU folders. Raises NoGpu for a folder that holds no GPU."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._folders: dict[GpuId, Path] = {}
@@ -34,7 +34,7 @@ class FakeProbe:
                 config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
             except FileNotFoundError:
                 raise NoGpu(
-                    f"no simulated card in {folder}", hint="start with --gpu fake:8GiB to make one"
+                    f"no simulated GPU in {folder}", hint="start with --gpu fake:8GiB to make one"
                 ) from None
             except (OSError, UnicodeDecodeError) as error:
                 raise _unreadable(folder, error) from error
@@ -52,14 +52,14 @@ class FakeProbe:
 
     def sample(self, gpu: GpuId) -> Reading:
         if gpu not in self._folders:
-            raise UnknownGpu(f"no simulated card {gpu}", details={"known": sorted(self._folders)})
+            raise UnknownGpu(f"no simulated GPU {gpu}", details={"known": sorted(self._folders)})
         folder = self._folders[gpu]
         try:
             self._suffer(folder)
             with locked(folder):
                 card = settled(folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
-            raise ProbeFailed(f"the simulated card in {folder} cannot be read: {error}") from error
+            raise ProbeFailed(f"the simulated GPU in {folder} cannot be read: {error}") from error
         processes = None
         if not card.config.faults.hide_processes:
             processes = tuple(
@@ -73,7 +73,7 @@ class FakeProbe:
         self._closed.set()
 
     def _suffer(self, folder: Path) -> None:
-        """Fail or hang as the card's faults say; a hang ends with the fault or with `close`."""
+        """Fail or hang as the GPU's faults say; a hang ends with the fault or with `close`."""
         while (
             fault := fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text()).faults.probe
         ) != "ok":
@@ -87,16 +87,16 @@ class FakeProbe:
 
 def _unreadable(folder: Path, error: OSError | UnicodeDecodeError) -> ConfigError:
     return ConfigError(
-        f"the simulated card in {folder} cannot be used: {error}",
+        f"the simulated GPU in {folder} cannot be used: {error}",
         hint="name a folder that this user may read and write, or let --gpu fake:8GiB make one",
     )
 
 
 def open_cards(text: str, runtime: Path) -> FakeProbe:
-    """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the card in
+    """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the GPU in
     RUNTIME/fakegpu) or a folder.
 
-    Sizes may be listed, `8GiB,16GiB`: the second card lies in RUNTIME/fakegpu-1, and so on. Raises
+    Sizes may be listed, `8GiB,16GiB`: the second GPU lies in RUNTIME/fakegpu-1, and so on. Raises
     ConfigError.
     """
     if "/" in text:
@@ -125,7 +125,7 @@ def make_card(
     index: int = 0,
     release_lag_s: float = fakegpu.RELEASE_LAG_S,
 ) -> None:
-    """Make a card in `folder`, or keep the one there. Raises ConfigError if that one is in use with
+    """Make a GPU in `folder`, or keep the one there. Raises ConfigError if that one is in use with
     another capacity."""
     boot_id = procfs.boot_id()
     wanted = fakegpu.CardConfig(

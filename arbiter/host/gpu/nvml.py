@@ -1,10 +1,11 @@
-"""Reader of NVIDIA cards through NVML (nvidia-ml-py, module `pynvml`).
+"""Reader of NVIDIA GPUs through NVML (nvidia-ml-py, module `pynvml`).
 
-NVML only reads: it creates no CUDA context, which alone would cost 120-550 MB of the card. It knows
+NVML only reads: it creates no CUDA context, which alone would cost 120-550 MB of the GPU. It knows
 nothing of leases.
 """
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from vram_arbiter.arbiter.core.events import ProcessUse
@@ -13,14 +14,14 @@ from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 
-_HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a card"
+_HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a GPU"
 
 
 class NvmlProbe:
-    """`GpuProbe` over all NVIDIA cards of the machine, by UUID.
+    """`GpuProbe` over all NVIDIA GPUs of the machine, by UUID.
 
     `nvml` is the module `pynvml` unless a test brings its own. Raises NoGpu without library, driver
-    or card, ConfigError for a card in MIG mode. When no card answers any more, everything is opened
+    or GPU, ConfigError for a GPU in MIG mode. When no GPU answers any more, everything is opened
     anew: after a reset of the driver old handles are dead.
     """
 
@@ -36,20 +37,12 @@ class NvmlProbe:
         self._handles = self._open()
 
     def _open(self) -> dict[GpuId, Any]:
-        nvml = self._nvml
+        """Return the handles of all GPUs. Nothing stays open where that raises."""
+        nvml, handles = self._nvml, dict[GpuId, Any]()
         try:
             nvml.nvmlInit()
         except nvml.NVMLError as error:
             raise NoGpu(f"no NVIDIA driver answers: {error}", hint=_HINT) from error
-        try:
-            return self._find()
-        except BaseException:
-            self.close()
-            raise
-
-    def _find(self) -> dict[GpuId, Any]:
-        nvml = self._nvml
-        handles: dict[GpuId, Any] = {}
         try:
             for index in range(nvml.nvmlDeviceGetCount()):
                 handle = nvml.nvmlDeviceGetHandleByIndex(index)
@@ -61,22 +54,26 @@ class NvmlProbe:
                         hint=f"nvidia-smi -i {index} -mig 0",
                     )
                 handles[gpu] = handle
+            if not handles:
+                raise NoGpu("the NVIDIA driver knows no GPU", hint=_HINT)
         except nvml.NVMLError as error:
+            self.close()
             raise NoGpu(
-                f"the NVIDIA driver cannot list its cards: {error}", hint="see nvidia-smi -L"
+                f"the NVIDIA driver cannot list its GPUs: {error}", hint="see nvidia-smi -L"
             ) from error
-        if not handles:
-            raise NoGpu("the NVIDIA driver knows no card", hint=_HINT)
+        except BaseException:
+            self.close()
+            raise
         return handles
 
     def _is_split(self, handle: Any) -> bool:
         try:
             return bool(self._nvml.nvmlDeviceGetMigMode(handle)[0])
         except self._nvml.NVMLError:
-            return False  # most cards have no such mode
+            return False  # most GPUs have no such mode
 
     def _reopen_if_dead(self) -> None:
-        """While another card still answers, its readings are not disturbed."""
+        """While another GPU still answers, its readings are not disturbed."""
         with self._lock:
             if len(self._failing) < len(self._handles):
                 return
@@ -95,20 +92,15 @@ class NvmlProbe:
     def cards(self) -> tuple[Card, ...]:
         found = []
         for gpu, handle in self._handles.items():
-            try:
-                index = int(self._nvml.nvmlDeviceGetIndex(handle))
-                name = _text(self._nvml.nvmlDeviceGetName(handle))
-            except self._nvml.NVMLError as error:
-                raise ProbeFailed(
-                    f"{gpu} does not answer: {error}", hint="see nvidia-smi and dmesg"
-                ) from error
+            index = int(self._ask(gpu, self._nvml.nvmlDeviceGetIndex))
+            name = _text(self._ask(gpu, self._nvml.nvmlDeviceGetName))
             _, total, reserved = self._memory(gpu, handle)
             found.append(Card(gpu, index, name, total, reserved))
         return tuple(sorted(found, key=lambda card: card.index))
 
     def sample(self, gpu: GpuId) -> Reading:
         if gpu not in self._handles:
-            raise UnknownGpu(f"no NVIDIA card {gpu}", details={"known": sorted(self._handles)})
+            raise UnknownGpu(f"no NVIDIA GPU {gpu}", details={"known": sorted(self._handles)})
         self._reopen_if_dead()
         handle = self._handles[gpu]
         try:
@@ -120,7 +112,7 @@ class NvmlProbe:
         return Reading(used, total, self._processes(handle))
 
     def memory_supported(self) -> bool:
-        """False where the card has no memory of its own (GB10): NVML says NOT_SUPPORTED. Other
+        """False where the GPU has no memory of its own (GB10): NVML says NOT_SUPPORTED. Other
         failures may pass."""
         handle = next(iter(self._handles.values()))
         try:
@@ -132,18 +124,21 @@ class NvmlProbe:
         return True
 
     def first(self) -> tuple[GpuId, str]:
-        """Id and name of the first card. Raises ProbeFailed."""
-        gpu, handle = next(iter(self._handles.items()))
-        try:
-            return gpu, _text(self._nvml.nvmlDeviceGetName(handle))
-        except self._nvml.NVMLError as error:
-            raise ProbeFailed(
-                f"{gpu} does not answer: {error}", hint="see nvidia-smi and dmesg"
-            ) from error
+        """Id and name of the first GPU. Raises ProbeFailed."""
+        gpu = next(iter(self._handles))
+        return gpu, _text(self._ask(gpu, self._nvml.nvmlDeviceGetName))
 
     def processes(self, gpu: GpuId) -> tuple[ProcessUse, ...] | None:
         """Return the processes on a GPU; None where the driver does not list them."""
         return self._processes(self._handles[gpu])
+
+    def _ask(self, gpu: GpuId, call: Callable[[Any], Any]) -> Any:
+        try:
+            return call(self._handles[gpu])
+        except self._nvml.NVMLError as error:
+            raise ProbeFailed(
+                f"{gpu} does not answer: {error}", hint="see nvidia-smi and dmesg"
+            ) from error
 
     def close(self) -> None:
         try:

@@ -3,7 +3,7 @@
 
 NVML answers NOT_SUPPORTED for their memory, and cudaMemGetInfo counts the page cache as used.
 `MemAvailable` is what can still be had without swapping. The whole machine lives in that memory, so
-it fluctuates: the card asks for a larger reserve and a larger tolerance than others. Bytes per
+it fluctuates: the GPU asks for a larger reserve and a larger tolerance than others. Bytes per
 process are evidence where there is a source: nvmap's list of clients on an Orin (debugfs, root
 only), NVML's on Thor and GB10.
 """
@@ -23,7 +23,7 @@ from vram_arbiter.schemas.ids import GpuId
 
 MARGIN_SHARE = 0.15
 """Of the machine's memory that is never leased: kernel, desktop, cameras and their growth. A
-discrete card needs 300 MiB."""
+discrete GPU needs 300 MiB."""
 MARGIN_MIN_BYTES = GIB
 NOISE_BYTES = 256 * MIB
 """By how much the free memory of a quiet machine moves."""
@@ -34,7 +34,7 @@ type Evidence = Callable[[], tuple[ProcessUse, ...] | None]
 
 
 class UnifiedProbe:
-    """`GpuProbe` with one card: the memory of the machine.
+    """`GpuProbe` with one GPU: the memory of the machine.
 
     `root` is where /proc, /sys and /etc are looked for; `evidence` lists bytes per process; None
     where that is impossible.
@@ -55,7 +55,7 @@ class UnifiedProbe:
 
     def sample(self, gpu: GpuId) -> Reading:
         if gpu != self._gpu:
-            raise UnknownGpu(f"no card {gpu}", details={"known": [self._gpu]})
+            raise UnknownGpu(f"no GPU {gpu}", details={"known": [self._gpu]})
         total, available = read_meminfo(self._root)
         return Reading(total - available, total, self._evidence())
 
@@ -118,13 +118,13 @@ def choose(
     root: Path = Path("/"),
     nvml: Any = None,
 ) -> tuple[GpuProbe, str]:
-    """(backend, `nvml` or `unified`) for a source. A machine with a card of its own is never read
+    """(backend, `nvml` or `unified`) for a source. A machine with a GPU of its own is never read
     by its main memory.
 
     1. Tegra: unified. 2. NVML answers and knows the memory: nvml. 3. It answers and does not
-       (GB10): unified, named by NVML. 4. No NVML,
-    but the machine calls itself a GB10: unified. Raises NoGpu, or ConfigError for a source that
-    this machine does not have.
+    (GB10): unified, named by NVML. 4. No NVML, but the machine calls itself a GB10: unified.
+
+    Raises NoGpu, or ConfigError for a source that this machine does not have.
     """
     tegra = tegra_name(root)
     if source == "nvml" and tegra is not None:
@@ -147,7 +147,7 @@ def choose(
         if source == "nvml":
             probe.close()
             raise ConfigError(
-                "NVML does not know the memory of this card: it is the machine's",
+                "NVML does not know the memory of this GPU: it is the machine's",
                 hint="write gpu.source: auto",
             )
         gpu, name = probe.first()
@@ -155,7 +155,7 @@ def choose(
     if source == "unified":
         probe.close()
         raise ConfigError(
-            "this machine's card has memory of its own; main memory says nothing about it",
+            "this machine's GPU has memory of its own; main memory says nothing about it",
             hint="write gpu.source: nvml, or auto",
         )
     return probe, "nvml"  # 2

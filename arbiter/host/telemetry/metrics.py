@@ -10,12 +10,12 @@ import asyncio
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 from opentelemetry import metrics
 from opentelemetry.context import Context
 from opentelemetry.metrics import CallbackOptions, Observation
 
+from vram_arbiter.arbiter.core.report.status import Figures, GpuFigures
 from vram_arbiter.schemas.runtime.telemetry import names as names
 
 PICTURE_S = 1.0
@@ -26,8 +26,6 @@ CONSUMERS_MAX = 200
 """Names of consumers that get curves of their own; clients choose their names, and every curve
 lives as long as the daemon."""
 OTHERS = "(others)"
-
-Figures = Mapping[str, Any]
 
 
 class LeaseMetrics:
@@ -59,11 +57,21 @@ class LeaseMetrics:
             (names.METRIC_WAITERS, _waiters, "{lease}", "Leases that wait"),
             (names.METRIC_CHARGED, self._charged, "By", "Bytes that are leased"),
             (names.METRIC_MEASURED, self._measured, "By", "Bytes that are held, by consumer"),
-            (names.METRIC_USED, _by_gpu("used_bytes"), "By", "Bytes that are held on the GPU"),
-            (names.METRIC_CAPACITY, _by_gpu("capacity_bytes"), "By", "Bytes of the GPU"),
+            (
+                names.METRIC_USED,
+                _by_gpu(lambda gpu: gpu.used_bytes),
+                "By",
+                "Bytes that are held on the GPU",
+            ),
+            (
+                names.METRIC_CAPACITY,
+                _by_gpu(lambda gpu: gpu.capacity_bytes),
+                "By",
+                "Bytes of the GPU",
+            ),
             (
                 names.METRIC_PRESSURE,
-                _by_gpu("pressure_bytes"),
+                _by_gpu(lambda gpu: gpu.pressure_bytes),
                 "By",
                 "Bytes held beyond what was granted",
             ),
@@ -75,13 +83,13 @@ class LeaseMetrics:
             ),
             (
                 names.METRIC_DRAINED,
-                _flag("drained"),
+                _flag(lambda figures: figures.drained),
                 "",
                 "1 while an operator's drain stops grants",
             ),
             (
                 names.METRIC_JOURNAL_HEALTHY,
-                _flag("journal_healthy"),
+                _flag(lambda figures: figures.journal_healthy),
                 "",
                 "1 while the journal can be written",
             ),
@@ -146,19 +154,19 @@ class LeaseMetrics:
         return callback
 
     def _charged(self, figures: Figures) -> Iterable[Observation]:
-        for card in figures["gpus"]:
-            yield from self._by_consumer(card["gpu"], card["charged"])
+        for gpu in figures.gpus:
+            yield from self._by_consumer(gpu.gpu, gpu.charged)
 
     def _measured(self, figures: Figures) -> Iterable[Observation]:
-        for card in figures["gpus"]:
-            if card["measured"] is not None:
-                yield from self._by_consumer(card["gpu"], card["measured"])
+        for gpu in figures.gpus:
+            if gpu.measured is not None:
+                yield from self._by_consumer(gpu.gpu, gpu.measured)
 
     def _reading_age(self, figures: Figures) -> Iterable[Observation]:
         now = self._clock()
-        for card in figures["gpus"]:
-            if card["read_at"] is not None:
-                yield Observation(max(0.0, now - card["read_at"]), {names.ATTR_GPU: card["gpu"]})
+        for gpu in figures.gpus:
+            if gpu.read_at is not None:
+                yield Observation(max(0.0, now - gpu.read_at), {names.ATTR_GPU: gpu.gpu})
 
     def _by_consumer(self, gpu: str, amounts: Mapping[str, int]) -> Iterable[Observation]:
         sums: dict[str, int] = {}
@@ -179,22 +187,24 @@ class LeaseMetrics:
 
 
 def _waiters(figures: Figures) -> Iterable[Observation]:
-    yield Observation(figures["waiters"])
+    yield Observation(figures.waiters)
 
 
-def _by_gpu(key: str) -> Callable[[Figures], Iterable[Observation]]:
+def _by_gpu(
+    figure: Callable[[GpuFigures], int | None],
+) -> Callable[[Figures], Iterable[Observation]]:
     """The gauge of one figure of each GPU; an unknown one (None) has no series."""
 
     def read(figures: Figures) -> Iterable[Observation]:
-        for card in figures["gpus"]:
-            if card[key] is not None:
-                yield Observation(card[key], {names.ATTR_GPU: card["gpu"]})
+        for gpu in figures.gpus:
+            if (count := figure(gpu)) is not None:
+                yield Observation(count, {names.ATTR_GPU: gpu.gpu})
 
     return read
 
 
-def _flag(key: str) -> Callable[[Figures], Iterable[Observation]]:
+def _flag(flag: Callable[[Figures], bool]) -> Callable[[Figures], Iterable[Observation]]:
     def read(figures: Figures) -> Iterable[Observation]:
-        yield Observation(int(figures[key]))
+        yield Observation(int(flag(figures)))
 
     return read

@@ -18,16 +18,38 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 from opentelemetry import trace
 from opentelemetry.context import Context
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from vram_arbiter.arbiter.core import effects as fx
+from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.model.refusals import LimitReached
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.telemetry import names as names
 from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.notes import (
+    About,
+    AnyNote,
+    CancelledNote,
+    DeadlinePassedNote,
+    DeniedNote,
+    ExpiredNote,
+    GrantedNote,
+    LostNote,
+    QueuedNote,
+    ReadyNote,
+    ReleasedNote,
+    RemindedNote,
+    ResizedNote,
+    RevokeAckedNote,
+    RevokeAskedNote,
+    SignalledNote,
+    UnloadingNote,
+    VerifiedNote,
+)
 from vram_arbiter.schemas.wire.pushes import AnyPush, RevokePush
 
 OPEN_MAX = 32_768
@@ -37,16 +59,14 @@ REASON_CHARS = 300
 
 _W3C = TraceContextTextMapPropagator()
 _NONE: Mapping[str, str] = {}
-_STEPS = {
-    "revoke_acked": names.EVENT_REVOKE_ACKED,
-    "reminded": names.EVENT_REMINDED,
-    "deadline_passed": names.EVENT_DEADLINE_PASSED,
-    "signalled": names.EVENT_SIGNALLED,
-    "unloading": names.EVENT_UNLOADING,
+_STEPS: Mapping[type, str] = {
+    RevokeAckedNote: names.EVENT_REVOKE_ACKED,
+    RemindedNote: names.EVENT_REMINDED,
+    DeadlinePassedNote: names.EVENT_DEADLINE_PASSED,
+    SignalledNote: names.EVENT_SIGNALLED,
+    UnloadingNote: names.EVENT_UNLOADING,
 }
 _GOOD_VERDICTS = frozenset({"verified", "residue"})
-
-Event = Mapping[str, Any]
 
 
 class Counts(Protocol):
@@ -106,19 +126,20 @@ class LeaseTelemetry:
     def outgoing(self, effects: Sequence[fx.Effect]) -> None:
         """Begin the spans of evictions before a revoke is sent, and count refusals, which history
         leaves out."""
-        asked: dict[str, Event] = {}
+        asked: dict[str, tuple[About, RevokeAskedNote]] = {}
         told: list[str] = []
         for effect in effects:
-            if isinstance(effect, fx.Note):
-                if effect.kind == "revoke_asked":
-                    asked[effect.data["lease_id"]] = effect.data
-                elif effect.kind == "denied":
-                    told.append(effect.data["code"])  # counted with its event
+            if isinstance(effect, Note):
+                match effect.body:
+                    case RevokeAskedNote() as body if effect.about is not None:
+                        asked[str(effect.about.lease_id)] = effect.about, body
+                    case DeniedNote(refusal):
+                        told.append(refusal.code)  # counted with its event
         for effect in effects:
             match effect:
                 case fx.Push(_, RevokePush() as push) if push.lease_id in asked:
                     traceparent = push.traceparent or None
-                    self._begin_evict(asked.pop(push.lease_id), traceparent, self._wall_ns())
+                    self._begin_evict(*asked.pop(push.lease_id), traceparent, self._wall_ns())
                 case fx.Refuse(_, _, refusal) if refusal.code in told:
                     told.remove(refusal.code)
                 case fx.Refuse(_, _, refusal) if _refuses_a_lease(refusal):
@@ -142,40 +163,40 @@ class LeaseTelemetry:
         self._counts.wrote(seconds, failed=failed)
 
     # -- what has happened
-    def observe(self, event: Event) -> Mapping[str, str]:
-        """One event of the history. Returns `trace_id` and `span_id` of what it belongs to, for its
-        line of the log."""
-        lease_id = event.get("lease_id")
-        if not isinstance(lease_id, str):
+    def observe(self, note: Note, event: JsonMap) -> Mapping[str, str]:
+        """One note and its event in the history. Returns `trace_id` and `span_id` of what it
+        belongs to, for its line of the log."""
+        about = note.about
+        if about is None or about.lease_id is None:
             return _NONE
-        at_ns = int(event["at_wall_s"] * 1e9)
+        lease_id, at_ns, reason = about.lease_id, int(event["at_wall_s"] * 1e9), event.get("reason")
         span: trace.Span | None = None
-        match event["kind"]:
-            case "queued":
-                span = self._queued(lease_id, event, at_ns)
-            case "granted":
-                span = self._granted(lease_id, event, at_ns)
-            case "ready":
-                span = self._end_acquire(
-                    lease_id, at_ns, attributes=_bytes(event, "measured_bytes")
-                )
-            case "denied" | "cancelled":
-                if event["kind"] == "denied":
-                    self._counts.denied(str(event["code"]))
-                why = str(event.get("code", event["kind"]))
-                span = self._end_acquire(lease_id, at_ns, failed=f"{why}: {event['reason']}")
-            case "revoke_asked":
+        match note.body:
+            case QueuedNote() as queued:
+                span = self._queued(about, queued, str(reason), at_ns)
+            case GrantedNote() as granted:
+                span = self._granted(about, granted, str(reason), at_ns)
+            case ReadyNote(measured_bytes=measured):
+                span = self._end_acquire(lease_id, at_ns, attributes=_bytes(measured))
+            case DeniedNote(refusal):
+                self._counts.denied(refusal.code)
+                span = self._end_acquire(lease_id, at_ns, failed=f"{refusal.code}: {reason}")
+            case CancelledNote():
+                span = self._end_acquire(lease_id, at_ns, failed=f"cancelled: {reason}")
+            case RevokeAskedNote():
                 leaving = self._leaving.get(lease_id)
                 span = None if leaving is None else leaving.evict
-            case "released" | "lost" | "expired":
-                span = self._let_go(lease_id, event, at_ns)
-            case "verified":
-                span = self._verdict(lease_id, event, at_ns)
-            case "resized" if lease_id in self._growths:
+            case ReleasedNote():
+                span = self._let_go(about, "", at_ns)
+            case LostNote() | ExpiredNote():
+                span = self._let_go(about, f"{note.kind}: {reason}", at_ns)
+            case VerifiedNote() as verdict:
+                span = self._verdict(about, verdict, at_ns)
+            case ResizedNote() if lease_id in self._growths:
                 span = self._end_acquire(self._growths[lease_id], at_ns)
-            case kind if kind in _STEPS:
-                span = self._step(lease_id, _STEPS[kind], event, at_ns)
-        return _named_by(event) if span is None else _ids(span)
+            case body if type(body) in _STEPS:
+                span = self._step(lease_id, _STEPS[type(body)], body, at_ns)
+        return _named_by(about) if span is None else _ids(span)
 
     def close(self) -> None:
         """The daemon ends. Its leases go on; their spans are exported as far as they came."""
@@ -187,45 +208,43 @@ class LeaseTelemetry:
             self._end_leaving(lease_id, now_ns, names.EVENT_DAEMON_STOPPED)
 
     # -- asking and getting
-    def _queued(self, lease_id: str, event: Event, at_ns: int) -> trace.Span:
-        acquire = self._acquire(lease_id, event["consumer"], event.get("traceparent"), at_ns)
-        if (grows := event.get("grows")) is not None:
-            acquire.grows = grows
-            self._growths[grows] = lease_id
+    def _queued(self, about: About, queued: QueuedNote, reason: str, at_ns: int) -> trace.Span:
+        lease_id = str(about.lease_id)
+        acquire = self._acquire(lease_id, about.consumer, about.traceparent, at_ns)
+        if queued.grows is not None:
+            acquire.grows = queued.grows
+            self._growths[queued.grows] = lease_id
         if acquire.queue is None:
             acquire.queue = self._child(names.SPAN_QUEUE, acquire.span, at_ns)
-        acquire.queue.set_attribute(names.ATTR_REASON, str(event["reason"])[:REASON_CHARS])
+        acquire.queue.set_attribute(names.ATTR_REASON, reason[:REASON_CHARS])
         return acquire.span
 
-    def _granted(self, lease_id: str, event: Event, at_ns: int) -> trace.Span:
-        waited_ns = int(event["waited_ms"] * 1e6)
-        acquire = self._acquires.get(lease_id)
-        if acquire is None:
-            acquire = self._acquire(
-                lease_id,
-                event["consumer"],
-                event.get("traceparent"),
-                at_ns - waited_ns,
-                by_itself=bool(event.get("by_itself")),
-            )
+    def _granted(self, about: About, granted: GrantedNote, reason: str, at_ns: int) -> trace.Span:
+        waited_ns = int(granted.waited_ms * 1e6)
+        acquire = self._acquire(
+            str(about.lease_id),
+            about.consumer,
+            about.traceparent,
+            at_ns - waited_ns,
+            by_itself=granted.by_itself,
+        )
         if acquire.queue is None and waited_ns > 0:
             acquire.queue = self._child(names.SPAN_QUEUE, acquire.span, acquire.started_ns)
         if acquire.queue is not None:
             _end(acquire.queue, at_ns)
             acquire.queue = None
         where = {
-            names.ATTR_GPU: str(event["gpu"]),
-            names.ATTR_REASON: str(event["reason"])[:REASON_CHARS],
+            names.ATTR_GPU: str(about.gpu),
+            names.ATTR_REASON: reason[:REASON_CHARS],
         }
         acquire.span.set_attributes(where)
-        acquire.load = self._child(
-            names.SPAN_LOAD, acquire.span, at_ns, _bytes(event, "charge_bytes")
-        )
+        size = _bytes(granted.charge_bytes)
+        acquire.load = self._child(names.SPAN_LOAD, acquire.span, at_ns, size)
         handover_s = None
-        if acquire.asked_ns is not None and event.get("evicted"):
+        if acquire.asked_ns is not None and granted.evicted:
             handover_s = max(0, at_ns - acquire.asked_ns) / 1e9
         context = trace.set_span_in_context(acquire.span, Context())
-        self._counts.granted(event["consumer"], waited_ns / 1e9, handover_s, context)
+        self._counts.granted(about.consumer, waited_ns / 1e9, handover_s, context)
         return acquire.span
 
     def _acquire(
@@ -279,13 +298,14 @@ class LeaseTelemetry:
         return acquire.span
 
     # -- leaving
-    def _begin_evict(self, asked: Event, traceparent: str | None, at_ns: int) -> None:
-        """`asked`: the note `revoke_asked`. It belongs to the request's trace; under pressure it is
-        a trace of its own."""
-        lease_id, wanted_by = asked["lease_id"], asked["wanted_by_lease"]
+    def _begin_evict(
+        self, about: About, asked: RevokeAskedNote, traceparent: str | None, at_ns: int
+    ) -> None:
+        """It belongs to the request's trace; under pressure it is a trace of its own."""
+        lease_id, wanted_by = str(about.lease_id), asked.wanted_by_lease
         parent = Context()
         if wanted_by is not None:
-            acquire = self._acquire(wanted_by, asked["wanted_by"], traceparent, at_ns)
+            acquire = self._acquire(wanted_by, asked.wanted_by, traceparent, at_ns)
             acquire.asked_ns = acquire.asked_ns or at_ns
             parent = trace.set_span_in_context(acquire.span, parent)
         span = self._tracer.start_span(
@@ -294,10 +314,10 @@ class LeaseTelemetry:
             start_time=at_ns,
             attributes={
                 names.ATTR_LEASE: lease_id,
-                names.ATTR_CONSUMER: asked["consumer"],
-                names.ATTR_GPU: str(asked["gpu"]),
-                names.ATTR_WANTED_BY: asked["wanted_by"],
-                names.ATTR_REASON: str(asked["cause"]),
+                names.ATTR_CONSUMER: about.consumer,
+                names.ATTR_GPU: str(about.gpu),
+                names.ATTR_WANTED_BY: asked.wanted_by,
+                names.ATTR_REASON: asked.cause,
             },
         )
         # it was never measured: asked again, the earlier way out has no end of its own
@@ -312,74 +332,72 @@ class LeaseTelemetry:
         made = self._leaving[lease_id] = _Leaving()
         return made
 
-    def _step(self, lease_id: str, name: str, event: Event, at_ns: int) -> trace.Span | None:
+    def _step(self, lease_id: str, name: str, body: AnyNote, at_ns: int) -> trace.Span | None:
         leaving = self._leaving.get(lease_id)
         if leaving is None or leaving.evict is None:
             return None
         facts = {
-            key: event[key]
+            key: value
             for key in ("uses", "signal", "safe_point_eta_s")
-            if event.get(key) is not None
+            if (value := getattr(body, key, None)) is not None
         }
         leaving.evict.add_event(name, facts, at_ns)
         return leaving.evict
 
-    def _let_go(self, lease_id: str, event: Event, at_ns: int) -> trace.Span | None:
-        """Its bytes are looked for from now on; one that was away has none."""
-        before = "" if event["kind"] == "released" else f"{event['kind']}: {event['reason']}"
-        acquire = self._end_acquire(
-            lease_id, at_ns, failed=before or "released before it was ready"
-        )
-        if event["gpu"] is None:
+    def _let_go(self, about: About, failed: str, at_ns: int) -> trace.Span | None:
+        """Its bytes are looked for from now on; one that was away has none. `failed`: it did not
+        release them."""
+        lease_id = str(about.lease_id)
+        early = failed or "released before it was ready"
+        acquire = self._end_acquire(lease_id, at_ns, failed=early)
+        if about.gpu is None:
             return acquire
         leaving = self._leave(lease_id, at_ns)
-        if leaving.evict is not None and before:
-            leaving.evict.set_status(trace.Status(trace.StatusCode.ERROR, before))
-        return self._verifying(leaving, event, at_ns)
+        if leaving.evict is not None and failed:
+            leaving.evict.set_status(trace.Status(trace.StatusCode.ERROR, failed))
+        return self._verifying(leaving, about, at_ns)
 
-    def _verifying(self, leaving: _Leaving, event: Event, at_ns: int) -> trace.Span:
+    def _verifying(self, leaving: _Leaving, about: About, at_ns: int) -> trace.Span:
         if leaving.verify is None:
             links: list[trace.Link] = []
             parent = Context()
             if leaving.evict is not None:
                 parent = trace.set_span_in_context(leaving.evict, parent)
-            elif traceparent := event.get(
-                "traceparent"
-            ):  # came back by itself: not part of its acquirer's trace
-                links = _links(_W3C.extract({"traceparent": traceparent}, Context()))
+            elif about.traceparent:  # came back by itself: not part of its acquirer's trace
+                links = _links(_W3C.extract({"traceparent": about.traceparent}, Context()))
             leaving.verify = self._tracer.start_span(
                 names.SPAN_VERIFY,
                 context=parent,
                 links=links,
                 start_time=at_ns,
                 attributes={
-                    names.ATTR_LEASE: event["lease_id"],
-                    names.ATTR_CONSUMER: event["consumer"],
-                    names.ATTR_GPU: str(event["gpu"]),
+                    names.ATTR_LEASE: str(about.lease_id),
+                    names.ATTR_CONSUMER: about.consumer,
+                    names.ATTR_GPU: str(about.gpu),
                 },
             )
         return leaving.verify
 
-    def _verdict(self, lease_id: str, event: Event, at_ns: int) -> trace.Span:
+    def _verdict(self, about: About, found: VerifiedNote, at_ns: int) -> trace.Span:
+        lease_id = str(about.lease_id)
         leaving = self._leave(lease_id, at_ns)
-        verify = self._verifying(leaving, event, at_ns - int(event["ms"] * 1e6))
-        verdict = str(event["verdict"])
-        if not event["resolved"]:
-            verify.add_event(names.EVENT_VERDICT, {names.ATTR_VERDICT: verdict}, at_ns)
+        verify = self._verifying(leaving, about, at_ns - int(found.ms * 1e6))
+        verdict = {names.ATTR_VERDICT: found.verdict}
+        if not found.resolved:
+            verify.add_event(names.EVENT_VERDICT, verdict, at_ns)
             return verify
-        found = {names.ATTR_VERDICT: verdict, **_bytes(event, "residue_bytes")}
-        for key, name in (
-            ("before_bytes", names.ATTR_BYTES_BEFORE),
-            ("after_bytes", names.ATTR_BYTES_AFTER),
-        ):
-            if event[key] is not None:
-                found[name] = event[key]
-        verify.set_attributes(found)
-        if verdict not in _GOOD_VERDICTS:
-            verify.set_status(trace.Status(trace.StatusCode.ERROR, verdict))
+        sizes = {
+            names.ATTR_BYTES: found.residue_bytes,
+            names.ATTR_BYTES_BEFORE: found.before_bytes,
+            names.ATTR_BYTES_AFTER: found.after_bytes,
+        }
+        verify.set_attributes(verdict)
+        verify.set_attributes({key: count for key, count in sizes.items() if count is not None})
+        if found.verdict not in _GOOD_VERDICTS:
+            verify.set_status(trace.Status(trace.StatusCode.ERROR, found.verdict))
         if leaving.evict is not None:
-            leaving.evict.set_attribute(names.ATTR_VERDICT, verdict)
-            self._counts.evicted(verdict)
+            leaving.evict.set_attribute(names.ATTR_VERDICT, found.verdict)
+            self._counts.evicted(found.verdict)
         self._end_leaving(lease_id, at_ns)
         return verify
 
@@ -416,8 +434,8 @@ def _refuses_a_lease(refusal: Refusal) -> bool:
     return refusal.code in ("vram_insufficient", "load_failing", "unknown_gpu")
 
 
-def _bytes(event: Event, key: str) -> dict[str, Any]:
-    return {} if event.get(key) is None else {names.ATTR_BYTES: event[key]}
+def _bytes(count: int | None) -> dict[str, int]:
+    return {} if count is None else {names.ATTR_BYTES: count}
 
 
 def _links(context: Context) -> list[trace.Link]:
@@ -432,9 +450,9 @@ def _ids(span: trace.Span) -> Mapping[str, str]:
     return {"trace_id": f"{context.trace_id:032x}", "span_id": f"{context.span_id:016x}"}
 
 
-def _named_by(event: Event) -> Mapping[str, str]:
+def _named_by(about: About) -> Mapping[str, str]:
     """The acquirer's own span, as it was told us."""
-    traceparent = event.get("traceparent")
-    if traceparent is None:
+    if about.traceparent is None:
         return _NONE
-    return _ids(trace.get_current_span(_W3C.extract({"traceparent": traceparent}, Context())))
+    parent = _W3C.extract({"traceparent": about.traceparent}, Context())
+    return _ids(trace.get_current_span(parent))

@@ -4,14 +4,14 @@ installed. Imported only then."""
 import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from opentelemetry import metrics, trace
 
-from vram_arbiter.arbiter import log as telemetry
-from vram_arbiter.arbiter.core.effects import Effect
+from vram_arbiter.arbiter.core.effects import Effect, Note
+from vram_arbiter.arbiter.core.report.status import Figures
 from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.telemetry import names as names
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.wire.pushes import AnyPush
@@ -34,8 +34,8 @@ class Harmless:
     def revoke(self, body: AnyPush) -> AnyPush:
         return self._ask(lambda leases: leases.revoke(body), body)
 
-    def observe(self, event: Mapping[str, Any]) -> Mapping[str, str]:
-        return self._ask(lambda leases: leases.observe(event), _NONE)
+    def observe(self, note: Note, event: JsonMap) -> Mapping[str, str]:
+        return self._ask(lambda leases: leases.observe(note, event), _NONE)
 
     def wrote(self, seconds: float, *, failed: bool) -> None:
         self._ask(lambda leases: leases.wrote(seconds, failed=failed), None)
@@ -57,7 +57,7 @@ class Harmless:
 
 
 class Traced:
-    """`leases` goes to the executor, `log_event` too; `watch` once the core is there, `close`
+    """`leases` goes to the executor; `watch` once the core is there, `close`
     before the SDK ends.
 
     The daemon's own run is a span beside what it serves, `cli.command`.
@@ -71,14 +71,7 @@ class Traced:
         self._metrics = LeaseMetrics(metrics.get_meter(names.TRACER), version=version)
         self.leases = Harmless(LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics))
 
-    def log_event(self, event: Mapping[str, Any]) -> None:
-        """One event of the history: as spans and numbers, and as a line of the log that names its
-        span."""
-        telemetry.log_event(event, self.leases.observe(event))
-
-    def watch(
-        self, loop: asyncio.AbstractEventLoop, read: Callable[[], Mapping[str, Any] | None]
-    ) -> None:
+    def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Figures | None]) -> None:
         self._metrics.watch(loop, read)
 
     def close(self, code: int = 0, error: BaseException | None = None) -> None:

@@ -1,0 +1,214 @@
+"""Eviction ladder of a revoked holder.
+
+| step      | when                                                   | what                            |
+| --------- | ------------------------------------------------------ | ------------------------------- |
+| push      | at once, then every `revoke_resend_s` while the holder | `revoke`                        |
+|           | has not acknowledged, or is at its safe point          |                                 |
+| remind    | `revoke_remind_s` after the first push                 | a note                          |
+| deadline  | `revoke_deadline_s` after it, and again so long after  | the bytes are not counted on;   |
+|           | the unloading began                                    | the waiter may be denied        |
+| signal    | `revoke_deadline_s` after it, after the last use and   | SIGTERM, then SIGKILL, if the   |
+|           | after the last step towards the exit                   | lease agreed to (`on_overstay`) |
+
+A holder unloads by itself, at its safe point: `unloading` is refused before that. A process that
+uses any lease is never signalled.
+
+Public: `ask` revokes a holder; `push_revoke` repeats that at once; `deny` ends a wait with an
+error; `on_ladder_due` and `on_overstay_due` serve the timers.
+"""
+
+from typing import Literal
+
+from vram_arbiter.arbiter.core.effects import Signal
+from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Why
+from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.notes import (
+    DeadlinePassedNote,
+    DeniedNote,
+    RemindedNote,
+    RevokeAskedNote,
+    SignalledNote,
+)
+from vram_arbiter.schemas.wire.pushes import DeniedPush, RevokePush
+
+
+def ask(
+    core: Core,
+    gpu: Gpu,
+    holder: Lease,
+    waiter: Lease | None,
+    *,
+    order: Order | None = None,
+) -> None:
+    """Revoke a held lease: for a waiter, by an operator's `order`, or because of pressure.
+
+    A fresh reading is taken, so that the verification has something to compare with.
+    """
+    if waiter is None:
+        why = RevokeCause("operator" if order else "pressure", order=order)
+    else:
+        gang = "" if waiter.spec.gang is None else waiter.spec.gang.id
+        why = RevokeCause("waiter", waiter.spec.consumer, gang)
+    eviction = holder.departure.eviction = Eviction(
+        lease=holder.id,
+        consumer=holder.spec.consumer,
+        charge_bytes=gpu.ledger.charge_bytes(holder.id),
+        wanted_by=None if waiter is None else waiter.id,
+        why=why,
+        asked_at=core.now,
+        next_push_at=core.now,
+        traceparent=None if waiter is None else waiter.request.traceparent,
+    )
+    gpu.evictions.append(eviction)
+    core.move(holder, LeaseState.REVOKING, Why.REVOKED)
+    core.want_sample(gpu, core.now)
+    push_revoke(core, holder)
+    if holder.spec.on_overstay != "wait":
+        core.timers.set(("overstay", holder.id), core.now + core.settings.revoke_deadline_s)
+    asked = RevokeAskedNote(
+        wanted_by=why.wanted_by,
+        wanted_by_lease=eviction.wanted_by,
+        uses=len(holder.uses),
+        cause=why.cause,
+        gang=why.gang,
+        order=why.order,
+    )
+    core.note(asked, holder)
+
+
+def push_revoke(core: Core, holder: Lease, *, extra: bool = False) -> None:
+    """Push `revoke` now, if the holder is being revoked, and plan the next step.
+
+    `uses` counts what still runs on the lease, also what others marked: at 0 the holder is at its
+    safe point. An `extra` push leaves the plan as it is.
+    """
+    eviction = holder.departure.eviction
+    if eviction is None or holder.state is not LeaseState.REVOKING:
+        return
+    assert holder.token is not None, f"{holder.id} is revoked without a token"
+    why, waiter = eviction.why, None
+    if eviction.wanted_by is not None and why.order is None:
+        waiter = core.waiting.get(eviction.wanted_by)
+    core.push(
+        holder,
+        RevokePush(
+            lease_id=holder.id,
+            token=holder.token,
+            wanted_by=why.wanted_by,
+            deadline_in_s=max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
+            cause=why.cause,
+            gang=why.gang,
+            order=why.order,
+            priority=None if waiter is None else waiter.spec.priority,
+            uses=len(holder.uses),
+            park=bool(holder.features) and any(one.can_park(holder) for one in holder.features),
+            traceparent=eviction.traceparent or "",
+        ),
+    )
+    if not extra:
+        eviction.next_push_at = core.now + core.settings.revoke_resend_s
+        _plan_step(core, holder, eviction)
+
+
+def _plan_step(core: Core, holder: Lease, eviction: Eviction) -> None:
+    times = [] if eviction.overdue else [eviction.asked_at + core.settings.revoke_deadline_s]
+    if not eviction.reminded:
+        times.append(eviction.asked_at + core.settings.revoke_remind_s)
+    if eviction.acked_at is None or not holder.uses:
+        times.append(eviction.next_push_at)
+    if times:
+        core.timers.set(("revoke", holder.id), min(times))
+
+
+def on_ladder_due(core: Core, lease_id: str) -> None:
+    """Take the steps of the ladder that are due.
+
+    A holder that unloads is pushed nothing more, and has a whole deadline for it.
+    """
+    holder = core.leases[LeaseId(lease_id)]
+    eviction, settings = holder.departure.eviction, core.settings
+    if holder.state is LeaseState.UNLOADING:
+        holder.departure.hangs = True
+        if eviction is not None:
+            eviction.overdue = True
+        _pass_deadline(core, holder, eviction)
+    if eviction is None or holder.state is not LeaseState.REVOKING:
+        return
+    if core.now >= eviction.next_push_at:
+        eviction.next_push_at = core.now + settings.revoke_resend_s
+        if eviction.acked_at is None or not holder.uses:
+            push_revoke(core, holder)
+    if not eviction.reminded and core.now >= eviction.asked_at + settings.revoke_remind_s:
+        eviction.reminded = True
+        core.note(RemindedNote(len(holder.uses), eviction.acked_at is not None), holder)
+    if not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s:
+        eviction.overdue = True
+        _pass_deadline(core, holder, eviction)
+    _plan_step(core, holder, eviction)
+
+
+def _pass_deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
+    """Look for other victims and other GPUs, and deny the waiter if that is its wish.
+
+    The `revoke` stands in any case.
+    """
+    wanted_by, consumer = (eviction.wanted_by, eviction.why.wanted_by) if eviction else (None, "")
+    core.note(DeadlinePassedNote(len(holder.uses), consumer), holder)
+    core.wake(core.gpu_of(holder))
+    waiter = None if wanted_by is None else core.waiting.get(wanted_by)
+    if waiter is None:
+        return
+    for gpu_id in waiter.request.gpus:
+        core.wake(core.gpus[gpu_id])  # it may be served on another GPU now
+    if waiter.spec.on_deadline == "deny":
+        deadline_s, uses = core.settings.revoke_deadline_s, len(holder.uses)
+        deny(core, waiter, no.HolderOutstays(holder.id, holder.spec.consumer, uses, deadline_s))
+
+
+def on_overstay_due(core: Core, lease_id: str) -> None:
+    """Signal the process of a holder that outstayed, as its lease agreed to.
+
+    A process that uses any lease, or whose leases are used, is left alone and looked at again.
+    """
+    holder, deadline_s = core.leases[LeaseId(lease_id)], core.settings.revoke_deadline_s
+    eviction = holder.departure.eviction
+    if eviction is None or holder.state not in (LeaseState.REVOKING, LeaseState.UNLOADING):
+        return
+    due_at = max(eviction.asked_at, holder.uses.last_at, holder.since) + deadline_s
+    if eviction.signalled:
+        due_at = core.now
+    if holder.process in core.users or any(one.uses for one in core.leases_of(holder.process)):
+        due_at = core.now + deadline_s
+    if due_at > core.now:
+        core.timers.set(("overstay", holder.id), due_at)
+        return
+    kind: Literal["term", "kill"] = "kill" if eviction.signalled else "term"
+    eviction.signalled = kind
+    core.turn.effects.append(Signal(holder.process, kind))
+    signalled = SignalledNote(
+        signal=kind,
+        pid=holder.process.pid,
+        wanted_by=eviction.why.wanted_by,
+        asked_s=core.now - eviction.asked_at,
+        on_overstay=holder.spec.on_overstay,
+    )
+    core.note(signalled, holder)
+    if kind == "term" and holder.spec.on_overstay == "kill":
+        core.timers.set(("overstay", holder.id), core.now + core.settings.terminate_grace_s)
+
+
+def deny(core: Core, waiter: Lease, refusal: Refusal) -> None:
+    """End a waiter's wait with a refusal."""
+    core.move(waiter, LeaseState.DENIED, refusal.code)
+    core.dequeue(waiter)
+    if waiter.request.answered or waiter.request.id is None:
+        core.push(waiter, DeniedPush(waiter.request.extends or waiter.id, refusal.view()))
+    else:  # it has only just asked
+        core.refuse(waiter.client, waiter.request.id, refusal)
+    core.note(DeniedNote(refusal), waiter)
+    core.end(waiter, refusal)

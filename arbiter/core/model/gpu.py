@@ -1,0 +1,203 @@
+"""One GPU: its leases by state (`Residents`), its requests by effective priority (`WaitQueue`), and
+its ledger, readings and verifications (`Gpu`).
+
+Effective priority is priority + waited/ageing. All requests age at the same rate, so the order of
+two is fixed when they arrive: `arrival time − priority × ageing` (smaller first), then arrival. The
+queue is a sorted list that time never disturbs; every wait is bounded. Without ageing (0) it is the
+order of arrival.
+"""
+
+from bisect import bisect_left, bisect_right, insort
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from math import inf
+
+from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.arbiter.core.hooks import Group
+from vram_arbiter.arbiter.core.ledger import GpuLedger, PendingFree
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Eviction, Lease, LeaseState, Verification
+from vram_arbiter.arbiter.core.settings import GpuInfo
+from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.codes import Block
+
+LEFT_KEPT = 64
+"""Verdicts remembered: more than can fall between a baseline and its own."""
+
+type Rank = tuple[float, int]
+
+
+class Residents(dict[LeaseId, Lease]):
+    """Leases of one GPU by id, oldest grant first, with tables of the few that a decision asks
+    about.
+
+    A GPU may have ten thousand small leases while one loads and two leave. `Lease.move` keeps the
+    tables, so that a decision costs what has changed and not what is there.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.by_state: dict[LeaseState, dict[LeaseId, Lease]] = {state: {} for state in LeaseState}
+        self.exclusive: dict[LeaseId, Lease] = {}
+        self.recent: dict[LeaseId, Lease] = {}
+        """Leases granted, enlarged or ready since the newest reading began; may hold more."""
+        self.touched: set[LeaseId] = set()
+        """Leases that came or went since the last check of the invariants."""
+
+    # -- changing
+    def add(self, lease: Lease) -> None:
+        """A lease is granted here, or found after a restart."""
+        self[lease.id] = self.by_state[lease.state][lease.id] = self.recent[lease.id] = lease
+        self.touched.add(lease.id)
+        lease.roster = self
+        if lease.spec.exclusive:
+            self.exclusive[lease.id] = lease
+
+    def remove(self, lease: Lease) -> None:
+        """Take a lease off the GPU, if it is there."""
+        if lease.id not in self:
+            return
+        lease.roster = None
+        lease.observed.enlarged_at = -inf
+        for table in (self, self.by_state[lease.state], self.exclusive, self.recent):
+            table.pop(lease.id, None)
+        self.touched.add(lease.id)
+
+    def moved(self, lease: Lease, before: LeaseState) -> None:
+        """A lease of this GPU came to another state."""
+        self.by_state[before].pop(lease.id, None)
+        self.by_state[lease.state][lease.id] = lease
+        if lease.state is LeaseState.HELD:
+            self.recent[lease.id] = lease
+
+    def seen(self, taken_at: float) -> None:
+        """Forget recent leases that a reading that began at `taken_at` has seen."""
+        for lease in [lease for lease in self.recent.values() if not self._after(lease, taken_at)]:
+            del self.recent[lease.id]
+
+    # -- reading
+    def unseen(self, taken_at: float) -> list[Lease]:
+        """Return leases granted, enlarged or ready after a reading began: it cannot show their
+        bytes.
+        """
+        return [lease for lease in self.recent.values() if self._after(lease, taken_at)]
+
+    def _after(self, lease: Lease, taken_at: float) -> bool:
+        return max(lease.granted_at, lease.ready_at, lease.observed.enlarged_at) > taken_at
+
+    def filling(self, since: float) -> Iterator[Lease]:
+        """Yield leases that load, or became ready after `since`.
+
+        HELD lists them in the order of `ready_at`.
+        """
+        for lease in reversed(self.by_state[LeaseState.HELD].values()):
+            if lease.ready_at <= since:
+                break
+            yield lease
+        yield from self.by_state[LeaseState.LOADING].values()
+        for state in LEAVING:
+            for lease in self.by_state[state].values():
+                if lease.ready_at > since:
+                    yield lease
+
+    def ready_since(self, moment: float) -> Iterator[Lease]:
+        """Yield leases that became ready at `moment` or later and do not unload yet."""
+        for lease in reversed(self.by_state[LeaseState.HELD].values()):
+            if lease.ready_at < moment:
+                break
+            yield lease
+        for lease in self.by_state[LeaseState.REVOKING].values():
+            if lease.ready_at >= moment:
+                yield lease
+
+
+class WaitQueue:
+    """Sorted requests; keeps the smallest need, so that a full GPU is seen at a glance."""
+
+    def __init__(self, ageing_s_per_point: float) -> None:
+        self._ageing_s = ageing_s_per_point
+        self.head: Lease | None = None
+        self._ranks: list[Rank] = []
+        self.by_arrival: dict[int, Lease] = {}
+        self._needs: list[int] = []
+
+    def __iter__(self) -> Iterator[Lease]:
+        return (self.by_arrival[arrival] for _, arrival in self._ranks)
+
+    def __contains__(self, lease: Lease) -> bool:
+        return lease.request.arrival in self.by_arrival
+
+    def add(self, lease: Lease) -> None:
+        insort(self._ranks, self.rank(lease))
+        insort(self._needs, lease.request.load_peak_bytes)
+        self.by_arrival[lease.request.arrival] = lease
+        self.head = self.by_arrival[self._ranks[0][1]]
+
+    def discard(self, lease: Lease) -> None:
+        """Take a request out, if it is here."""
+        if lease.request.arrival not in self.by_arrival:
+            return
+        del self.by_arrival[lease.request.arrival]
+        del self._ranks[bisect_left(self._ranks, self.rank(lease))]
+        del self._needs[bisect_left(self._needs, lease.request.load_peak_bytes)]
+        self.head = self.by_arrival[self._ranks[0][1]] if self._ranks else None
+
+    def smallest_need_bytes(self) -> int:
+        """Return the smallest load peak of a queue that is not empty."""
+        return self._needs[0]
+
+    def position(self, lease: Lease) -> int:
+        """Return the place of a request; 1 is the head."""
+        return bisect_left(self._ranks, self.rank(lease)) + 1
+
+    def ahead_of(self, lease: Lease) -> LeaseId | None:
+        """Return the request directly before this one."""
+        index = self.position(lease) - 2
+        return self.by_arrival[self._ranks[index][1]].id if index >= 0 else None
+
+    def after(self, rank: Rank) -> Iterator[Lease]:
+        """Yield the requests behind a rank, whether or not a request has it now."""
+        first = bisect_right(self._ranks, rank)
+        return (self.by_arrival[arrival] for _, arrival in islice(self._ranks, first, None))
+
+    def rank(self, lease: Lease) -> Rank:
+        """Return the key by which any queue orders this request."""
+        if lease.request.rank is not None:
+            return (lease.request.rank, lease.request.arrival)
+        return (
+            lease.request.arrived_at - lease.spec.priority * self._ageing_s,
+            lease.request.arrival,
+        )
+
+
+@dataclass(slots=True)
+class Gpu:
+    """One GPU: its ledger, residents, queue and readings."""
+
+    info: GpuInfo
+    ledger: GpuLedger
+    queue: WaitQueue
+    residents: Residents = field(default_factory=Residents)
+    verifications: dict[str, Verification] = field(default_factory=dict)
+    evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
+    pending_free: PendingFree = field(default_factory=PendingFree)
+    # when the newest verdicts fell, and how many bytes left by each
+    left: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LEFT_KEPT))
+    sample: MemorySampled | None = None
+    before_sleep: MemorySampled | None = None  # says nothing of now, but what was there then
+    reading_s: float = 0.0  # how long the newest reading took
+    failed_at: float | None = None  # last failed reading, None after a good one
+    failure: str = ""
+    read_from: float = 0.0  # no reading that began earlier counts (resume from suspend)
+    asked_at: float | None = None  # last Sample asked for, None if its answer is here
+    changed_at: float = 0.0  # last grant, ready or verdict
+    blocked: Block | None = None
+    keeper: Group | None = None  # loads on it: no other request is granted meanwhile
+    pressed: bool = False  # a pressure note is out
+    debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
+
+    def in_state(self, *states: LeaseState) -> list[Lease]:
+        """Return its leases in these states, in the order in which they came to them."""
+        by_state = self.residents.by_state
+        return [lease for state in states for lease in by_state[state].values()]

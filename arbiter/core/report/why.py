@@ -1,0 +1,484 @@
+"""Answers to `why`: what a lease waits for, what is in its way, and what happens next.
+
+`explain` composes them in this order, as codes and values without words:
+  1. standing: the GPU and the company of a request, as its feature tells
+  2. blockers: the bytes of each holder, and the condition on which they come free
+  3. situation: the one thing that the lease waits for now
+  4. plan: the next steps of the arbiter, and the instants at which they are planned
+  5. estimate: seconds until the lease is loaded, from learned medians
+Reads only, and only when asked: the plan costs a search for victims per instant.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from heapq import nlargest
+from math import inf
+
+from vram_arbiter.arbiter.core.learning import footprints
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.report import status
+from vram_arbiter.arbiter.core.scheduling import admission, victims
+from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.explained import (
+    Because,
+    Blocker,
+    Condition,
+    Explanation,
+    NextAction,
+    Return,
+    Situation,
+    Step,
+    WhyReply,
+)
+from vram_arbiter.schemas.wire.views import GangView
+
+EXPLAINED_MAX = 8
+"""Leases of one answer to `why`."""
+
+BLOCKERS_MAX = 32
+"""Blockers of one waiter that are listed; of more, the largest holders."""
+
+LONG_LOAD_S = 10.0
+"""From then on the progress of a load is shown, and for how long it has not grown."""
+
+ASK_TIMES_MAX = 16
+"""Number of future eviction times to examine."""
+
+WEIGHED_MAX = 400
+"""Holders weighed over all of these times: beside many holders fewer times are examined."""
+
+_PHASES_LEFT = {
+    LeaseState.REVOKING: ("drain_s", "unload_s", "verify_s"),
+    LeaseState.UNLOADING: ("unload_s", "verify_s"),
+    LeaseState.VERIFYING: ("verify_s",),
+}
+"""Learned phases that a leaving lease has before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A request's GPU, company and prospects."""
+
+    gpu: Gpu  # where it is, where room is made for it, or where it may be placed
+    request: Lease  # as it is admitted there: the requests of a group count as one
+    fellows: tuple[Lease, ...]  # requests that have one place in the queues together
+    loads: tuple[Lease, ...] | None  # to be loaded there, up to this one; None: not known yet
+    gang: GangView | None = None  # that it is granted with
+    lacks: tuple[Lease, ...] = ()  # other members of it that are not held
+    back: Return | None = None  # what it waits for where it is away
+    ahead: str = ""  # consumer before it then
+    due_s: float | None = None
+    reserved_bytes: int = 0  # charged already, for its turn to load
+    gives_up: tuple[float, Because] | None = None  # when its gang is broken, and why
+
+
+def why(core: Core, consumer: str) -> WhyReply:
+    """Explain why a consumer is not running, or that it is. A lease's id stands for that lease.
+
+    Of a consumer with many leases the oldest are explained: each costs a search for victims.
+    """
+    named = core.leases.get(LeaseId(consumer))
+    mine = [one for one in core.leases.values() if one.spec.consumer == consumer]
+    mine = [named] if named else mine
+    told = tuple(explain(core, lease, plan=True) for lease in mine[:EXPLAINED_MAX])
+    return WhyReply(consumer, told, more=len(mine[EXPLAINED_MAX:]))
+
+
+def explain(core: Core, lease: Lease, *, plan: bool = False) -> Explanation:
+    """Explain one lease: what it needs, what is in its way, and when it is loaded.
+
+    `plan`: with the next steps. They also give an estimate where no holder was revoked yet.
+    """
+    standing = standing_of(core, lease)
+    gpu, kept = standing.gpu, standing.reserved_bytes
+    free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes() + kept
+    away = lease.state in AWAY
+    told = Explanation(
+        lease_id=lease.id,
+        consumer=lease.spec.consumer,
+        state=lease.state,
+        position=0,
+        needed_bytes=0,
+        free_bytes=max(0, free),
+        deficit_bytes=0,
+        condition=Situation.AWAY if away else Situation.RESIDENT,
+        blockers=(),
+        eta_s=None,
+        eta_source="none",
+        footprint=footprints.footprint(core, lease),
+        plan=(),
+        ahead=standing.ahead,
+        block=status.block_view(core, gpu),
+        gang=standing.gang,
+    )
+    if lease.state is LeaseState.QUEUED:
+        return _explain_waiter(core, lease, standing, free, told, plan=plan)
+    eviction = lease.departure.eviction
+    return replace(
+        told,
+        lacks=tuple(holder(core, standing_of(core, one).gpu, one) for one in standing.lacks),
+        holder=None if away else holder(core, gpu, lease),
+        revoked=None if eviction is None else eviction.why,
+        drifted=bool(footprints.drift_bytes(core, gpu, lease)),
+        back=standing.back,
+        due_s=standing.due_s,
+    )
+
+
+def _explain_waiter(
+    core: Core, lease: Lease, standing: Standing, free: int, told: Explanation, *, plan: bool
+) -> Explanation:
+    gpu, request, kept = standing.gpu, lease.request, standing.reserved_bytes
+    needed = request.load_peak_bytes if kept else admission.added_bytes(gpu, standing.request)
+    deficit = max(0, needed - free)
+    raised = request.load_peak_bytes > lease.spec.footprint.load_peak_bytes
+    # a gang has the place of its foremost member
+    position = min(status.position(core, member) for member in standing.fellows)
+    blockers = _blockers(core, gpu, standing.request, deficit)
+    situation = _situation(core, standing, lease, position, blocked=bool(blockers))
+    leaving = _leaving(gpu) if situation is Situation.MAKING_ROOM else ()
+    steps = _steps(core, standing, lease) if plan else ()
+    eta_s = _eta_s(core, standing, steps)
+    return replace(
+        told,
+        position=position,
+        needed_bytes=needed,
+        deficit_bytes=deficit,
+        condition=situation,
+        blockers=blockers,
+        eta_s=eta_s,
+        eta_source="none" if eta_s is None else "learnt",
+        plan=steps,
+        ahead=ahead_of(core, lease),
+        wait=request.reason,
+        leaving=tuple(holder(core, gpu, one) for one in leaving),
+        measuring=tuple(one.consumer for one in gpu.verifications.values()),
+        kept=bool(kept),
+        expected_bytes=request.load_peak_bytes if raised else None,
+    )
+
+
+# -- 1. standing -----------------------------------------------------------------------------------
+def standing_of(core: Core, lease: Lease) -> Standing:
+    """Return the standing of a request, or of a granted lease whose group is not complete."""
+    for feature in lease.features:
+        told = feature.standing(core, lease)
+        if told is not None:
+            return told
+    gpu = core.gpus[lease.gpu or lease.request.planned_gpu or lease.request.gpus[0]]
+    return Standing(gpu, lease, (lease,), (lease,))
+
+
+def ahead_of(core: Core, lease: Lease) -> str:
+    """Return the consumer of the request before this one; "" for the head, which alone has
+    blockers of its own."""
+    fellows = standing_of(core, lease).fellows
+    foremost = min(fellows, key=lambda member: status.position(core, member))
+    if status.position(core, foremost) <= 1:
+        return ""
+    before = standing_of(core, foremost).gpu.queue.ahead_of(foremost)
+    return core.waiting[before].spec.consumer if before else "others"
+
+
+# -- 2. blockers -----------------------------------------------------------------------------------
+def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> tuple[Blocker, ...]:
+    """List what holds bytes that the waiter lacks, or holds the GPU alone.
+
+    Everything charged on the GPU is listed: holders, members of a gang that wait for their turn,
+    contexts, debts, stowaways.
+    """
+    loading = gpu.in_state(LeaseState.LOADING)
+    if waiter.id in gpu.ledger.reserved:  # it has its bytes, and waits for its turn
+        return tuple(holder(core, gpu, lease, waiter) for lease in loading)
+    alone = waiter.spec.exclusive or gpu.residents.exclusive
+    if not deficit and not alone and not loading:
+        return ()
+    residents = list(gpu.residents.values())
+    if len(residents) > BLOCKERS_MAX:
+        charge_of = gpu.ledger.charge_bytes
+        residents = nlargest(BLOCKERS_MAX, residents, lambda lease: charge_of(lease.id))
+    holders = [holder(core, gpu, lease, waiter) for lease in residents]
+    return tuple([*holders, *_reserved(core, gpu), *_keepers(core, gpu, waiter)][:BLOCKERS_MAX])
+
+
+def holder(core: Core, gpu: Gpu, lease: Lease, waiter: Lease | None = None) -> Blocker:
+    """Return a resident lease as it stands in a waiter's way, or for itself."""
+    condition, seconds = _condition(core, lease, waiter)
+    long = condition is Condition.LOADING and core.now - lease.granted_at >= LONG_LOAD_S
+    quiet_s = core.now - max(lease.observed.grew_at, lease.granted_at)
+    group = lease.request.group
+    by = group.name if group is not None and condition is Condition.GANG else ""
+    if condition is Condition.PINNED and lease.pinned:
+        by = str(lease.pinned)
+    blocker = Blocker(
+        lease_id=lease.id,
+        consumer=lease.spec.consumer,
+        bytes=gpu.ledger.charge_bytes(lease.id),
+        state=lease.state,
+        uses=len(lease.uses),
+        condition=condition,
+        paused=len(lease.uses.paused),
+        seconds=seconds,
+        pid=lease.process.pid if condition is Condition.HANGING else None,
+        by=by,
+        loaded_bytes=lease.observed.peak_bytes if long else None,
+        quiet_s=quiet_s if long and quiet_s >= LONG_LOAD_S else None,
+    )
+    if waiter is None or condition is not Condition.PRIORITY:
+        return blocker
+    aged = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
+    return replace(blocker, priority=lease.spec.priority, waiter_priority=aged)
+
+
+def _condition(core: Core, lease: Lease, waiter: Lease | None) -> tuple[Condition, float | None]:
+    """Return on which condition a holder's bytes come free, and its seconds."""
+    match lease.state:
+        case LeaseState.LOADING:
+            return Condition.LOADING, core.now - lease.granted_at
+        case LeaseState.REVOKING:
+            eviction = lease.departure.eviction
+            return Condition.REVOKED, core.now - (eviction.asked_at if eviction else lease.since)
+        case LeaseState.UNLOADING:
+            hangs = Condition.HANGING if lease.departure.hangs else Condition.UNLOADING
+            return hangs, core.now - lease.since
+        case LeaseState.VERIFYING:
+            return Condition.MEASURED, None
+    if not lease.attached:
+        return Condition.NOT_BACK, lease.expires_at - core.now
+    if lease.request.group is not None:
+        return Condition.GANG, None
+    if not lease.evictable:
+        return Condition.PINNED, None
+    if waiter is not None:
+        ends_at = victims.residency_ends_at(core, lease, waiter)
+        if ends_at > core.now:
+            stretched = ends_at > lease.ready_at + lease.spec.min_residency_s
+            return (Condition.THRASHING if stretched else Condition.RESIDENCY), ends_at - core.now
+        aged = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
+        if lease.uses and lease.spec.priority > aged:
+            return Condition.PRIORITY, None
+    return (Condition.IN_USE if lease.uses else Condition.IDLE), None
+
+
+def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:
+    """List requests whose bytes are charged here and that wait for their turn to load. The next
+    one has the headroom too."""
+    reserved, blockers = gpu.ledger.reserved, list[Blocker]()
+    for lease in [lease for lease in core.waiting.values() if lease.id in reserved]:
+        count = gpu.ledger.charge_bytes(lease.id)
+        if not blockers:
+            count = standing_of(core, lease).reserved_bytes
+        name, gang = lease.spec.consumer, gpu.keeper.name if gpu.keeper else ""
+        turn = Blocker(lease.id, name, count, lease.state, 0, Condition.TURN, by=gang)
+        blockers.append(turn)
+    return blockers
+
+
+def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
+    """List processes without a resident lease that hold bytes: contexts of live processes, debts,
+    stowaways."""
+    ledger = gpu.ledger
+    names = {client.process: client.name for client in core.clients.values()}
+    kept: list[Blocker] = []
+    for process, account in ledger.accounts.items():
+        count, pid = account.granted_bytes, process.pid
+        resident = not gpu.residents.keys().isdisjoint(account.charges)
+        if process == waiter.process or not count or resident:
+            continue
+        if any(lease not in ledger.reserved for lease in account.charges):
+            debts = [one for one in gpu.verifications.values() if one.process == process]
+            keeps = any(one.overdue and one.alive for one in debts)
+            state, condition = "debt", Condition.DEBT_KEPT if keeps else Condition.DEBT
+        else:
+            more = account.retained_bytes > account.retained_floor_bytes
+            state, condition = "residue", Condition.RETAINED if more else Condition.CONTEXT
+        name = names.get(process, f"pid {pid}")
+        kept.append(Blocker(None, name, count, state, 0, condition, pid=pid))
+    for stowaway in ledger.stowaways.values():
+        pid = stowaway.process.pid
+        if pid != waiter.process.pid:
+            name, count = stowaway.name or f"pid {pid}", stowaway.held_bytes
+            kept.append(Blocker(None, name, count, "stowaway", 0, Condition.STOWAWAY, pid=pid))
+    return kept
+
+
+# -- 3. situation ----------------------------------------------------------------------------------
+def _situation(
+    core: Core, standing: Standing, lease: Lease, position: int, *, blocked: bool
+) -> Situation:
+    """Return the one thing that a request waits for now."""
+    gpu = standing.gpu
+    if position > 1:
+        return Situation.BEHIND
+    if standing.gang is not None:
+        phases = {"gathering": Situation.GATHERING, "loading": Situation.GANG_LOADS}
+        return phases.get(standing.gang.phase, Situation.GANG_WAITS)
+    leaving = _leaving(gpu)
+    if leaving and lease.request.planned_gpu == gpu.info.id:
+        return Situation.MAKING_ROOM
+    if admission.blocked(core, gpu):
+        return Situation.BLOCKED
+    if leaving:
+        return Situation.MAKING_ROOM
+    return Situation.NO_ROOM if blocked and not gpu.verifications else Situation.MEASURING
+
+
+# -- 4. plan ---------------------------------------------------------------------------------------
+def _steps(core: Core, standing: Standing, waiter: Lease) -> tuple[Step, ...]:
+    """Return the next steps for a request, the nearest first, those without an instant last."""
+    gpu, request = standing.gpu, waiter.request
+    found: list[Step] = []
+    if waiter.id not in core.unqueued:
+        first = admission.front(core, gpu)
+        if any(first is one for one in standing.fellows):
+            found = _steps_of_head(core, gpu, standing.request)
+    else:  # it waits for the rest of its gang, or with its bytes reserved for its turn to load
+        if standing.reserved_bytes:
+            found = _ends_of_loads(core, gpu) or [_next_reading(core, gpu, Because.KEPT)]
+        if standing.gives_up is not None:
+            gang = "" if standing.gang is None else standing.gang.id
+            broken = _step(core, NextAction.BREAK, None, *standing.gives_up)
+            found.append(replace(broken, gang=gang))
+    if request.wait_timeout_s is not None:
+        at = request.arrived_at + request.wait_timeout_s
+        found.append(_step(core, NextAction.GIVE_UP, waiter, at, Because.TIMEOUT))
+    return tuple(sorted(found, key=lambda step: inf if step.in_s is None else step.in_s))
+
+
+def _steps_of_head(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
+    if not core.serving:
+        ends = [core.leases[lease].expires_at for lease in core.recovering if lease in core.leases]
+        at = max(ends, default=None)
+        return [_step(core, NextAction.SERVE, None, at, Because.ACCOUNTED)]
+    if gpu.failed_at is not None or gpu.sample is None:
+        return [_next_reading(core, gpu, Because.UNREADABLE)]
+    leaving = [_of_leaving(core, gpu, waiter, lease) for lease in _leaving(gpu)]
+    found = _ends_of_loads(core, gpu) + leaving
+    if found or admission.blocked(core, gpu):
+        return found
+    if admission.fits(gpu, waiter, admission.leaving(gpu)):
+        return [_next_reading(core, gpu, Because.MEASUREMENT)]
+    return _asks(core, gpu, waiter)
+
+
+def _asks(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
+    """Return which holders will be revoked, and when: at the first instant at which a sufficient
+    set may be."""
+    going = admission.leaving(gpu)
+    times = sorted({core.now, *victims.ask_times(core, gpu, waiter)})
+    for at in times[: max(1, min(ASK_TIMES_MAX, WEIGHED_MAX // (1 + len(gpu.residents))))]:
+        chosen = victims.choose_victims(core, gpu, waiter, going, at)
+        if chosen is not None:
+            return [
+                _step(core, NextAction.ASK, victim, at, _ripens(core, waiter, victim, at))
+                for victim in chosen
+            ]
+    if missing := [lease for lease in gpu.in_state(LeaseState.HELD) if not lease.attached]:
+        last = max(missing, key=lambda lease: lease.expires_at)
+        return [_step(core, NextAction.WAIT, last, last.expires_at, Because.NOT_BACK)]
+    return [_step(core, NextAction.WAIT, None, None, Because.NO_VICTIM)]
+
+
+def _ripens(core: Core, waiter: Lease, victim: Lease, at: float) -> Because:
+    """Return why a holder can be revoked at an instant and not before."""
+    if at <= core.now:
+        return Because.NEXT_READING
+    if at == victims.residency_ends_at(core, victim, waiter):
+        return Because.RESIDENCY
+    return Because.AGEING if victim.uses else Because.TOGETHER
+
+
+def _of_leaving(core: Core, gpu: Gpu, waiter: Lease, leaving: Lease) -> Step:
+    """Return the step of a holder whose room is being made."""
+    verification = gpu.verifications.get(leaving.id)
+    if verification is not None:
+        latest_s = max(0.0, verification.deadline_at - core.now) or None
+        because = Because.VERDICT if latest_s else Because.MEASURED_GONE
+        step = _step(core, NextAction.MEASURE, leaving, verification.next_poll_at, because)
+        return replace(step, latest_s=latest_s)
+    eviction = leaving.departure.eviction
+    if eviction is None or eviction.overdue:
+        because = Because.HANGING if leaving.departure.hangs else Because.LEAVING
+        return _step(core, NextAction.WAIT, leaving, None, because)
+    unloads = leaving.state is LeaseState.UNLOADING
+    at = (leaving.since if unloads else eviction.asked_at) + core.settings.revoke_deadline_s
+    because = Because.DENIED if waiter.spec.on_deadline == "deny" else Because.WAITS_ON
+    return replace(
+        _step(core, NextAction.DEADLINE, leaving, at, because), waiter=waiter.spec.consumer
+    )
+
+
+def _ends_of_loads(core: Core, gpu: Gpu) -> list[Step]:
+    steps: list[Step] = []
+    for lease in gpu.in_state(LeaseState.LOADING):
+        end = lease.granted_at + (core.costs.learnt_s(lease.spec.consumer, "load_s") or 0.0)
+        at = end if end > core.now else None
+        steps.append(_step(core, NextAction.LOADED, lease, at, Because.ONE_LOAD))
+    return steps
+
+
+def _next_reading(core: Core, gpu: Gpu, because: Because) -> Step:
+    times = [core.timers.get((kind, gpu.info.id)) for kind in ("verify", "probe")]
+    at = min((time for time in times if time is not None), default=None)
+    return _step(core, NextAction.READ, None, at, because)
+
+
+def _step(
+    core: Core, action: NextAction, lease: Lease | None, at: float | None, because: Because
+) -> Step:
+    """Return a step with, or of, a lease. `at` None: no instant is planned."""
+    consumer, lease_id = ("", None) if lease is None else (lease.spec.consumer, lease.id)
+    return Step(
+        action, consumer, lease_id, None if at is None else max(0.0, at - core.now), because
+    )
+
+
+# -- 5. estimate -----------------------------------------------------------------------------------
+def _eta_s(core: Core, standing: Standing, steps: Sequence[Step]) -> float | None:
+    """Return the seconds until a request is loaded, if every phase takes as long as usual.
+
+    None: a phase on the way was never seen, or nothing is planned.
+    """
+    gpu, load_s = standing.gpu, 0.0
+    if standing.loads is None:
+        return None
+    for one in standing.loads:  # those of its gang that load before it, too
+        usual_s = core.costs.learnt_s(one.spec.consumer, "load_s")
+        if usual_s is None:
+            return None
+        load_s += usual_s
+    emptied_s, kept = _emptied_s(core, gpu), standing.reserved_bytes
+    if emptied_s or (emptied_s is not None and (kept or admission.fits(gpu, standing.request))):
+        return emptied_s + load_s
+    left_s = 0.0
+    asked = [step for step in steps if step.action is NextAction.ASK]
+    for step in asked:
+        usual_s = _usual_s(core, step.consumer, LeaseState.REVOKING)
+        if usual_s is None:
+            return None
+        left_s = max(left_s, (step.in_s or 0.0) + usual_s)
+    return load_s + left_s if asked else None
+
+
+def _emptied_s(core: Core, gpu: Gpu) -> float | None:
+    """Return the seconds until the last of the leaving holders is measured gone."""
+    slowest_s = 0.0
+    for one in _leaving(gpu):
+        usual_s = _usual_s(core, one.spec.consumer, one.state)
+        if usual_s is None:
+            return None
+        slowest_s = max(slowest_s, usual_s - (core.now - one.since))
+    return slowest_s
+
+
+def _usual_s(core: Core, consumer: str, state: LeaseState) -> float | None:
+    """Return how long a consumer takes from a state until its bytes are measured gone."""
+    times = [core.costs.learnt_s(consumer, phase) for phase in _PHASES_LEFT[state]]
+    known = [seconds for seconds in times if seconds is not None]
+    return sum(known) if len(known) == len(times) else None
+
+
+def _leaving(gpu: Gpu) -> list[Lease]:
+    return [lease for lease in gpu.residents.values() if lease.state in LEAVING]
