@@ -12,10 +12,10 @@ import os
 import time
 import uuid
 from collections import deque
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import anyio
 from anyio.abc import TaskGroup
@@ -30,9 +30,11 @@ from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.dealer import Dealer
 from vram_arbiter.clients.net.diagnose import START, obstacle
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.decode import AnyReply
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +59,7 @@ class _Subscriber:
     """Events that a subscriber has not read yet."""
 
     def __init__(self) -> None:
-        self._events: deque[Mapping[str, Any]] = deque(maxlen=SUBSCRIBER_QUEUE_MAX)
+        self._events: deque[JsonMap] = deque(maxlen=SUBSCRIBER_QUEUE_MAX)
         self._arrived = anyio.Event()
         self._closed = False
 
@@ -65,11 +67,11 @@ class _Subscriber:
         self._closed = True
         self._arrived.set()
 
-    def put(self, event: Mapping[str, Any]) -> None:
+    def put(self, event: JsonMap) -> None:
         self._events.append(event)
         self._arrived.set()
 
-    async def get(self) -> Mapping[str, Any]:
+    async def get(self) -> JsonMap:
         while not self._events:
             self._arrived = anyio.Event()
             if self._closed:
@@ -177,7 +179,7 @@ class Session:
         self._waits[nonce] = _Wait(granted, spec, handlers)
         self.protocol.waits.acquire(
             nonce,
-            spec.model_dump(mode="json"),
+            to_map(spec),
             self.now(),
             wait_timeout_s=wait_timeout_s,
             traceparent=traceparent or traces.present(),
@@ -215,7 +217,7 @@ class Session:
         use_context.enter(use_id)
         return use
 
-    async def events(self) -> AsyncGenerator[Mapping[str, Any]]:
+    async def events(self) -> AsyncGenerator[JsonMap]:
         """Yield history events from now on."""
         subscriber = _Subscriber()
         self._subscribers.append(subscriber)
@@ -370,7 +372,7 @@ class Session:
             self.protocol.waits.cancel(nonce, self.now())
             self.pump()
 
-    def _received(self, message: r.Message) -> None:
+    def _received(self, message: Message) -> None:
         self.protocol.connection.receive(message, self.now())
         self.pump()
 

@@ -1,13 +1,15 @@
 """A lease spec from what a caller of `lease` or `acquire` writes."""
 
 from collections.abc import Mapping
+from dataclasses import fields as dataclass_fields
 
 from pydantic import ValidationError
 
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.sizes import parse_bytes
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import checked_spec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 type Vram = int | str | Footprint
 """Bytes, a text such as `5.3GB` or `8GiB`, or a footprint with its parts."""
@@ -39,11 +41,11 @@ def lease_spec(
         )
     own = {"consumer": name, "model_id": model or name, "footprint": _footprint(vram)}
     try:
-        return LeaseSpec.model_validate({**own, **fields})
+        return checked_spec({**own, **fields})
     except ValidationError as error:
         wrong = error.errors()[0]
         where = ".".join(str(part) for part in wrong["loc"])
-        known = ", ".join(LeaseSpec.model_fields)
+        known = ", ".join(field.name for field in dataclass_fields(LeaseSpec))
         raise BadRequest(
             f"{where}: {wrong['msg']}, got {wrong['input']!r}", hint=f"fields of a lease: {known}"
         ) from None

@@ -14,11 +14,11 @@ robots.
 import os
 import uuid
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Concatenate, Final, Self
 
 import anyio
 
@@ -28,17 +28,41 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._session import LEAVE_TIMEOUT_S, Session, closed
 from vram_arbiter.clients._spec import Vram, lease_spec
-from vram_arbiter.clients.handlers import Handler, Handlers
+from vram_arbiter.clients.handlers import Handler, Handlers, with_signature_of
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
-from vram_arbiter.schemas.wire.requests import Gang, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Gang, LeaseSpec
 
 CONNECT_TIMEOUT_S: Final = 5.0
+
+
+def _block[C, **P](
+    acquire: Callable[Concatenate[C, P], Awaitable[AsyncLease]],
+) -> Callable[Concatenate[C, P], AbstractAsyncContextManager[AsyncLease]]:
+    @asynccontextmanager
+    async def lease(
+        client: C, /, *arguments: P.args, **options: P.kwargs
+    ) -> AsyncIterator[AsyncLease]:
+        """`acquire` as a block, with the same parameters; at its end, also when it raises: unload
+        and release."""
+        granted = await acquire(client, *arguments, **options)
+        try:
+            yield granted
+        finally:
+            try:
+                await granted.give_up()
+            except anyio.get_cancelled_exc_class():
+                with anyio.move_on_after(LEAVE_TIMEOUT_S, shield=True):
+                    await granted.give_up()
+                raise
+
+    return with_signature_of(acquire, lease)
 
 
 class AsyncClient:
@@ -106,6 +130,7 @@ class AsyncClient:
     # -- leases
     async def acquire(
         self,
+        /,
         spec: LeaseSpec | None = None,
         wait_timeout_s: float | None = None,
         *,
@@ -139,7 +164,7 @@ class AsyncClient:
         """
         wanted = lease_spec(spec, self._name, vram, model, fields)
         if not use_context.a_use():
-            wanted = wanted.model_copy(update={"independent": True})
+            wanted = replace(wanted, independent=True)
         merged = (handlers or Handlers[AsyncLease]()).merged(
             unload=unload,
             park=park,
@@ -150,49 +175,7 @@ class AsyncClient:
         )
         return await self._session.acquire(wanted, merged, wait_timeout_s, traceparent)
 
-    @asynccontextmanager
-    async def lease(
-        self,
-        spec: LeaseSpec | None = None,
-        wait_timeout_s: float | None = None,
-        *,
-        vram: Vram | None = None,
-        model: str | None = None,
-        handlers: Handlers[AsyncLease] | None = None,
-        unload: Handler | None = None,
-        park: Handler | None = None,
-        restore: Callable[[AsyncLease], object] | None = None,
-        on_revoke: Callable[[AsyncLease, r.Eviction], object] | None = None,
-        on_lost: Callable[[AsyncLease, VramError], object] | None = None,
-        safe_point_eta_s: Callable[[], float | None] | None = None,
-        traceparent: str | None = None,
-        **fields: Any,
-    ) -> AsyncIterator[AsyncLease]:
-        """`acquire` as a block; at its end, also when it raises: unload and release."""
-        lease = await self.acquire(
-            spec,
-            wait_timeout_s,
-            vram=vram,
-            model=model,
-            handlers=handlers,
-            unload=unload,
-            park=park,
-            restore=restore,
-            on_revoke=on_revoke,
-            on_lost=on_lost,
-            safe_point_eta_s=safe_point_eta_s,
-            traceparent=traceparent,
-            **fields,
-        )
-        try:
-            yield lease
-        finally:
-            try:
-                await lease.give_up()
-            except anyio.get_cancelled_exc_class():
-                with anyio.move_on_after(LEAVE_TIMEOUT_S, shield=True):
-                    await lease.give_up()
-                raise
+    lease = _block(acquire)
 
     async def gang(
         self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
@@ -214,7 +197,7 @@ class AsyncClient:
 
         async def member(index: int, spec: LeaseSpec, end: Answer[AsyncLease]) -> None:
             try:
-                end.set(await self.acquire(spec.model_copy(update={"gang": gang}), wait_timeout_s))
+                end.set(await self.acquire(replace(spec, gang=gang), wait_timeout_s))
             except VramError as error:
                 end.fail(error)
             finally:
@@ -270,7 +253,7 @@ class AsyncClient:
     async def ask(
         self,
         op: str,
-        fields: Mapping[str, Any] | None = None,
+        fields: JsonMap | None = None,
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> AnyReply:
@@ -309,7 +292,7 @@ class AsyncClient:
         """Wait for a sign of life."""
         return await self._asked(PingReply, "ping", timeout_s=timeout_s)
 
-    async def subscribe(self) -> AsyncIterator[Mapping[str, Any]]:
+    async def subscribe(self) -> AsyncIterator[JsonMap]:
         """Yield history events from now on, also across restarts of the arbiter. A subscriber that
         does not read loses the oldest."""
         events = self._session.events()
@@ -323,7 +306,7 @@ class AsyncClient:
         self,
         kind: type[R],
         op: str,
-        fields: Mapping[str, Any] | None = None,
+        fields: JsonMap | None = None,
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> R:

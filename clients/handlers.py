@@ -60,3 +60,10 @@ async def call(handler: Callable[..., object], *arguments: object) -> None:
     )
     if inspect.isawaitable(result):
         await result
+
+
+def with_signature_of[F: Callable[..., object]](model: Callable[..., object], function: F) -> F:
+    """Return a function that takes the parameters of another, shown as its own by `help`."""
+    shown = inspect.signature(model).replace(return_annotation=inspect.Signature.empty)
+    vars(function)["__signature__"] = shown
+    return function

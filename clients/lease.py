@@ -8,6 +8,7 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
+from dataclasses import replace
 from typing import Literal
 
 from vram_arbiter.clients import use_context
@@ -15,10 +16,11 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord, TokenPair
 from vram_arbiter.clients.eviction import Departure, Driver
 from vram_arbiter.clients.handlers import Handlers, call
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
 from vram_arbiter.schemas.wire.pushes import RevokePush
 from vram_arbiter.schemas.wire.replies import AcquireReply
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +165,7 @@ class AsyncLease:
         self._raise_if_leaving()
         self._resize_error = None
         request = self._driver.protocol.holdings.resize(
-            self._record, footprint.model_dump(mode="json"), wait_timeout_s, self._driver.now()
+            self._record, to_map(footprint), wait_timeout_s, self._driver.now()
         )
         self._resizing = True
         reply = await self._driver.reply(request)
@@ -175,7 +177,7 @@ class AsyncLease:
         self._raise_if_gone()
         if self._resize_error is not None:
             raise self._resize_error
-        self._spec = self._spec.model_copy(update={"footprint": footprint})
+        self._spec = replace(self._spec, footprint=footprint)
 
     async def park(self) -> None:
         """Leave the GPU at the safe point and keep the weights in host RAM; `reacquire` returns.

@@ -4,9 +4,9 @@ knows no robot and no GPU."""
 import asyncio
 import os
 import uuid
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, Self, cast
+from typing import Literal, Self, cast
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.estop import Stopped, stop
@@ -18,9 +18,8 @@ from vram_arbiter.schemas.errors import (
     from_wire,
 )
 from vram_arbiter.schemas.goals import FeedbackPush, FrameReply, ResultPush
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
-
-Message = dict[str, Any]
 
 CALL_TIMEOUT_S = 10.0
 CONNECT_TIMEOUT_S = 10.0
@@ -107,7 +106,7 @@ class RunnerClient:
         *,
         revision: str = "",
         prompt: str = "",
-        goal_params: Mapping[str, Any] | None = None,
+        goal_params: JsonMap | None = None,
         deadline_s: float = 0.0,
         max_ticks: int | None = None,
         goal_id: str | None = None,
@@ -194,7 +193,7 @@ class RunnerClient:
         await self._exchange("shutdown", {}, self._timeout_s)
 
     async def call(
-        self, op: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float | None = None
+        self, op: str, fields: JsonMap | None = None, *, timeout_s: float | None = None
     ) -> Message:
         """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer
         before anything is said."""
@@ -205,7 +204,7 @@ class RunnerClient:
         )
 
     # -- steps -------------------------------------------------------------------------------------
-    async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Message:
+    async def _exchange(self, op: str, fields: JsonMap, timeout_s: float) -> Message:
         try:
             reply = await self._rpc.exchange({"op": op, **fields}, timeout_s)
         except TimeoutError:

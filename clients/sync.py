@@ -13,12 +13,12 @@ survive a fork. Every class has the methods of its async twin; a test compares t
 """
 
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Concatenate, Self
 
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
@@ -27,13 +27,14 @@ from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._spec import Vram
 from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
-from vram_arbiter.clients.handlers import Handler, Handlers
+from vram_arbiter.clients.handlers import Handler, Handlers, with_signature_of
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease, AsyncUse, LeaseState
 from vram_arbiter.schemas.errors import BadState, VramError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 
 class _Portal:
@@ -236,6 +237,22 @@ class ForeignUse:
         self._portal.call(self._use.end)
 
 
+def _block[C, **P](
+    acquire: Callable[Concatenate[C, P], Lease],
+) -> Callable[Concatenate[C, P], AbstractContextManager[Lease]]:
+    @contextmanager
+    def lease(client: C, /, *arguments: P.args, **options: P.kwargs) -> Iterator[Lease]:
+        """`acquire` as a block, with the same parameters; at its end, also when it raises: unload
+        and release."""
+        granted = acquire(client, *arguments, **options)
+        try:
+            yield granted
+        finally:
+            granted.give_up()
+
+    return with_signature_of(acquire, lease)
+
+
 class Client:
     """One connection to the arbiter, open inside `with`. Raises as `clients.client.AsyncClient`.
 
@@ -302,6 +319,7 @@ class Client:
     # -- leases ------------------------------------------------------------------------------------
     def acquire(
         self,
+        /,
         spec: LeaseSpec | None = None,
         wait_timeout_s: float | None = None,
         *,
@@ -338,44 +356,7 @@ class Client:
         )
         return Lease(self._portal, granted)
 
-    @contextmanager
-    def lease(
-        self,
-        spec: LeaseSpec | None = None,
-        wait_timeout_s: float | None = None,
-        *,
-        vram: Vram | None = None,
-        model: str | None = None,
-        handlers: Handlers[Lease] | None = None,
-        unload: Handler | None = None,
-        park: Handler | None = None,
-        restore: Callable[[Lease], object] | None = None,
-        on_revoke: Callable[[Lease, r.Eviction], object] | None = None,
-        on_lost: Callable[[Lease, VramError], object] | None = None,
-        safe_point_eta_s: Callable[[], float | None] | None = None,
-        traceparent: str | None = None,
-        **fields: Any,
-    ) -> Iterator[Lease]:
-        """`acquire` as a block; at its end, also when it raises: unload and release."""
-        lease = self.acquire(
-            spec,
-            wait_timeout_s,
-            vram=vram,
-            model=model,
-            handlers=handlers,
-            unload=unload,
-            park=park,
-            restore=restore,
-            on_revoke=on_revoke,
-            on_lost=on_lost,
-            safe_point_eta_s=safe_point_eta_s,
-            traceparent=traceparent,
-            **fields,
-        )
-        try:
-            yield lease
-        finally:
-            lease.give_up()
+    lease = _block(acquire)
 
     def gang(
         self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
@@ -410,7 +391,7 @@ class Client:
     def ask(
         self,
         op: str,
-        fields: Mapping[str, Any] | None = None,
+        fields: JsonMap | None = None,
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> AnyReply:
@@ -433,7 +414,7 @@ class Client:
         """Wait for a sign of life."""
         return self._portal.call(self._client.ping, timeout_s=timeout_s)
 
-    def subscribe(self) -> Iterator[Mapping[str, Any]]:
+    def subscribe(self) -> Iterator[JsonMap]:
         """Yield history events from now on; blocks for the next one. Close the iterator to stop."""
         return self._iterate(self._client.subscribe())
 

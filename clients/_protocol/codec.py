@@ -1,12 +1,11 @@
 """A message as the bytes of a frame: msgpack, and whatever words are in it."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import msgpack
 
+from vram_arbiter.schemas.plain import JsonMap
 
-def pack(message: Mapping[str, Any]) -> bytes:
+
+def pack(message: JsonMap) -> bytes:
     """Texts that UTF-8 has no bytes for (halves of surrogate pairs: undecodable file names,
     arguments) are sent as `\\udcff`: an emergency stop is not lost for its words. Raises TypeError,
     ValueError and OverflowError for what msgpack does not carry."""

@@ -10,21 +10,20 @@ the pushes. The owner (`clients._session`) feeds `receive`, performs what `take_
 idempotent. Each request has a deadline.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator
+from typing import Protocol
 
 from vram_arbiter.clients._protocol.records import (
     ContactLost,
     Event,
     Failed,
-    Message,
     OnError,
     OnReply,
     Pending,
     Refused,
     Replied,
     Up,
-)  # fmt: skip
+)
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import CodecError, from_map
 from vram_arbiter.schemas.errors import (
@@ -34,6 +33,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
     from_wire,
 )
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.decode import decode_push, decode_reply
 from vram_arbiter.schemas.wire.pushes import AnyPush
 from vram_arbiter.schemas.wire.replies import ReattachReply, WelcomeReply
@@ -143,7 +143,7 @@ class Connection:
     def request(
         self,
         op: str,
-        fields: Mapping[str, Any],
+        fields: JsonMap,
         now: float,
         *,
         timeout_s: float = REQUEST_TIMEOUT_S,

@@ -16,7 +16,6 @@ from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S, Connect
 from vram_arbiter.clients._protocol.records import (
     Gone,
     LeaseRecord,
-    Message,
     OnError,
     OnReply,
     Resized,
@@ -24,7 +23,7 @@ from vram_arbiter.clients._protocol.records import (
     RevokeAsked,
     error_of,
     token_of,
-)  # fmt: skip
+)
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
@@ -33,6 +32,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
     WaitTimeout,
 )
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.pushes import LostPush, RevokePush
 from vram_arbiter.schemas.wire.replies import (

@@ -14,8 +14,9 @@ from collections.abc import Iterator
 from vram_arbiter.clients._protocol.connection import Connection
 from vram_arbiter.clients._protocol.foreign_uses import ForeignUses
 from vram_arbiter.clients._protocol.leases import Holdings
-from vram_arbiter.clients._protocol.records import HistoryEvent, Message, error_of
+from vram_arbiter.clients._protocol.records import HistoryEvent, error_of
 from vram_arbiter.clients._protocol.waits import Waits
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.pushes import (
     AnyPush,

@@ -2,20 +2,19 @@
 uses. Plain data.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError, from_wire
 from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.pushes import RevokePush
 from vram_arbiter.schemas.wire.views import LeaseView
 
-Message = dict[str, Any]
 TokenPair = tuple[int, int]
 OnReply = Callable[[AnyReply, float], None]
 OnError = Callable[[VramError, float], None]
@@ -143,7 +142,7 @@ class UseLost:
 
 @dataclass(frozen=True, slots=True)
 class HistoryEvent:
-    event: Mapping[str, Any]
+    event: JsonMap
 
 
 Event = (

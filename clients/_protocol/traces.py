@@ -5,9 +5,10 @@ the import.
 """
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+
+from vram_arbiter.schemas.plain import JsonMap, Message
 
 
 def present() -> str | None:
@@ -19,7 +20,7 @@ def present() -> str | None:
     return tracing.traceparent()
 
 
-def along(fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def along(fields: JsonMap | None = None) -> Message:
     """The fields of a message, with the present span's traceparent where there is one."""
     sent = dict(fields or {})
     if (traceparent := present()) is not None:

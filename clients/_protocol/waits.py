@@ -9,8 +9,7 @@ After a reconnect the same acquire is sent again, with the time that is left.
 The module must not know what becomes of a lease once it is granted.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S, Connection
 from vram_arbiter.clients._protocol.leases import Holdings, waited_in_vain
@@ -22,6 +21,7 @@ from vram_arbiter.clients._protocol.records import (
     token_of,
 )
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.views import LeaseView
@@ -42,7 +42,7 @@ class Waits:
     def acquire(
         self,
         nonce: str,
-        spec: Mapping[str, Any],
+        spec: JsonMap,
         now: float,
         *,
         wait_timeout_s: float | None = None,

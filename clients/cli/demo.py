@@ -37,6 +37,7 @@ from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
@@ -65,8 +66,8 @@ class Watch:
 
     start_s: float
     wall_offset_s: float  # wall clock minus monotonic clock
-    events: list[dict[str, Any]] = field(default_factory=list)
-    samples: list[tuple[float, Mapping[str, Any]]] = field(default_factory=list)
+    events: list[JsonObject] = field(default_factory=list)
+    samples: list[tuple[float, JsonMap]] = field(default_factory=list)
     capacity_bytes: int = 0
 
 
@@ -119,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if (summary["completed"] and not oom if arbiter else oom) else 1
 
 
-async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> dict[str, Any]:
+async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> JsonObject:
     shutil.rmtree(out, ignore_errors=True)
     (out / "logs").mkdir(parents=True)
     runtime = Path(
@@ -140,7 +141,7 @@ async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> dict[str, Any]
 
 async def _episode(
     programs: Programs, runtime: Path, *, seed: int, arbiter: bool, gpu: str, out: Path
-) -> dict[str, Any]:
+) -> JsonObject:
     card = runtime / "fakegpu"
     if gpu.startswith("fake:"):
         _make_card(card, parse_bytes(gpu.removeprefix("fake:")))

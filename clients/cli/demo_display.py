@@ -7,9 +7,8 @@ requests.
 
 import sys
 from collections import deque
-from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -17,6 +16,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.units import format_bytes
 
@@ -28,7 +28,7 @@ QUIET_KINDS = frozenset(
 COLOURS = {"detector": "red", "scene-vlm": "blue", "grab": "green"}
 
 
-def describe(event: Mapping[str, Any]) -> str:
+def describe(event: JsonMap) -> str:
     """One history event as a sentence, without its time."""
     who = str(event.get("consumer", event.get("lease_id", "")))
     match event["kind"]:
@@ -83,7 +83,7 @@ class Display:
         if self._live is None:
             self._console.print(text, markup=False, highlight=False)
 
-    def event(self, event: Mapping[str, Any], at_s: float) -> None:
+    def event(self, event: JsonMap, at_s: float) -> None:
         """A history event of the arbiter, `at_s` seconds after the start."""
         if event["kind"] not in QUIET_KINDS:
             self.say(f"{at_s:6.1f} s  {describe(event)}")
@@ -96,7 +96,7 @@ class Display:
             if self._live is None:
                 self._console.print(f"{at_s:6.1f} s  robot: {line}", markup=False, highlight=False)
 
-    def show(self, status: Mapping[str, Any] | None) -> None:
+    def show(self, status: JsonMap | None) -> None:
         """Redraw from the arbiter's status (None: there is no arbiter)."""
         if self._live is None:
             return
@@ -112,7 +112,7 @@ class Display:
         self._live.update(Panel(Group(*parts), title=title))
 
 
-def _bar(gpu: Mapping[str, Any], leases: list[Mapping[str, Any]]) -> Text:
+def _bar(gpu: JsonMap, leases: list[JsonMap]) -> Text:
     capacity = gpu["capacity_bytes"]
     bar = Text("card ")
     cells = 0
@@ -130,7 +130,7 @@ def _bar(gpu: Mapping[str, Any], leases: list[Mapping[str, Any]]) -> Text:
     return bar
 
 
-def _table(leases: list[Mapping[str, Any]]) -> Table:
+def _table(leases: list[JsonMap]) -> Table:
     table = Table("consumer", "state", "charged", "uses", "since", expand=False)
     for lease in leases:
         table.add_row(

@@ -8,9 +8,9 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.units import format_bytes
 
 SPLIT = ("wait_ms", "drain_ms", "unload_ms", "verify_ms", "load_ms", "total_ms")
@@ -39,7 +39,8 @@ class CardStory:
 
 def read_log(text: str, names: Mapping[int, str]) -> CardStory:
     """Story of a simulated card from its allocation log; `names` says which pid is which program.
-    Torn lines are skipped."""
+    Any other process, such as a sidecar's model, has the name that it gave itself. Torn lines are
+    skipped."""
     points: list[Point] = []
     refused: list[float] = []
     peak = 0
@@ -48,11 +49,8 @@ def read_log(text: str, names: Mapping[int, str]) -> CardStory:
             entry = json.loads(line)
         except ValueError:
             continue
-        points.append(
-            Point(
-                entry["t"], names.get(entry["pid"], f"pid {entry['pid']}"), entry["process_bytes"]
-            )
-        )
+        name = names.get(entry["pid"]) or entry.get("name") or f"pid {entry['pid']}"
+        points.append(Point(entry["t"], name, entry["process_bytes"]))
         peak = max(peak, entry["used_after"])
         if entry["op"] == "oom":
             refused.append(entry["t"])
@@ -60,9 +58,9 @@ def read_log(text: str, names: Mapping[int, str]) -> CardStory:
 
 
 def read_samples(
-    samples: Sequence[tuple[float, Mapping[str, Any]]],
+    samples: Sequence[tuple[float, JsonMap]],
     names: Mapping[int, str],
-    events: Iterable[Mapping[str, Any]],
+    events: Iterable[JsonMap],
     wall_offset_s: float,
 ) -> CardStory:
     """The same for a real card, from `status` readings of the arbiter: (monotonic seconds,
@@ -85,9 +83,9 @@ def read_samples(
 
 def summarise(
     *, seed: int, arbiter: bool, task: str, story: CardStory, capacity_bytes: int,
-    events: Sequence[Mapping[str, Any]],
-    reasoner: Mapping[str, Any], truth: Mapping[str, Any], target: str, seconds: float,
-) -> dict[str, Any]:  # fmt: skip
+    events: Sequence[JsonMap],
+    reasoner: JsonMap, truth: JsonMap, target: str, seconds: float,
+) -> JsonObject:  # fmt: skip
     """The demo's outcome. `completed` needs three witnesses: the simulator, the scene VLM and the
     reasoner."""
     switches = [event for event in events if event["kind"] == "switch"]
@@ -128,7 +126,7 @@ def draw_timeline(
     path: Path,
     story: CardStory,
     capacity_bytes: int,
-    events: Sequence[Mapping[str, Any]],
+    events: Sequence[JsonMap],
     *,
     start_s: float,
     wall_offset_s: float,

@@ -11,6 +11,7 @@ import vram_arbiter
 from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.replies import NO, OK, UNREACHABLE
 from vram_arbiter.clients.net import request
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.version import version
@@ -122,7 +123,7 @@ def _arbiter(endpoint: str) -> tuple[bool, list[Finding]]:
     return True, about + [_card(gpu) for gpu in status["gpus"]]
 
 
-def _card(gpu: dict[str, Any]) -> Finding:
+def _card(gpu: JsonObject) -> Finding:
     what = f"gpu {gpu['index']}"
     if gpu["measured_used_bytes"] is None:
         return Finding(

@@ -10,14 +10,14 @@ import datetime
 import json
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.clients.cli import arguments, text
 from vram_arbiter.clients.cli.replies import ENVELOPE, answer
 from vram_arbiter.clients.net import request
-from vram_arbiter.clients.net.request import Message
+from vram_arbiter.schemas.plain import JsonMap, Message
 
 LIMIT = 50
 PAGE = 2000  # events in one reply; more would not fit a message
@@ -109,7 +109,7 @@ class Wanted:
     limit: int = LIMIT
     after: int | None = None
 
-    def keeps(self, event: Mapping[str, Any]) -> bool:
+    def keeps(self, event: JsonMap) -> bool:
         """Also what was done to others for a consumer's sake is about it."""
         about = (event.get("consumer"), event.get("wanted_by"))
         return (
@@ -125,7 +125,7 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
     def shown(reply: Message) -> list[str]:
         return [text.event_line(event) for event in reply["events"]]
 
-    def question(op: str, fields: Mapping[str, Any], where: str | None) -> Message:
+    def question(op: str, fields: JsonMap, where: str | None) -> Message:
         return collect(wanted, where)
 
     hidden = ENVELOPE | {"epoch"}
@@ -208,7 +208,7 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
     """
     from vram_arbiter.clients.client import AsyncClient
 
-    def tell(event: Mapping[str, Any]) -> None:
+    def tell(event: JsonMap) -> None:
         if wanted.keeps(event):
             print(json.dumps(event) if as_json else text.event_line(event), flush=True)
 

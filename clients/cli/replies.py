@@ -5,7 +5,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 from vram_arbiter.clients.cli import text
-from vram_arbiter.clients.net.request import Message, Unreachable, ask
+from vram_arbiter.clients.net.request import Unreachable, ask
+from vram_arbiter.schemas.plain import Message
 
 OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
 """Exit codes: done; refused or an error; wrong usage; the arbiter cannot be reached."""

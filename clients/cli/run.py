@@ -29,12 +29,14 @@ from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes, parse_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import checked_spec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -136,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
         args.grace,
     )
     try:
-        lease_spec(spec)
+        checked_spec(to_map(lease_spec(spec)))
     except ValidationError as error:
         problem = error.errors()[0]
         option = "--gpu" if problem["loc"] == ("gpu",) else "--name"

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.cli.arguments import add_endpoint, add_json
 from vram_arbiter.clients.cli.replies import answer
-from vram_arbiter.clients.net.request import Message, ask
+from vram_arbiter.clients.net.request import ask
+from vram_arbiter.schemas.plain import Message
 
 DESCRIPTIONS = {"status": "Show GPUs, leases and the queue."}
 

@@ -9,10 +9,10 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.printable import makes_printable, printable
 from vram_arbiter.schemas.sizes import format_bytes
 
-Message = Mapping[str, Any]
 _COLUMNS = (
     "LEASE",
     "CONSUMER",
@@ -51,7 +51,7 @@ def plural(count: int, word: str) -> str:
 
 # -- status
 @makes_printable
-def status_lines(status: Message) -> list[str]:
+def status_lines(status: JsonMap) -> list[str]:
     """Return the arbiter, each GPU with its other processes, and all leases: residents, then the
     queue."""
     lines = [
@@ -81,7 +81,7 @@ def status_lines(status: Message) -> list[str]:
     )
 
 
-def _gpu_lines(gpu: Message) -> list[str]:
+def _gpu_lines(gpu: JsonMap) -> list[str]:
     size, known = format_bytes, gpu["measured_used_bytes"] is not None
     room = (
         gpu["capacity_bytes"] - gpu["reserve_bytes"] - gpu["charged_bytes"] - gpu["stowaway_bytes"]
@@ -114,7 +114,7 @@ def _gpu_lines(gpu: Message) -> list[str]:
     return lines
 
 
-def _lease_row(lease: Message, indices: Mapping[str, str]) -> tuple[str, ...]:
+def _lease_row(lease: JsonMap, indices: Mapping[str, str]) -> tuple[str, ...]:
     state = lease["state"]
     if "position" in lease:
         state = f"{state} #{lease['position']}"
@@ -137,7 +137,7 @@ def _lease_row(lease: Message, indices: Mapping[str, str]) -> tuple[str, ...]:
     )
 
 
-def _since_s(lease: Message) -> float:
+def _since_s(lease: JsonMap) -> float:
     """Since the grant of a lease with bytes on a GPU; otherwise since it waits, or since
     it left."""
     if lease["state"] in ("queued", "standby", "parked"):
@@ -167,7 +167,7 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 # -- why
 @makes_printable
-def why_lines(why: Message) -> list[str]:
+def why_lines(why: JsonMap) -> list[str]:
     """Return what blocks a consumer: leases, bytes, conditions, what happens next and when."""
     if not why["leases"]:
         name = why["consumer"]
@@ -181,7 +181,7 @@ def why_lines(why: Message) -> list[str]:
     return lines
 
 
-def _why_details(lease: Message) -> list[str]:
+def _why_details(lease: JsonMap) -> list[str]:
     size = format_bytes
     lines = [
         f"  lease     {lease['lease_id']}, {lease['state']}",
@@ -202,16 +202,15 @@ def _why_details(lease: Message) -> list[str]:
     lines.append(f"  next      {lease['next']}")
     lines += [f"  then      {step['text']}" for step in lease.get("plan", ())]
     eta = lease["eta_s"]
-    lines.append(
-        "  expected  "
-        f"{'unknown, never seen before' if eta is None else f'in {duration(eta)} ({lease["eta_source"]})'}"
-    )
-    return lines
+    expected = "unknown, never seen before"
+    if eta is not None:
+        expected = f"in {duration(eta)} ({lease['eta_source']})"
+    return [*lines, f"  expected  {expected}"]
 
 
 # -- by hand
 @makes_printable
-def by_hand_lines(action: str, reply: Message) -> list[str]:
+def by_hand_lines(action: str, reply: JsonMap) -> list[str]:
     """What an operator's action did, and what happens next."""
     if "drained" in reply:
         return [
@@ -234,7 +233,7 @@ def by_hand_lines(action: str, reply: Message) -> list[str]:
     ]
 
 
-def _footprint_lines(footprint: Message | None) -> list[str]:
+def _footprint_lines(footprint: JsonMap | None) -> list[str]:
     """Declared and measured bytes per part; nothing before anything was measured."""
     if footprint is None or not any(footprint["learnt_bytes"].values()):
         return []
@@ -248,7 +247,7 @@ def _footprint_lines(footprint: Message | None) -> list[str]:
 
 
 # -- events
-def event_line(event: Message) -> str:
+def event_line(event: JsonMap) -> str:
     """One history event: local date and time, kind, consumer and lease, reason, and its other plain
     fields."""
     at = event["at_wall_s"]
@@ -287,7 +286,7 @@ def _seconds(seconds: float) -> str:
     return f"{seconds * 1e3:.1f}ms" if abs(seconds) < 1 else f"{seconds:.1f}s"
 
 
-def error_line(error: Message) -> str:
+def error_line(error: JsonMap) -> str:
     """`message (hint)` of a typed error."""
     hint = f" ({error['hint']})" if error.get("hint") else ""
     return printable(f"vramctl: {error['message']}{hint}")

@@ -6,13 +6,13 @@ import asyncio
 import contextlib
 import sys
 from collections import deque
-from typing import Any
 
 from vram_arbiter.clients.cli import arguments, text
 from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.request import TIMEOUT_S
 from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.plain import JsonObject
 
 REFRESH_S = 0.5
 """Between two readings of the status; every event refreshes at once as well."""
@@ -59,7 +59,7 @@ async def _live(client: AsyncClient, events_shown: int) -> None:
     from rich.live import Live
     from rich.text import Text
 
-    newest: deque[dict[str, Any]] = deque(maxlen=max(1, events_shown))
+    newest: deque[JsonObject] = deque(maxlen=max(1, events_shown))
     changed = asyncio.Event()
 
     async def follow() -> None:

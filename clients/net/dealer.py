@@ -8,7 +8,7 @@ where heartbeats would take seconds. The module must not know what messages mean
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import anyio
 import anyio.lowlevel
@@ -18,6 +18,7 @@ import zmq
 from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.clients.net.link import Link
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.trust import Program
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ class Dealer:
     def __init__(
         self,
         endpoint: str,
-        received: Callable[[dict[str, Any]], None],
+        received: Callable[[Message], None],
         hung_up: Callable[[], None],
         refused: Callable[[VramError], None],
         *,
@@ -54,7 +55,7 @@ class Dealer:
         self._link: Link | None = None  # while it is open
         self._reading: anyio.CancelScope | None = None  # while the reader waits
 
-    def send(self, message: dict[str, Any]) -> bool:
+    def send(self, message: Message) -> bool:
         """Queue one message. False: the queue is full, the server does not read."""
         payload = pack(message)
         if self._link is None or self._link.state != "open":
@@ -146,7 +147,7 @@ class Dealer:
                 self._hand_on(message)
         return True
 
-    def _hand_on(self, message: dict[str, Any]) -> None:
+    def _hand_on(self, message: Message) -> None:
         try:
             self._received(message)
         except Exception:

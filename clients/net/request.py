@@ -7,12 +7,12 @@ Operators type `vramctl status` often and scripts poll it; a test checks the imp
 import contextlib
 import os
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.schemas.defaults import WIRE_VERSION
 from vram_arbiter.schemas.errors import UntrustedServer, VramError
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ HANGS = (
     "VRAM_ARBITER_ENDPOINT"
 )
 
-Message = dict[str, Any]
-
 
 class Unreachable(Exception):
     """No arbiter answers that may be believed; the text says where, `hint` what to do, `code` is
@@ -45,7 +43,7 @@ class Unreachable(Exception):
 
 def ask(
     op: str,
-    fields: Mapping[str, Any],
+    fields: JsonMap,
     endpoint: str | None = None,
     timeout_s: float = TIMEOUT_S,
     role: str = "observer",

@@ -6,15 +6,13 @@ module must not know what requests and replies mean.
 
 import asyncio
 import itertools
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.dealer import Dealer
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.trust import Program
-
-Message = dict[str, Any]
 
 
 class RpcClient:
@@ -40,7 +38,7 @@ class RpcClient:
         self._dealer: Dealer | None = None
         self._running: asyncio.Task[None] | None = None
 
-    async def exchange(self, request: Mapping[str, Any], timeout_s: float) -> Message:
+    async def exchange(self, request: JsonMap, timeout_s: float) -> Message:
         """Return the reply to a request, which gets an `id` here.
 
         Raises: TimeoutError; UntrustedServer before anything is sent; the error of `lost`.

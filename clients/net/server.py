@@ -14,11 +14,12 @@ import os
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
 from vram_arbiter.schemas.errors import LimitExceeded, MessageTooLarge, VramError
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.connection import Connection, Limits
 from vram_arbiter.schemas.runtime.endpoints import socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
@@ -28,7 +29,6 @@ from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 log = logging.getLogger(__name__)
 
-Message = dict[str, Any]
 REASON_MAX_CHARS = 500
 ENVELOPE_MAX_BYTES = 64 * 1024
 IMAGES_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + ENVELOPE_MAX_BYTES

@@ -10,7 +10,7 @@ program started is used and left running. No failure here reads as an answer: *e
 import asyncio
 import contextlib
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from time import monotonic
 from typing import Any, Self, cast
 
@@ -18,9 +18,8 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.sidecar.spawn import Child, SpawnSpec
 from vram_arbiter.schemas.errors import ModelError, SidecarUnavailable, VramError, from_wire
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.sidecar import LoadResult, PingResult
-
-Message = dict[str, Any]
 
 CALL_TIMEOUT_S = 180.0  # a cold load of a large model; the field's clients wait as long
 CONNECT_TIMEOUT_S = 10.0  # for a sidecar that another program starts
@@ -91,7 +90,7 @@ class SidecarClient:
     async def call(
         self,
         op: str,
-        fields: Mapping[str, Any] | None = None,
+        fields: JsonMap | None = None,
         *,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
@@ -179,8 +178,10 @@ class SidecarClient:
         that lives and is silent is waited for: it still boots, or is dying, and then it is
         replaced.
         """
-        started = self.child is None or not self.child.alive
-        child = self.child = Child(spec) if self.child is None or started else self.child
+        if self.child is not None and not self.child.alive:
+            await self._bury()
+        started = self.child is None
+        child = self.child = self.child or Child(spec)
         exited = asyncio.create_task(child.exited.wait())
         answered: asyncio.Task[bool] | None = None
         loop = asyncio.get_running_loop()
@@ -230,7 +231,7 @@ class SidecarClient:
             await child.end(0.0)
 
     # -- steps: one exchange
-    async def _exchange(self, op: str, fields: Mapping[str, Any], timeout_s: float) -> Any:
+    async def _exchange(self, op: str, fields: JsonMap, timeout_s: float) -> Any:
         try:
             reply = await self._rpc.exchange({self.family: op, **fields}, timeout_s)
         except TimeoutError:

@@ -1,12 +1,12 @@
 """Client of a policy sidecar (endpoint family): load, reset, get_action. Arrays travel as .npy
 (`clients.sidecar.npy`)."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.plain import JsonMap, Message
 
 
 class PolicyClient(SidecarClient):
@@ -17,11 +17,11 @@ class PolicyClient(SidecarClient):
 
     async def reset(
         self,
-        data: Mapping[str, Any] | None = None,
+        data: JsonMap | None = None,
         *,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
-    ) -> dict[str, Any]:
+    ) -> Message:
         """Forget the episode so far. Raises Evicted, NotResident, SidecarUnavailable."""
         fields = {"data": npy.pack(dict(data or {}))}
         result = await self.call("reset", fields, token=token, timeout_s=timeout_s)
@@ -29,12 +29,12 @@ class PolicyClient(SidecarClient):
 
     async def get_action(
         self,
-        observation: Mapping[str, Any],
+        observation: JsonMap,
         *,
-        options: Mapping[str, Any] | None = None,
+        options: JsonMap | None = None,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
-    ) -> dict[str, Any]:
+    ) -> Message:
         """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`.
 
         Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory,
