@@ -8,10 +8,10 @@ import argparse
 import asyncio
 import contextlib
 import importlib.util
-import logging
 import os
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from vram_arbiter.clients import cuda
@@ -28,10 +28,10 @@ from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
-from vram_arbiter.sidecars.adapters.base import ModelAdapter
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
-from vram_arbiter.sidecars.device.memory import DeviceMemory, NoDevice
+from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.model_process import ENVIRONMENT
 from vram_arbiter.sidecars.settings import (
     NICE,
     REQUEST_TIMEOUT_S,
@@ -45,15 +45,6 @@ from vram_arbiter.sidecars.settings import (
 from vram_arbiter.sidecars.weights import Weights, cached
 
 FOOTPRINTS = "models/footprints.yaml"
-# settings of the model libraries, before they are imported: progress bars, telemetry
-_ENVIRONMENT = {
-    "HF_HUB_DISABLE_PROGRESS_BARS": "1",
-    "HF_HUB_DISABLE_TELEMETRY": "1",
-    "TOKENIZERS_PARALLELISM": "false",
-}
-
-
-AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 
 
 @terminal.program
@@ -72,7 +63,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     try:
         settings = settings_from(flags)
         adapter = adapter_for(settings.manifest, settings.weights)
-        for name, value in _ENVIRONMENT.items():
+        for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
         if flags.check:
             found = compare_weights(settings.manifest, settings.weights, adapter_for)
@@ -88,14 +79,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         with command(
             service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}
         ):
-            finished = asyncio.run(SidecarHost(settings, adapter, open_memory(settings)).serve())
-        if not finished:
-            logging.shutdown()
-            os._exit(
-                0
-                # the interpreter would wait for an import of many seconds that is not needed any
-                # more
-            )
+            with _temporary_files_in(os.path.dirname(path_of(settings.endpoint))):
+                asyncio.run(SidecarHost(settings, adapter_for).serve())
     except (VramError, ManifestError) as error:
         terminal.complain("vram-sidecar", error)
         wrong = (
@@ -105,6 +90,18 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         )
         return 2 if isinstance(error, wrong) else 1
     return 0
+
+
+@contextlib.contextmanager
+def _temporary_files_in(folder: str) -> Iterator[None]:
+    """Let the socket of the imports' server lie beside the sidecar's own (`model_process`): a
+    killed program leaves nothing in the machine's temporary folder."""
+    before = tempfile.tempdir
+    tempfile.tempdir = folder
+    try:
+        yield
+    finally:
+        tempfile.tempdir = before
 
 
 def _need_packages(manifest: RSkillManifest) -> None:
@@ -179,21 +176,6 @@ def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: Ada
         except ImportError as error:
             raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
     return "the weights hold the whole model"
-
-
-def open_memory(settings: Settings) -> DeviceMemory:
-    """Open the device of the settings. Raises NoGpu or ConfigError."""
-    if settings.device == "none":
-        return NoDevice()
-    if settings.device.startswith("fake:"):
-        from vram_arbiter.sidecars.device.fake import FakeMemory
-
-        folder = Path(settings.device.removeprefix("fake:"))
-        return FakeMemory(folder, settings.name, settings.footprint.residue_bytes)
-    from vram_arbiter.sidecars.device.cuda import CudaMemory
-
-    index = settings.device.partition(":")[2]
-    return CudaMemory(int(index) if index else None, settings.footprint.residue_bytes)
 
 
 def _device(text: str | None) -> str:
@@ -298,8 +280,8 @@ def _parser() -> argparse.ArgumentParser:
         "--request-timeout-s",
         type=_number(float, 0.1, 86_400),
         default=REQUEST_TIMEOUT_S,
-        help="limit of one request's work in the model: longer work is stuck, and the sidecar ends "
-        "with 1; default %(default)s",
+        help="limit of one request's work in the model: longer work is stuck, and its process "
+        "is ended; default %(default)s",
     )
     add(
         "--idle-release-s",
@@ -318,7 +300,7 @@ def _parser() -> argparse.ArgumentParser:
         "--nice",
         type=_number(int, 0, 19),
         default=NICE,
-        help="nice value of the thread that loads and runs the model; default %(default)s",
+        help="nice value of the process that loads and runs the model; default %(default)s",
     )
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")

@@ -10,10 +10,14 @@ import contextlib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.sidecars.weights import Weights, from_pretrained, is_quantized
+
+if TYPE_CHECKING:
+    from lerobot.configs import PolicyFeature
+    from torch import Tensor
 
 META = "meta"
 NAMES_SHOWN = 4
@@ -117,7 +121,7 @@ def _load_recorded(cls: Any, weights: Weights, config: Any, record: "_Record") -
     return model.eval()
 
 
-def need_statistics(pipeline: Any, features: Mapping[str, Any], source: str) -> None:
+def need_statistics(pipeline: Any, features: "Mapping[str, PolicyFeature]", source: str) -> None:
     """Raise ModelError if a processor lacks the statistics of one of `features`.
 
     lerobot's processor then leaves the feature unchanged, in other units.
@@ -158,7 +162,7 @@ class _Record:
         """Note a failed load, which concerns the checkpoint and not only building without bytes."""
         return self.built and (not self._compared or self._found != Differences())
 
-    def compare(self, own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    def compare(self, own: "Mapping[str, Tensor]", given: "Mapping[str, Tensor]") -> None:
         """Compare a state dict before it is copied.
 
         Raises ModelError for defects that no further part of the checkpoint can repair.
@@ -206,7 +210,7 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
             record.built = True
 
         def load_state_dict(
-            self, state_dict: Mapping[str, Any], *arguments: Any, **options: Any
+            self, state_dict: "Mapping[str, Tensor]", *arguments: Any, **options: Any
         ) -> Any:
             record.compare(self.state_dict(keep_vars=True), state_dict)
             with _silence():

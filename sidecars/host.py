@@ -1,8 +1,7 @@
 """Host of one sidecar: a socket, a model, a lease. Starts the parts and stops them in order.
 
 `prepare` runs from the start; `load` waits for the first request (or runs at once without an
-arbiter). Everything that blocks runs in the worker's thread, so `ping` and `revoke` are answered
-meanwhile.
+arbiter). The model lives in another process, so `ping` and `revoke` are answered whatever it does.
 """
 
 import asyncio
@@ -10,21 +9,20 @@ import contextlib
 import logging
 import os
 import signal
-from typing import Any, NoReturn
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import RouterServer
-from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.errors import NoGpu, VramError
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.sidecar import EndpointCall
-from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
-from vram_arbiter.sidecars.device.memory import DeviceMemory
+from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.model_process import ModelProcesses
 from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.wires import Wire, error_reply
-from vram_arbiter.sidecars.worker import Worker
 
-LAST_WORDS_S = 0.5  # until the last answers are with the kernel
 _log = logging.getLogger("sidecars")
 
 # share of the time for the socket: a flood leaves the model's thread the interpreter
@@ -37,27 +35,26 @@ class SidecarHost:
     Then it finishes the op in progress, unloads, releases and returns.
     """
 
-    def __init__(self, settings: Settings, adapter: ModelAdapter, memory: DeviceMemory) -> None:
+    def __init__(self, settings: Settings, adapter_for: AdapterFor) -> None:
         self._settings = settings
-        self._adapter = adapter
-        self._memory = memory
+        self._adapter = adapter_for(settings.manifest, settings.weights)
+        self._processes = ModelProcesses(settings, adapter_for)
         self._stopping = asyncio.Event()
         self._residency: Residency | None = None
+        self._refused: NoGpu | None = None
         self._boot_id = procfs.boot_id()
 
-    async def serve(self) -> bool:
+    async def serve(self) -> None:
         """Serve until the end.
 
-        Returns False if the worker's thread is still importing: the process should not wait for
-        that. Raises AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is
+        Raises NoGpu, AlreadyRunning, ConfigError, ArbiterUnreachable at the start; later trouble is
         answered on the wire.
         """
-        settings, worker = self._settings, Worker(self._settings.nice)
+        settings = self._settings
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
         async with contextlib.AsyncExitStack() as stack:
-            stack.callback(worker.close)
             client = None
             if settings.arbiter is not None:
                 client = await stack.enter_async_context(
@@ -66,13 +63,15 @@ class SidecarHost:
             server = await stack.enter_async_context(
                 RouterServer(settings.endpoint, error_reply, work_share=WORK_SHARE)
             )
-            residency = self._residency = Residency(
-                settings, self._adapter, self._memory, worker, client
-            )
+            self._processes.preload(self._adapter.modules)
+            residency = self._residency = Residency(settings, self._processes.start, client)
             background = [
                 asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")
             ]
             residency.prepare()
+            background.append(
+                asyncio.create_task(self._stop_without_gpu(residency), name="prepare")
+            )
             if client is None:
                 background.append(asyncio.create_task(self._load_at_start(residency), name="load"))
             elif settings.idle_release_s is not None:
@@ -85,39 +84,29 @@ class SidecarHost:
                 "%s serves %s on %s", settings.name, settings.manifest.name, settings.endpoint
             )
             stopped = asyncio.create_task(self._stopping.wait(), name="stopped")
-            stuck = asyncio.create_task(worker.stuck.wait(), name="stuck")
             try:
-                await asyncio.wait(
-                    [stopped, stuck, background[0]], return_when=asyncio.FIRST_COMPLETED
-                )
+                await asyncio.wait([stopped, background[0]], return_when=asyncio.FIRST_COMPLETED)
             finally:
                 stopped.cancel()
-                leaving = asyncio.create_task(residency.leave(), name="leave")
-                await asyncio.wait([leaving, stuck], return_when=asyncio.FIRST_COMPLETED)
-                if worker.stuck.is_set():
-                    await self._end_at_once()
-                stuck.cancel()
-                finished = await leaving
+                await residency.leave()
                 for task in background:
                     task.cancel()
                 outcomes = await asyncio.gather(*background, return_exceptions=True)
+            if self._refused is not None:
+                raise self._refused
             if isinstance(outcomes[0], Exception):
                 raise outcomes[0]
         _log.info("%s has ended", settings.name)
-        return finished
 
-    @staticmethod
-    async def _end_at_once() -> NoReturn:
-        """End a sidecar with a hanging model thread: the thread can neither be ended nor asked to
-        unload.
-
-        Only the end of the process frees the lease and its bytes; systemd, or the next request,
-        starts another.
-        """
-        _log.critical("the model is stuck: ending, so that its lease and its memory are freed")
-        await asyncio.sleep(LAST_WORDS_S)
-        logging.shutdown()
-        os._exit(1)
+    async def _stop_without_gpu(self, residency: Residency) -> None:
+        """End a sidecar whose device is not there; any other trouble is answered on the wire."""
+        try:
+            await residency.prepared()
+        except NoGpu as error:
+            self._refused = error
+            self.stop()
+        except VramError as error:
+            _log.error("preparing failed: %s", error)
 
     @staticmethod
     async def _load_at_start(residency: Residency) -> None:
@@ -134,7 +123,7 @@ class SidecarHost:
     def stop(self) -> None:
         self._stopping.set()
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Message:
         residency, settings = self._here, self._settings
         token = residency.token()
         found = {
@@ -161,7 +150,7 @@ class SidecarHost:
             found["last_error"] = f"{residency.last_error.code}: {residency.last_error.message}"
         return found
 
-    async def load(self, timeout_s: float | None) -> dict[str, Any]:
+    async def load(self, timeout_s: float | None) -> Message:
         residency = self._here
         loaded = await residency.load(timeout_s)
         lease = residency.lease
@@ -175,16 +164,17 @@ class SidecarHost:
     async def unload(self) -> None:
         await self._here.unload()
 
-    async def run(self, name: str, call: ModelCall) -> dict[str, Any]:
+    async def run(self, name: str, call: ModelCall, message: Message) -> Message:
         residency = self._here
         if name == "reset" and call.token is None and residency.state != "resident":
             return {
                 "ok": True
             }  # a model that is not resident has nothing to forget, and no reason to load
         fresh_s = None if isinstance(call, EndpointCall) else call.fresh_s
-        return await residency.run(
-            name, call.token, lambda: self._adapter.run(call), fresh_s=fresh_s
-        )
+        answer: Message = (await residency.run(name, call.token, message, fresh_s=fresh_s))[
+            "answer"
+        ]
+        return answer
 
     @property
     def _here(self) -> Residency:

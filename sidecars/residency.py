@@ -1,19 +1,19 @@
 """Residency of one model: acquire, load, use, unload, in step with the lease.
 
 States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model,
-one lease at a time. The lease's own protocol (revoke, quiesce, release, fencing) is the client
-library's, which calls `_unload` when the bytes must go. A lease on standby is unloaded and not
-over: the arbiter grants it again when there is room (`_restore` loads then), and a request calls
-it back as a waiter. Must not know sockets or wires.
+one lease at a time, and one process for each residency (`model_process`), whose end returns all of
+its memory. The lease's own protocol (revoke, quiesce, release, fencing) is the client library's,
+which calls `_unload` when the bytes must go. A lease on standby is unloaded and not over: the
+arbiter grants it again when there is room (`_restore` loads then), and a request calls it back as
+a waiter. Must not know sockets, wires or processes.
 """
 
 import asyncio
 import contextlib
-import gc
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
-from typing import Any, Literal
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from typing import Final, Literal
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
@@ -25,6 +25,7 @@ from vram_arbiter.schemas.errors import (
     LeaseLost,
     LeaseRevoking,
     Loading,
+    ModelError,
     NotResident,
     OutOfMemory,
     SidecarUnavailable,
@@ -33,15 +34,22 @@ from vram_arbiter.schemas.errors import (
     VramError,
     WaitTimeout,
 )
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.sidecars.adapters.base import ModelAdapter
-from vram_arbiter.sidecars.device.memory import Block, DeviceMemory, fill
+from vram_arbiter.sidecars.model_process import Model
 from vram_arbiter.sidecars.settings import Settings
-from vram_arbiter.sidecars.worker import Worker
 
 State = Literal["unloaded", "waiting", "loading", "resident", "unloading"]
+TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
+    "unloaded": frozenset({"waiting", "loading"}),  # loading: its lease came back by itself
+    "waiting": frozenset({"loading", "unloaded"}),
+    "loading": frozenset({"resident", "unloading", "unloaded"}),  # unloaded: its process died
+    "resident": frozenset({"unloading", "unloaded"}),
+    "unloading": frozenset({"unloaded"}),
+}
+"""State → states that may follow."""
 Token = tuple[int, int]
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
 _LEAVING = ("revoking", "unloading")
@@ -57,23 +65,18 @@ class Residency:
     def __init__(
         self,
         settings: Settings,
-        adapter: ModelAdapter,
-        memory: DeviceMemory,
-        worker: Worker,
+        start: Callable[[], Awaitable[Model]],
         client: AsyncClient | None,
     ) -> None:
         self._settings = settings
-        self._adapter = adapter
-        self._memory = memory
-        self._worker = worker
+        self._start = start
         self._client = client
         self._turn = asyncio.Lock()  # one attempt to become resident at a time
-        self._prepared: asyncio.Task[None] | None = None
-        self._bound: str | None = None  # the only GPU that this process can use
-        self._blocks: list[Block] = []
-        # number of loads and unloads, in the worker: an op that was queued before an unload must
-        # not run after it
-        self._loads = 0
+        self._model: Model | None = None  # prepared at least, or being prepared
+        self._prepared: asyncio.Task[Model] | None = None
+        self._unloaded = asyncio.Event()  # the unload in progress is over
+        self._warm = False  # the libraries are imported: a process is prepared in no time
+        self._ending = False
         self._running = 0
         self._last_use_s = time.monotonic()
         self._resident_since_s = self._last_use_s
@@ -81,20 +84,25 @@ class Residency:
         self._unloads = 0  # number of unload requests: earlier waits for the model end
         # the call that brings a standby lease back
         self._calling: asyncio.Task[VramError | None] | None = None
+        self._watching: asyncio.Task[None] | None = None  # the process's end
         self.lease: AsyncLease | None = None
         self.state: State = "unloaded"
         self.last_error: VramError | None = None
 
     # -- what the wire asks
     def prepare(self) -> None:
-        """Begin the host work (imports, processors) that needs no lease. Repeats only after a
-        failure."""
-        if self._prepared is None or (
-            self._prepared.done() and self._prepared.exception() is not None
+        """Begin the work (a process, imports, processors) that needs no lease. Repeats only after a
+        failure, or where the process has died since."""
+        ready = self._prepared
+        if ready is None or (
+            ready.done() and (ready.exception() is not None or ready.result().ended.is_set())
         ):
-            self._prepared = asyncio.create_task(
-                self._worker.run(self._prepare_blocking, abandon=True)
-            )
+            self._prepared = asyncio.create_task(self._make_ready(), name="prepare")
+
+    async def prepared(self) -> None:
+        """Wait for the work that `prepare` began. Raises what ended it."""
+        if self._prepared is not None:
+            await asyncio.shield(self._prepared)
 
     async def load(self, timeout_s: float | None = None) -> bool:
         """Make the model resident; return False if it was.
@@ -131,7 +139,9 @@ class Residency:
         elif self.lease is not None:
             await self.lease.give_up()
         elif self._client is None:
-            async with self._turn:  # a load in progress undoes itself
+            if self.state == "loading":
+                await self._end_model(at_once=True)  # the load undoes itself
+            async with self._turn:
                 if self.state == "resident":
                     await self._unload()
 
@@ -139,20 +149,20 @@ class Residency:
         self,
         label: str,
         token: Token | None,
-        work: Callable[[], dict[str, Any]],
+        call: Message,
         *,
         fresh_s: float | None = None,
-    ) -> dict[str, Any]:
-        """Run one op of the model as a use of the lease.
+    ) -> Message:
+        """Answer one request of the model's wire as a use of the lease.
 
         With a `token` the caller protects the lease by a use of its own: any other token than the
         current one raises Evicted. Without, the model is made resident first, also if it was
         evicted a moment ago. Raises FrameStale when the work could not begin within `fresh_s`: the
         model is resident by then, for a request with a newer picture.
 
-        The use does not outlive the request's time. Work that has not begun by then never does, and
-        its use ends (WaitTimeout). Work that does not end keeps the lease in use: the caller gets
-        ModelError, and the host ends the process.
+        The use does not outlive the request's time. Work that has not begun by then never does
+        (WaitTimeout). Work that does not end is ended with its process, and the lease is released
+        (ModelError).
         """
         came_s = time.monotonic()
         deadline = came_s + self._settings.wait_timeout_s
@@ -161,13 +171,16 @@ class Residency:
                 await self.load(max(0.0, deadline - time.monotonic()))
             else:
                 self._check(token)
-            lease, loads = self.lease, self._loads
+            lease, model = self.lease, self._model
             try:
                 async with self._use(lease, label, handed=token is not None):
-                    return await self._worker.run_for(
-                        lambda: self._guarded(loads, came_s, fresh_s, work),  # noqa: B023
+                    if model is None:
+                        raise self._evicted()
+                    return await model.run(
+                        call,
                         begin_s=max(0.0, deadline - time.monotonic()),
                         end_s=self._settings.request_timeout_s,
+                        begins=lambda: self._begins(model, came_s, fresh_s),  # noqa: B023
                     )
             except _GONE as error:
                 if token is not None:
@@ -192,26 +205,18 @@ class Residency:
         both."""
         return self._turn.locked() or (self._calling is not None and not self._calling.done())
 
-    async def leave(self) -> bool:
-        """End of the process: after the op in progress, free everything, the context included.
-
-        Returns False if imports still run in the worker's thread: nothing was loaded then, and
-        nothing can stop them.
-        """
-        self._worker.stopping.set()
-        if self._prepared is not None and not self._prepared.done():
-            self._prepared.cancel()
-            return False
-        lease = self.lease
-        try:
-            if self.state != "unloaded":
-                await self._unload()
-            await self._worker.run(self._memory.close)
-        except VramError as error:  # e.g. the fake GPU's folder is gone: nothing is left to free
-            _log.warning("leaving: %s", error)
+    async def leave(self) -> None:
+        """End of the program: after the op in progress, free everything."""
+        self._ending = True
+        lease, prepared = self.lease, self._prepared
+        if prepared is not None and not prepared.done():
+            prepared.cancel()
+            await asyncio.wait({prepared})
+        elif prepared is not None and prepared.exception() is None:
+            await prepared.result().end()
+        await self._unload()
         if lease is not None:
             await lease.release(exiting=True)
-        return True
 
     async def release_when_idle(self, idle_s: float) -> None:
         """Release a model that was not used for `idle_s`, at the latest after twice as long.
@@ -245,12 +250,20 @@ class Residency:
             return True
         return any(view.lease_id == self.lease.lease_id and view.uses for view in status.leases)
 
-    def _prepare_blocking(self) -> None:
-        self._adapter.prepare()
-        gc.collect()
-        # a million objects of imported code: each later collection, at every unload, would walk
-        # them
-        gc.freeze()
+    async def _make_ready(self) -> Model:
+        model = await self._start()
+        try:
+            await model.prepare()
+        except BaseException:
+            await model.end(at_once=True)  # also in the middle of its work: it holds nothing yet
+            raise
+        self._warm = True
+        return model
+
+    def _to(self, state: State) -> None:
+        """Go to another state; the only place that writes it."""
+        assert state in TRANSITIONS[self.state], f"{self.state} → {state}"
+        self.state = state
 
     # -- loading
     async def _load_in_turn(self, deadline: float | None) -> bool:
@@ -263,18 +276,20 @@ class Residency:
         if unloads != self._unloads:
             raise self._unwanted()
         self.prepare()
-        self.state = "waiting"
+        self._to("waiting")
         self._obtaining = asyncio.create_task(self._obtain(deadline), name="obtain")
         try:
             lease = await self._obtaining
-            self.state, self.lease = "loading", lease
+            self._to("loading")
+            self.lease = lease
             if unloads != self._unloads:  # an unload came in the moment of the grant
                 if lease is not None:
                     await lease.release()
                 raise self._unwanted()
             await self._load(lease)
         except BaseException as error:
-            self.state = "unloaded"
+            if self.state != "unloaded":
+                self._to("unloaded")
             if (
                 isinstance(error, asyncio.CancelledError)
                 and unloads != self._unloads
@@ -288,7 +303,7 @@ class Residency:
         return True
 
     def _refuse_if_ending(self) -> None:
-        if self._worker.stopping.is_set():
+        if self._ending:
             raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
 
     async def _until_left(self, lease: AsyncLease, deadline: float | None) -> None:
@@ -372,14 +387,15 @@ class Residency:
 
         A load that fails ends the lease; the next request starts a new one.
         """
-        if self._worker.stopping.is_set():
+        if self._ending:
             return  # `leave` releases it
         _log.info("back from standby: loading")
-        self.state = "loading"
+        self._to("loading")
         try:
             await self._load(lease)
         except BaseException as error:
-            self.state = "unloaded"
+            if self.state != "unloaded":
+                self._to("unloaded")
             if not isinstance(error, VramError):
                 raise
             self.last_error = error
@@ -387,25 +403,24 @@ class Residency:
             self.last_error = None
 
     async def _obtain(self, deadline: float | None) -> AsyncLease | None:
-        """Finish the host work, and wait for a lease; `unload` cancels it and leaves the queue.
+        """Wait for a lease; `unload` cancels it and leaves the queue.
 
-        Imports take half a minute and more on a busy machine; the lease is waited for from then on,
-        for the time that was left before.
+        The first imports take half a minute and more on a busy machine; the lease is waited for
+        from then on, for the time that was left before. Later a process is ready in less time than
+        another model needs to leave: it prepares meanwhile.
         """
         assert self._prepared is not None
         wait_s = _left_s(deadline)
-        await asyncio.shield(self._prepared)
+        if not self._warm:
+            await asyncio.shield(self._prepared)
         if self._client is None:
             return None
         if wait_s == 0.0:
             raise WaitTimeout(
                 f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"
             )
-        spec = self._settings.lease_spec()
-        if self._bound is not None:
-            spec = spec.model_copy(update={"gpu": self._bound})
         return await self._client.acquire(
-            spec,
+            self._settings.lease_spec(),
             wait_s,
             unload=self._unload,
             restore=self._restore,
@@ -434,13 +449,16 @@ class Residency:
             return unloads != self._unloads if lease is None else lease.given_up
 
         try:
-            if lease is not None:
-                self._bound = self._memory.bind(lease.gpu)
-            loads = await self._worker.run(self._load_blocking)
-            measured = await self._worker.run(self._memory.used_bytes)
+            self.prepare()
+            assert self._prepared is not None, "it was just begun"
+            model = await asyncio.shield(self._prepared)
+            if given_up() or (lease and lease.state == "gone"):
+                raise self._unwanted()  # before a byte was loaded; the process stays prepared
+            self._model, self._prepared = model, None
+            measured = await model.load("" if lease is None else lease.gpu)
             if lease is not None:
                 await lease.ready(measured)
-            if loads != self._loads or given_up() or (lease is not None and lease.state == "gone"):
+            if model is not self._model or given_up() or (lease and lease.state == "gone"):
                 raise self._unwanted()  # it was unloaded while `ready` was sent
         except BaseException as error:
             await self._take_back(lease, error)
@@ -449,19 +467,20 @@ class Residency:
                 raise self._unwanted() from None
             _log.error("loading failed: %s", error)
             raise
-        model = {telemetry.ATTR_MODEL: self._settings.manifest.name}
-        meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, model)
+        labels = {telemetry.ATTR_MODEL: self._settings.manifest.name}
+        meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
         if measured is not None:
             tracing.note({telemetry.ATTR_BYTES: measured})
         self._last_use_s = self._resident_since_s = time.monotonic()
-        self.state = "resident"
+        self._to("resident")
+        self._watching = asyncio.create_task(self._watch(model, lease), name="watch the model")
         _log.info("resident after %.2f s: %s bytes on the GPU", time.monotonic() - began, measured)
 
     async def _take_back(self, lease: AsyncLease | None, error: BaseException) -> None:
         """Undo a failed load. Whatever else fails in it, the lease ends: it would be renewed for
         ever."""
         try:
-            await self._worker.run(self._unload_blocking)
+            await self._end_model(at_once=True)
             if lease is not None and isinstance(error, OutOfMemory) and not lease.given_up:
                 requested = int(
                     error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
@@ -476,58 +495,49 @@ class Residency:
                 except VramError as refused:
                     _log.warning("the release of %s was refused: %s", lease.lease_id, refused)
 
-    def _load_blocking(self) -> int:
-        """Load in the worker: real weights, then ballast up to the footprint, at the pace of a real
-        load.
-
-        Returns the number of this load or unload.
-        """
-        self._loads += 1
-        loads = self._loads
-        settings, memory = self._settings, self._memory
-        footprint = settings.footprint
-        memory.touch()
-        self._adapter.load(memory.torch_device)
-        used = memory.used_bytes()
-        if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
-            return loads  # a real model has its own bytes
-        paces = [
-            pace for pace in (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s()) if pace
-        ]
-        pace = min(paces, default=None)
-        self._blocks = fill(
-            memory,
-            "weights",
-            footprint.steady_bytes - used,
-            bytes_per_s=pace,
-            wait=self._worker.stopping.wait,
-        )
-        if footprint.load_peak_bytes > footprint.steady_bytes:
-            memory.free(
-                memory.allocate("load peak", footprint.load_peak_bytes - footprint.steady_bytes)
-            )
-            memory.empty_cache()
-        return loads
-
     # -- unloading
     async def _unload(self) -> None:
-        """Unload: called by the lease (revoked, lost, given up) or at the end of the process."""
-        began, self.state = time.monotonic(), "unloading"
+        """Unload: called by the lease (revoked, lost, given up) or at the end of the program."""
+        if self.state == "unloading":
+            await self._unloaded.wait()
+        if self.state not in ("loading", "resident"):
+            return
+        began, loading = time.monotonic(), self.state == "loading"
+        self._to("unloading")
+        self._unloaded.clear()
         try:
             with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
-                await self._worker.run(self._unload_blocking)
+                await self._end_model(at_once=loading)
         finally:
-            self.state = "unloaded"
+            self._to("unloaded")
+            self._unloaded.set()
         _log.info("unloaded in %.2f s", time.monotonic() - began)
+        if self._settings.standby and not self._ending:
+            self.prepare()  # for its return
 
-    def _unload_blocking(self) -> None:
-        self._loads += 1
-        self._adapter.unload()
-        gc.collect()  # models are full of reference cycles, and each keeps its tensors
-        blocks, self._blocks = self._blocks, []
-        for block in blocks:
-            self._memory.free(block)
-        self._memory.empty_cache()
+    async def _end_model(self, *, at_once: bool) -> None:
+        """End the model's process. `at_once`: also in the middle of a load."""
+        model, self._model = self._model, None
+        if model is not None:
+            await model.end(at_once=at_once)
+
+    async def _watch(self, model: Model, lease: AsyncLease | None) -> None:
+        """Release the lease of a model whose process died: its bytes are free."""
+        await model.ended.wait()
+        if model is not self._model:
+            return  # it was ended by this program
+        self._model = None
+        self._to("unloaded")
+        self.last_error = ModelError(
+            f"the process of {self._settings.name} ended while it was resident",
+            hint="the next request loads it again; see the sidecar's log",
+        )
+        _log.error("%s", self.last_error)
+        if lease is not None:
+            try:
+                await lease.release()
+            except VramError as refused:
+                _log.warning("the release of %s was refused: %s", lease.lease_id, refused)
 
     async def _on_lost(self, lease: AsyncLease, error: VramError) -> None:
         self.last_error = error
@@ -559,7 +569,7 @@ class Residency:
         revoked.
 
         Without contact to the arbiter nothing is marked: no lease can be granted then, and an
-        unload waits for the op in the worker's queue in any case.
+        unload waits for the op in progress in any case.
         """
         self._running += 1
         try:
@@ -575,11 +585,9 @@ class Residency:
             self._running -= 1
             self._last_use_s = time.monotonic()
 
-    def _guarded(
-        self, loads: int, came_s: float, fresh_s: float | None, work: Callable[[], dict[str, Any]]
-    ) -> dict[str, Any]:
-        """Check in the worker that no unload came between, and that the picture is not too old."""
-        if loads != self._loads:
+    def _begins(self, model: Model, came_s: float, fresh_s: float | None) -> None:
+        """Check that no unload came between, and that the picture is not too old."""
+        if model is not self._model or self.state != "resident":
             raise self._evicted()
         waited_s = time.monotonic() - came_s
         if fresh_s is not None and waited_s > fresh_s:
@@ -589,7 +597,6 @@ class Residency:
                 hint="ask again about a new one: the model is there now",
                 details={"waited_s": waited_s},
             )
-        return work()
 
 
 def _being_cancelled() -> bool:

@@ -4,7 +4,7 @@ Put together from a manifest, the footprint file and flags.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -14,10 +14,12 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.schemas.yamltext import read_yaml
 from vram_arbiter.sidecars.weights import Weights, resolve
 
+NICE_VARIABLE = "VRAM_ARBITER_SIDECAR_NICE"
+"""Tells the server of imports its nice value (`preload`)."""
 NICE = 5  # a third of the cores' time beside one ordinary program, all of it on idle cores
 WAIT_TIMEOUT_S = 120.0  # wait for the lease of a request without a time limit of its own
 # limit of work in the model; the field's clients wait as long for an answer
@@ -78,12 +80,14 @@ class Settings:
         return self.manifest.weights_revision or self.manifest.version
 
     def lease_spec(self) -> LeaseSpec:
+        """Nothing is retained after an unload: the model's process ends, and its context too."""
+        footprint = replace(self.footprint, residue_bytes=0)
         return LeaseSpec(
             consumer=self.name,
             model_id=self.manifest.name,
             revision=self.revision,
             gpu=self.gpu,
-            footprint=self.footprint,
+            footprint=footprint,
             priority=self.priority,
             evictable=self.evictable,
             min_residency_s=self.min_residency_s,

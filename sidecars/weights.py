@@ -4,15 +4,19 @@
 Must not know devices' bytes or leases.
 """
 
+import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from vram_arbiter.clients.configs import CONFIGS_VARIABLE
 from vram_arbiter.schemas.errors import ConfigError, ModelError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
+from vram_arbiter.schemas.plain import Message
+
+CONFIG_FILE: Final = "config.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,23 @@ def resolve(uri: str, configs: Path) -> Weights:
     return Weights(str(folder), local=True)
 
 
+def model_type(weights: Weights, key: str) -> str:
+    """Return a text of a local checkpoint's `config.json`, such as `model_type`; "" if it has none
+    that a module could be named by."""
+    try:
+        found = json.loads((Path(weights.source) / "config.json").read_text(encoding="utf-8"))
+        named = found.get(key)
+    except (OSError, ValueError, AttributeError):
+        return ""
+    return named if isinstance(named, str) and named.isidentifier() else ""
+
+
+def transformers_modules(weights: Weights) -> tuple[str, ...]:
+    """Return the modules of a transformers model."""
+    kind = model_type(weights, "model_type")
+    return ("torch", "transformers", "PIL.Image", f"transformers.models.{kind}.modeling_{kind}")
+
+
 def cached(weights: Weights) -> Weights | None:
     """Return the local folder of a hub repository in the hub's cache; None if never fetched."""
     from huggingface_hub import snapshot_download
@@ -79,13 +100,39 @@ def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
             type(error).__name__ == "OutOfMemoryError"
         ):  # torch's error, which says more than that the weights are bad
             raise
-        raise ModelError(
-            f"{cls.__name__} cannot load {weights.source}: {type(error).__name__}: {error}",
-            hint="check that it is complete and of the manifest's kind",
-        ) from error
+        raise _unfit(cls, weights, error) from error
 
 
-def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> dict[str, Any]:
+def read_config(cls: Any, weights: Weights) -> Any:
+    """Return a checkpoint's configuration, decoded by a configuration class of lerobot.
+
+    `cls.from_pretrained` does the same through a temporary file that it leaves behind. Raises
+    ModelError.
+    """
+    import draccus
+    from huggingface_hub import hf_hub_download
+
+    try:
+        if weights.local:
+            path = Path(weights.source) / CONFIG_FILE
+        else:
+            path = Path(hf_hub_download(weights.source, CONFIG_FILE, revision=weights.revision))
+        fields = json.loads(path.read_text(encoding="utf-8"))
+        kind = cls.get_choice_class(fields.pop("type"))
+        with draccus.config_type("json"):
+            return draccus.decode(kind, fields)
+    except Exception as error:
+        raise _unfit(cls, weights, error) from error
+
+
+def _unfit(cls: Any, weights: Weights, error: Exception) -> ModelError:
+    return ModelError(
+        f"{cls.__name__} cannot load {weights.source}: {type(error).__name__}: {error}",
+        hint="check that it is complete and of the manifest's kind",
+    )
+
+
+def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> Message:
     """Return options for loading a transformers model onto `device` as in production.
 
     On the CPU: none, float32 as saved. On CUDA: shards go straight to the GPU, one after the other
@@ -102,7 +149,7 @@ def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> di
     import torch
 
     dtype = manifest.quantization.dtype
-    options: dict[str, Any] = {"device_map": {"": device}, "low_cpu_mem_usage": True}
+    options: Message = {"device_map": {"": device}, "low_cpu_mem_usage": True}
     options["dtype"] = {Dtype.FP32: torch.float32, Dtype.FP16: torch.float16}.get(
         dtype, torch.bfloat16
     )
@@ -113,11 +160,23 @@ def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> di
             load_in_4bit=True,
             bnb_4bit_quant_type="nf4",
             bnb_4bit_compute_dtype=torch.bfloat16,
-            llm_int8_skip_modules=list(
-                manifest.quantization.extra.get("skip_modules", ("lm_head", "visual"))
-            ),
+            llm_int8_skip_modules=unquantized_modules(manifest),
         )
     return options
+
+
+def unquantized_modules(manifest: RSkillManifest) -> list[str]:
+    """Return the modules that keep their precision: `quantization.extra.skip_modules`.
+
+    Raises ConfigError for anything but a list of names.
+    """
+    names = manifest.quantization.extra.get("skip_modules", ["lm_head", "visual"])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(
+            f"quantization.extra.skip_modules is {names!r}",
+            hint="give a list of module names, e.g. [lm_head, visual]",
+        )
+    return [str(name) for name in names]
 
 
 def is_quantized(weights: Weights) -> bool:

@@ -6,12 +6,12 @@ ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decide
 
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from vram_arbiter.clients.net.server import Message, Peer
+from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -20,6 +20,7 @@ from vram_arbiter.schemas.errors import (
     UnknownOp,
     VramError,
 )
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
@@ -46,15 +47,17 @@ class Host(Protocol):
     @property
     def model_ops(self) -> frozenset[str]: ...
 
-    def identity(self) -> dict[str, Any]: ...
+    def identity(self) -> Message: ...
 
-    async def load(self, timeout_s: float | None) -> dict[str, Any]: ...
+    async def load(self, timeout_s: float | None) -> Message: ...
 
     async def unload(self) -> None: ...
 
     async def run(
-        self, name: str, call: DetectOp | QueryOp | ScoreOp | EndpointCall
-    ) -> dict[str, Any]: ...
+        self, name: str, call: DetectOp | QueryOp | ScoreOp | EndpointCall, message: Message
+    ) -> Message:
+        """Answer a request of the model; `message` is the call as it came."""
+        ...
 
     def stop(self) -> None: ...
 
@@ -70,7 +73,7 @@ class Wire:
     async def handle(self, peer: Peer, message: Message) -> None:
         try:
             call = parse(message, self._host.model_ops)
-            reply = await self._answer(call)
+            reply = await self._answer(call, message)
         except VramError as error:
             reply = error_reply(error)
         except Exception as error:  # noqa: BLE001  the outermost loop of a server
@@ -84,7 +87,7 @@ class Wire:
             reply = {**reply, "re": number}
         await self._send(peer, reply)
 
-    async def _answer(self, call: Call) -> dict[str, Any]:
+    async def _answer(self, call: Call, message: Message) -> Message:
         name = name_of(call)
         if name == "ping":
             return self._host.identity()
@@ -95,7 +98,7 @@ class Wire:
         outcome, began = "canceled", time.monotonic()
         with tracing.span(telemetry.SPAN_SIDECAR_REQUEST, call.traceparent, labels):
             try:
-                reply = await self._answer_by_the_model(name, call)
+                reply = await self._answer_by_the_model(name, call, message)
                 outcome = "ok"
                 return reply
             except VramError as error:
@@ -108,7 +111,7 @@ class Wire:
                     telemetry.METRIC_SIDECAR_REQUEST, (time.monotonic() - began) * 1e3, labels
                 )
 
-    async def _answer_by_the_model(self, name: str, call: Call) -> dict[str, Any]:
+    async def _answer_by_the_model(self, name: str, call: Call, message: Message) -> Message:
         if name == "unload":
             await self._host.unload()
             return {"ok": True}
@@ -125,8 +128,7 @@ class Wire:
             assert isinstance(call, DetectOp | QueryOp | ScoreOp | EndpointCall), (
                 "the model's own requests"
             )
-            answer: dict[str, Any] = npy.pack(await self._host.run(name, call))
-            return answer
+            return await self._host.run(name, call, message)
         finally:
             self._pending -= 1
 
@@ -201,7 +203,7 @@ def _timeout_s(call: Call) -> float | None:
     return None
 
 
-def _field(problem: Mapping[str, Any], family: str) -> str:
+def _field(problem: JsonMap, family: str) -> str:
     where = (
         problem["loc"][1:] if family == "op" else problem["loc"]
     )  # a union puts its tag, the op, in front

@@ -3,15 +3,16 @@
 An adapter knows its model and nothing of leases, sockets or bytes.
 """
 
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
 
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 
 
 class ModelAdapter(Protocol):
-    """One model. All methods block and are called from one worker thread, never two at a time.
+    """One model. All methods block, and run in the model's own process, one at a time.
 
     `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no device (imports,
     processors). `load` puts the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every
@@ -27,10 +28,13 @@ class ModelAdapter(Protocol):
     @property
     def ops(self) -> frozenset[str]: ...
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that take long to import, for the server of model processes (`preload`)."""
+        ...
+
     def prepare(self) -> None: ...
 
     def load(self, device: str) -> None: ...
 
-    def unload(self) -> None: ...
-
-    def run(self, call: ModelCall) -> dict[str, Any]: ...
+    def run(self, call: ModelCall) -> Message: ...

@@ -11,11 +11,17 @@ from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
-from vram_arbiter.sidecars.weights import Weights, from_pretrained, model_options
+from vram_arbiter.sidecars.weights import (
+    Weights,
+    from_pretrained,
+    model_options,
+    transformers_modules,
+)
 
 NORM = 1000  # the field's grounding answers give boxes in thousandths of the image
 _SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # the field joins its labels by </c>
@@ -34,6 +40,10 @@ class DetectorAdapter:
         self._weights = weights
         self._processor: Any = None
         self._model: Any = None
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        return transformers_modules(self._weights)
 
     def prepare(self) -> None:
         from transformers import (
@@ -56,10 +66,7 @@ class DetectorAdapter:
             AutoModelForZeroShotObjectDetection, self._weights, **options
         )
 
-    def unload(self) -> None:
-        self._model = None
-
-    def run(self, call: ModelCall) -> dict[str, Any]:
+    def run(self, call: ModelCall) -> Message:
         assert isinstance(call, DetectOp)
         labels = split_query(call.query)
         picture = decode(call.image)

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Modality
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
 
@@ -57,16 +58,15 @@ class GpuPassthroughAdapter:
         self._device: str | None = None
         self._pose: Any = None
 
+    modules = ("torch",)
+
     def prepare(self) -> None:
         import torch  # noqa: F401  its import time belongs here
 
     def load(self, device: str) -> None:
         self._device = device
 
-    def unload(self) -> None:
-        self._device = self._pose = None
-
-    def run(self, call: ModelCall) -> dict[str, Any]:
+    def run(self, call: ModelCall) -> Message:
         """Check an observation. Raises BadRequest for one that is incomplete."""
         assert isinstance(call, EndpointCall)
         if call.endpoint == "reset":
@@ -94,7 +94,7 @@ class GpuPassthroughAdapter:
         return float((picture.to(torch.float32) / 255).mean().cpu())
 
 
-def _state(observation: Mapping[str, Any]) -> Any:
+def _state(observation: JsonMap) -> Any:
     import numpy as np
 
     try:
@@ -113,7 +113,7 @@ def _state(observation: Mapping[str, Any]) -> Any:
     return state
 
 
-def _pixels(observation: Mapping[str, Any], name: str, height: int, width: int) -> Any:
+def _pixels(observation: JsonMap, name: str, height: int, width: int) -> Any:
     import numpy as np
 
     pixels = observation.get(name)

@@ -2,20 +2,29 @@
 
 import importlib
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
 from vram_arbiter.sidecars.images import decode
-from vram_arbiter.sidecars.weights import Weights, from_pretrained
+from vram_arbiter.sidecars.weights import Weights, model_type, read_config
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from torch import Tensor
 
 IMAGE_PREFIX = "observation.images."
 _OWN_POLICIES = (
     "vram_arbiter.sidecars.models.compact_act",
 )  # own policy types, by lerobot's naming convention
+
+
+type Batch = dict[str, "Tensor | str"]
+"""One observation as lerobot's processors take it: tensors, and the task in words."""
 
 
 class PolicyAdapter:
@@ -39,13 +48,19 @@ class PolicyAdapter:
         self._before: Any = None
         self._after: Any = None
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        kind = model_type(self._weights, "type")
+        own = f"lerobot.policies.{kind}.modeling_{kind}"
+        return ("torch", "lerobot.policies.factory", own, *_OWN_POLICIES)
+
     def prepare(self) -> None:
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class
 
         for package in _OWN_POLICIES:
             importlib.import_module(package)  # registers itself
-        self._config = from_pretrained(PreTrainedConfig, self._weights)
+        self._config = read_config(PreTrainedConfig, self._weights)
         self._policy_class = get_policy_class(self._config.type)
 
     def load(self, device: str) -> None:
@@ -72,10 +87,7 @@ class PolicyAdapter:
         need_statistics(self._before, self._config.input_features, self._weights.source)
         need_statistics(self._after, self._config.output_features, self._weights.source)
 
-    def unload(self) -> None:
-        self._policy = self._before = self._after = None
-
-    def run(self, call: ModelCall) -> dict[str, Any]:
+    def run(self, call: ModelCall) -> Message:
         assert isinstance(call, EndpointCall)
         if call.endpoint == "reset":
             self._policy.reset()
@@ -88,7 +100,7 @@ class PolicyAdapter:
             )
         return {"action": self._act(self._batch(observation))}
 
-    def _act(self, batch: dict[str, Any]) -> Any:
+    def _act(self, batch: Batch) -> "NDArray[Any]":
         import torch
 
         with torch.inference_mode():
@@ -101,14 +113,15 @@ class PolicyAdapter:
             raise ModelError(
                 "the policy's actions are not finite numbers", hint="nothing was sent to the robot"
             )
-        return actions.numpy()
+        rows: NDArray[Any] = actions.numpy()
+        return rows
 
-    def _batch(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+    def _batch(self, observation: JsonMap) -> Batch:
         """Return the observation as lerobot's preprocessor takes it.
 
         Raises BadRequest naming what is missing or has the wrong shape.
         """
-        batch: dict[str, Any] = {"task": _task(observation.get("task"))}
+        batch: Batch = {"task": _task(observation.get("task"))}
         given = {self._feature_name(name): (name, value) for name, value in observation.items()}
         for feature, spec in self._config.input_features.items():
             if feature not in given:

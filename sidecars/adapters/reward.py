@@ -9,11 +9,12 @@ from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import ScoreOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.checkpoints import load_lerobot
 from vram_arbiter.sidecars.images import decode_all
-from vram_arbiter.sidecars.weights import Weights, from_pretrained
+from vram_arbiter.sidecars.weights import Weights, read_config
 
 _OWN_MODELS = (
     "vram_arbiter.sidecars.models.compact_progress",
@@ -42,13 +43,17 @@ class RewardAdapter:
         self._model: Any = None
         self._before: Any = None
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        return ("torch", "lerobot.rewards.factory", *_OWN_MODELS)
+
     def prepare(self) -> None:
         from lerobot.configs.rewards import RewardModelConfig
         from lerobot.rewards.factory import get_reward_model_class
 
         for package in _OWN_MODELS:
             importlib.import_module(package)  # registers itself
-        self._config = from_pretrained(RewardModelConfig, self._weights)
+        self._config = read_config(RewardModelConfig, self._weights)
         self._model_class = get_reward_model_class(self._config.type)
 
     def load(self, device: str) -> None:
@@ -66,10 +71,7 @@ class RewardAdapter:
                 hint="install the packages that this reward model needs",
             ) from error
 
-    def unload(self) -> None:
-        self._model = self._before = None
-
-    def run(self, call: ModelCall) -> dict[str, Any]:
+    def run(self, call: ModelCall) -> Message:
         assert isinstance(call, ScoreOp)
         if self._contract.instruction_required and not call.task.strip():
             raise BadRequest("score needs a task", hint="add the instruction as `task`")

@@ -6,11 +6,17 @@ These are Qwen3.5 and others.
 from typing import Any, Literal
 
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QueryOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
-from vram_arbiter.sidecars.weights import Weights, from_pretrained, model_options
+from vram_arbiter.sidecars.weights import (
+    Weights,
+    from_pretrained,
+    model_options,
+    transformers_modules,
+)
 
 ANSWER_MAX_S = (
     120.0  # limit of one answer, as by max_new_tokens: below the time that counts as stuck
@@ -32,6 +38,10 @@ class SceneVlmAdapter:
         self._processor: Any = None
         self._model: Any = None
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        return transformers_modules(self._weights)
+
     def prepare(self) -> None:
         from transformers import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING, AutoConfig, AutoProcessor
 
@@ -47,10 +57,7 @@ class SceneVlmAdapter:
         options = model_options(self._manifest, self._weights, device)
         self._model = load_transformers(AutoModelForImageTextToText, self._weights, **options)
 
-    def unload(self) -> None:
-        self._model = None
-
-    def run(self, call: ModelCall) -> dict[str, Any]:
+    def run(self, call: ModelCall) -> Message:
         assert isinstance(call, QueryOp)
         picture = within(decode(call.image), call.max_side)
         return {"ok": True, "answer": self._answer(picture, call.question, call.max_new_tokens)}

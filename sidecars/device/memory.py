@@ -3,6 +3,7 @@
 Calls block and belong to the host's worker thread. Must not know leases.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -94,14 +95,13 @@ def fill(
     size_bytes: int,
     *,
     bytes_per_s: int | None,
-    wait: Callable[[float], bool],
+    sleep: Callable[[float], object] = time.sleep,
     piece_bytes: int = 128 * 1024 * 1024,
 ) -> list[Block]:
     """Allocate `size_bytes` piece by piece, as a loader does by shards, no faster than
     `bytes_per_s`.
 
-    `wait(seconds)` sleeps and returns whether to stop early (the rest then stays unallocated). On
-    OutOfMemory every piece is freed before the error goes on.
+    On OutOfMemory every piece is freed before the error goes on.
     """
     blocks: list[Block] = []
     left = size_bytes
@@ -110,8 +110,8 @@ def fill(
             piece = min(piece_bytes, left)
             blocks.append(memory.allocate(label, piece))
             left -= piece
-            if bytes_per_s and wait(piece / bytes_per_s):
-                break
+            if bytes_per_s:
+                sleep(piece / bytes_per_s)
     except BaseException:
         for block in blocks:
             memory.free(block)

@@ -14,9 +14,11 @@ import json
 import math
 import os
 import random
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
+
+from vram_arbiter.schemas.plain import JsonMap
 
 LABELS_FILE: Final = "labels.jsonl"
 # Below this many visible pixels (at the frame's own size) an object is too hidden for a yes or no.
@@ -90,7 +92,7 @@ def read_frames(folder: Path, cameras: Sequence[str] | None = None) -> list[Fram
     return frames
 
 
-def _frame(folder: Path, raw: Mapping[str, Any]) -> Frame:
+def _frame(folder: Path, raw: JsonMap) -> Frame:
     objects = tuple(
         SeenObject(
             name=f"{item['colour']} {item['shape']}",
@@ -234,7 +236,7 @@ def batches(count: int, size: int, seed: int) -> Iterator[list[int]]:
         del queue[:size]
 
 
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
+def write_json(path: Path, value: JsonMap) -> None:
     """Write stable, readable JSON with a newline at the end."""
     path.write_text(json.dumps(value, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 

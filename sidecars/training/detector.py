@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.sidecars.training import common, queries
 from vram_arbiter.sidecars.training.common import Frame
 from vram_arbiter.sidecars.training.detector_report import (
@@ -385,7 +386,7 @@ def train(
     words: Sequence[str],
     out: Path,
     start: Path | None = None,
-) -> tuple[Any, Any, dict[str, Any]]:
+) -> tuple[Any, Any, JsonObject]:
     """Train on `frames`, from the weights of `start` if given.
 
     Returns (processor, model, figures of the run).
@@ -467,7 +468,7 @@ def train(
     )
 
 
-def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
+def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> JsonObject:
     """Train, save, evaluate the saved checkpoint as a user would load it, write the model card.
 
     Returns the figures.

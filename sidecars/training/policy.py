@@ -17,7 +17,13 @@ import random
 import sys
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+from vram_arbiter.schemas.plain import JsonObject
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from torch import Tensor
 
 FORMAT: Final = "grab-demonstrations/1"
 CAMERAS: Final = ("front", "wrist")
@@ -37,12 +43,12 @@ class Demonstrations:
     `episode_end[i]` is one past step i's episode.
     """
 
-    images: dict[str, Any]
+    images: dict[str, NDArray[Any]]
     state: Any
     action: Any
     point: Any
     episode_end: Any
-    info: dict[str, Any]
+    info: JsonObject
 
 
 def load_demonstrations(*folders: Path) -> Demonstrations:
@@ -62,7 +68,7 @@ def load_demonstrations(*folders: Path) -> Demonstrations:
     )
 
 
-def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def _load_folder(folder: Path) -> tuple[JsonObject, JsonObject]:
     import numpy as np
 
     path = folder / "info.json"
@@ -71,7 +77,7 @@ def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             f"{path} is missing: record with `python -m vram_arbiter.runner.sim.training.dataset "
             f"grab --out {folder}`"
         )
-    info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    info: JsonObject = json.loads(path.read_text(encoding="utf-8"))
     if info.get("format") != FORMAT:
         raise BadDemonstrations(
             f"{path} says format {info.get('format')!r}, this script reads {FORMAT!r}"
@@ -89,7 +95,7 @@ def _load_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return info, arrays
 
 
-def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
+def make_config(info: JsonObject, *, action_steps: int) -> Any:
     """Return the policy's configuration: cameras at full size, crops as the data describes."""
     from lerobot.configs import FeatureType, PolicyFeature
 
@@ -119,7 +125,7 @@ def make_config(info: dict[str, Any], *, action_steps: int) -> Any:
     )
 
 
-def make_stats(data: Demonstrations) -> dict[str, dict[str, Any]]:
+def make_stats(data: Demonstrations) -> dict[str, dict[str, Tensor]]:
     """Return mean and spread of state and action, per joint, for the normalizing processors."""
     import torch
 
@@ -130,11 +136,11 @@ def make_stats(data: Demonstrations) -> dict[str, dict[str, Any]]:
     return stats
 
 
-def load_stats(checkpoint: Path) -> dict[str, dict[str, Any]]:
+def load_stats(checkpoint: Path) -> dict[str, dict[str, Tensor]]:
     """Return the normalization that a checkpoint was trained with, from its preprocessor."""
     from safetensors.torch import load_file
 
-    stats: dict[str, dict[str, Any]] = {}
+    stats: dict[str, dict[str, Tensor]] = {}
     for path in checkpoint.glob("policy_preprocessor_step_*_normalizer_processor.safetensors"):
         for name, value in load_file(path).items():
             key, _, which = name.rpartition(".")
@@ -149,7 +155,7 @@ class Batches:
     """Random training batches with light augmentation: shifts, brightness, tint, joint noise."""
 
     def __init__(
-        self, data: Demonstrations, config: Any, stats: dict[str, dict[str, Any]], seed: int
+        self, data: Demonstrations, config: Any, stats: dict[str, dict[str, Tensor]], seed: int
     ) -> None:
         import torch
 
@@ -161,7 +167,7 @@ class Batches:
         self._state, self._action = torch.from_numpy(data.state), torch.from_numpy(data.action)
         self._point, self._end = torch.from_numpy(data.point), torch.from_numpy(data.episode_end)
 
-    def draw(self, size: int) -> dict[str, Any]:
+    def draw(self, size: int) -> dict[str, Tensor]:
         """Return a batch of `size` random steps."""
         import torch
 
@@ -174,7 +180,7 @@ class Batches:
         noisy = self._state[pick] + 0.004 * torch.randn(
             size, self._state.shape[1], generator=self._generator
         )
-        batch: dict[str, Any] = {
+        batch: dict[str, Tensor] = {
             "observation.state": (noisy - state["mean"]) / state["std"],
             "observation.point": self._point[pick],
             "action": (self._action[torch.minimum(ahead, last)] - action["mean"]) / action["std"],

@@ -19,6 +19,9 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
+from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.sidecars.weights import Weights, read_config
+
 FORMAT: Final = "grab-progress/1"
 HELD_OUT: Final = 0.12  # share of the tries, the last ones: a try is never split
 # share of the training questions for the object of the grab; the others ask for anything else
@@ -124,7 +127,7 @@ def ask(data: Pictures, index: int, rng: random.Random) -> str:
 
 def batch_of(
     data: Pictures, config: Any, questions: list[tuple[int, str]], rng: Any | None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return tensors for (picture, object) pairs; `rng` (a torch generator) adds tint, light and
     noise."""
     import torch
@@ -233,7 +236,7 @@ def judge(data: Pictures, checkpoint: Path) -> dict[str, float]:
 
     import vram_arbiter.sidecars.models.compact_progress  # noqa: F401  # registers the type
 
-    config = RewardModelConfig.from_pretrained(checkpoint)
+    config = read_config(RewardModelConfig, Weights(str(checkpoint), local=True))
     model = get_reward_model_class(config.type).from_pretrained(checkpoint, config=config)
     _, kept = split(data)
     asked: dict[str, list[tuple[int, str]]] = {

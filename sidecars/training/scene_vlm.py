@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.sidecars.training import common, questions
 from vram_arbiter.sidecars.training.common import Frame, visible_names
 from vram_arbiter.sidecars.training.scene_vlm_report import (
@@ -417,7 +418,7 @@ def train(
     names: Sequence[str],
     out: Path,
     start: Path | None = None,
-) -> tuple[Any, dict[str, Any]]:
+) -> tuple[Any, JsonObject]:
     """Run all stages on `frames`, from the weights of `start` if given; saves the processor.
 
     Returns (model, figures).
@@ -449,7 +450,7 @@ def train(
         "language": (recipe.language_steps, language),
         "both": (recipe.steps, [*tower, *language]),
     }
-    figures: dict[str, Any] = {"train_frames": len(frames)}
+    figures: JsonObject = {"train_frames": len(frames)}
     for stage, (steps, parameters) in stages.items():
         optimizer = torch.optim.AdamW(
             parameters, lr=recipe.learning_rate, betas=(0.9, 0.98), weight_decay=0.02
@@ -506,7 +507,7 @@ def balanced(some: Sequence[int], others: Sequence[int]) -> list[int]:
     return [half[i % len(half)] for i in range(longest) for half in (some, others)]
 
 
-def run(recipe: VlmRecipe, data: Path, out: Path, start: Path | None = None) -> dict[str, Any]:
+def run(recipe: VlmRecipe, data: Path, out: Path, start: Path | None = None) -> JsonObject:
     """Train, save, evaluate the saved checkpoint as a user would load it, write the model card.
 
     Returns the figures.
@@ -526,13 +527,13 @@ def report(
     testing: Sequence[Frame],
     names: Sequence[str],
     out: Path,
-    figures: dict[str, Any],
-) -> dict[str, Any]:
+    figures: JsonObject,
+) -> JsonObject:
     """Evaluate the checkpoint in `out` and write its model card. Returns the figures."""
     asker = Asker(out)
     rows = evaluate(asker, testing, names, recipe.seed)
     grasp = [r for r in rows if r["group"] in ("held", "holds another", "empty")]
-    found: dict[str, Any] = {
+    found: JsonObject = {
         "train_frames": len(training),
         "test_frames": len(testing),
         "parameters": sum(p.numel() for p in asker.model.parameters()),

@@ -10,8 +10,9 @@ import random
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.sidecars.training import questions
 from vram_arbiter.sidecars.training.common import Frame, visible_names
 
@@ -47,7 +48,7 @@ class Asker:
 
 def evaluate(
     asker: Asker, frames: Sequence[Frame], names: Sequence[str], seed: int
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return one row a question: group, right, exact, frame, question, truth, answer.
 
     *right* is the yes or no, or the whole answer. Every frame is asked whether its target is
@@ -145,7 +146,7 @@ Held out, through the chat template and greedy `generate`.
 """
 
 
-def card_rows(rows: Sequence[dict[str, Any]]) -> str:
+def card_rows(rows: Sequence[JsonObject]) -> str:
     """Return one table row a group of questions, the grasp questions together first."""
     grasp = ("held", "holds another", "empty")
     groups = {"grasped? (all)": [r for r in rows if r["group"] in grasp]}
@@ -159,6 +160,6 @@ def card_rows(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def share(rows: Sequence[dict[str, Any]], key: str) -> float:
+def share(rows: Sequence[JsonObject], key: str) -> float:
     """Return the mean of a flag; 0 for no rows."""
     return sum(bool(row[key]) for row in rows) / max(1, len(rows))
