@@ -13,15 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import (
-    Episode,
-    JsonObject,
-    Note,
-    Outcome,
-    OutcomeData,
-    Status,
-    Step,
-)
+from vram_arbiter.reasoner.planner import Episode, Note, Outcome, Status, Step
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.tools import (
     ExecuteRskill,
     LocateInView,
@@ -144,7 +137,7 @@ def told(call: ToolCall, outcome: Outcome) -> JsonObject:
     return fields | ({"data": _told_data(outcome.data)} if outcome.data else {})
 
 
-def _told_data(data: OutcomeData) -> JsonObject:
+def _told_data(data: JsonMap) -> JsonObject:
     """Return data of a skill or model as JSON within the limit of an answer; mark what is left
     out.
     """

@@ -19,17 +19,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import (
-    Episode,
-    Finish,
-    JsonObject,
-    Note,
-    Outcome,
-    Planner,
-    Step,
-    benched,
-)
+from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
 from vram_arbiter.schemas.errors import EstopRequested, VramError
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing

@@ -12,13 +12,14 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 
 from vram_arbiter.reasoner.params import JsonSchema, misfits
-from vram_arbiter.reasoner.planner import Arguments, JsonObject
 from vram_arbiter.schemas.body import UNKNOWN_BODY, Body
 from vram_arbiter.schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from vram_arbiter.schemas.manifest import Role, RSkillManifest
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
+    FunctionTool,
     LifecycleTransition,
     LocateInView,
     QueryScene,
@@ -215,7 +216,7 @@ class Palette:
         return None
 
     # -- what is offered, and how it is read back
-    def functions(self, *, goal_runs: bool = False) -> list[JsonObject]:
+    def functions(self, *, goal_runs: bool = False) -> list[FunctionTool]:
         """Return OpenAI-style descriptions of the tools and executable skills that are allowed
         now.
         """
@@ -242,7 +243,7 @@ class Palette:
                 offered.append(function)
         return offered
 
-    def parse(self, name: str, arguments: str | Arguments) -> ToolCall:
+    def parse(self, name: str, arguments: str | JsonMap) -> ToolCall:
         """Read a call by the name of its offer, or by the tool's own.
 
         Raises UnknownOp and BadRequest.

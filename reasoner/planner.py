@@ -5,19 +5,13 @@ the calls, and a planner's decision can put bytes on a GPU only through a sideca
 lease.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 from vram_arbiter.schemas.errors import SidecarUnavailable
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.tools import ExecuteRskill, QueryScene, ToolCall
-
-type JsonObject = dict[str, Any]
-"""A JSON object, as a model server's API or a tool exchanges it."""
-type Arguments = Mapping[str, Any]
-"""Arguments of a tool call, as the model wrote them."""
-type OutcomeData = Mapping[str, Any]
-"""Data of a tool's outcome: a JSON object that a planner may read."""
 
 UNSTARTABLE_MAX = 3
 
@@ -43,7 +37,7 @@ class Outcome:
     status: Status
     text: str
     code: str = ""
-    data: OutcomeData = field(default_factory=dict)
+    data: JsonMap = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

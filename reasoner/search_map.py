@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from vram_arbiter.reasoner.planner import OutcomeData
+from vram_arbiter.schemas.plain import JsonMap
 
 # two looks at one thing differ by less; the arm's gripper needs more room between two things
 SAME_M = 0.05
@@ -53,7 +53,7 @@ class Places:
     joined: bool = False
     """Whether odometry joins the newest look to the ones before."""
 
-    def add(self, data: OutcomeData) -> None:
+    def add(self, data: JsonMap) -> None:
         """Add `data` of a locate that found something: `point_base_m`, optionally `seen` and
         `base_pose`.
         """

@@ -12,7 +12,7 @@ from typing import Any, Self
 from pydantic import ValidationError
 
 from vram_arbiter.clients.net.rpc_client import RpcClient
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer, reason_of
+from vram_arbiter.clients.net.server import Peer, RouterServer, reason_of
 from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
@@ -22,6 +22,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
     from_wire,
 )
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.reasoner import OPS, REASONER_REQUEST, CancelEpisode, GetEpisode, Say
 
 log = logging.getLogger(__name__)

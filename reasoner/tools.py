@@ -27,7 +27,7 @@ from vram_arbiter.clients.sidecar.perception import (
 )
 from vram_arbiter.reasoner.history import Past, Taken
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import JsonObject, Outcome
+from vram_arbiter.reasoner.planner import Outcome
 from vram_arbiter.reasoner.search_map import SAME_M
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -41,6 +41,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.goals import FrameReply, ResultPush
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,

@@ -8,9 +8,10 @@ that no other request delays it.
 import asyncio
 import logging
 
-from vram_arbiter.clients.runner import Message, RunnerClient
+from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.reasoner.inbox import Danger, Inbox
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import Message
 
 log = logging.getLogger(__name__)
 

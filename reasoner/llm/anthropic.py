@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
 from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner
-from vram_arbiter.reasoner.planner import Arguments, JsonObject
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.tools import FunctionTool
 
 VERSION = "2023-06-01"
 
@@ -26,7 +27,7 @@ class AnthropicPlanner(LlmPlanner):
         return headers | {"x-api-key": self.config.api_key} if self.config.api_key else headers
 
     def _request(
-        self, turns: Sequence[Turn], functions: Sequence[JsonObject]
+        self, turns: Sequence[Turn], functions: Sequence[FunctionTool]
     ) -> tuple[str, JsonObject]:
         tools = [
             {
@@ -60,7 +61,7 @@ class AnthropicPlanner(LlmPlanner):
         return Answer(" ".join(words), tuple(calls))
 
 
-def _input(value: Any) -> Arguments | str:
+def _input(value: Any) -> JsonMap | str:
     return value if isinstance(value, dict) else str(value)
 
 

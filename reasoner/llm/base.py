@@ -21,9 +21,10 @@ from vram_arbiter.reasoner.llm.http import (
     without_credentials,
 )
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import Arguments, Episode, Finish, JsonObject, benched
+from vram_arbiter.reasoner.planner import Episode, Finish, benched
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, LlmError, NotPermitted, UnknownOp
-from vram_arbiter.schemas.tools import ToolCall, read_arguments
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.tools import FunctionTool, ToolCall, read_arguments
 
 TRIES_MAX = 3
 TIMEOUT_S = 60.0
@@ -44,7 +45,7 @@ from the person in charge. Call `finish` when done."""
 NUDGE = "Answer with exactly one tool call."
 
 
-FINISH: JsonObject = {
+FINISH: FunctionTool = {
     "type": "function",
     "function": {
         "name": "finish",
@@ -137,7 +138,7 @@ class Call:
 
     id: str
     name: str
-    arguments: str | Arguments
+    arguments: str | JsonMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +184,7 @@ class LlmPlanner(ABC):
 
     @abstractmethod
     def _request(
-        self, turns: Sequence[Turn], functions: Sequence[JsonObject]
+        self, turns: Sequence[Turn], functions: Sequence[FunctionTool]
     ) -> tuple[str, JsonObject]:
         """Address and body of a request. `functions` are OpenAI-style descriptions."""
 
@@ -221,7 +222,7 @@ class LlmPlanner(ABC):
             hint="try a model that is better at calling tools",
         )
 
-    async def _ask(self, turns: Sequence[Turn], functions: Sequence[JsonObject]) -> Answer:
+    async def _ask(self, turns: Sequence[Turn], functions: Sequence[FunctionTool]) -> Answer:
         url, body = self._request(turns, functions)
         answer = await self._http.post(url, body)
         try:
@@ -250,7 +251,7 @@ def _decision(
     return decoded
 
 
-def _finish(arguments: str | Arguments) -> Finish:
+def _finish(arguments: str | JsonMap) -> Finish:
     fields = read_arguments("finish", arguments)
     success, reason = fields.get("success"), fields.get("reason")
     if not isinstance(success, bool) or not isinstance(reason, str):

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from typing import Any, Self
 from urllib.parse import urlsplit, urlunsplit
 
-from vram_arbiter.reasoner.planner import JsonObject
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.errors import ConfigError, LlmError
+from vram_arbiter.schemas.plain import JsonObject
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
 from vram_arbiter.reasoner.llm.base import Answer, Call, LlmConfig, LlmPlanner
-from vram_arbiter.reasoner.planner import JsonObject
+from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.tools import FunctionTool
 
 __all__ = ["LlmConfig", "OpenAiPlanner"]
 
@@ -22,7 +23,7 @@ class OpenAiPlanner(LlmPlanner):
         return {"authorization": f"Bearer {self.config.api_key}"} if self.config.api_key else {}
 
     def _request(
-        self, turns: Sequence[Turn], functions: Sequence[JsonObject]
+        self, turns: Sequence[Turn], functions: Sequence[FunctionTool]
     ) -> tuple[str, JsonObject]:
         messages = [{"role": "system", "content": self._system}, *map(_message, turns)]
         return f"{self.config.base_url}/chat/completions", {

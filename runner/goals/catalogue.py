@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from vram_arbiter.clients.net.server import Message
 from vram_arbiter.runner.protocols import Skill, SkillKey
 from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.errors import ManifestInvalid, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 
 EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 from vram_arbiter.clients._protocol.codec import pack
-from vram_arbiter.clients.net.server import Message, Peer
+from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
@@ -31,6 +31,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.goals import FeedbackPush, ResultPush, SendGoal
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing

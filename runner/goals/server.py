@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals import frames
@@ -45,6 +45,7 @@ from vram_arbiter.schemas.goals import (
     SendGoal,
     ShutdownRunner,
 )
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.world import WorldState
 
 log = logging.getLogger(__name__)

@@ -6,7 +6,6 @@ Every mistake is a ConfigError that names the field (`hal.params.start_pose_rad.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -20,6 +19,7 @@ from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.units import JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
 
 LEROBOT = "lerobot:"
@@ -107,9 +107,7 @@ def _params[T: _Params](kind: type[T], config: HalConfig, source: str) -> T:
         raise config_error(source, problems) from error
 
 
-def _joints_are_known(
-    given: Mapping[str, Any], names: tuple[str, ...], path: Path, source: str
-) -> None:
+def _joints_are_known(given: JsonMap, names: tuple[str, ...], path: Path, source: str) -> None:
     problems = [
         Problem(
             0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Mapping
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, problems_of
 
 
@@ -67,5 +67,5 @@ def _error(config: SensorReaderConfig, found: list[tuple[str, str]]) -> ConfigEr
 
 def _named(config: SensorReaderConfig, problems: list[Problem]) -> ConfigError:
     error = config_error(f"sensor {config.sensor_id}", problems)
-    details: dict[str, Any] = {**error.details, "sensor_id": config.sensor_id}
+    details: JsonObject = {**error.details, "sensor_id": config.sensor_id}
     return ConfigError(error.message, details=details)

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from vram_arbiter.runner.sim.config import (
     ARM_JOINTS,
@@ -30,6 +30,9 @@ from vram_arbiter.runner.sim.scene import (
     load_mujoco,
 )
 from vram_arbiter.schemas.world import CameraModel
+
+if TYPE_CHECKING:
+    from mujoco import Renderer
 
 HELD_LIFT_M = (
     0.03  # a thing is held when its centre is this far above where it would rest on the table
@@ -83,7 +86,7 @@ class SimEnv:
 
     def __init__(self, config: SceneConfig | None = None) -> None:
         self.config = config or SceneConfig()
-        self._renderers: dict[str, Any] = {}
+        self._renderers: dict[str, Renderer] = {}
         self._layout: Layout | None = None
         self._model: Any = None
         self._data: Any = None

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from vram_arbiter.schemas.control import JOINT_MODES, ControlMode
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest.vocabulary import EmbodimentTag
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.yamltext import read_yaml, validated
 
 RENDER: Final = "render"  # the camera that is the environment's own `render()`
@@ -44,7 +45,7 @@ class GymConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kwargs: dict[str, Any] = {}
+    kwargs: JsonObject = {}
     state: str = ""
     joints: dict[str, Index] = {}
     velocities: dict[str, Index] = {}

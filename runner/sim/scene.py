@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.runner.sim.config import COLOURS, SceneConfig
 from vram_arbiter.runner.sim.layout import Layout
+from vram_arbiter.schemas.plain import JsonObject
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.sim.config import CameraSpec, ObjectSpec
@@ -238,7 +239,7 @@ def arm_spec(mujoco: Any) -> Any:
     dress("gripper", box, _MOTOR, solid=True, pos=[0.004, 0.0, -0.020], size=[0.016, 0.018, 0.018])
     # fixed finger: inner face at x = -0.0015 as on the wheel's own pad
     dress("gripper", box, _SHELL, pos=[-0.010, 0, -0.060], size=[0.006, 0.011, 0.030])
-    grip: dict[str, Any] = {
+    grip: JsonObject = {
         "condim": 6,
         "friction": [1.6, 0.02, 0.002],
         "priority": 1,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.schemas.plain import JsonObject
 
 
-def truth_as_wire(env: SimEnv) -> dict[str, Any]:
+def truth_as_wire(env: SimEnv) -> JsonObject:
     """Target, objects with their place (meters, map and base frame), what is held."""
     truth = env.ground_truth()
     return {

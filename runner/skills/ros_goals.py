@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from vram_arbiter.runner.protocols import GoalParams
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.plain import JsonObject, Message
 
 
-def merge(base: GoalParams, over: GoalParams) -> dict[str, Any]:
+def merge(base: GoalParams, over: GoalParams) -> JsonObject:
     """Deep merge: maps are merged, everything else of `over` replaces."""
     merged = dict(base)
     for key, value in over.items():

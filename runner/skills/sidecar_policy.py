@@ -44,6 +44,7 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.sidecar import LoadResult
@@ -299,9 +300,7 @@ class SidecarPolicy(SkillBase):
         finally:
             await self._client.close()
 
-    async def _fetch(
-        self, observation: Mapping[str, Any], token: tuple[int, ...] | None
-    ) -> list[Row]:
+    async def _fetch(self, observation: JsonMap, token: tuple[int, ...] | None) -> list[Row]:
         """Request a chunk; the tick that asked is the span's parent, or the goal if it is not
         recorded.
         """
@@ -376,13 +375,13 @@ class SidecarPolicy(SkillBase):
             max(column) - min(column) < STILL_RAD for column in zip(*self._recent, strict=True)
         )
 
-    def _observation(self, world: WorldState, measured: Mapping[str, float]) -> dict[str, Any]:
+    def _observation(self, world: WorldState, measured: Mapping[str, float]) -> Message:
         import numpy as np
 
         values = [measured[name] for name in self._wiring.joints]
         if self._wiring.degrees:
             values = [math.degrees(value) for value in values]
-        observation: dict[str, Any] = {
+        observation: Message = {
             STATE_KEY: np.asarray(values, dtype=np.float32),
             TASK_KEY: self._task,
         }
@@ -403,7 +402,7 @@ class SidecarPolicy(SkillBase):
             raise BadState(f"{self.key} has no event loop")
         return asyncio.run_coroutine_threadsafe(self._fetch(observation, token), self._loop)
 
-    def _rows(self, answer: Mapping[str, Any]) -> list[Row]:
+    def _rows(self, answer: JsonMap) -> list[Row]:
         """Return rows of joint targets in rad.
 
         Raises ModelError for a wrong shape or infinite numbers.

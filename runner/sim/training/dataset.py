@@ -27,6 +27,7 @@ from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert
 from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.tasks import stand_before
 from vram_arbiter.runner.sim.training.learned import LoadedPolicy
+from vram_arbiter.schemas.plain import JsonObject
 
 # Views of the grab policy: crops as fractions of the image (x0, y0, x1, y1), and the size they are
 # averaged down to.
@@ -43,7 +44,7 @@ class Capture:
     """One frame of the scene dataset: camera, the RGB image and its label."""
 
     image: Any
-    label: dict[str, Any]
+    label: JsonObject
 
 
 def policy_view(image: Any, camera: str) -> Any:

@@ -9,9 +9,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.runner.sim.env import SimEnv
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from torch import Tensor
 
 # registers the demo's policy type; loaded by name, as any lerobot plug-in
 OWN_POLICIES = "vram_arbiter.sidecars.models.compact_act"
@@ -43,13 +47,15 @@ class LoadedPolicy:
         """Forget the last episode."""
         self._policy.reset()
 
-    def chunk(self, env: SimEnv, images: Mapping[str, Any] | None = None) -> list[list[float]]:
+    def chunk(
+        self, env: SimEnv, images: Mapping[str, NDArray[Any]] | None = None
+    ) -> list[list[float]]:
         """Return the next joint targets (rad); `images` (RGB by camera) saves rendering them
         again.
         """
         import torch
 
-        observation: dict[str, Any] = {
+        observation: dict[str, Tensor] = {
             f"observation.images.{camera}": torch.from_numpy(env.render(camera))
             .permute(2, 0, 1)
             .float()
