@@ -76,11 +76,13 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             _need_packages(settings.manifest)
         from vram_arbiter.sidecars.host import SidecarHost
 
-        with command(
-            service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}
+        with (
+            command(
+                service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}
+            ),
+            _temporary_files_in(os.path.dirname(path_of(settings.endpoint))),
         ):
-            with _temporary_files_in(os.path.dirname(path_of(settings.endpoint))):
-                asyncio.run(SidecarHost(settings, adapter_for).serve())
+            asyncio.run(SidecarHost(settings, adapter_for).serve())
     except (VramError, ManifestError) as error:
         terminal.complain("vram-sidecar", error)
         wrong = (

@@ -7,6 +7,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,7 +30,15 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LONGEST = ("tests/e2e/test_demo.py", "tests/e2e/", "tests/arbiter/test_")
+LONGEST = (
+    "tests/e2e/test_demo.py",
+    "tests/bench/",
+    "tests/e2e/",
+    "tests/sidecars/",
+    "tests/runner/recording/",
+    "tests/runner/cli/",
+    "tests/arbiter/test_",
+)
 """Where the longest tests are: begun last, one worker would end minutes after the other."""
 
 
@@ -84,8 +93,8 @@ def connect(arbiter_daemon: ArbiterProcess) -> Iterator[Callable[..., WireClient
     """`connect()` makes a bare connection to `arbiter_daemon` (no hello yet)."""
     made: list[WireClient] = []
 
-    def make(**options: object) -> WireClient:
-        made.append(WireClient(arbiter_daemon.endpoint, **options))  # type: ignore[arg-type]  # handed on as they are
+    def make(**options: Any) -> WireClient:
+        made.append(WireClient(arbiter_daemon.endpoint, **options))
         return made[-1]
 
     yield make

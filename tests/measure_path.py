@@ -1,12 +1,23 @@
-"""Length of the path of one acquire with one eviction: `PYTHONPATH=. python tests/measure_path.py`.
+"""Length of the path of one acquire with one eviction: `python tests/measure_path.py`.
 
 A real daemon, a holder and a waiter, each a process of its own on a simulated GPU that returns
 memory at once. Counted in the main thread of each, from the call of `acquire` to the grant: the
 product's functions that run, their files, and how often the next function to run lies in another
 file than the last one. Libraries, tests, and the threads that read the GPU and write the history
-are left out; so is what a program does before and after. `--list` prints the path itself.
+are left out; so is what a program does before and after.
+
+The path is warm: the scene plays once before it is counted, so that imports, encoders made on
+demand and filled caches are not part of it. Of five such runs the shortest counts: readings by
+the clock fall into some of them. A generator expression or a lambda is a line of its
+function, not a function; a switch into its file counts.
+
+Options:
+    --list   print the path itself: each function once, in the order of its first call
+    --files  print functions and entries per file; an entry is a switch into the file
+    --cold   count the first scene, and generator expressions and lambdas as functions
 """
 
+import argparse
 import asyncio
 import json
 import os
@@ -16,11 +27,16 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType
 from typing import Any
+
+# Some wheel installs a package `tests` of its own, and an environment may hold another tree.
+sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
 from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
@@ -28,9 +44,13 @@ from vram_arbiter.arbiter.host.gpu.fake import make_card
 
 GIB = 1 << 30
 PATIENCE_S = 60.0
+RUNS = 5
 PACKAGES = ("arbiter", "clients", "schemas")
 TARGETS = {"files": 30, "functions": 150, "switches": 300, "core modules": 12, "core functions": 80}
 
+
+LINES = ("<genexpr>", "<lambda>")
+"""Code objects that are lines of their function."""
 
 type Step = tuple[str, str, int]
 """File, function, line."""
@@ -90,47 +110,63 @@ def daemon(tracer: Tracer, arguments: list[str]) -> None:
 
 
 async def holder(tracer: Tracer) -> None:
-    """Hold the GPU with an idle lease, and free it when the arbiter asks."""
+    """Hold the GPU with an idle lease; free it when the arbiter asks: `hold`, `trace`, `write`."""
     from vram_arbiter.clients.client import AsyncClient
-    from vram_arbiter.sidecars.device.fake import FakeMemory
+    from vram_arbiter.sidecars.device.fake import Block, FakeMemory
 
     memory = FakeMemory(Path(os.environ["VRAM_ARBITER_RUNTIME"]) / "fakegpu", "holder")
+    blocks: list[Block] = []
 
     def free() -> None:
-        memory.free(block)
+        memory.free(blocks.pop())
         memory.empty_cache()
 
     async def unload() -> None:
         await asyncio.to_thread(free)
 
     async with AsyncClient(name="holder") as client:
-        lease = await client.acquire(_spec("holder"), unload=unload)
-        memory.bind(lease.gpu)
-        block = memory.allocate("weights", 5 * GIB)
-        await lease.ready(5 * GIB)
-        tracer.start()
-        print("ready", flush=True)
-        await asyncio.to_thread(sys.stdin.readline)
-        tracer.stop()
+        async for command in _commands():
+            match command:
+                case "hold":
+                    lease = await client.acquire(_spec("holder"), unload=unload)
+                    memory.bind(lease.gpu)
+                    blocks.append(memory.allocate("weights", 5 * GIB))
+                    await lease.ready(5 * GIB)
+                case "trace":
+                    tracer.start()
+                case "write":
+                    tracer.stop()
+            print(command, flush=True)
     memory.close()
 
 
 async def waiter(tracer: Tracer) -> None:
-    """Ask for the holder's place, and get it."""
+    """Ask for the holder's place, and get it: `acquire`, `release`, `measure`."""
     from vram_arbiter.clients.client import AsyncClient
 
     async with AsyncClient(name="waiter") as client:
         spec = _spec("waiter")
-        print("ready", flush=True)
-        await asyncio.to_thread(sys.stdin.readline)
-        tracer.start()
-        await client.acquire(spec)
-        tracer.stop()
-        print("granted", flush=True)
+        async for command in _commands():
+            match command:
+                case "acquire":
+                    lease = await client.acquire(spec)
+                case "release":
+                    await lease.release()
+                case "measure":
+                    tracer.start()
+                    await client.acquire(spec)
+                    tracer.stop()
+            print(command, flush=True)
+
+
+async def _commands() -> AsyncIterator[str]:
+    """Lines of stdin until it closes."""
+    while line := await asyncio.to_thread(sys.stdin.readline):
+        yield line.strip()
 
 
 def _spec(consumer: str) -> Any:
-    from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+    from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
     size = Footprint(load_peak_bytes=5 * GIB, steady_bytes=5 * GIB, residue_bytes=450 << 20)
     # a TTL without renewals in the measured time, and no minimum residency to wait for
@@ -140,37 +176,43 @@ def _spec(consumer: str) -> Any:
 
 
 # -- measuring
-def record(folder: Path) -> dict[str, list[Step]]:
-    """Run the scene once. Returns the steps of each side."""
+def record(folder: Path, *, cold: bool = False) -> dict[str, list[Step]]:
+    """Play the scene twice, or once with `cold`. Returns the steps of each side in the last one."""
     arbiter = ArbiterProcess()
     make_card(arbiter.card, 8 * GIB, release_lag_s=0.0)
     out = {side: folder / f"{side}.json" for side in ("daemon", "holder", "waiter")}
     arbiter.program = [sys.executable, str(Path(__file__)), "daemon", str(out["daemon"])]
-    programs: list[subprocess.Popen[str]] = []
+    programs: dict[str, subprocess.Popen[str]] = {}
 
-    def start(side: str) -> subprocess.Popen[str]:
-        command = [sys.executable, str(Path(__file__)), side, str(out[side])]
-        programs.append(
-            subprocess.Popen(
-                command,
+    def tell(side: str, command: str) -> None:
+        program = programs[side]
+        assert program.stdin is not None
+        assert program.stdout is not None
+        print(command, file=program.stdin, flush=True)
+        if (line := program.stdout.readline().strip()) != command:
+            raise RuntimeError(f"expected {command!r} from the {side}, got {line!r}")
+
+    try:
+        arbiter.start()
+        for side in ("holder", "waiter"):
+            programs[side] = subprocess.Popen(
+                [sys.executable, str(Path(__file__)), side, str(out[side])],
                 env=arbiter.environ,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
             )
-        )
-        _heard(programs[-1], "ready")
-        return programs[-1]
-
-    try:
-        arbiter.start()
-        held, waits = start("holder"), start("waiter")
+        if not cold:
+            tell("holder", "hold")
+            tell("waiter", "acquire")
+            tell("waiter", "release")
+        tell("holder", "hold")
+        tell("holder", "trace")
         os.kill(arbiter.pid, signal.SIGUSR1)
         _until(out["daemon"].with_suffix(".started").exists)
-        _tell(waits)
-        _heard(waits, "granted")
+        tell("waiter", "measure")
         os.kill(arbiter.pid, signal.SIGUSR2)
-        _tell(held)
+        tell("holder", "write")
         for path in out.values():
             _until(path.exists)
         return {
@@ -178,24 +220,19 @@ def record(folder: Path) -> dict[str, list[Step]]:
             for side, path in out.items()
         }
     finally:
-        for program in programs:
-            if program.poll() is None:
-                program.kill()
+        for program in programs.values():
+            program.kill()
             program.communicate()
         arbiter.close()
 
 
-def _tell(program: "subprocess.Popen[str]") -> None:
-    assert program.stdin is not None
-    program.stdin.write("\n")
-    program.stdin.flush()
+def _recorded(cold: bool) -> dict[str, list[Step]]:
+    with tempfile.TemporaryDirectory(prefix="path") as folder:
+        return record(Path(folder), cold=cold)
 
 
-def _heard(program: "subprocess.Popen[str]", word: str) -> None:
-    assert program.stdout is not None
-    line = program.stdout.readline().strip()
-    if line != word:
-        raise RuntimeError(f"expected {word!r} from {program.args}, got {line!r}")
+def _length(steps: Mapping[str, list[Step]]) -> int:
+    return len(steps["waiter"]) + len(steps["daemon"])
 
 
 def _until(condition: Callable[[], bool]) -> None:
@@ -206,34 +243,63 @@ def _until(condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def figures(steps: Mapping[str, list[Step]]) -> dict[str, dict[str, int]]:
+def figures(
+    steps: Mapping[str, list[Step]], lines: tuple[str, ...] = LINES
+) -> dict[str, dict[str, int]]:
     """Files, functions and switches of each side and of the path: the waiter's and the daemon's.
 
-    Of the path also the modules and functions of the core.
+    Of the path also the modules and functions of the core. `lines` do not count as functions.
     """
-    told = {side: _counted(side_steps) for side, side_steps in steps.items()}
+    told = {side: _counted(side_steps, lines) for side, side_steps in steps.items()}
     path = [*steps["waiter"], *steps["daemon"]]
-    told["path"] = _counted(path)
-    core = _counted([step for step in path if step[0].startswith("arbiter/core/")])
+    told["path"] = _counted(path, lines)
+    core = _counted([step for step in path if step[0].startswith("arbiter/core/")], lines)
     told["path"] |= {"core modules": core["files"], "core functions": core["functions"]}
     return told
 
 
-def _counted(path: list[Step]) -> dict[str, int]:
+def _counted(path: list[Step], lines: tuple[str, ...]) -> dict[str, int]:
     switches = sum(before[0] != after[0] for before, after in pairwise(path))
     files = {file for file, _, _ in path}
-    return {"files": len(files), "functions": len(set(path)), "switches": switches}
+    return {"files": len(files), "functions": len(_functions(path, lines)), "switches": switches}
 
 
-def main() -> int:
-    with tempfile.TemporaryDirectory(prefix="path") as folder:
-        steps = record(Path(folder))
-    told = figures(steps)
-    if "--list" in sys.argv:
+def _functions(path: list[Step], lines: tuple[str, ...]) -> dict[Step, None]:
+    """Return the functions of a path, in the order of their first call."""
+    return dict.fromkeys(step for step in path if not step[1].endswith(lines))
+
+
+def per_file(path: list[Step], lines: tuple[str, ...] = LINES) -> list[tuple[str, int, int]]:
+    """File, functions and entries of each file on a path, most functions first."""
+    entries = Counter(file for file, _, _ in path[:1])
+    entries.update(after[0] for before, after in pairwise(path) if before[0] != after[0])
+    functions = Counter(file for file, _, _ in _functions(path, lines))
+    return sorted(
+        ((file, functions[file], count) for file, count in entries.items()),
+        key=lambda row: (-row[1], -row[2], row[0]),
+    )
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description="length of the path of one acquire")
+    parser.add_argument("--list", action="store_true", help="print the path itself")
+    parser.add_argument("--files", action="store_true", help="print functions, entries per file")
+    parser.add_argument(
+        "--cold", action="store_true", help="count first-use work and generator expressions too"
+    )
+    asked = parser.parse_args(arguments)
+    steps = min((_recorded(asked.cold) for _ in range(RUNS)), key=_length)
+    lines = () if asked.cold else LINES
+    if asked.list:
         for side, path in steps.items():
-            seen = dict.fromkeys(f"{file}:{line} {name}" for file, name, line in path)
+            seen = (f"{file}:{line} {name}" for file, name, line in _functions(path, lines))
             print(f"{side}:", *seen, sep="\n  ")
-    for side, counts in told.items():
+    if asked.files:
+        for side in ("waiter", "daemon", "holder"):
+            print(f"{side}: functions, entries")
+            for file, functions, entries in per_file(steps[side], lines):
+                print(f"  {functions:4} {entries:5}  {file}")
+    for side, counts in figures(steps, lines).items():
         print(f"{side:8}" + "".join(f" {name} {count}  " for name, count in counts.items()))
     print("targets: " + ", ".join(f"{name} {most}" for name, most in TARGETS.items()))
     return 0
@@ -247,5 +313,5 @@ if __name__ == "__main__":
             asyncio.run(holder(Tracer(Path(out))))
         case ["waiter", out]:
             asyncio.run(waiter(Tracer(Path(out))))
-        case _:
-            raise SystemExit(main())
+        case arguments:
+            raise SystemExit(main(arguments))

@@ -28,3 +28,27 @@ def test_the_path_passes_the_engine_and_the_client(
     assert any(name == "Arbiter.handle" for _, name, _ in steps["daemon"])
     assert any(file.startswith("clients/") for file, _, _ in steps["waiter"])
     assert all(not file.startswith(("arbiter/", "tests/")) for file, _, _ in steps["waiter"])
+
+
+def test_the_figures_of_the_files_add_up(steps: dict[str, list[measure_path.Step]]) -> None:
+    rows = measure_path.per_file(steps["daemon"])
+    figures = measure_path.figures(steps)["daemon"]
+    assert len(rows) == figures["files"]
+    assert sum(functions for _, functions, _ in rows) == figures["functions"]
+    assert sum(entries for _, _, entries in rows) == figures["switches"] + 1
+
+
+def test_generator_expressions_and_lambdas_are_lines_of_their_function() -> None:
+    path = [
+        ("a.py", "f", 1),
+        ("a.py", "f.<locals>.<genexpr>", 2),
+        ("b.py", "g.<locals>.<lambda>", 9),
+    ]
+    figures = measure_path.figures({"waiter": path, "daemon": [], "holder": []})
+    assert figures["path"]["functions"] == 1
+    assert figures["path"]["switches"] == 1
+
+
+def test_first_use_work_is_not_on_the_path(steps: dict[str, list[measure_path.Step]]) -> None:
+    names = {name for side in steps.values() for _, name, _ in side}
+    assert not [name for name in names if name == "<module>"]

@@ -72,7 +72,7 @@ def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) 
         (["--gpu", "fake:lots"], "not a size"),
         (["--gpu", "fake:100MiB"], "leaves nothing of"),
         (["--gpu", "fake:0"], "a card without memory"),
-        (["--gpu", "fake:/dev/null"], "the simulated card in /dev/null cannot be used"),
+        (["--gpu", "fake:/dev/null"], "the simulated GPU in /dev/null cannot be used"),
         (["--gpu", "fake:8GX", "--check-config"], "not a size"),
         (["--endpoint", "tcp://127.0.0.1:5555"], "without CURVE keys"),
         (["--config", "/nonexistent/arbiter.yaml"], "readable YAML file"),
@@ -94,7 +94,7 @@ def test_a_cap_on_a_card_that_is_not_there(make_arbiter: Make) -> None:
     arbiter = make_arbiter(config="gpu:\n  capacity_bytes: {'7': 4GiB}\n")
     done = run_daemon(arbiter, *arbiter.arguments, "--gpu", "fake:8GiB")
     assert done.returncode == 2
-    assert "names no card of this machine: 7" in done.stderr
+    assert "names no GPU of this machine: 7" in done.stderr
 
 
 @pytest.mark.skipif(os.path.exists("/dev/nvidiactl"), reason="this machine has an NVIDIA driver")

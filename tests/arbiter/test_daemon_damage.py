@@ -30,13 +30,15 @@ HOLDER = """
 import asyncio, sys
 from pathlib import Path
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 async def main():
     memory, size = FakeMemory(Path(sys.argv[1]), "holder", 0), 2 << 30
     footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
-    spec = LeaseSpec(consumer="holder", model_id="m", mode="exclusive", footprint=footprint, min_residency_s=0.0)
+    spec = LeaseSpec(
+        consumer="holder", model_id="m", mode="exclusive", footprint=footprint, min_residency_s=0.0
+    )
     async with AsyncClient(name="holder") as client:
         lease = await client.acquire(spec)
         blocks = [memory.allocate("m", size)]

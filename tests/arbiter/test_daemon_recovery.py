@@ -68,7 +68,8 @@ def reattach(client: WireClient, on: dict[str, Any], name: str, size: int) -> di
 RUNNER = """
 import sys
 from vram_arbiter.clients.sync import Client
-with Client(name="runner") as client, client.use(sys.argv[1], (int(sys.argv[2]), int(sys.argv[3])), "goal") as use:
+lease_id, epoch, counter = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+with Client(name="runner") as client, client.use(lease_id, (epoch, counter), "goal") as use:
     print("in use", flush=True)
     sys.stdin.readline()
     print(use.lost, flush=True)
@@ -267,9 +268,7 @@ def test_a_measured_footprint_is_charged_after_a_restart_and_a_reboot(make_arbit
         assert client.ask("oom", **on, requested_bytes=2 * GIB, allocated_bytes=GIB)["ok"]
         assert client.ask("bye")["ok"]
     assert arbiter.stop() == 0
-    with sqlite3.connect(arbiter.state / "journal.sqlite") as database:
-        database.execute("UPDATE meta SET value = 'another' WHERE name = 'boot_id'")
-    database.close()
+    Journal.open(arbiter.state, "an earlier boot").close()
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
         lease = client.hello().granted("holder", GIB, nonce="again")

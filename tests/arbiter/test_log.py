@@ -2,12 +2,15 @@
 
 import json
 import logging
+import re
+import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from vram_arbiter.arbiter import log as telemetry
-from vram_arbiter.arbiter.log import REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
+from vram_arbiter.arbiter.log import LINES_MAX, REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
 
 EVENT = {"seq": 4, "at_wall_s": 1.0, "kind": "granted", "lease_id": "L1-4", "consumer": "detector",
          "charge_bytes": 5 << 30, "waited_s": 1.25, "reason": "fits"}  # fmt: skip
@@ -65,6 +68,31 @@ def test_an_exception_is_part_of_the_line(capsys: pytest.CaptureFixture[str]) ->
         except ValueError:
             logging.getLogger("x").exception("it failed")
         assert "ValueError: why" in capsys.readouterr().err
+
+
+def test_a_log_that_is_not_read_holds_up_nothing_and_loses_lines_in_words() -> None:
+    """A reader of stderr that stopped held up the whole daemon, until its watchdog killed it."""
+    read, lines = threading.Event(), list[str]()
+
+    class Slow(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            read.wait(60)
+            lines.append(record.getMessage())
+
+    root = logging.getLogger()
+    root.handlers, root.level = [Slow()], logging.INFO
+    close = telemetry.write_in_thread()
+    for _ in range(LINES_MAX + 10):
+        telemetry.log_event(EVENT)
+    read.set()
+    while len(lines) < LINES_MAX:
+        time.sleep(0.001)
+    telemetry.log_event(EVENT)
+    close()
+    logging.getLogger("x").warning("after the end")
+    assert re.fullmatch(r"(9|10) lines are left out: the log was not read", lines[-3])
+    assert lines[-2].startswith("granted L1-4 (detector)")
+    assert lines[-1] == "after the end"
 
 
 def test_a_flood_of_refusals_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:

@@ -16,7 +16,6 @@ from vram_arbiter.schemas.ids import (
     ClientId,
     GpuId,
     LeaseId,
-    ModelKey,
     ProcessKey,
     RequestId,
     Token,
@@ -24,6 +23,7 @@ from vram_arbiter.schemas.ids import (
 )
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import AcquireReply
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 CARD = GpuId("GPU-0")
 STEP_S = 0.001
@@ -84,11 +84,9 @@ class Bench:
         self.handle(ev.MemorySampled(CARD, self.now, 0, self.capacity, None))
 
     def acquire(self, client: ClientId, size: int) -> LeaseId:
-        spec = ev.Spec(
-            consumer="bench", key=ModelKey("m"), gpu="any", exclusive=False, load_peak_bytes=size,
-            steady_bytes=size, residue_bytes=0, priority=50, evictable=True, ttl_s=1e9,
+        spec = LeaseSpec(
+            consumer="bench", model_id="m", footprint=Footprint(size, size, 0), ttl_s=1e9,
             min_residency_s=0.0,
-            deny_on_deadline=False,
         )  # fmt: skip
         event = ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
         reply = next(effect for effect in self.handle(event) if isinstance(effect, Reply))

@@ -43,7 +43,7 @@ def run(suite: Suite) -> None:
         peer.close()
     suite.time("bare Python's start", found["bare"])
     suite.compare(
-        "start of vramctl status, answered", found["status"], found["bare"], "bare Python", 6.0
+        "start of vramctl status, answered", found["status"], found["bare"], "bare Python", 8.0
     )
 
 

@@ -46,7 +46,6 @@ ATTACKS = ("empties", "maps", "more", "connects")
 RATE_HZ = 30.0
 JITTER_MAX_US = 2000.0
 STOP_MAX_US = 10_000.0
-STOPS = 200
 STOP_PAUSE_S = 0.01
 NO_HOLD = (
     "scheduling:\n  thrash_hold_max_s: 0\n"  # it would slow down on purpose what is measured here
@@ -58,6 +57,19 @@ BOOT_S = 240.0
 SETTLE_S = 3.0  # after the start: imports, first pictures, page cache
 POLL_S = 0.1
 END_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How much is measured: rounds of stretches, their length, and emergency stops."""
+
+    rounds: int
+    stretch_s: float
+    stops: int
+
+
+FULL = Extent(rounds=4, stretch_s=15.0, stops=200)
+QUICK = Extent(rounds=1, stretch_s=1.5, stops=50)
 
 Tick = dict[str, float]
 Stretch = tuple[float, float]  # monotonic seconds
@@ -80,9 +92,7 @@ class RunnerRow:
 def run(*, quick: bool, out: Path) -> list[RunnerRow]:
     """Measure and write. Raises RuntimeError when a program ends by itself."""
     with arbiter(SHIPPED + NO_HOLD) as daemon:
-        measured = asyncio.run(
-            _measure(daemon, rounds=1 if quick else 4, stretch_s=4.0 if quick else 15.0)
-        )
+        measured = asyncio.run(_measure(daemon, QUICK if quick else FULL))
     rows = measured.rows()
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps([asdict(row) for row in rows], indent=1, ensure_ascii=False) + "\n")
@@ -204,7 +214,7 @@ def _compare(name: str, busy: Sequence[float], idle: Sequence[float]) -> RunnerR
 
 
 # -- the run
-async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Measured:
+async def _measure(daemon: ArbiterProcess, extent: Extent) -> Measured:
     found = Measured([], [], [], [], [], [], [], [], [], [], [], [], [])
     timings = daemon.runtime / "ticks.jsonl"
     video = daemon.runtime / "episode.mp4"
@@ -233,7 +243,8 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
                 await _until_up(sidecar.ping, [process, *sidecars.values()])
             await _switch(runner, detector, grab)
             await asyncio.sleep(SETTLE_S)
-            for _ in range(rounds):
+            stretch_s = extent.stretch_s
+            for _ in range(extent.rounds):
                 began = time.monotonic()
                 await asyncio.sleep(stretch_s)
                 found.idle.append((began, time.monotonic()))
@@ -243,10 +254,10 @@ async def _measure(daemon: ArbiterProcess, rounds: int, stretch_s: float) -> Mea
                 found.switching.append((began, time.monotonic()))
                 await _drive(found, runner, detector, grab, stretch_s)
             found.starting.append(await _start_another(daemon, [process]))
-            await _goals(found, runner, detector, grab, 3 * rounds)
+            await _goals(found, runner, detector, grab, 3 * extent.rounds)
             for attack in ATTACKS:
                 await _attacked(found, runner, attack, stretch_s / 2)
-            await _stops(found, runner)
+            await _stops(found, runner, extent.stops)
     found.ticks = [json.loads(line) for line in timings.read_text().splitlines()]
     return found
 
@@ -330,12 +341,12 @@ async def _attacked(found: Measured, runner: RunnerClient, attack: str, stretch_
         found.attacked.append((began, time.monotonic()))
 
 
-async def _stops(found: Measured, runner: RunnerClient) -> None:
+async def _stops(found: Measured, runner: RunnerClient, count: int) -> None:
     """The last that is measured: the robot stays stopped. First nothing beside, then all attacks at
     once."""
     for stops_us, attacks in ((found.stops_us, ()), (found.attacked_stops_us, ATTACKS)):
         with _attackers(runner, attacks):
-            for _ in range(STOPS):
+            for _ in range(count):
                 stops_us.append(await asyncio.to_thread(_stop, path_of(runner.endpoint)))
                 await asyncio.sleep(STOP_PAUSE_S)
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.costly import COSTLY
+
 HERE = Path(__file__).parent
 KEYS = {
     "name",
@@ -97,6 +99,24 @@ def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> 
     (jitter,) = [row for row in rows if row["name"] == "tick_jitter"]
     assert isinstance(jitter["idle_p99_us"], float)
     assert jitter["ok"] == (float(str(jitter["p99_us"])) < 2000)
+
+
+@pytest.mark.parametrize("kind", COSTLY)
+def test_a_costly_message_is_decoded_or_refused(kind: str) -> None:
+    """The row called a function that had changed, and no test ran it."""
+    sys.path.insert(0, str(HERE))
+    from bench_attacks import cost_us
+
+    assert cost_us(COSTLY[kind]) > 0
+
+
+def test_decisions_of_the_engine_alone_are_timed() -> None:
+    sys.path.insert(0, str(HERE))
+    from bench_core import Bench
+
+    bench = Bench(leases=4, waiters=8)
+    bench.mix(3)
+    assert {kind: len(took) for kind, took in bench.samples.items()}["Renewed"] == 3
 
 
 def test_a_loop_that_stood_still_is_in_the_figures_however_long() -> None:

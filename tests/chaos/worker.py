@@ -25,7 +25,7 @@ from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
 

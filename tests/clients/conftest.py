@@ -2,6 +2,7 @@
 condition with a deadline."""
 
 from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any
 
 import anyio
 import pytest
@@ -11,7 +12,7 @@ from tests.support.process import ArbiterProcess
 from tests.support.protocol_wire import Wire
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 DEADLINE_S = 60.0
 TTL_S = 120.0
@@ -42,16 +43,8 @@ def spec() -> Callable[..., LeaseSpec]:
     def make(consumer: str, gib: float, **fields: object) -> LeaseSpec:
         size = int(gib * GIB)
         footprint = Footprint(load_peak_bytes=size, steady_bytes=size, residue_bytes=0)
-        return LeaseSpec.model_validate(
-            {
-                "consumer": consumer,
-                "model_id": consumer,
-                "footprint": footprint,
-                "min_residency_s": 0.0,
-                "ttl_s": TTL_S,
-                **fields,
-            }
-        )
+        wanted: dict[str, Any] = {"min_residency_s": 0.0, "ttl_s": TTL_S, **fields}
+        return LeaseSpec(consumer=consumer, model_id=consumer, footprint=footprint, **wanted)
 
     return make
 

@@ -18,6 +18,7 @@ from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import STATUS_PAGE
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
@@ -32,21 +33,19 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import Totals
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
-pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+pytestmark = [
+    pytest.mark.anyio,
+    pytest.mark.parametrize("anyio_backend", ["asyncio", "trio"]),
+    pytest.mark.e2e,
+]
 
 Spec = Callable[..., LeaseSpec]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
 WAIT_S = 60.0
-
-
-@pytest.fixture(params=["asyncio", "trio"])
-def anyio_backend(request: pytest.FixtureRequest) -> str:
-    """The client runs on both."""
-    return str(request.param)
 
 
 async def states(client: AsyncClient) -> dict[str, str]:
@@ -106,7 +105,7 @@ async def test_status_is_whole_though_it_comes_in_pages(
             for _ in range(5)
         ]
         await clients[0].acquire(spec("holder", 5))
-        asked = {"spec": spec("crowd", 5).model_dump()}
+        asked = {"spec": to_map(spec("crowd", 5))}
         for number in range(waiters):
             await clients[1 + number % 4].ask("acquire", {"nonce": f"n{number}", **asked})
         page = await clients[0].ask("status")

@@ -19,21 +19,19 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WouldDeadlock,
 )
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
-pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+pytestmark = [
+    pytest.mark.anyio,
+    pytest.mark.parametrize("anyio_backend", ["asyncio", "trio"]),
+    pytest.mark.e2e,
+]
 
 GIB = 1 << 30
 WAIT_S = 60.0
 Spec = Callable[..., LeaseSpec]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
-
-
-@pytest.fixture(params=["asyncio", "trio"])
-def anyio_backend(request: pytest.FixtureRequest) -> str:
-    """The client runs on both."""
-    return str(request.param)
 
 
 class Model:

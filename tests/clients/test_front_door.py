@@ -222,7 +222,7 @@ class TestThreads:
         [
             ({}, "neither a spec nor `vram`"),
             ({"vram": "abc"}, "not a size: 'abc'"),
-            ({"vram": "1GiB", "standy": True}, "standy: Extra inputs are not permitted"),
+            ({"vram": "1GiB", "standy": True}, "standy: Unexpected keyword argument"),
             ({"vram": "1GiB", "priority": 101}, "priority: .* got 101"),
         ],
     )

@@ -16,7 +16,7 @@ from vram_arbiter.schemas.errors import (
     LeaseRevoking,
     VramInsufficient,
 )
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = pytest.mark.e2e
 

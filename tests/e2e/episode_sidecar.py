@@ -6,6 +6,7 @@ of the model does not come back (`holding` says that it is in one); a file `fail
 makes the load or a call fail, `slow_load` makes the load last.
 """
 
+import functools
 import sys
 import threading
 from pathlib import Path
@@ -13,13 +14,15 @@ from typing import Any
 
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.sidecar import EndpointCall
-from vram_arbiter.sidecars.__main__ import main
+from vram_arbiter.sidecars.__main__ import main as serve
 from vram_arbiter.sidecars.weights import Weights
 
 LOOK_S = 0.005
 
 
 class StillModel:
+    modules = ()
+
     def __init__(self, manifest: RSkillManifest, folder: Path) -> None:
         self.kind: Any = manifest.kind.value
         self.ops = frozenset({"detect"} if self.kind == "detector" else {"get_action", "reset"})
@@ -40,9 +43,6 @@ class StillModel:
         self._while_there("slow_load")
         self._fail("fail_load")
 
-    def unload(self) -> None:
-        pass
-
     def run(self, call: Any) -> dict[str, Any]:
         """An answer that moves nothing: where the joints are, for ten steps; or no detection."""
         if not isinstance(call, EndpointCall):
@@ -59,10 +59,14 @@ class StillModel:
         return {"action": np.tile(call.data["observation"]["observation.state"], (10, 1))}
 
 
-def adapter_for(manifest: RSkillManifest, weights: Weights) -> Any:
+def adapter_for(folder: Path, manifest: RSkillManifest, weights: Weights) -> Any:
     return StillModel(manifest, folder)
 
 
-if __name__ == "__main__":
+def main() -> int:
     folder = Path(sys.argv.pop(1))
-    sys.exit(main(adapter_for=adapter_for))
+    return serve(adapter_for=functools.partial(adapter_for, folder))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

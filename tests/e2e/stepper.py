@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tests.support.saying import say
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 # a daemon that is started again on a busy machine is away for seconds, and nobody is to fence

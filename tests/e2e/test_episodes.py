@@ -135,8 +135,11 @@ class Programs:
         os.kill(self.running[name].pid, signal.SIGKILL)
         self.running[name].wait(WAIT_S)
 
-    def play(self, scenario: "Callable[[Stage], Coroutine[Any, Any, None]]") -> None:
-        """Run it on a stage of its own; a failure shows what the programs said."""
+    def play(self, scenario: "Callable[[Stage], Coroutine[Any, Any, None]]") -> list[str]:
+        """Run it on a stage of its own; a failure shows what the programs said.
+
+        Returns what was wrong on the simulated GPU until its end.
+        """
 
         async def bounded() -> None:
             async with asyncio.timeout(SCENARIO_S), AsyncExitStack() as stack:
@@ -148,6 +151,10 @@ class Programs:
         except BaseException:
             print((self.runtime / "programs.log").read_text(errors="replace")[-6000:])
             raise
+        return self.wrong_on_the_gpu()
+
+    def wrong_on_the_gpu(self) -> list[str]:
+        return check_log((self.arbiter.card / "log.jsonl").read_text()).problems
 
     def close(self) -> None:
         for process in reversed(self.running.values()):
@@ -159,9 +166,9 @@ class Programs:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait(WAIT_S)
-        report = check_log((self.arbiter.card / "log.jsonl").read_text())
+        wrong = self.wrong_on_the_gpu()
         self.arbiter.close()
-        assert report.problems == [], report
+        assert wrong == []
 
 
 class Stage:
@@ -432,10 +439,8 @@ async def canceled_while_loading(stage: Stage) -> None:
     await stage.until("granted", "policy")
     async with PolicyClient(f"ipc://{stage.programs.runtime}/policy.sock") as policy:
         await goal.cancel()
-        while (await policy.ping(timeout_s=WAIT_S))[
-            "state"
-        ] != "unloading":  # the runner has told it
-            await asyncio.sleep(0.01)
+        while (await policy.ping(timeout_s=WAIT_S))["state"] == "loading":
+            await asyncio.sleep(0.01)  # until the runner has told it
     stage.programs.tell("slow_load", False)
     assert (await goal.result(WAIT_S))["status"] == "canceled"
     await stage.detector_is_back(after="granted")
@@ -479,7 +484,7 @@ async def runner_killed(stage: Stage) -> None:
 def test_after_a_goal_the_detector_is_back_by_itself(
     episode_programs: Programs, end: Callable[[Stage], Coroutine[Any, Any, None]]
 ) -> None:
-    episode_programs.play(end)
+    assert episode_programs.play(end) == []
 
 
 async def called_back(stage: Stage) -> None:
@@ -522,7 +527,7 @@ def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
 ) -> None:
     """Regression: the detector left the card for a goal that had been canceled, and stayed away."""
     try:
-        episode_programs.play(called_back)
+        assert episode_programs.play(called_back) == []
     finally:
         episode_programs.kill("spare")
 
@@ -546,7 +551,7 @@ def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(
 ) -> None:
     """Nobody is made to leave in the middle of a step; the look that was wanted comes with the
     goal's end."""
-    episode_programs.play(wanted_meanwhile)
+    assert episode_programs.play(wanted_meanwhile) == []
 
 
 async def one_after_the_other(stage: Stage) -> None:
@@ -578,7 +583,7 @@ async def one_after_the_other(stage: Stage) -> None:
 def test_the_next_goal_with_other_words_loads_nothing_and_lets_nothing_back_in_between(
     episode_programs: Programs,
 ) -> None:
-    episode_programs.play(one_after_the_other)
+    assert episode_programs.play(one_after_the_other) == []
 
 
 async def without_a_gpu(stage: Stage) -> None:
@@ -592,7 +597,7 @@ async def without_a_gpu(stage: Stage) -> None:
 
 
 def test_a_goal_without_a_gpu_sends_nobody_away(episode_programs: Programs) -> None:
-    episode_programs.play(without_a_gpu)
+    assert episode_programs.play(without_a_gpu) == []
 
 
 async def slow_start(stage: Stage) -> None:
@@ -619,7 +624,7 @@ async def slow_start(stage: Stage) -> None:
 
 
 def test_no_goal_runs_before_its_policy_is_ready(episode_programs: Programs) -> None:
-    episode_programs.play(slow_start)
+    assert episode_programs.play(slow_start) == []
 
 
 class Script:

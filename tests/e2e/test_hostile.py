@@ -213,7 +213,8 @@ for op in ("ready", "revoke_ack", "unloading", "release"):
 codes["oom"] = client.ask("oom", **on, requested_bytes=1)["error"]["code"]
 codes["cancel"] = client.ask("cancel", lease_id=on["lease_id"])["error"]["code"]
 codes["renew"] = client.ask("renew", leases=[on])["gone"][0]["error"]["code"]
-spec = {"consumer": "honest", "model_id": "m", "footprint": {"load_peak_bytes": 1, "steady_bytes": 1}}
+footprint = {"load_peak_bytes": 1, "steady_bytes": 1}
+spec = {"consumer": "honest", "model_id": "m", "footprint": footprint}
 held = {**on, "spec": spec, "state": "held"}
 codes["reattach"] = client.ask("reattach", leases=[held])["leases"][0]["error"]["code"]
 codes["end"] = client.ask("use_end", **on, use_id="work")["uses"]

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import atheris
 
+from vram_arbiter.schemas.plain import Message
+
 with atheris.instrument_imports(include=["vram_arbiter.schemas.runtime.zmtp"]):
     from vram_arbiter.schemas.runtime.zmtp import (
         COMMAND_MAX_BYTES,

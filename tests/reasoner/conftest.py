@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
 from vram_arbiter.schemas.goals import (
     RUNNER_REQUEST,
@@ -21,6 +21,7 @@ from vram_arbiter.schemas.goals import (
     GetState,
     SendGoal,
 )
+from vram_arbiter.schemas.plain import Message
 
 
 class Runner:

@@ -14,7 +14,8 @@ class Point(gymnasium.Env[Any, Any]):
     episode. The mark follows from the seed.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 — gymnasium's own way
+    # gymnasium reads it from the class
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
 
     def __init__(
         self,
@@ -81,7 +82,8 @@ class Hand(gymnasium.Env[Any, Any]):
     given in the next observation.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 — gymnasium's own way
+    # gymnasium reads it from the class
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode

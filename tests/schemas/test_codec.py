@@ -80,7 +80,7 @@ def test_a_client_ignores_what_only_a_newer_arbiter_knows() -> None:
     ("damaged", "problem"),
     [
         ({}, "Everything lacks by_name, lease, pair, pet, token, tokens"),
-        ({**to_map(FULL), "token": 7}, "Token: expected a map, got 7"),
+        ({**to_map(FULL), "token": 7}, "expected a list of 2, got 7"),
         ({**to_map(FULL), "tokens": {}}, "expected a list, got {}"),
         ({**to_map(FULL), "pair": [1]}, r"expected a list of 2, got \[1\]"),
         ([], r"Everything: expected a map, got \[\]"),

@@ -2,14 +2,13 @@
 
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import pytest
 
 from tests.support.fakegpu_check import check_log
+from tests.support.prepared import start
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
@@ -64,9 +63,24 @@ class Sidecar:
         self.process.terminate()
         return self.process.wait(PATIENCE_S)
 
+    def model_pid(self):
+        """Pid of the model's process, which was forked from the server of imports."""
+        (server,) = [
+            pid
+            for pid in children(self.process.pid)
+            if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text()
+        ]
+        (model,) = children(server)
+        return model
+
     @property
     def log(self):
         return (self.folder / "log").read_text()
+
+
+def children(pid):
+    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(child) for child in listed.split()]
 
 
 class Box:
@@ -82,16 +96,12 @@ class Box:
         folder = self.runtime / f"{name}-model"
         folder.mkdir(exist_ok=True)
         (folder / "rskill.yaml").write_text(MANIFEST.format(name=name))
-        command = [
-            sys.executable, str(Path(__file__).with_name("echo_sidecar.py")), str(folder), "--name",
-            name,
-            "--rskill", str(folder / "rskill.yaml"), "--device", device or f"fake:{self.card}",
-            "--footprint", footprint, *flags,
+        arguments = [
+            str(folder), "--name", name, "--rskill", str(folder / "rskill.yaml"),
+            "--device", device or f"fake:{self.card}", "--footprint", footprint, *flags,
         ]  # fmt: skip
         with (folder / "log").open("ab") as log:
-            process = subprocess.Popen(
-                command, env=self.environ, stdout=log, stderr=log, stdin=subprocess.DEVNULL
-            )
+            process = start("echo", arguments, self.environ, log.fileno(), log.fileno())
         sidecar = Sidecar(process, f"ipc://{self.runtime}/{name}.sock", folder)
         self.sidecars.append(sidecar)
         return sidecar
@@ -125,6 +135,13 @@ def box(arbiter_daemon):
     box = Box(arbiter_daemon.runtime, arbiter_daemon.card, arbiter_daemon.environ)
     yield box
     box.close()
+
+
+@pytest.fixture
+def arbiter(arbiter_daemon):
+    """An operator's connection: the status that it gets shows tokens."""
+    with WireClient(arbiter_daemon.endpoint) as client:
+        yield client.hello("looker", role="operator")
 
 
 @pytest.fixture

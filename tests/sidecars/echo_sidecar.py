@@ -1,23 +1,25 @@
 """A whole sidecar process around a model without weights: `python echo_sidecar.py FOLDER [flags of
 vram-sidecar]`.
 
-FOLDER tells it what to do: a file `fail_prepare`, `fail_load` or `fail_unload` makes that step
-fail, `slow_prepare`, `slow_load` or `slow_unload` makes it last. The query tells `run`: `hold NAME`
+FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail,
+`slow_prepare` or `slow_load` makes it last. The query tells `run`: `hold NAME`
 waits until the file NAME appears there, `fail` raises; anything else is echoed. `query` is answered
 with what stands behind the picture's first eight bytes.
 """
 
+import functools
 import sys
 import threading
 from pathlib import Path
 
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.sidecar import QueryOp
-from vram_arbiter.sidecars.__main__ import main
+from vram_arbiter.sidecars.__main__ import main as serve
 
 
 class EchoAdapter:
     kind = "detector"
+    modules = ()
     ops = frozenset({"detect", "query", "get_action", "reset"})
 
     def __init__(self, folder: Path) -> None:
@@ -41,11 +43,6 @@ class EchoAdapter:
         self._fail("load")
         self._model = device
 
-    def unload(self) -> None:
-        self._last("unload")
-        self._model = None
-        self._fail("unload")
-
     def run(self, call) -> dict[str, object]:
         if self._model is None:
             raise RuntimeError("run without a model")
@@ -64,6 +61,14 @@ class EchoAdapter:
         return {"ok": True, "answer": query, "norm": 1000, "detections": []}
 
 
-if __name__ == "__main__":
+def adapter_for(folder: Path, manifest, weights) -> EchoAdapter:
+    return EchoAdapter(folder)
+
+
+def main() -> int:
     folder = Path(sys.argv.pop(1))
-    sys.exit(main(adapter_for=lambda manifest, weights: EchoAdapter(folder)))
+    return serve(adapter_for=functools.partial(adapter_for, folder))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

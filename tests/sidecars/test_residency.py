@@ -2,19 +2,16 @@
 it that no other process can hit."""
 
 import asyncio
-import threading
 
 import pytest
 
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.schemas.errors import NotResident
+from vram_arbiter.schemas.errors import Evicted, ModelError, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
-from vram_arbiter.sidecars.device.fake import FakeMemory
-from vram_arbiter.sidecars.residency import Residency
+from vram_arbiter.sidecars.residency import TRANSITIONS, Residency
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.weights import Weights
-from vram_arbiter.sidecars.worker import Worker
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -35,28 +32,49 @@ detector: {labels: [cube]}
 
 
 class Model:
-    """Counts its loads; one lasts until it `may_load`."""
+    """A residency without a process. Counts its loads; one lasts until it `may_load`."""
 
-    kind = "detector"
-    ops = frozenset({"detect"})
+    def __init__(self, box):
+        self._box = box
+        self.ended = asyncio.Event()
+
+    async def prepare(self):
+        pass
+
+    async def load(self, gpu):
+        self._box.loads += 1
+        loaded = asyncio.create_task(self._box.may_load.wait())
+        died = asyncio.create_task(self.ended.wait())
+        await asyncio.wait({loaded, died}, return_when=asyncio.FIRST_COMPLETED)
+        for waiting in (loaded, died):
+            waiting.cancel()
+        if self.ended.is_set():
+            raise ModelError("the model's process ended by SIGKILL")
+        return GB
+
+    async def run(self, call, *, begin_s, end_s, begins):
+        begins()
+        if call == "die":
+            self.ended.set()
+            raise ModelError("the model's process ended by SIGKILL")
+        return {"answer": call}
+
+    async def end(self, *, at_once=False):
+        self.ended.set()
+
+
+class Models:
+    """Starts them."""
 
     def __init__(self):
         self.loads = 0
-        self.may_load = threading.Event()
+        self.started = []
+        self.may_load = asyncio.Event()
         self.may_load.set()
 
-    def prepare(self):
-        pass
-
-    def load(self, device):
-        self.loads += 1
-        assert self.may_load.wait(WAIT_S)
-
-    def unload(self):
-        pass
-
-    def run(self, call):
-        return {"ok": True}
+    async def start(self):
+        self.started.append(Model(self))
+        return self.started[-1]
 
 
 class Client(AsyncClient):
@@ -88,64 +106,96 @@ def settings(daemon):
 async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon):
     """Regression: the wait was over and the lease not taken yet, so there was nothing to give up,
     and the model was loaded."""
-    worker, model = Worker(), Model()
+    models = Models()
     async with Client(arbiter_daemon.endpoint) as client, asyncio.timeout(WAIT_S):
-        memory = FakeMemory(arbiter_daemon.card, "eye", GB // 10)
-        residency = Residency(settings(arbiter_daemon), model, memory, worker, client)
+        residency = Residency(settings(arbiter_daemon), models.start, client)
         client.at_the_grant = residency.unload
         with pytest.raises(NotResident):
             await residency.load()
         await client.done
-        assert (model.loads, residency.state, residency.token()) == (0, "unloaded", None)
+        assert (models.loads, residency.state, residency.token()) == (0, "unloaded", None)
         while (await client.status()).leases:
             await asyncio.sleep(0.02)
         assert await residency.load(), "the next request asks anew"
-        assert (model.loads, residency.state) == (1, "resident")
-        assert await residency.leave()
-    worker.close()
-
-
-class OneGpu(FakeMemory):
-    """A process that stays on the GPU that it was granted first, as CUDA does."""
-
-    def bind(self, gpu):
-        return gpu
-
-
-async def test_a_process_that_cannot_change_its_gpu_asks_for_that_one(arbiter_daemon):
-    """A sidecar loaded on the first GPU whichever was granted."""
-    daemon = arbiter_daemon
-    worker = Worker()
-    async with AsyncClient("eye", endpoint=daemon.endpoint) as client, asyncio.timeout(WAIT_S):
-        memory = OneGpu(daemon.card, "eye", GB // 10)
-        residency = Residency(settings(daemon), Model(), memory, worker, client)
-        await residency.load()
-        first = residency.lease
-        assert first.spec.gpu == "any"
-        await residency.unload()
-        await residency.load()
-        assert residency.lease.spec.gpu == residency.lease.gpu == first.gpu
-        assert await residency.leave()
-    worker.close()
+        assert (models.loads, residency.state) == (1, "resident")
+        await residency.leave()
 
 
 async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too(arbiter_daemon):
     """Regression: there was no lease to give up and nothing resident to unload yet, so it was
     answered and the model stayed."""
-    worker, model = Worker(), Model()
-    memory = FakeMemory(arbiter_daemon.card, "eye", GB // 10)
-    residency = Residency(settings(arbiter_daemon), model, memory, worker, None)
-    model.may_load.clear()
+    models = Models()
+    residency = Residency(settings(arbiter_daemon), models.start, None)
+    models.may_load.clear()
     async with asyncio.timeout(WAIT_S):
         loading = asyncio.create_task(residency.load())
-        while not model.loads:
+        while not models.loads:
             await asyncio.sleep(0.01)
-        unloading = asyncio.create_task(residency.unload())
-        await asyncio.sleep(0)  # it has begun
-        model.may_load.set()
-        await unloading
+        await residency.unload()
         with pytest.raises(NotResident):
             await loading
-        assert (model.loads, residency.state) == (1, "unloaded")
-        assert await residency.leave()
-    worker.close()
+        assert (models.loads, residency.state) == (1, "unloaded")
+        await residency.leave()
+
+
+async def test_each_residency_has_a_model_of_its_own(arbiter_daemon):
+    models = Models()
+    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
+        async with asyncio.timeout(WAIT_S):
+            residency = Residency(settings(arbiter_daemon), models.start, client)
+            await residency.load()
+            await residency.unload()
+            assert models.started[0].ended.is_set()
+            await residency.load()
+            assert len(models.started) == 2
+            assert not models.started[1].ended.is_set()
+            await residency.leave()
+            assert models.started[1].ended.is_set()
+
+
+async def test_a_model_that_dies_ends_its_lease_and_the_next_request_loads_another(arbiter_daemon):
+    models = Models()
+    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
+        async with asyncio.timeout(WAIT_S):
+            residency = Residency(settings(arbiter_daemon), models.start, client)
+            with pytest.raises(ModelError, match="SIGKILL"):
+                await residency.run("detect", None, "die")
+            while residency.state != "unloaded" or (await client.status()).leases:
+                await asyncio.sleep(0.02)
+            assert residency.last_error.code == "model_error"
+            assert (await residency.run("detect", None, "look"))["answer"] == "look"
+            await residency.leave()
+
+
+async def test_a_process_that_died_while_it_waited_is_not_used(arbiter_daemon):
+    """A process is prepared ahead. It may die before its model is wanted: the next load would have
+    failed, although nothing was wrong with the model."""
+    models = Models()
+    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
+        async with asyncio.timeout(WAIT_S):
+            residency = Residency(settings(arbiter_daemon), models.start, client)
+            residency.prepare()
+            await residency.prepared()
+            models.started[0].ended.set()
+            assert await residency.load()
+            assert (len(models.started), residency.state) == (2, "resident")
+            await residency.leave()
+
+
+async def test_a_request_behind_an_unload_is_evicted_not_answered(arbiter_daemon):
+    """Regression: an op that was queued before an unload ran after it."""
+    models = Models()
+    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
+        async with asyncio.timeout(WAIT_S):
+            residency = Residency(settings(arbiter_daemon), models.start, client)
+            await residency.load()
+            token = residency.token()
+            await residency.unload()
+            with pytest.raises(Evicted):
+                await residency.run("detect", token, "look")
+            await residency.leave()
+
+
+def test_every_state_can_be_reached_and_left():
+    assert set().union(*TRANSITIONS.values()) == TRANSITIONS.keys()
+    assert all(TRANSITIONS.values())

@@ -1,12 +1,20 @@
 """Where weights come from."""
 
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.schemas.errors import ConfigError, ModelError
-from vram_arbiter.sidecars.weights import Weights, from_pretrained, resolve
+from vram_arbiter.schemas.manifest.load import load_manifest
+from vram_arbiter.sidecars.weights import (
+    Weights,
+    from_pretrained,
+    read_config,
+    resolve,
+    unquantized_modules,
+)
 
 
 def test_a_hub_id_keeps_its_revision(tmp_path):
@@ -53,3 +61,31 @@ def test_hub_and_folder_take_the_same_call(tmp_path):
         ModelError, match=r"Model cannot load broken: OSError: no file named config\.json"
     ):
         from_pretrained(Model, Weights("broken"))
+
+
+def test_modules_that_stay_unquantized_are_a_list_of_names():
+    """A bare text would be taken apart into its letters, and every module would be quantized."""
+    manifest = load_manifest(configs_folder({}) / "rskills" / "so101-grab" / "rskill.yaml")
+    assert unquantized_modules(manifest) == ["lm_head", "visual"]
+    extra = {"skip_modules": "lm_head"}
+    wrong = manifest.quantization.model_copy(update={"extra": extra})
+    with pytest.raises(ConfigError, match="give a list of module names"):
+        unquantized_modules(manifest.model_copy(update={"quantization": wrong}))
+
+
+@pytest.mark.heavy
+def test_reading_a_configuration_leaves_no_temporary_file(tmp_path, monkeypatch):
+    """lerobot parses a configuration through a temporary file and keeps it; each start of a policy
+    sidecar left one."""
+    configs = pytest.importorskip("lerobot.configs.policies")
+    import vram_arbiter.sidecars.models.compact_act  # noqa: F401  registers itself
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    weights = resolve("local://models/so101-grab", configs_folder({}))
+    found = read_config(configs.PreTrainedConfig, weights)
+    assert list(tmp_path.glob("tmp*")) == []
+    assert found == configs.PreTrainedConfig.from_pretrained(weights.source)
+    nothing = tmp_path / "nothing"
+    nothing.mkdir()
+    with pytest.raises(ModelError, match=r"PreTrainedConfig cannot load .*config\.json"):
+        read_config(configs.PreTrainedConfig, Weights(str(nothing), local=True))

@@ -39,7 +39,7 @@ class Host:
     async def unload(self):
         self.calls.append(("unload",))
 
-    async def run(self, name, call):
+    async def run(self, name, call, message):
         self.calls.append((name, call))
         await self.gate.wait()
         if isinstance(self.answer, Exception):
@@ -156,7 +156,7 @@ def test_arrays_go_both_ways_and_objects_never():
     observation = {"state": npy(np.arange(3.0)), "task": "grab"}
     (reply,), host = talk(
         {"endpoint": "get_action", "data": {"observation": observation}},
-        answer={"action": np.zeros((2, 6), np.float32)},
+        answer={"action": npy(np.zeros((2, 6), np.float32))},
     )
     assert (host.calls[0][1].data["observation"]["state"] == np.arange(3.0)).all()
     assert reply["action"]["__ndarray_class__"] is True

@@ -24,7 +24,8 @@ from vram_arbiter.clients.net.dealer import Dealer
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.ids import GpuId
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import checked_spec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 SIZES = (600 * d.MIB, d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_000_000, 7 * d.GIB)
 RESIDUES = (0, 200 * d.MIB, 450 * d.MIB)
@@ -56,7 +57,7 @@ class SimSession(Session):
             self._world.touch()
 
     def _new_dealer(self) -> Dealer:
-        return self._world.open_link(self._process, self._received, self._hung_up)  # type: ignore[return-value]
+        return self._world.open_link(self._process, self._received, self._hung_up)
 
     def _killed(self) -> None:
         self._open = False  # what is still on the stack of a dead process must not speak
@@ -157,18 +158,18 @@ class Cast:
             for record in client.protocol.holdings.held.values():
                 if client.now() >= client.protocol.holdings.fence_at(record):
                     continue
-                footprint = record.spec["footprint"]
+                spec = checked_spec(record.spec)
                 holding = self.holdings.get(record.lease_id)
-                residue = int(footprint["residue_bytes"])
+                residue = spec.footprint.residue_bytes
                 loaded = holding is not None and holding.loaded
-                size = int(footprint["steady_bytes" if loaded else "load_peak_bytes"])
+                size = spec.footprint.steady_bytes if loaded else spec.footprint.load_peak_bytes
                 yield Entitlement(
                     client.process.key,
                     record.lease_id,
                     GpuId(str(record.view.gpu)),
                     max(size, residue),
                     residue,
-                    record.spec["mode"] == "exclusive",
+                    spec.exclusive,
                 )
 
     def count_refusal(self, error: VramError) -> None:
@@ -263,7 +264,7 @@ class Consumer(Program):
         peak = choice(SIZES)
         steady = peak if chance(0.5) else max(peak // 2, self.residue_bytes)
         gpus = ["any", *(str(info.index) for info in self.world.gpus), *self.world.cards]
-        return LeaseSpec.model_validate(
+        return checked_spec(
             {
                 "consumer": self.process.name,
                 "model_id": f"{self.process.name}-{slot}",

@@ -16,7 +16,8 @@ from tests.support.simulation.world import Entitlement, SimFailure, World
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
-from vram_arbiter.schemas.wire.requests import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.requests import checked_spec
+from vram_arbiter.schemas.wire.spec import Footprint
 
 A, B, GPU = ProcessKey(1, 1), ProcessKey(2, 2), GpuId("GPU-0")
 
@@ -148,7 +149,7 @@ async def parked_slowly(
         "min_residency_s": 0.0,
         **fields,
     }
-    lease = await client.acquire(LeaseSpec.model_validate(spec), park=park, unload=unload)
+    lease = await client.acquire(checked_spec(spec), park=park, unload=unload)
     await lease.ready()
     return lease
 

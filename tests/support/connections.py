@@ -20,8 +20,8 @@ def peer_of(pid: int, uid: int | None = None, gid: int | None = None) -> Peer:
 
 
 class KeptConnection:
-    """The shape of `arbiter.rpc.session.Connection`. It is reachable until it is closed, or told
-    otherwise."""
+    """The shape of `schemas.runtime.connection.Connection`. It is reachable until it is closed, or
+    told otherwise."""
 
     def __init__(self, serial: int, peer: Peer) -> None:
         self.serial = serial

@@ -11,13 +11,13 @@ sleeps.
     driver.until(lambda: driver.state(lease) == "held")
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import msgpack
 
+from tests.support.full_check import check_arbiter
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import (
     Effect,
@@ -37,7 +37,6 @@ from vram_arbiter.arbiter.core.events import (
     ClientLeft,
     Event,
     JournalFailed,
-    LeaseSpec,
     MemorySampled,
     OomReported,
     ProbeFailed,
@@ -59,9 +58,8 @@ from vram_arbiter.arbiter.core.events import (
     UseYielded,
 )
 from vram_arbiter.arbiter.core.model.refusals import NotJournaled
-from vram_arbiter.arbiter.core.report.explain import NOTE_KINDS
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
-from vram_arbiter.arbiter.host.records import check_record
+from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import from_map, to_map
@@ -69,13 +67,13 @@ from vram_arbiter.schemas.ids import (
     ClientId,
     GpuId,
     LeaseId,
-    ModelKey,
     ProcessKey,
     RequestId,
     Token,
     UseId,
 )
 from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
 READING_S = 0.001
 """How long a simulated reading takes."""
@@ -198,7 +196,7 @@ class CoreDriver:
         those effects."""
         self.events.append((self.now, event))
         effects = self.arbiter.handle(event, self.now)
-        self.arbiter.check_all()
+        check_arbiter(self.arbiter)
         _well_formed(effects)
         failed: list[JournalPut] = []
         held_back: list[JournalPut] = []
@@ -218,7 +216,7 @@ class CoreDriver:
                         failed.append(effect)
                         held_back += [effect] if effect.gates else []
                     else:
-                        self.journal[effect.key] = effect.record
+                        self.journal[effect.key] = as_wire(effect.record)
                 case JournalDelete():
                     self.journal.pop(effect.key, None)
                 case Sample():
@@ -283,10 +281,7 @@ class CoreDriver:
         self.settings = replace(self.settings, epoch=epoch)
         self.arbiter = Arbiter(self.settings, self.now)
         self._readings.clear()
-        records = dict(self.journal) if keep_journal else {}
-        for key, record in records.items():
-            check_record(key, json.dumps(record))  # what the core writes, the next start takes
-        self.post(Recovered(records))
+        self.post(Recovered(records_of(self.journal) if keep_journal else {}))
         self.advance(0.01)
 
     # -- people
@@ -335,12 +330,13 @@ class CoreDriver:
         return as_wire(words.reply(self.arbiter.why(consumer, self.now)))
 
     def state(self, lease: LeaseId) -> str:
-        view = self.view(lease)
-        return "over" if view is None else str(view["state"])
+        """The state of a lease; "over" once it has none."""
+        found = self.arbiter.inspect().leases.get(lease)
+        return "over" if found is None else str(found.state)
 
     def notes(self, kind: str) -> list[Mapping[str, Any]]:
         return [
-            words.event(effect.kind, effect.data)
+            msgpack.unpackb(msgpack.packb(words.event(effect)))
             for effect in self.effects
             if isinstance(effect, Note) and effect.kind == kind
         ]
@@ -408,7 +404,7 @@ class Consumer:
         ttl_s: float = 3600.0,
         min_residency_s: float = 0.0,
         deny_on_deadline: bool = False,
-        on_overstay: str = "wait",
+        on_overstay: Literal["wait", "terminate", "kill"] = "wait",
         standby: bool = False,
         park_bytes: int = 0,
         key: str | None = None,
@@ -418,24 +414,23 @@ class Consumer:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked
         for.
         """
+        steady_bytes = load_peak_bytes if steady_bytes is None else steady_bytes
         return LeaseSpec(
             consumer=self.name,
-            key=ModelKey(key or f"{self.name}-model"),
+            model_id=key or f"{self.name}-model",
             gpu=gpu,
-            exclusive=exclusive,
-            load_peak_bytes=load_peak_bytes,
-            steady_bytes=load_peak_bytes if steady_bytes is None else steady_bytes,
-            residue_bytes=residue_bytes,
+            mode="exclusive" if exclusive else "shared",
+            footprint=Footprint(load_peak_bytes, steady_bytes, residue_bytes),
             priority=self.priority if priority is None else priority,
             evictable=evictable,
             ttl_s=ttl_s,
             min_residency_s=min_residency_s,
-            deny_on_deadline=deny_on_deadline,
+            on_deadline="deny" if deny_on_deadline else "wait",
             standby=standby,
             on_overstay=on_overstay,
             park_bytes=park_bytes,
             independent=independent,
-            gang=gang,
+            gang=None if gang is None else Gang(*gang),
         )
 
     def acquire(
@@ -601,19 +596,13 @@ class Consumer:
                 self.driver.next_request(),
                 lease,
                 self.token(lease),
-                peak,
-                steady_bytes,
-                residue_bytes,
+                Footprint(peak, steady_bytes, residue_bytes),
                 wait_timeout_s,
             )
         )
         if any(isinstance(effect, Reply) for effect in effects):  # what it loads from now on
-            self.specs[lease] = replace(
-                self.specs[lease],
-                load_peak_bytes=peak,
-                steady_bytes=steady_bytes,
-                residue_bytes=residue_bytes,
-            )
+            footprint = Footprint(peak, steady_bytes, residue_bytes)
+            self.specs[lease] = replace(self.specs[lease], footprint=footprint)
         return effects
 
     def oom(
@@ -646,11 +635,9 @@ class Consumer:
             lease,
             token,
             spec or self.specs[lease],
-            held,
+            "parked" if parked else "standby" if away else "held" if held else "loading",
             measured_bytes,
             tuple(UseId(use) for use in uses),
-            away or parked,
-            parked,
         )
         return self.driver.post(Reattached(self.client, self.driver.next_request(), (item,)))
 
@@ -665,7 +652,9 @@ class Consumer:
         view = self.driver.view(lease)
         if view is None:
             raise AssertionError(f"{lease} is over")
-        steady = self.specs[lease].steady_bytes if measured_bytes is None else measured_bytes
+        steady = (
+            self.specs[lease].footprint.steady_bytes if measured_bytes is None else measured_bytes
+        )
         self.hold(steady, gpu=GpuId(str(view["gpu"])))
         return self.ready(lease, measured_bytes)
 
@@ -679,7 +668,7 @@ class Consumer:
             raise AssertionError(f"{lease} is over")
         self.unloading(lease)
         self.driver.advance(unload_s)
-        self.hold(self.specs[lease].residue_bytes, gpu=GpuId(str(view["gpu"])))
+        self.hold(self.specs[lease].footprint.residue_bytes, gpu=GpuId(str(view["gpu"])))
         return self.release(lease, parked=parked)
 
 
@@ -707,13 +696,10 @@ def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
 
 
 def _well_formed(effects: Sequence[Effect]) -> None:
-    """Answers name their request, and the history has only kinds that clients can ask for. Raises
-    AssertionError."""
+    """Answers name their request. Raises AssertionError."""
     for effect in effects:
         if isinstance(effect, Reply | Refuse) and not isinstance(effect.request, int):
             raise AssertionError(f"an answer to nothing: {effect}")
-        if isinstance(effect, Note) and effect.kind not in NOTE_KINDS:
-            raise AssertionError(f"a kind that nobody knows: {effect}")
 
 
 def _names(effect: Effect, lease: str) -> bool:
@@ -724,6 +710,6 @@ def _names(effect: Effect, lease: str) -> bool:
             view = getattr(effect.body, "lease", None)
             return lease in (getattr(effect.body, "lease_id", None), view and view.lease_id)
         case Note():
-            return effect.data.get("lease_id") == lease
+            return effect.about is not None and effect.about.lease_id == lease
         case _:
             return False

@@ -15,9 +15,8 @@ _KEY = pytest.StashKey[Path]()
 _FAILED = pytest.StashKey[bool]()
 OF_TESTS = "p"
 """Folder of `tmp_path`."""
-KEPT = (OF_TESTS, "torchinductor_*", "tmp*.json", "sidecar-*.log")
-"""What may lie there at the end: `tmp_path`, files that torch's compiler and lerobot's loader of
-configurations never remove, and the log that a client keeps of a sidecar it started."""
+KEPT = (OF_TESTS, "torchinductor_*")
+"""What may lie there at the end: `tmp_path`, and the cache of torch's compiler."""
 
 
 def _is_worker() -> bool:

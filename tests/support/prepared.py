@@ -1,8 +1,8 @@
-"""Daemons forked from an interpreter that has imported the daemon already.
+"""Programs forked from an interpreter that has imported them already.
 
-A daemon of its own for each test is most of what `make test` computes: an import takes 0.6 s of a
-core, a fork some milliseconds. `start` returns what `subprocess.Popen` would. A daemon whose
-imports matter (other environment, other program) is started afresh by `ArbiterProcess`.
+Importing the daemon, `vramctl` or a sidecar for each test is most of what `make test` computes: an
+import takes 0.3 to 0.6 s of a core, a fork some milliseconds. `start` returns what
+`subprocess.Popen` would. A program whose imports matter is started afresh (`as_here`).
 """
 
 import atexit
@@ -14,17 +14,72 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 
 from tests.support.paths import ROOT
 
 MESSAGE_MAX = 1 << 17
 PATIENCE_S = 60.0
+INTERPRETER = ("PYTHON", "LANG", "LC_")
+"""Variables that an interpreter reads when it starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A program of the product: its `main` takes the arguments from `sys.argv` and may return the
+    exit code. `imports`: what it would import later."""
+
+    module: str
+    imports: Sequence[str] = ()
+
+
+PROGRAMS: Mapping[str, Program] = {
+    "vram-arbiter": Program(
+        "vram_arbiter.arbiter.__main__",
+        (
+            "vram_arbiter.arbiter.daemon",
+            "vram_arbiter.arbiter.host.process",
+            "vram_arbiter.arbiter.log",
+        ),
+    ),
+    "vramctl": Program(
+        "vram_arbiter.clients.cli.main",
+        (
+            "anyio._backends._asyncio",
+            "vram_arbiter.clients.client",
+            "vram_arbiter.clients.cli.doctor",
+            "vram_arbiter.clients.cli.history",
+            "vram_arbiter.clients.cli.operators",
+            "vram_arbiter.clients.cli.run",
+            "vram_arbiter.clients.cli.status",
+            "vram_arbiter.clients.cli.watch",
+            "vram_arbiter.clients.cli.why",
+        ),
+    ),
+    "echo": Program(
+        "tests.sidecars.echo_sidecar", ("anyio._backends._asyncio", "vram_arbiter.sidecars.host")
+    ),
+}
+
+
+def as_here(environ: Mapping[str, str]) -> bool:
+    """Return whether an interpreter with these variables would start as this one did."""
+    return _of_interpreter(environ) == _of_interpreter(os.environ)
+
+
+def _of_interpreter(environ: Mapping[str, str]) -> dict[str, str]:
+    found = {key: value for key, value in environ.items() if key.startswith(INTERPRETER)}
+    found.pop("PYTHONUNBUFFERED", None)
+    found["PYTHONPATH"] = ":".join(found.get("PYTHONPATH", "").split(":")[:2])
+    return found
 
 
 class Forked:
-    """A forked daemon, with the methods of `subprocess.Popen` that tests use."""
+    """A forked program, with the methods of `subprocess.Popen` that tests use."""
 
     def __init__(self, pid: int, pidfd: int, status: socket.socket) -> None:
         self.pid = pid
@@ -39,7 +94,7 @@ class Forked:
     def wait(self, timeout: float | None = None) -> int:
         code = self._wait(timeout)
         if code is None:
-            raise subprocess.TimeoutExpired(f"daemon {self.pid}", timeout or 0.0)
+            raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
         return code
 
     def send_signal(self, number: int) -> None:
@@ -61,25 +116,38 @@ class Forked:
         return self.returncode
 
 
-def start(arguments: Sequence[str], environ: Mapping[str, str], log: int) -> Forked:
-    """Start `python -m vram_arbiter.arbiter ARGUMENTS`, with both outputs in the file `log`."""
-    order = {"arguments": arguments, "environ": environ, "cwd": os.getcwd()}
+def start(
+    program: str,
+    arguments: Sequence[str],
+    environ: Mapping[str, str],
+    output: int,
+    errors: int,
+    *,
+    user: int | None = None,
+) -> Forked:
+    """Start one of PROGRAMS with its outputs in two open files, as another user if one is given."""
+    order = {"arguments": arguments, "environ": dict(environ), "cwd": os.getcwd(), "user": user}
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    orders = _server()
-    with there:
-        socket.send_fds(orders, [json.dumps(order).encode()], [log, there.fileno()])
-    pid, (pidfd, *_), _, _ = socket.recv_fds(orders, 16, 1)
+    with _ORDERING:
+        orders = _server(program)
+    with there, _ORDERING:
+        descriptors = [output, errors, there.fileno()]
+        socket.send_fds(orders, [json.dumps(order).encode()], descriptors)
+        pid, (pidfd, *_), _, _ = socket.recv_fds(orders, 16, 1)
     return Forked(int(pid), pidfd, here)
 
 
+_ORDERING = threading.Lock()
+
+
 @cache
-def _server() -> socket.socket:
-    """Start the server of this process, once."""
+def _server(program: str) -> socket.socket:
+    """Start the server of a program, once in this process."""
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     here.settimeout(PATIENCE_S)
     with there:
         process = subprocess.Popen(
-            [sys.executable, "-u", "-m", "tests.support.prepared", str(there.fileno())],
+            [sys.executable, "-u", "-m", "tests.support.prepared", program, str(there.fileno())],
             pass_fds=(there.fileno(),),
             stdin=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"},
@@ -96,7 +164,7 @@ def _server() -> socket.socket:
 
 # -- the server's side
 def serve(orders: socket.socket) -> list[str] | None:
-    """Fork a daemon for each order. Returns its arguments in the child, None when orders end."""
+    """Fork a program for each order. Returns its arguments in the child, None when orders end."""
     running: dict[int, tuple[int, socket.socket]] = {}  # pidfd → pid, where its status goes
     while True:
         for ready in select.select([orders, *running], [], [])[0]:
@@ -107,10 +175,10 @@ def serve(orders: socket.socket) -> list[str] | None:
                     told.send(str(code).encode())
                 os.close(ready)
                 continue
-            text, descriptors, _, _ = socket.recv_fds(orders, MESSAGE_MAX, 2)
+            text, descriptors, _, _ = socket.recv_fds(orders, MESSAGE_MAX, 3)
             if not text:
                 return None
-            log, status = descriptors
+            output, errors, status = descriptors
             order = json.loads(text)
             pid = os.fork()
             if pid == 0:
@@ -119,31 +187,35 @@ def serve(orders: socket.socket) -> list[str] | None:
                 for pidfd, (_, told) in running.items():
                     os.close(pidfd)
                     told.close()
-                _become(order["environ"], order["cwd"], log)
+                os.dup2(output, 1)
+                os.dup2(errors, 2)
+                os.close(output)
+                os.close(errors)
+                _become(order["environ"], order["cwd"], order["user"])
                 return list(order["arguments"])
-            os.close(log)
+            os.close(output)
+            os.close(errors)
             pidfd = os.pidfd_open(pid)
             running[pidfd] = (pid, socket.socket(fileno=status))
             socket.send_fds(orders, [str(pid).encode()], [pidfd])
 
 
-def _become(environ: Mapping[str, str], cwd: str, log: int) -> None:
+def _become(environ: Mapping[str, str], cwd: str, user: int | None) -> None:
     os.environ.clear()
     os.environ.update(environ)
     os.chdir(cwd)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
-    os.close(log)
+    if user is not None:
+        os.setgroups([])
+        os.setresgid(user, user, user)
+        os.setresuid(user, user, user)
 
 
 if __name__ == "__main__":
-    import vram_arbiter.arbiter.daemon
-    import vram_arbiter.arbiter.host.loop
-    import vram_arbiter.arbiter.host.memory
-    import vram_arbiter.arbiter.log  # noqa: F401
-    from vram_arbiter.arbiter.__main__ import main
-
-    given = serve(socket.socket(fileno=int(sys.argv[1])))
+    name, descriptor = sys.argv[1:]
+    for imported in PROGRAMS[name].imports:
+        import_module(imported)
+    main = import_module(PROGRAMS[name].module).main
+    given = serve(socket.socket(fileno=int(descriptor)))
     if given is not None:
-        sys.argv = ["vram-arbiter", *given]
-        sys.exit(main(given))
+        sys.argv = [name, *given]
+        sys.exit(main())

@@ -11,9 +11,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.support.prepared import Forked, start
+from tests.support.prepared import Forked, as_here, start
 
 START_S = 60.0
 STOP_S = 60.0
@@ -103,7 +104,8 @@ class ArbiterProcess:
         }
         with (self.runtime / "arbiter.log").open("ab") as log:
             if self._prepared and not extra_environ and self.program == list(PROGRAM):
-                self.process = start(self.command()[len(PROGRAM) :], environ, log.fileno())
+                given = self.command()[len(PROGRAM) :]
+                self.process = start("vram-arbiter", given, environ, log.fileno(), log.fileno())
                 return self.process
             self.process = subprocess.Popen(
                 self.command(), env=environ, stdout=log, stderr=log, stdin=subprocess.DEVNULL
@@ -189,17 +191,43 @@ class ArbiterProcess:
         shutil.rmtree(self.runtime, ignore_errors=True)
 
 
+type Finished = subprocess.CompletedProcess[str]
+
+
 def vramctl(
-    *arguments: str | bytes,
-    environ: Mapping[str, str],
-    program: tuple[str, ...] = ("-m", "vram_arbiter.clients"),
-) -> "subprocess.CompletedProcess[str]":
-    """Run `vramctl`, or another program that ends by itself, and return what it printed."""
-    return subprocess.run(
-        [sys.executable, *program, *arguments],
-        env=environ,
-        capture_output=True,
-        text=True,
-        timeout=STOP_S,
-        check=False,
-    )
+    *arguments: str | bytes, environ: Mapping[str, str], user: int | None = None
+) -> Finished:
+    """Run `vramctl`, as another user if one is given, and return what it printed.
+
+    It is forked from an interpreter that has imported it, unless its variables ask for another
+    interpreter.
+    """
+    if not as_here(environ):
+        assert user is None
+        return subprocess.run(
+            [sys.executable, "-m", "vram_arbiter.clients", *arguments],
+            env=environ,
+            capture_output=True,
+            text=True,
+            timeout=STOP_S,
+            check=False,
+        )
+    words = [os.fsdecode(word) for word in arguments]
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        process = start("vramctl", words, environ, output.fileno(), errors.fileno(), user=user)
+        try:
+            code = process.wait(STOP_S)
+        finally:
+            process.kill()
+        output.seek(0)
+        errors.seek(0)
+        return subprocess.CompletedProcess(words, code, output.read(), errors.read())
+
+
+def vramctl_at_once(
+    commands: Sequence[Sequence[str]], *, environ: Mapping[str, str]
+) -> Sequence[tuple[Sequence[str], Finished]]:
+    """Run commands that wait side by side, and return each with what it printed."""
+    with ThreadPoolExecutor(len(commands)) as pool:
+        ended = pool.map(lambda words: vramctl(*words, environ=environ), commands)
+        return list(zip(commands, ended, strict=True))

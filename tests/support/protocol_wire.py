@@ -7,14 +7,11 @@ from typing import Any
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.wire import requests as wire
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-SPEC = wire.LeaseSpec(
-    consumer="detector",
-    model_id="m",
-    ttl_s=9.0,
-    footprint=wire.Footprint(load_peak_bytes=5, steady_bytes=4, residue_bytes=1),
-).model_dump(mode="json")
+SPEC = to_map(LeaseSpec(consumer="detector", model_id="m", ttl_s=9.0, footprint=Footprint(5, 4, 1)))
 WELCOME = {
     "version": d.WIRE_VERSION,
     "boot_id": "b",

@@ -19,7 +19,7 @@ from vram_arbiter.arbiter.eventlog.logfile import (
 )
 from vram_arbiter.arbiter.lab.actors import START_S as SIMULATED_START_S
 from vram_arbiter.arbiter.lab.outcome import Outcome
-from vram_arbiter.arbiter.lab.simulator import Engine, simulate
+from vram_arbiter.arbiter.lab.simulator import simulate
 from vram_arbiter.arbiter.lab.workload import Workload
 
 
@@ -42,9 +42,8 @@ class Recording:
     """A simulated engine whose every event goes to a log file: what a daemon with these consumers
     would have recorded."""
 
-    engine: Engine
+    engine: Arbiter
     file: TextIO
-    holders_exit: bool = False
 
     def handle(self, event: Event, now: float) -> Sequence[Effect]:
         effects = self.engine.handle(event, now)
@@ -63,5 +62,5 @@ def record_workload(workload: Workload, settings: Settings, folder: Path) -> tup
     path = folder / file_name(0.0, settings.epoch, 0)
     with path.open("w") as file:
         file.write(header_line(header))
-        recording = Recording(Engine.under(settings, settings.policy), file)
+        recording = Recording(Arbiter(settings, SIMULATED_START_S), file)
         return path, simulate(workload, recording, settings.policy)

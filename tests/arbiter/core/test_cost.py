@@ -17,12 +17,13 @@ from vram_arbiter.schemas.ids import (
     ClientId,
     GpuId,
     LeaseId,
-    ModelKey,
     ProcessKey,
     RequestId,
     Token,
+    UseId,
 )
 from vram_arbiter.schemas.wire.replies import AcquireReply
+from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
 CARD = GpuId("GPU-0")
 FEW, MANY = 5, 500
@@ -77,19 +78,12 @@ class Counted:
         self.tell(ev.ClientConnected(client, process, 0, str(client), instance))
 
     def asking(self, client: ClientId) -> ev.AcquireRequested:
-        spec = ev.LeaseSpec(
+        spec = LeaseSpec(
             consumer="small",
-            key=ModelKey("m"),
-            gpu="any",
-            exclusive=False,
-            load_peak_bytes=SIZE,
-            steady_bytes=SIZE,
-            residue_bytes=0,
-            priority=50,
-            evictable=True,
+            model_id="m",
+            footprint=Footprint(SIZE, SIZE, 0),
             ttl_s=1e9,
             min_residency_s=0.0,
-            deny_on_deadline=False,
         )
         return ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
 
@@ -150,8 +144,33 @@ def test_no_event_costs_more_beside_gangs_that_gather() -> None:
         counted.tell(ev.ReadyReported(ClientId("busy"), counted.request(), *lease, None))
         for number in range(gangs):
             asking = counted.asking(ClientId("idle0"))
-            counted.tell(replace(asking, spec=replace(asking.spec, gang=(f"g{number}", 2))))
+            counted.tell(replace(asking, spec=replace(asking.spec, gang=Gang(f"g{number}", 2))))
         counted.tell(ev.Tick())
         return counted.counted(ev.Renewed(ClientId("busy"), counted.request(), (lease,)))
 
     assert renewal(200) == renewal(2)
+
+
+def test_clients_come_and_go_at_no_cost_beside_leases_that_others_use() -> None:
+    """Each hello of a known instance, each goodbye and each death looked at every lease in use."""
+
+    def cost(leases: int) -> list[int]:
+        counted = Counted(leases, listed=True)
+        for lease in list(counted.core.inspect().leases.values()):
+            assert lease.token is not None
+            marking = (ClientId("idle0"), counted.request(), lease.id, lease.token)
+            counted.tell(ev.UseBegan(*marking, UseId("use"), "work"))
+        process = ProcessKey(300, 1)
+        return [
+            counted.counted(event)
+            for event in (
+                ev.ClientConnected(ClientId("one"), process, 0, "visitor", "same"),
+                ev.ClientConnected(ClientId("two"), process, 0, "visitor", "same"),
+                ev.ClientLeft(ClientId("two"), "gone"),
+                ev.ClientConnected(ClientId("three"), process, 0, "visitor", "same"),
+                ev.ProcessDied(process),
+            )
+        ]
+
+    few, many = cost(FEW), cost(MANY)
+    assert all(after <= 1.1 * before for before, after in zip(few, many, strict=True)), (few, many)

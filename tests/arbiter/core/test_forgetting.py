@@ -7,9 +7,9 @@ from typing import Any
 from tests.support.core_driver import CoreDriver
 from tests.support.engine_state import state_of
 from tests.support.scenes import held
-from vram_arbiter.arbiter.core.model import state
+from vram_arbiter.arbiter.core.learning.costs import CONSUMERS_REMEMBERED
 from vram_arbiter.arbiter.core.model.lease import NONCES_MAX
-from vram_arbiter.arbiter.core.model.state import CONSUMERS_REMEMBERED, ENDED_REMEMBERED
+from vram_arbiter.arbiter.core.model.state import ENDED_REMEMBERED
 from vram_arbiter.schemas import defaults as d
 
 GIB, MIB = d.GIB, d.MIB
@@ -27,7 +27,7 @@ def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_
     driver = CoreDriver(8 * GIB)
     driver.consumer("holder").acquire(7 * GIB)
     core = state_of(driver.arbiter)
-    before = sizes(core)
+    before = {**sizes(core), **sizes(core.costs)}
     for number in range(30):
         person = driver.consumer(f"crowd{number}")
         for _ in range(10):
@@ -36,25 +36,25 @@ def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_
             person.die()
         else:
             person.leave()
-    after = sizes(core)
+    after = {**sizes(core), **sizes(core.costs)}
     assert after.pop("ended") <= before.pop("ended") + 300 <= ENDED_REMEMBERED
     assert after.pop("nonces") <= before.pop("nonces") + 300
     assert after == before
-    assert len(core.gpus[driver.card.gpu].queue) == 0
+    assert core.gpus[driver.card.gpu].queue.head is None
 
 
 def test_consumers_of_ever_new_names_are_remembered_up_to_a_number() -> None:
     driver = CoreDriver(8 * GIB)
     core = state_of(driver.arbiter)
     for number in range(CONSUMERS_REMEMBERED + 10):
-        core.learn(f"c{number}", "load_s", 1.0)
-        core.seen_leaving(f"c{number}")
-    assert len(core.durations) == len(core.reuse) == CONSUMERS_REMEMBERED
-    assert core.learnt_s("c0", "load_s") is None
-    core.learn("c10", "load_s", 3.0)
-    core.learn("new", "load_s", 1.0)
-    assert core.learnt_s("c10", "load_s") == 2.0, "the newest stay"
-    assert len(core.durations) == state.CONSUMERS_REMEMBERED
+        core.costs.learn(f"c{number}", "load_s", 1.0)
+        core.costs.left(f"c{number}", 0.0)
+    assert len(core.costs.durations) == len(core.costs.reuse) == CONSUMERS_REMEMBERED
+    assert core.costs.learnt_s("c0", "load_s") is None
+    core.costs.learn("c10", "load_s", 3.0)
+    core.costs.learn("new", "load_s", 1.0)
+    assert core.costs.learnt_s("c10", "load_s") == 2.0, "the newest stay"
+    assert len(core.costs.durations) == CONSUMERS_REMEMBERED
 
 
 def test_a_lease_that_is_taken_over_again_and_again_is_known_by_its_last_nonces() -> None:

@@ -176,8 +176,10 @@ class Leases(RuleBasedStateMachine):
     def load(self, lease: LeaseId) -> None:
         spec = self.mine[lease].specs[lease]
         process = self.mine[lease].process
-        self.loaded.setdefault(process, {})[lease] = max(spec.steady_bytes, spec.residue_bytes)
-        self.context[process] = max(self.context.get(process, 0), spec.residue_bytes)
+        self.loaded.setdefault(process, {})[lease] = max(
+            spec.footprint.steady_bytes, spec.footprint.residue_bytes
+        )
+        self.context[process] = max(self.context.get(process, 0), spec.footprint.residue_bytes)
         self.show(process)
         self.mine[lease].ready(lease)
 
@@ -241,10 +243,10 @@ class Leases(RuleBasedStateMachine):
         lease = self.pick(n, HELD)
         person = self.mine[lease]
         spec = person.specs[lease]
-        size = max(self.loaded[person.process][lease] - less, spec.residue_bytes)
+        size = max(self.loaded[person.process][lease] - less, spec.footprint.residue_bytes)
         self.loaded[person.process][lease] = size
         self.show(person.process)
-        person.resize(lease, size, residue_bytes=spec.residue_bytes)
+        person.resize(lease, size, residue_bytes=spec.footprint.residue_bytes)
 
     @precondition(some(HELD))
     @rule(n=PICK, more=st.sampled_from([100 * d.MIB, 1 * d.GIB]))
@@ -253,7 +255,7 @@ class Leases(RuleBasedStateMachine):
         lease = self.pick(n, HELD)
         person = self.mine[lease]
         size = self.loaded[person.process][lease] + more
-        person.resize(lease, size, residue_bytes=person.specs[lease].residue_bytes)
+        person.resize(lease, size, residue_bytes=person.specs[lease].footprint.residue_bytes)
 
     @precondition(some(LOADING))
     @rule()
@@ -330,7 +332,7 @@ class Leases(RuleBasedStateMachine):
         coming = 0
         for lease in self.having(LOADING):
             person = self.mine[lease]
-            peak = self.taking_over.get(lease, person.specs[lease].load_peak_bytes)
+            peak = self.taking_over.get(lease, person.specs[lease].footprint.load_peak_bytes)
             if self.loaded.get(person.process):
                 coming += peak
             else:  # its context is part of the peak
@@ -348,7 +350,7 @@ class Leases(RuleBasedStateMachine):
         for process, leases in self.loaded.items():
             held = max(sum(leases.values()), self.context[process])
             account = gpu.ledger.accounts.get(process)
-            booked = 0 if account is None else account.booked_bytes()
+            booked = 0 if account is None else account.charged_bytes
             assert booked + unsure >= held, f"{process} holds {held}, {booked} are booked"
 
     def tokens_grow(self) -> None:
@@ -364,7 +366,7 @@ class Leases(RuleBasedStateMachine):
         been granted)."""
         core = state_of(self.driver.arbiter)
         (gpu,) = core.gpus.values()
-        head = gpu.queue.head()
+        head = gpu.queue.head
         if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
             return
         room = admission.measured_room_bytes(core, gpu)

@@ -6,7 +6,7 @@ from typing import Any
 from tests.support.core_driver import Consumer, CoreDriver, refusal
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.effects import Effect, Refuse
-from vram_arbiter.arbiter.core.learning.crashes import FORGOTTEN_S, NAMES_MAX, PAUSE_MAX_S
+from vram_arbiter.arbiter.core.learning.costs import FORGOTTEN_S, NAMES_MAX, PAUSE_MAX_S
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -104,4 +104,4 @@ def test_17_dying_while_resident_is_no_failed_load_and_the_table_is_bounded() ->
     driver = CoreDriver(8 * GIB)
     for n in range(NAMES_MAX + 3):
         crash(driver, f"p{n}", 1)
-    assert len(driver.arbiter.inspect().crashes) == NAMES_MAX
+    assert len(driver.arbiter.inspect().costs.failures) == NAMES_MAX

@@ -45,7 +45,10 @@ def test_3_the_end_of_a_ttl_and_an_unload_do_not_block_each_other() -> None:
             policy.release(lease)
         driver.advance(3.0)
         policy.hold(0)
-        driver.until(lambda: driver.state(waiter) == "loading", limit_s=20.0)  # noqa: B023 - called at once
+        driver.until(
+            lambda: driver.state(waiter) == "loading",  # noqa: B023 - called at once
+            limit_s=20.0,
+        )
         assert driver.state(lease) == "over"
 
 

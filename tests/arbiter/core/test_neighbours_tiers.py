@@ -51,7 +51,7 @@ def test_4_an_idle_holder_does_not_keep_a_card_for_minutes(priority: int) -> Non
     driver = CoreDriver(8 * GIB, settings={"learnt": learnt})
     person, lease = held(driver, "idle", 5)
     core = state_of(driver.arbiter)
-    core.switches["idle", "w"] = core.switches["w", "idle"] = driver.now
+    core.costs.switches["idle", "w"] = core.costs.switches["w", "idle"] = driver.now
     waiter = driver.consumer("w").acquire(5 * GIB, priority=priority)
     assert driver.until(lambda: driver.state(lease) == "revoking") <= d.THRASH_HOLD_MAX_S + 0.1
     person.unload(lease)

@@ -291,9 +291,7 @@ def shared_memory(driver: CoreDriver, gib: float) -> None:
     driver.advance(1.5)
 
 
-def test_20_on_shared_memory_a_model_that_goes_is_verified_by_the_total_although_the_machine_breathes() -> (
-    None
-):
+def test_20_on_shared_memory_a_release_is_verified_by_the_total_although_the_total_drifts() -> None:
     """ollama#12283, sglang#10075: MemAvailable moves by itself, so the tolerance is larger
     there."""
     driver = CoreDriver(8 * GIB, settings={"verify_tolerance_bytes": 256 * MIB})
@@ -366,7 +364,7 @@ def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it() -> None:
     driver = CoreDriver(8 * GIB)
     job, lease = held(driver, "job", 2, exclusive=True, residue_bytes=128 * MIB)
     token = job.token(lease)
-    context = job.specs[lease].residue_bytes
+    context = job.specs[lease].footprint.residue_bytes
     job.unloading(lease)
     job.hold(context)
     driver.card.overhead_bytes = 2 * GIB - context  # freed, not returned

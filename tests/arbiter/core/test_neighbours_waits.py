@@ -129,7 +129,7 @@ def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
     people = [driver.consumer(f"w{n}") for n in range(6)]
     waiters = [person.acquire(1 * GIB) for person in people]
     for person, lease in zip(people, waiters, strict=True):
-        driver.until(lambda lease=lease: driver.state(lease) == "loading", limit_s=0.5)  # type: ignore[misc]
+        driver.until(lambda lease=lease: driver.state(lease) == "loading", limit_s=0.5)
         person.load(lease)
     assert [driver.state(lease) for lease in (idle, *waiters)] == ["held"] * 7
 

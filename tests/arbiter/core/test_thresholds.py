@@ -21,7 +21,7 @@ def kept(driver: CoreDriver, who: Consumer) -> int:
     """What the journal has of the residue of a process, which is what is charged for it."""
     record = driver.journal.get(f"residue:{who.process}:GPU-0", {"residue_bytes": 0})
     account = driver.arbiter.inspect().gpus[driver.card.gpu].ledger.accounts.get(who.process)
-    assert (0 if account is None else account.residue_bytes) == record["residue_bytes"]
+    assert (0 if account is None else account.retained_bytes) == record["residue_bytes"]
     return int(record["residue_bytes"])
 
 
@@ -328,9 +328,7 @@ def test_what_a_process_shows_of_its_peak_may_be_what_is_kept_for_its_next_membe
     driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
 
 
-def test_the_headroom_goes_to_the_member_that_loads_and_what_it_does_not_need_stays_for_the_next() -> (
-    None
-):
+def test_the_headroom_goes_to_the_loading_member_and_the_rest_of_it_stays_for_the_next() -> None:
     driver = CoreDriver(8 * GIB)
     sizes = [(2100 * MIB, 2000 * MIB), (2500 * MIB, 2000 * MIB), (2300 * MIB, 2000 * MIB)]
     members = gang_of(driver, *sizes)
@@ -427,7 +425,7 @@ def test_a_residue_of_the_journal_takes_what_room_there_is(room: int) -> None:
     driver.journal[key] = {**driver.journal[key], "charge_bytes": BUDGET - room}
     driver.restart()
     account = driver.arbiter.inspect().gpus[driver.card.gpu].ledger.accounts.get(person.process)
-    found = (0, 0) if account is None else (account.residue_bytes, account.residue_floor_bytes)
+    found = (0, 0) if account is None else (account.retained_bytes, account.retained_floor_bytes)
     assert found == (room, room)
     assert (f"residue:{person.process}:GPU-0" in driver.journal) == bool(room)
 
@@ -444,5 +442,6 @@ def test_what_a_restart_found_is_told_and_what_is_of_a_card_that_is_gone_is_take
         **gone,
     }
     driver.restart()
-    assert driver.notes("recovered")[-1] == {"leases": [lease], "records": 4}
+    recovered = driver.notes("recovered")[-1]
+    assert (recovered["leases"], recovered["records"]) == ([lease], 4)
     assert driver.journal.keys() == {f"lease:{lease}", f"residue:{person.process}:GPU-0"}

@@ -78,7 +78,7 @@ def test_another_input_is_another_decision(log: Path) -> None:
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     number = next(i for i, line in enumerate(lines[1:], 1) if line["event"] == "AcquireRequested")
     data = lines[number]["data"]
-    data["spec"]["load_peak_bytes"] = 1 << 40
+    data["spec"]["footprint"]["load_peak_bytes"] = 1 << 40
     tamper(log, number, data=data)
     found = runner.replay(runner.load(log))
     assert found.divergence is not None

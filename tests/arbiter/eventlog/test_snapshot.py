@@ -8,8 +8,9 @@ import pytest
 from tests.support.core_driver import START_S, CoreDriver
 from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core.arbiter import Arbiter
-from vram_arbiter.arbiter.eventlog.codec import CodecError, digest
+from vram_arbiter.arbiter.eventlog.codec import digest
 from vram_arbiter.arbiter.eventlog.snapshot import freeze, from_plain, thaw, to_plain
+from vram_arbiter.schemas.codec import CodecError
 
 
 def through_json(engine: Arbiter) -> Arbiter:

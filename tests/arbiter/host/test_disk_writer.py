@@ -122,12 +122,11 @@ def test_a_disk_that_hangs_holds_a_bounded_number_and_the_oldest_are_dropped() -
     async def test(scene: Scene) -> None:
         await scene.hang()
         for number in range(1, ITEMS_MAX + 1):
-            scene.writer.put(number)
-        assert scene.writer.full
+            assert scene.writer.put(number)
         scene.writer.flush()
         assert scene.writer.behind == ITEMS_MAX + 1
-        for number in range(100, 100 + ITEMS_MAX + 3):
-            scene.writer.put(number)
+        room = [scene.writer.put(number) for number in range(100, 100 + ITEMS_MAX + 3)]
+        assert room == [True] * ITEMS_MAX + [False] * 3
         scene.writer.flush()
         assert isinstance(scene.told[-1], DiskBehind)
         scene.heard.clear()

@@ -8,18 +8,24 @@ from typing import Any
 from tests.support.messages import lease_view, revoke
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core.model.records import DrainRecord
 from vram_arbiter.arbiter.core.model.refusals import LeaseOver
 from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.errors import JournalUnavailable
-from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId, Token
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
+from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.notes import About, GrantedNote, ReleasedNote
 from vram_arbiter.schemas.wire.pushes import AnyPush, GrantedPush, ResizedPush, RevokePush
 from vram_arbiter.schemas.wire.replies import AcquireReply, StateReply
 
 A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
 LEASE = AcquireReply("loading", lease_view())
 GRANTED = GrantedPush(lease_view())
+RECORD = DrainRecord("operator", "service")
+WRITTEN = {"by": "operator", "reason": "service"}
+ABOUT = About(LeaseId("L1-1"), "det", GPU)
 REVOKE = revoke("L1-9")
 RESIZED = ResizedPush("L1-1", Token(1, 2), 5)
 
@@ -64,7 +70,7 @@ class Recorder:
     def post(self, event: ev.Event) -> None:
         self.done.append(("post", event))
 
-    def log_event(self, event: Mapping[str, Any]) -> None:
+    def log_event(self, event: Mapping[str, Any], trace: object) -> None:
         self.done.append(("log", event["kind"]))
 
 
@@ -78,18 +84,18 @@ def test_answers_go_out_in_order_then_facts_then_readings() -> None:
     recorder = Recorder()
     recorder.executor.perform(
         [
-            fx.JournalPut("lease:L1-1", {"a": 1}),
+            fx.JournalPut("lease:L1-1", RECORD),
             fx.JournalDelete("lease:L1-0"),
             fx.Reply(A, ONE, LEASE),
             fx.Push(A, REVOKE),
             fx.Sample(GPU),
-            fx.Note("granted", {"lease_id": "L1-1", "evicted": []}),
+            fx.Note(GrantedNote(5, 0.0, ()), ABOUT),
             fx.Refuse(A, ONE, LeaseOver("L1-1", "released")),
             fx.JournalDelete("lease:L1-1"),
         ]
     )
     assert recorder.done == [
-        ("journal", ("lease:L1-1", {"a": 1}), ("lease:L1-0", None), ("lease:L1-1", None)),
+        ("journal", ("lease:L1-1", WRITTEN), ("lease:L1-0", None), ("lease:L1-1", None)),
         ("reply", A, ONE, LEASE),
         ("push", A, REVOKE),
         ("refuse", A, ONE, "bad_state"),
@@ -105,9 +111,9 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
     recorder.disk_full = True
     recorder.executor.perform(
         [
-            fx.JournalPut("lease:L1-1", {"a": 1}, gates=True),
+            fx.JournalPut("lease:L1-1", RECORD, gates=True),
             fx.Reply(A, ONE, LEASE),
-            fx.Note("granted", {"lease_id": "L1-1", "evicted": []}),
+            fx.Note(GrantedNote(5, 0.0, ()), ABOUT),
             fx.Push(A, GRANTED),
             fx.Push(A, REVOKE),
             fx.Sample(GPU),
@@ -128,10 +134,10 @@ def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be
     recorder.disk_full = True
     recorder.executor.perform(
         [
-            fx.JournalPut("lease:L1-0", {"state": "verifying"}),
+            fx.JournalPut("lease:L1-0", RECORD),
             fx.Reply(A, RequestId(2), StateReply("verifying")),
             fx.Push(A, RESIZED),
-            fx.JournalPut("lease:L1-1", {"a": 1}, gates=True),
+            fx.JournalPut("lease:L1-1", RECORD, gates=True),
             fx.Push(A, GRANTED),
         ]
     )
@@ -150,8 +156,8 @@ def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None
     recorder.disk_full = True
     recorder.executor.perform(
         [
-            fx.JournalPut("lease:L1-1", {"state": "verifying"}),
-            fx.Note("released", {"lease_id": "L1-1"}),
+            fx.JournalPut("lease:L1-1", RECORD),
+            fx.Note(ReleasedNote(False, "held", Why.LET_GO), ABOUT),
             fx.Reply(A, ONE, LEASE),
         ]
     )
@@ -179,10 +185,10 @@ def test_a_record_that_a_full_disk_could_not_delete_goes_with_the_next_write() -
         [fx.JournalDelete("lease:L1-1"), fx.JournalDelete("residue:1@1:GPU-1")]
     )
     recorder.disk_full = False
-    recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", {"a": 1})])
+    recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", RECORD)])
     recorder.executor.perform([fx.JournalDelete("lease:L1-2")])
     assert recorder.done == [
-        ("journal", ("lease:L1-1", None), ("residue:1@1:GPU-1", {"a": 1})),
+        ("journal", ("lease:L1-1", None), ("residue:1@1:GPU-1", WRITTEN)),
         ("journal", ("lease:L1-2", None)),
     ]
 
@@ -191,7 +197,7 @@ def test_a_record_that_is_written_again_is_not_deleted_later() -> None:
     recorder = Recorder()
     recorder.disk_full = True
     recorder.executor.perform([fx.JournalDelete("residue:1@1:GPU-1")])
-    recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", {"a": 1})])
+    recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", RECORD)])
     recorder.disk_full = False
     recorder.executor.perform([fx.JournalDelete("lease:L1-2")])
     assert recorder.done[-1] == ("journal", ("lease:L1-2", None))
@@ -220,6 +226,9 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
             assert isinstance(body, RevokePush)
             return replace(body, traceparent="mine")
 
+        def observe(self, note: fx.Note, event: Mapping[str, Any]) -> Mapping[str, str]:
+            return {}
+
         def wrote(self, seconds: float, *, failed: bool) -> None:
             recorder.done.append(("wrote", seconds >= 0, failed))
 
@@ -235,10 +244,10 @@ def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() ->
         Traces(),
     )
     push = fx.Push(A, REVOKE)
-    executor.perform([fx.JournalPut("lease:L1-1", {}), push])
+    executor.perform([fx.JournalPut("lease:L1-1", RECORD), push])
     assert [done[0] for done in recorder.done] == ["outgoing", "journal", "wrote", "push"]
     assert recorder.done[2] == ("wrote", True, False)
     assert recorder.done[-1][2] == replace(REVOKE, traceparent="mine")
     recorder.disk_full = True
-    executor.perform([fx.JournalPut("lease:L1-2", {})])
+    executor.perform([fx.JournalPut("lease:L1-2", RECORD)])
     assert ("wrote", True, True) in recorder.done

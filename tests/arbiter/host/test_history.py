@@ -167,7 +167,9 @@ def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(
     as older than a week."""
     store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
     assert store.last_seq() == 0
-    store.add([{"seq": number, "at_wall_s": 60.0 * number, "kind": "x"} for number in range(1, 6)])
+    store.write(
+        [{"seq": number, "at_wall_s": 60.0 * number, "kind": "x"} for number in range(1, 6)]
+    )
     store.prune(1.8e9)
     assert [event["seq"] for event in store.find(0, 100, ())] == [1, 2, 3, 4, 5]
     store.close()
@@ -212,7 +214,7 @@ class HangingDisk:
         self.hangs, self.goes_on = threading.Event(), threading.Event()
         self.written: list[int] = []
 
-    def add(self, events: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, events: Sequence[Mapping[str, Any]]) -> None:
         self.hangs.set()
         assert self.goes_on.wait(PATIENCE_S)
         self.written += [event["seq"] for event in events]

@@ -6,14 +6,14 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Set
 
 import pytest
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
 from vram_arbiter.arbiter.host.prober import Prober, within
-from vram_arbiter.arbiter.host.process_tree import Known, read_kin
+from vram_arbiter.arbiter.host.process_tree import read_kin
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
@@ -52,13 +52,19 @@ Posted = "asyncio.Queue[ev.Event]"
 def probing(
     test: Callable[[Prober, ScriptedProbe, Posted], Awaitable[None]],
     deadline_s: float = PATIENCE_S,
-    known: Callable[[GpuId], Known] = lambda _: Known(frozenset(), frozenset()),
+    owners: Callable[[GpuId], Set[ProcessKey]] = lambda _: frozenset(),
 ) -> None:
     async def run() -> None:
         probe = ScriptedProbe()
         posted: asyncio.Queue[ev.Event] = asyncio.Queue()
         prober = Prober(
-            probe, [GPU], deadline_s, asyncio.get_running_loop(), posted.put_nowait, known
+            probe,
+            [GPU],
+            deadline_s,
+            asyncio.get_running_loop(),
+            posted.put_nowait,
+            owners,
+            frozenset,
         )
         async with asyncio.timeout(PATIENCE_S):
             await test(prober, probe, posted)
@@ -172,23 +178,23 @@ def test_bytes_of_a_child_are_booked_on_who_holds_the_lease_when_the_reading_is_
     me, parent = read_kin(os.getpid()), read_kin(os.getppid())
     assert me is not None
     assert parent is not None
-    owners: set[ProcessKey] = set()
+    known: set[ProcessKey] = set()
     asked_on: list[int] = []
 
-    def known(gpu: GpuId) -> Known:
+    def owners(gpu: GpuId) -> Set[ProcessKey]:
         asked_on.append(threading.get_ident())
-        return Known(frozenset(owners), frozenset())
+        return known
 
     async def test(prober: Prober, probe: ScriptedProbe, posted: Posted) -> None:
         use = ev.ProcessUse(me.process, "child", 40)
         prober.sample(GPU)
         await began(probe)
-        owners.add(parent.process)
+        known.add(parent.process)
         probe.answers.put(Reading(40, 100, (use,)))
         event = await posted.get()
         assert isinstance(event, ev.MemorySampled)
         assert event.processes == (ev.ProcessUse(parent.process, f"{parent.name} (child)", 40),)
-        owners.clear()
+        known.clear()
         prober.sample(GPU)
         probe.answers.put(Reading(40, 100, (use,)))
         event = await posted.get()
@@ -196,7 +202,7 @@ def test_bytes_of_a_child_are_booked_on_who_holds_the_lease_when_the_reading_is_
         assert event.processes == (use,)
         assert set(asked_on) == {threading.get_ident()}, "the core is asked on its own thread only"
 
-    probing(test, known=known)
+    probing(test, owners=owners)
 
 
 def test_closing_does_not_wait_for_a_hanging_driver() -> None:

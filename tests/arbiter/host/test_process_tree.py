@@ -4,6 +4,7 @@ real text is read."""
 import os
 import subprocess
 import sys
+from collections.abc import Set
 
 import pytest
 
@@ -12,7 +13,6 @@ from vram_arbiter.arbiter.host.process_tree import (
     DEPTH_MAX,
     NAME_MAX,
     Kin,
-    Known,
     Lineages,
     on_owners,
     read_kin,
@@ -29,8 +29,11 @@ def use(pid: int, count: int | None, name: str = "python") -> ProcessUse:
     return ProcessUse(key(pid), name, count)
 
 
+Known = tuple[Set[ProcessKey], Set[ProcessKey]]
+
+
 def known(owners: tuple[int, ...] = (), clients: tuple[int, ...] = ()) -> Known:
-    return Known(frozenset(map(key, owners)), frozenset(map(key, clients)))
+    return frozenset(map(key, owners)), frozenset(map(key, clients))
 
 
 class Proc:
@@ -53,7 +56,7 @@ class Proc:
         )
 
     def book(self, who: Known, *uses: ProcessUse) -> tuple[ProcessUse, ...]:
-        return on_owners(uses, Lineages(self.kin.get).trace(uses), who)
+        return on_owners(uses, Lineages(self.kin.get).trace(uses), *who)
 
 
 def test_a_child_s_bytes_are_its_owner_s_at_any_depth() -> None:
@@ -102,7 +105,7 @@ def test_a_dying_owner_that_is_listed_without_its_start_time_keeps_its_bytes() -
     lineages.trace([use(40, 3)])
     del proc.kin[40]
     left = ProcessUse(ProcessKey(40, 0), "", 3)
-    assert on_owners([left], lineages.trace([left]), known((30, 40))) == (left,)
+    assert on_owners([left], lineages.trace([left]), *known((30, 40))) == (left,)
 
 
 def test_children_of_a_mere_observer_are_not_hidden() -> None:
@@ -113,17 +116,19 @@ def test_a_reused_pid_is_no_ancestor() -> None:
     proc = Proc()
     proc.add(30, 20, "other", start_ticks=9_999)  # younger than its "child": the pid was used again
     owner = ProcessKey(30, 9_999)
-    assert proc.book(Known(frozenset({owner}), frozenset()), use(40, 3)) == (use(40, 3),)
+    assert proc.book((frozenset({owner}), frozenset()), use(40, 3)) == (use(40, 3),)
     assert proc.book(known((30,)), use(40, 3)) == (use(40, 3),), "and the owner of that pid is dead"
 
 
 def test_an_orphan_is_a_stowaway() -> None:
     proc = Proc()
     lineages = Lineages(proc.kin.get)
-    assert on_owners([use(40, 3)], lineages.trace([use(40, 3)]), known((30,)))[0].process == key(30)
+    assert on_owners([use(40, 3)], lineages.trace([use(40, 3)]), *known((30,)))[0].process == key(
+        30
+    )
     del proc.kin[30]
     proc.add(40, 1, "sh")  # the kernel gave it to init
-    assert on_owners([use(40, 3)], lineages.trace([use(40, 3)]), known((30,))) == (use(40, 3),)
+    assert on_owners([use(40, 3)], lineages.trace([use(40, 3)]), *known((30,))) == (use(40, 3),)
 
 
 @pytest.mark.parametrize("listed", [key(40), ProcessKey(40, 0)])
@@ -136,9 +141,9 @@ def test_who_dies_between_the_reading_and_the_tracing_belongs_where_it_did(
     del proc.kin[40]
     left = ProcessUse(listed, "python", 3)
     for _ in range(2):
-        assert on_owners([left], lineages.trace([left]), known((30,)))[0].process == key(30)
+        assert on_owners([left], lineages.trace([left]), *known((30,)))[0].process == key(30)
     lineages.trace([])
-    assert on_owners([left], lineages.trace([left]), known((30,))) == (left,), (
+    assert on_owners([left], lineages.trace([left]), *known((30,))) == (left,), (
         "remembered for one reading"
     )
 
@@ -149,7 +154,7 @@ def test_somebody_else_with_the_pid_of_the_dead_inherits_nothing() -> None:
     lineages.trace([use(40, 3)])
     del proc.kin[40]
     other = ProcessUse(ProcessKey(40, 77_777), "other", 3)
-    assert on_owners([other], lineages.trace([other]), known((30,))) == (other,)
+    assert on_owners([other], lineages.trace([other]), *known((30,))) == (other,)
 
 
 def test_lines_are_followed_so_far_and_names_are_bounded() -> None:
@@ -176,7 +181,7 @@ def test_the_kernel_s_own_text() -> None:
         assert kin is not None
         entry = ProcessUse(kin.process, "child", 1)
         (booked,) = on_owners(
-            [entry], Lineages().trace([entry]), Known(frozenset({mine.process}), frozenset())
+            [entry], Lineages().trace([entry]), frozenset({mine.process}), frozenset()
         )
         assert booked == ProcessUse(mine.process, f"{mine.name} (child)", 1)
         child.communicate(b"\n")

@@ -19,18 +19,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.busy import busy_driver
-from tests.support.core_driver import CoreDriver
+from tests.support.core_driver import CoreDriver, as_wire
 from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import JournalPut
 from vram_arbiter.arbiter.core.events import DOUBT_KEY, MemorySampled, Recovered, Tick
+from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.daemon import processes_of, try_records
 from vram_arbiter.arbiter.host.journal import Journal, Opened
-from vram_arbiter.arbiter.host.records import LeaseRecord, check_record
+from vram_arbiter.arbiter.host.records import record_of, records_of
 from vram_arbiter.arbiter.host.seal import digest
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
 Records = dict[str, dict[str, Any]]
 STARTED_S = 1000.0
@@ -48,7 +50,7 @@ def records_written() -> tuple[tuple[Settings, Records], ...]:
     sent_away(alone)
     found = []
     for driver in (busy_driver(7), used, alone):
-        records = {e.key: dict(e.record) for e in driver.effects if isinstance(e, JournalPut)}
+        records = {e.key: as_wire(e.record) for e in driver.effects if isinstance(e, JournalPut)}
         records["drain"] = {"by": "operator", "reason": "service"}
         found.append((driver.settings, records))
     return tuple(found)
@@ -65,13 +67,14 @@ def start_with(settings: Settings, texts: dict[str, str]) -> Opened:
         ):
             rows = [(key, text, digest(key, text)) for key, text in texts.items()]
             connection.executemany("INSERT INTO records VALUES (?, ?, ?)", rows)
-        journal = Journal.open(Path(root), "boot", check=check_record)
+        journal = Journal.open(Path(root), "boot", check=record_of)
         with contextlib.closing(journal):
             try_records(journal, settings)
             opened = journal.opened
     core = Arbiter(settings, STARTED_S)
-    core.handle(Recovered(opened.records), STARTED_S)
-    assert all(0 < process.pid < 1 << 31 for process in processes_of(opened.records))
+    found = records_of(opened.records)
+    core.handle(Recovered(found), STARTED_S)
+    assert all(0 < process.pid < 1 << 31 for process in processes_of(found))
     for later_s in (0.0, 1.0, 20.0, 7200.0):
         now = STARTED_S + later_s
         for gpu in settings.gpus:
@@ -111,9 +114,6 @@ def deep(levels: int) -> Any:
 @pytest.mark.parametrize("index", [0, 1, 2])
 def test_what_the_core_writes_is_taken(index: int) -> None:
     settings, records = records_written()[index]
-    for key, record in records.items():
-        if key.startswith("lease:"):
-            assert set(record) <= set(LeaseRecord.model_fields), "a field that no model checks"
     opened = start_with(settings, texts_of(records))
     assert set(opened.records) == {*records, DOUBT_KEY}, (
         "planted behind the seal's back, so in doubt"
@@ -127,6 +127,39 @@ NASTY = st.sampled_from(
      "\0", "\x1b[2J", "x" * 100_000, [], [None], [1, 2], [[]], [-1, -1], [10**30, 1], {}, {"a": 1},
      {"": []}, deep(70), deep(400)]
 )  # fmt: skip
+
+
+def test_a_record_of_version_0_1_is_read() -> None:
+    """Its spec was flat, and said less."""
+    old = {
+        "lease_id": "L1-1", "token": [1, 2], "state": "held", "gpu": "GPU-0", "pid": 7,
+        "start_ticks": 9, "nonce": "n1", "charge_bytes": 5, "load_peak_bytes": 6,
+        "measured_bytes": None, "exiting": False, "said_ready": True, "estate": None,
+        "spec": {
+            "consumer": "det", "model_id": "owl", "revision": "r2", "gpu": "any",
+            "exclusive": True, "load_peak_bytes": 6, "steady_bytes": 5, "residue_bytes": 1,
+            "priority": 60, "evictable": False, "ttl_s": 4.0, "min_residency_s": 0.0,
+            "deny_on_deadline": True, "gang": ["pair", 2], "parent": None,
+        },
+    }  # fmt: skip
+    record = record_of("lease:L1-1", old)
+    assert isinstance(record, LeaseRecord)
+    assert record.spec == LeaseSpec(
+        consumer="det",
+        model_id="owl",
+        revision="r2",
+        mode="exclusive",
+        footprint=Footprint(6, 5, 1),
+        priority=60,
+        evictable=False,
+        ttl_s=4.0,
+        min_residency_s=0.0,
+        on_deadline="deny",
+        gang=Gang("pair", 2),
+    )
+    assert (record.token, record.users, record.held_from) == ((1, 2), (), None)
+    with pytest.raises(ValueError, match="steady_bytes"):
+        record_of("lease:L1-1", {**old, "spec": {**old["spec"], "steady_bytes": -1}})
 
 
 @given(st.integers(0, 2), st.data())

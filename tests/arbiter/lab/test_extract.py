@@ -28,7 +28,7 @@ def shipped(name: str) -> Scenario:
     return load_scenario(text, name).model_copy(update={"seconds": 180.0})
 
 
-def recorded(name: str, folder: Path) -> tuple[Path, Outcome]:
+def record_shipped(name: str, folder: Path) -> tuple[Path, Outcome]:
     return record_workload(workload_of(shipped(name)), settings_of(shipped(name)), folder)
 
 
@@ -40,7 +40,7 @@ def near(value: float, wanted: float, share: float, slack: float) -> bool:
 def test_the_simulator_reproduces_a_log_within_its_stated_error(name: str, tmp_path: Path) -> None:
     """Switches and loads within 10 %, the longest wait within 15 % or half a second.
     docs/policies.md states this."""
-    log, truth = recorded(name, tmp_path)
+    log, truth = record_shipped(name, tmp_path)
     found = extract(runner.load(log))
     assert found.replayed.identical
     again = compare.under(found.workload, found.settings, "default")
@@ -55,7 +55,7 @@ def test_the_simulator_reproduces_a_log_within_its_stated_error(name: str, tmp_p
 
 
 def test_another_policy_on_a_log_does_what_it_does_on_the_scenario(tmp_path: Path) -> None:
-    log, _ = recorded("small-behind-large", tmp_path)
+    log, _ = record_shipped("small-behind-large", tmp_path)
     found = extract(runner.load(log))
     made = shipped("small-behind-large")
     for policy in ("fifo", "one_model", "ollama_rules"):
@@ -146,7 +146,7 @@ def test_a_wild_log_is_taken_as_far_as_it_goes(
 def test_what_if_prints_the_log_beside_the_policies(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, _ = recorded("find-navigate-grab", tmp_path)
+    log, _ = record_shipped("find-navigate-grab", tmp_path)
     assert main(["replay", str(log), "--policy", "one_model", "--policy", "default"]) == 0
     out = capsys.readouterr().out
     assert "default (logged)" in out

@@ -4,8 +4,7 @@ each rule says."""
 import pytest
 
 from tests.support.paths import ROOT
-from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
-from vram_arbiter.arbiter.core.settings import Settings
+from vram_arbiter.arbiter.core.settings import SCHEDULING, Settings
 from vram_arbiter.arbiter.lab import compare
 from vram_arbiter.arbiter.lab.outcome import Outcome, as_plain
 from vram_arbiter.arbiter.lab.rules import RULES, OneCardOnly
@@ -42,7 +41,11 @@ def under(made: Scenario, policy: str = "default") -> Outcome:
 
 
 def story(outcome: Outcome, *kinds: str) -> list[tuple[str, str]]:
-    return [(kind, str(data["consumer"])) for _, kind, data in outcome.timeline if kind in kinds]
+    return [
+        (note.kind, note.about.consumer)
+        for _, note in outcome.timeline
+        if note.kind in kinds and note.about is not None
+    ]
 
 
 @pytest.mark.parametrize("policy", SCHEDULING)
@@ -68,7 +71,7 @@ def test_a_switch_waits_for_the_safe_point_and_for_the_memory() -> None:
         ("verified", "left"),
         ("granted", "right"),
     ]
-    at = {(kind, str(data["consumer"])): when for when, kind, data in outcome.timeline}
+    at = {(note.kind, note.about.consumer): when for when, note in outcome.timeline if note.about}
     assert at["use_ended", "left"] <= at["unloading", "left"]
     assert at["granted", "right"] - at["released", "left"] >= 0.5  # the card's lag
     assert outcome.switches == 1
@@ -115,7 +118,8 @@ def test_a_request_that_never_fits_is_denied_at_once() -> None:
 
 def test_whoever_still_waits_at_the_end_is_counted() -> None:
     text = """
-  pinned: {load_peak: 6GiB, load_s: 1, use_s: 1, evictable: false, min_residency_s: 0, arrivals: {at_s: [0]}, wait_timeout_s: 5}
+  pinned: {load_peak: 6GiB, load_s: 1, use_s: 1, evictable: false, min_residency_s: 0,
+           arrivals: {at_s: [0]}, wait_timeout_s: 5}
   other: {load_peak: 1.5GiB, load_s: 1, use_s: 200, arrivals: {at_s: [2]}}
   late: {load_peak: 1.5GiB, use_s: 1, arrivals: {at_s: [20]}}
 """

@@ -10,13 +10,15 @@ from pydantic import ValidationError
 
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.pushes import ResizedPush
 from vram_arbiter.schemas.wire.replies import UsesReply
-from vram_arbiter.schemas.wire.requests import Acquire, Footprint, Gang, LeaseSpec, Ping, Reattach
+from vram_arbiter.schemas.wire.requests import Acquire, Ping, Reattach
+from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
 LIMIT = 1 << 20
 
@@ -148,9 +150,9 @@ def test_a_client_with_all_its_leases_and_many_uses_reattaches() -> None:
     """The limit of values must not refuse what an honest client holds: then its leases would
     expire."""
     size = {"load_peak_bytes": 5, "steady_bytes": 4, "residue_bytes": 1}
-    spec = LeaseSpec(
-        consumer="c", model_id="m", footprint=Footprint(**size), gang=Gang(id="g", size=2)
-    ).model_dump()
+    spec = to_map(
+        LeaseSpec(consumer="c", model_id="m", footprint=Footprint(**size), gang=Gang("g", 2))
+    )
     lease = {"lease_id": "L", "token": [1, 1], "state": "held", "spec": spec, "measured_bytes": 4}
     leases = [
         {**lease, "use_ids": [f"use-{n}" for n in range(16)]}

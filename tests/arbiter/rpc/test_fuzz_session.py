@@ -6,7 +6,7 @@ processes are gone nothing of them is left.
 import os
 import random
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from tests.support.connections import KeptConnection, peer_of
 from tests.support.core_driver import SimCard
 from tests.support.engine_state import state_of
+from tests.support.full_check import check_arbiter
 from tests.support.hostile import Forger, pack
 from tests.support.messages import IDLE_STATUS, NO_EVENTS, no_reason
 from vram_arbiter.arbiter.core import effects as fx
@@ -26,7 +27,8 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.rpc import words
-from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.arbiter.rpc.registry import SessionSettings
+from vram_arbiter.arbiter.rpc.session import SessionTable
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
@@ -83,7 +85,7 @@ class RealCore:
             self,
             self._sample,
             self.post,
-            lambda event: None,
+            lambda event, trace: None,
             self._signal,
             words,
         )
@@ -101,7 +103,7 @@ class RealCore:
         self._busy = True
         while self._queue:
             self.executor.perform(self.arbiter.handle(self._queue.popleft(), self.plant.now))
-            self.arbiter.check_all()
+            check_arbiter(self.arbiter)
         self._busy = False
 
     def when_read(self, answer: Callable[[], None]) -> None:
@@ -153,12 +155,12 @@ class Plant:
         self.outbox: Any = self  # the executor's way out, until the table is there
         values: dict[str, Any] = {
             "sessions_max": 50,
-            "processes_max": 1000, "rate_per_s": 1_000_000, "process_rate_per_s": 1_000_000,
-            "subscribers_max": 3,
+            "processes_max": 1000, "rate_per_client_per_s": 1_000_000,
+            "rate_per_process_per_s": 1_000_000, "subscribers_max": 3,
             "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, **limits,
         }  # fmt: skip
         settings_ = SessionSettings(
-            epoch=1, boot_id="b", server="test", heartbeat_s=2.0, grace_s=5.0,
+            epoch=1, boot_id="b", server="test", heartbeat_s=2.0, fence_grace_s=5.0,
             message_max_bytes=d.MESSAGE_MAX_BYTES,
             operators_gid=None, **values,
         )  # fmt: skip
@@ -236,22 +238,18 @@ class Plant:
 
     def leftovers(self) -> dict[str, int]:
         """Everything that the table remembers of somebody."""
-        table = self.table
-        return {
-            name: len(getattr(table, name))
-            for name in (
-                "_entries",
-                "_sessions",
-                "_of_process",
-                "_sessions_of_user",
-                "_subscribers",
-                "_instances",
-                "_moved",
-                "_casual",
-                "_watched",
-            )
-            if getattr(table, name)
+        registry = self.table._registry
+        tables: dict[str, Sized] = {
+            "budgets": self.table._budgets,
+            "sessions": registry.sessions,
+            "subscribers": registry.subscribers,
+            "moved": registry.moved,
+            "of_process": registry._of_process,
+            "of_user": registry._of_user,
+            "instances": registry._instances,
+            "watched": registry._watched,
         }
+        return {name: len(table) for name, table in tables.items() if table}
 
 
 def attack_table(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
@@ -352,7 +350,7 @@ def test_an_instance_that_reconnects_for_ever_is_one_session() -> None:
     for number in range(3000):
         assert plant.hello(b"r%d" % number, ATTACKERS[0], instance="same")["ok"]
     assert len(plant.table) == plant.core.status().clients == 1
-    assert plant.leftovers()["_moved"] == 1, "only the connection before this one is remembered"
+    assert plant.leftovers()["moved"] == 1, "only the connection before this one is remembered"
     plant.everybody_dies()
     assert not plant.leftovers()
     assert plant.core.status().clients == 0

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from vram_arbiter.arbiter.rpc.peer import check_visible, group_id, is_operator
-from vram_arbiter.schemas.errors import NotPermitted
+from vram_arbiter.schemas.errors import ConfigError, NotPermitted
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.peercred import Peer
 
@@ -23,7 +23,7 @@ def test_a_peer_of_another_pid_namespace_is_told_what_to_do() -> None:
 
 
 def test_operators_are_root_the_same_user_and_the_group() -> None:
-    group = group_id("daemon")
+    group = group_id("wire.group", "daemon")
     assert group is not None
     assert is_operator(peer(0, 0), None)
     assert is_operator(peer(os.getuid(), 0), None)
@@ -31,4 +31,6 @@ def test_operators_are_root_the_same_user_and_the_group() -> None:
     assert not is_operator(peer(54_321, 54_321), group)
     assert is_operator(peer(54_321, group), group)
     assert is_operator(peer(1, 54_321), group)  # user `daemon` by its account
-    assert group_id("no-such-group-here") is None
+    assert group_id("wire.group", None) is None
+    with pytest.raises(ConfigError, match="no group 'no-such-group-here'"):
+        group_id("wire.group", "no-such-group-here")

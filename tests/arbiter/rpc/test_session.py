@@ -12,12 +12,12 @@ import pytest
 from tests.support.connections import KeptConnection, peer_of
 from tests.support.messages import IDLE_STATUS, NO_EVENTS, lease_view, no_reason, revoke
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.arbiter.rpc.registry import SessionSettings
+from vram_arbiter.arbiter.rpc.session import SessionTable
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import (
     ClientId,
     LeaseId,
-    ModelKey,
     ProcessKey,
     RequestId,
     Token,
@@ -30,6 +30,7 @@ from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 ME = peer_of(os.getpid())
 PARENT = peer_of(os.getppid())
@@ -134,11 +135,11 @@ class Bench:
 
 def make_bench(**changes: Any) -> Bench:
     values: dict[str, Any] = {
-        "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "grace_s": 5.0,
+        "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "fence_grace_s": 5.0,
         "message_max_bytes": 4096,
         "sessions_max": 3, "processes_max": 1000, "operator_reserve": 0, "user_share": 1.0,
-        "process_share": 1.0, "rate_per_s": 100,
-        "process_rate_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
+        "process_share": 1.0, "rate_per_client_per_s": 100,
+        "rate_per_process_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
     }  # fmt: skip
     session_bench = Bench()
     settings = SessionSettings(**{**values, **changes})
@@ -250,12 +251,12 @@ def test_requests_of_leases_that_come_back(session_bench: Bench) -> None:
     session_bench.ask("resize", **on, footprint=FOOTPRINT, wait_timeout_s=2.0)
     reacquired, reattached, resized = session_bench.events
     assert resized == ev.ResizeAsked(
-        me, RequestId(session_bench.next_id), LEASE, token, 10, 8, 2, 2.0
+        me, RequestId(session_bench.next_id), LEASE, token, Footprint(10, 8, 2), 2.0
     )
     assert reacquired == ev.Reacquired(me, RequestId(session_bench.next_id - 2), LEASE, token, 4.0)
     assert isinstance(reattached, ev.Reattached)
     (item,) = reattached.leases
-    assert (item.away, item.held, item.spec.standby) == (True, False, True)
+    assert (item.state, item.spec.standby) == ("standby", True)
 
 
 def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None:
@@ -265,8 +266,15 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
     wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT,
     "mode": "exclusive",
               "priority": 60, "evictable": False, "on_deadline": "deny"}  # fmt: skip
-    spec = ev.LeaseSpec(
-        "detector", ModelKey("m", "r"), "any", True, 10, 8, 2, 60, False, 10.0, 2.0, True
+    spec = LeaseSpec(
+        consumer="detector",
+        model_id="m",
+        revision="r",
+        mode="exclusive",
+        footprint=Footprint(10, 8, 2),
+        priority=60,
+        evictable=False,
+        on_deadline="deny",
     )
     trace = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
     session_bench.ask("acquire", nonce="n1", spec=wanted, wait_timeout_s=4.0, traceparent=trace)
@@ -296,7 +304,9 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
         ev.UnloadStarted(me, next(ids), LEASE, token),
         ev.ReleaseReported(me, next(ids), LEASE, token, True),
         ev.CancelRequested(me, next(ids), LEASE),
-        ev.Reattached(me, next(ids), (ev.ReattachedLease(LEASE, token, spec, True, None, (USE,)),)),
+        ev.Reattached(
+            me, next(ids), (ev.ReattachedLease(LEASE, token, spec, "held", None, (USE,)),)
+        ),
         ev.OomReported(me, next(ids), LEASE, token, 11, 12),
     ]
 
@@ -494,7 +504,7 @@ def test_the_rate_is_limited_per_session_and_refills(session_bench: Bench) -> No
 
 
 def test_the_rate_of_a_process_is_limited_over_all_its_connections() -> None:
-    session_bench = make_bench(process_rate_per_s=150, sessions_max=10)
+    session_bench = make_bench(rate_per_process_per_s=150, sessions_max=10)
     assert sum(session_bench.hello(b"%d" % number)["ok"] for number in range(5)) == 5
     replies = [session_bench.ask("ping", b"%d" % (number % 5)) for number in range(200)]
     assert sum(reply["ok"] for reply in replies) == 145
@@ -502,7 +512,7 @@ def test_the_rate_of_a_process_is_limited_over_all_its_connections() -> None:
 
 
 def test_connecting_again_does_not_refill_the_rate_of_a_process() -> None:
-    session_bench = make_bench(process_rate_per_s=150)
+    session_bench = make_bench(rate_per_process_per_s=150)
     accepted = 0
     for _ in range(10):
         accepted += sum(code(session_bench.raw(b"junk")) == "bad_frame" for _ in range(50))

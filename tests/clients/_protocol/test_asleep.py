@@ -5,8 +5,8 @@ from typing import Any
 from tests.support.protocol_wire import WELCOME, Wire, evict, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
-from vram_arbiter.clients._protocol.records import Message
 from vram_arbiter.schemas.errors import ArbiterUnreachable, LeaseLost, WaitTimeout
+from vram_arbiter.schemas.plain import Message
 
 
 def test_an_evicted_lease_comes_back_under_a_new_token(link: Wire) -> None:

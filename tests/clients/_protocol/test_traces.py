@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,13 +13,14 @@ from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.clients.sync import Client
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.wire.replies import HistoryReply
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 OTHER = "00-1af7651916cd43dd8448eb211c80319d-c7ad6b7169203332-01"
@@ -159,17 +159,3 @@ def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
     asyncio.run(story())
     assert heard["goal"]["traceparent"] == heard["get_action"]["traceparent"] == PARENT
     assert "traceparent" not in heard["reset"]
-
-
-def test_the_models_thread_is_in_its_requests_trace() -> None:
-    from vram_arbiter.sidecars.worker import Worker
-
-    async def story() -> tuple[Any, Any]:
-        worker = Worker()
-        with tracing.joined(PARENT):
-            inside = await worker.run(tracing.traceparent)
-        outside = await worker.run(tracing.traceparent)
-        worker.close()
-        return inside, outside
-
-    assert asyncio.run(story()) == (PARENT, None)

@@ -60,6 +60,13 @@ def test_the_log_gives_bytes_by_program_peak_and_refusals() -> None:
     )
 
 
+def test_a_models_process_has_the_name_that_it_gave_itself() -> None:
+    """Its pid is not the sidecar's: the timeline was grey and named pids."""
+    named = json.loads(line(9, 1.0, "alloc", 5, 5)) | {"name": "detector"}
+    story = read_log(json.dumps(named), {7: "detector"})
+    assert story.points == (Point(1.0, "detector", 5),)
+
+
 def test_samples_of_a_real_card_give_the_same_story() -> None:
     gpu = {
         "measured_used_bytes": 6,

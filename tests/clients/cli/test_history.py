@@ -17,7 +17,7 @@ from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.cli import history
 from vram_arbiter.clients.cli.history import Wanted, collect, parse_since
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 PATIENCE_S = 60.0
 NOON = datetime.datetime(2026, 11, 21, 12, 0).timestamp()

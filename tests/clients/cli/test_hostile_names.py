@@ -19,11 +19,14 @@ from rich.console import Console
 from rich.text import Text
 
 from vram_arbiter.arbiter import log as telemetry
-from vram_arbiter.arbiter.lab import text as lab_text
+from vram_arbiter.arbiter.core.effects import Note
+from vram_arbiter.arbiter.lab import compare as lab_text
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
+from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.wire.notes import About, QueuedNote
 
 GIB = 1 << 30
 HOSTILE = (
@@ -162,7 +165,7 @@ SAID: dict[str, Callable[[str], list[str]]] = {
     "table": lambda name: text.table(["LEASE", "CONSUMER"], [["L1", name], [name, "x"]]),
     "table of the laboratory": lambda name: lab_text.table(["consumer", "waits"], [[name, 1]]),
     "timeline": lambda name: lab_text.timeline_lines(
-        name, [(1.0, "queued", {"consumer": name, "reason": name})], 5
+        name, [(1.0, Note(QueuedNote(1, None, name), About(LeaseId("L1"), name, None)))], 5
     ),
 }
 

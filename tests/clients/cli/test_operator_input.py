@@ -8,35 +8,26 @@ import grp
 import json
 import os
 import signal
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess, vramctl
+from tests.support.process import ArbiterProcess, Finished, vramctl, vramctl_at_once
 from vram_arbiter.clients.net.diagnose import obstacle
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import CODES
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = pytest.mark.e2e
 Spec = Callable[..., LeaseSpec]
-Finished = subprocess.CompletedProcess[str]
 PATIENCE_S = 60.0
 EVERY_ACTION = (
     ("evict", "x", "-r", "why"), ("pin", "x", "-r", "why"), ("unpin", "x"),
     ("release-dead", "x", "-r", "why"),
     ("drain", "-r", "why"), ("resume",),
 )  # fmt: skip
-STRANGER = """
-import os, sys
-import anyio._backends._asyncio, msgpack, zmq  # later the interpreter's folder may be closed to it
-import vram_arbiter.clients.client, vram_arbiter.clients.cli.main
-import vram_arbiter.clients.cli.operators, vram_arbiter.clients.cli.history
-os.setgroups([]); os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
-vram_arbiter.clients.cli.main.main()
-"""
+STRANGER = 65534
 
 
 def one_line(done: Finished) -> str:
@@ -141,15 +132,14 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
     sock = arbiter_daemon.runtime / "arbiter.sock"
     arbiter_daemon.runtime.chmod(0o755)
     sock.chmod(0o666)
-    stranger = ("-c", STRANGER)
     for action in EVERY_ACTION:
-        refused = vramctl(*action, program=stranger, environ=environ)
+        refused = vramctl(*action, user=STRANGER, environ=environ)
         assert (refused.returncode, "operators_group" in one_line(refused)) == (1, True), action
     assert (
-        typed(vramctl("evict", "det", "-r", "why", "--json", program=stranger, environ=environ))
+        typed(vramctl("evict", "det", "-r", "why", "--json", user=STRANGER, environ=environ))
         == "not_permitted"
     )
-    assert vramctl("why", "det", program=stranger, environ=environ).returncode == 0
+    assert vramctl("why", "det", user=STRANGER, environ=environ).returncode == 0
     assert lease.state == "held"
     sock.chmod(0o660)
     os.chown(sock, -1, 0)
@@ -159,7 +149,7 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
         ("history", "--follow"),
         ("run", "--vram", "1GiB", "true"),
     ):
-        shut_out = vramctl(*command, program=stranger, environ=environ)
+        shut_out = vramctl(*command, user=STRANGER, environ=environ)
         assert (shut_out.returncode, "may not be used by uid 65534" in one_line(shut_out)) == (
             3,
             True,
@@ -167,11 +157,11 @@ def test_who_is_no_operator_may_look_and_is_told_who_may_act(
     assert "join the group root" in shut_out.stderr
     arbiter_daemon.runtime.chmod(0o700)
     assert "its folder is closed to you" in one_line(
-        vramctl("status", program=stranger, environ=environ)
+        vramctl("status", user=STRANGER, environ=environ)
     )
     os.chown(arbiter_daemon.runtime, -1, grp.getgrnam("daemon").gr_gid)
     arbiter_daemon.runtime.chmod(0o750)  # as the daemon makes it for a group
-    assert "join the group daemon" in one_line(vramctl("status", program=stranger, environ=environ))
+    assert "join the group daemon" in one_line(vramctl("status", user=STRANGER, environ=environ))
 
 
 def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) -> None:
@@ -188,14 +178,15 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     status = json.loads(vramctl("status", "--json", environ=environ).stdout)
     assert status["drained"] == "", "what ended with 3 was not done afterwards"
     arbiter_daemon.kill()
-    for action in (*EVERY_ACTION, ("history",), ("why", "x"), ("watch",), ("history", "-f")):
-        dead = vramctl(*action, environ=environ)
+    others = (("history",), ("why", "x"), ("watch",), ("history", "-f"))
+    for action, dead in vramctl_at_once((*EVERY_ACTION, *others), environ=environ):
         assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (
             3,
             True,
         ), action
-    for action in (("resume", "--json"), ("history", "-f", "--json")):
-        assert typed(vramctl(*action, environ=environ)) == "arbiter_unreachable"
+    as_json = (("resume", "--json"), ("history", "-f", "--json"))
+    for action, dead in vramctl_at_once(as_json, environ=environ):
+        assert typed(dead) == "arbiter_unreachable", action
     (arbiter_daemon.runtime / "arbiter.sock").unlink()
     assert "there is no such socket" in one_line(vramctl("resume", environ=environ))
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")

@@ -22,7 +22,7 @@ from vram_arbiter.clients.cli.run import RunSpec, _Run, lease_spec
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
 
 Spec = Callable[..., LeaseSpec]

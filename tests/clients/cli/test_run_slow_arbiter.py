@@ -15,9 +15,10 @@ from typing import Any
 import pytest
 
 from tests.support import protocol_wire
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.defaults import WIRE_VERSION
 from vram_arbiter.schemas.errors import LeaseLost, VramError
+from vram_arbiter.schemas.plain import Message
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess, vramctl
+from tests.support.process import ArbiterProcess, vramctl, vramctl_at_once
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.wire.requests import LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
@@ -53,14 +53,13 @@ def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> No
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize(
-    "command", [["status"], ["why", "x"], ["history"], ["watch"], ["run", "--vram", "1GiB", "true"]]
-)
-def test_3_without_an_arbiter(command: list[str], nowhere: dict[str, str]) -> None:
-    done = vramctl(*command, environ=nowhere)
-    assert done.returncode == 3
-    assert "VRAM_ARBITER_ENDPOINT" in done.stderr
-    assert "Traceback" not in done.stderr
+def test_3_without_an_arbiter(nowhere: dict[str, str]) -> None:
+    run = ["run", "--vram", "1GiB", "true"]
+    commands = (["status"], ["why", "x"], ["history"], ["watch"], run)
+    for command, done in vramctl_at_once(commands, environ=nowhere):
+        assert done.returncode == 3, command
+        assert "VRAM_ARBITER_ENDPOINT" in done.stderr, command
+        assert "Traceback" not in done.stderr, command
 
 
 def test_errors_are_json_where_json_was_asked_for(nowhere: dict[str, str]) -> None:

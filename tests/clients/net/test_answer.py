@@ -2,6 +2,7 @@
 sockets, processes that are really stopped."""
 
 import asyncio
+import itertools
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -18,10 +20,11 @@ from tests.support import protocol_wire
 from tests.support.paths import ROOT
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.answer import Answer
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.reasoner import server as reasoner
+from vram_arbiter.schemas.plain import Message
 
 PATIENCE_S = 60.0
 LIMIT_S = 0.5
@@ -82,12 +85,13 @@ def serve_answer() -> Iterator[Callable[..., str]]:
     after it answers."""
     with tempfile.TemporaryDirectory(prefix="va") as folder:
         made: list[Answering] = []
+        numbers = itertools.count()
 
         def start(
             before: Callable[[Peer], None] = lambda _: None,
             after: Callable[[Peer], None] = lambda _: None,
         ) -> str:
-            made.append(Answering(f"ipc://{folder}/s.sock", before, after))
+            made.append(Answering(f"ipc://{folder}/{next(numbers)}", before, after))
             return made[-1].endpoint
 
         yield start
@@ -114,51 +118,68 @@ async def ask_reasoner(endpoint: str) -> None:
     await reasoner.send(endpoint, {"op": "state"}, timeout_s=LIMIT_S)
 
 
-@pytest.mark.parametrize("ask", [connect_once, ping_runner, ping_sidecar, ask_reasoner])
+ASKS = (connect_once, ping_runner, ping_sidecar, ask_reasoner)
+
+
+def each_at_once(play: Callable[[Any], None]) -> None:
+    """Play a story with each of ASKS, all side by side: each stands still for a while."""
+    with ThreadPoolExecutor(len(ASKS)) as pool:
+        list(pool.map(play, ASKS))
+
+
 def test_an_answer_that_came_while_the_loop_stood_still_counts(
-    serve_answer: Callable[..., str], ask: Any
+    serve_answer: Callable[..., str],
 ) -> None:
-    """Regression: a program that imported something for longer than its time limit said that nobody
-    had answered."""
-    asked, standing, said = threading.Event(), threading.Event(), threading.Event()
+    """A program that imported something for longer than its time limit said that no server had
+    answered."""
 
-    def before(_: Peer) -> None:
-        asked.set()
-        standing.wait(PATIENCE_S)
+    def play(ask: Any) -> None:
+        asked, standing, said = threading.Event(), threading.Event(), threading.Event()
 
-    endpoint = serve_answer(before, lambda _: said.set())
+        def before(_: Peer) -> None:
+            asked.set()
+            standing.wait(PATIENCE_S)
 
-    def stand_still() -> None:
-        if not asked.is_set():  # the client connects first, which takes a few turns of its loop
+        endpoint = serve_answer(before, lambda _: said.set())
+
+        def stand_still() -> None:
+            if not asked.is_set():  # the client connects first, which takes a few turns of its loop
+                asyncio.get_running_loop().call_later(0.001, stand_still)
+                return
+            standing.set()
+            said.wait(PATIENCE_S)
+            time.sleep(3 * LIMIT_S)
+
+        async def run() -> None:
+            asking = asyncio.create_task(ask(endpoint))
             asyncio.get_running_loop().call_soon(stand_still)
-            return
-        standing.set()
-        said.wait(PATIENCE_S)
-        time.sleep(3 * LIMIT_S)
+            await asking
 
-    async def run() -> None:
-        asking = asyncio.create_task(ask(endpoint))
-        asyncio.get_running_loop().call_soon(stand_still)
-        await asking
+        asyncio.run(run())
+        assert said.is_set(), ask
 
-    asyncio.run(run())
-    assert said.is_set()
+    each_at_once(play)
 
 
-@pytest.mark.parametrize("ask", [connect_once, ping_runner, ping_sidecar, ask_reasoner])
 def test_a_loop_that_stood_still_before_it_could_ask_still_asks(
-    serve_answer: Callable[..., str], ask: Any
+    serve_answer: Callable[..., str],
 ) -> None:
     """A client says nothing before it knows whose server it is: its connection is noticed on its
     loop."""
-    endpoint = serve_answer()
 
-    async def run() -> None:
-        asking = asyncio.create_task(ask(endpoint))
-        asyncio.get_running_loop().call_soon(time.sleep, 3 * LIMIT_S)
-        await asking
+    def play(ask: Any) -> None:
+        asked = threading.Event()
+        endpoint = serve_answer(lambda _: asked.set())
 
-    asyncio.run(run())
+        async def run() -> None:
+            asking = asyncio.create_task(ask(endpoint))
+            asyncio.get_running_loop().call_soon(time.sleep, 3 * LIMIT_S)
+            await asking
+
+        asyncio.run(run())
+        assert asked.is_set(), ask
+
+    each_at_once(play)
 
 
 def test_an_answer_that_came_while_the_process_was_stopped_counts(

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from tests.support.wire import WireClient
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer, check_free
+from vram_arbiter.clients.net.server import Peer, RouterServer, check_free
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError, RobotFault, VramError
+from vram_arbiter.schemas.plain import Message
 
 ANSWER = bytes(16 << 20)  # far more than the kernel takes in one go
 

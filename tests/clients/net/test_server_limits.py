@@ -19,13 +19,13 @@ import zmq.asyncio
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
     WAITING_MAX,
-    Message,
     Peer,
     RouterServer,
     check_free,
 )
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import ConfigError, VramError
+from vram_arbiter.schemas.plain import Message
 
 WAIT_S = 60.0
 

@@ -125,6 +125,34 @@ async def test_a_killed_child_is_replaced(detector: DetectorClient) -> None:
     assert await detector.detect(PNG, "x")
 
 
+class DyingInBetween(DetectorClient):
+    """Its child dies after the client found that nothing serves the endpoint."""
+
+    def _somebody_listens(self) -> bool:
+        return False
+
+    async def _boot(self, spec: SpawnSpec) -> None:
+        if self.child is not None:
+            os.kill(self.child.pid, signal.SIGKILL)
+            await self.child.exited.wait()
+        await super()._boot(spec)
+
+
+async def test_a_replaced_child_leaves_no_log(
+    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log of a child that died between two looks at it stayed in the temporary folder."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    async with DyingInBetween(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
+        await client.detect(PNG, "x")
+        first = client.child
+        client._drop("a broken connection")
+        await client.detect(PNG, "x")
+        assert client.child is not first
+        assert len(list(tmp_path.glob("sidecar-*.log"))) == 1
+    assert list(tmp_path.glob("sidecar-*.log")) == []
+
+
 async def test_a_child_that_takes_its_time_to_die_is_replaced_all_the_same(
     detector: DetectorClient,
 ) -> None:

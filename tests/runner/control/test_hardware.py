@@ -363,7 +363,7 @@ def test_it_does_not_start_on_a_camera_that_shows_nothing(
     make_runner: MakeRunner, twin: Twin, front: FedCamera, clock: Any
 ) -> None:
     front.always = False
-    front._run_begins = lambda feed: feed.end("there is no /dev/video7")  # type: ignore[method-assign]
+    front._run_begins = lambda feed: feed.end("there is no /dev/video7")
     runner = make_runner([front])
     with pytest.raises(FrameStale, match="video7"):
         runner.activate()

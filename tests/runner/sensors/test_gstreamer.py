@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.sensors.reading import CLOCK, WAIT_S, end_of, frame_of, soon
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.gstreamer import _Run, load, make, without_credentials
 from vram_arbiter.runner.sensors.pipelines import GStreamerParams, build
@@ -28,8 +29,6 @@ pytest.importorskip(
     "gi", reason="GStreamer's binding is not installed; .ci/setup says what to install"
 )
 
-CLOCK = SystemClock()
-WAIT_S = 60.0
 FILE_FPS = 25
 FILE_FRAMES = 50
 SIZE = (96, 64)
@@ -71,25 +70,6 @@ def h264_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
             grey = 255 * index // (FILE_FRAMES - 1)
             writer.append_data(numpy.full((SIZE[1], SIZE[0], 3), grey, numpy.uint8))
     return path
-
-
-def soon() -> int:
-    return CLOCK.now_ns() + round(WAIT_S * 1e9)
-
-
-def frame_of(source: SlotReader) -> SensorFrame:
-    """The next picture whole; fails after a minute."""
-    return source.read_synced(soon())
-
-
-def end_of(source: SlotReader) -> str:
-    """Wait until the source ends, and say why."""
-    deadline_ns = soon()
-    while source.slot.ended is None:
-        with contextlib.suppress(FrameStale):  # of the end, or of the deadline
-            source.read_synced(deadline_ns)
-        assert CLOCK.now_ns() < deadline_ns, "it does not end"
-    return source.slot.ended
 
 
 class Recorder:
@@ -385,7 +365,8 @@ from vram_arbiter.runner.sensors.gstreamer import make
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 params = {"source": "test", "pattern": "red", "width": 16, "height": 16}
 clock = SystemClock()
-camera = make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params=params), clock, None)
+config = SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params=params)
+camera = make(config, clock, None)
 camera.start()
 assert camera.read_synced(clock.now_ns() + 60 * 10**9).data == b"\\x00\\x00\\xff" * 256
 camera.stop()

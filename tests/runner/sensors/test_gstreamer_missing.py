@@ -13,7 +13,9 @@ from vram_arbiter.runner.sensors.gstreamer import make
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 try:
-    make(SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params={"source": "test"}), SystemClock(), None)
+    params = {"source": "test"}
+    config = SensorReaderConfig(sensor_id="wrist", backend="gstreamer", backend_params=params)
+    make(config, SystemClock(), None)
 except ConfigError as error:
     print(error.message)
 """

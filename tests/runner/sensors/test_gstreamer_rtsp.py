@@ -10,20 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from vram_arbiter.runner.control.clock import SystemClock
+from tests.runner.sensors.reading import CLOCK, end_of, frame_of
 from vram_arbiter.runner.sensors.factory import make_reader
 from vram_arbiter.runner.sensors.slot import SlotReader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 from vram_arbiter.schemas.errors import FrameStale
-from vram_arbiter.schemas.world import SensorFrame
 
 pytestmark = pytest.mark.heavy
 pytest.importorskip(
     "gi", reason="GStreamer's binding is not installed; .ci/setup says what to install"
 )
 
-CLOCK = SystemClock()
-WAIT_S = 60.0
 SIZE = (96, 64)
 """Width and height of what the camera sends."""
 FORMATS = {"h264": "96 H264/90000", "mjpeg": "26 JPEG/90000"}
@@ -167,19 +164,6 @@ def h264_packets(tmp_path_factory: pytest.TempPathFactory) -> str:
         for _ in range(25):
             writer.append_data(numpy.full((SIZE[1], SIZE[0], 3), 128, numpy.uint8))
     return f'filesrc location="{path}" ! qtdemux ! rtph264pay config-interval=-1 pt=96'
-
-
-def frame_of(reader: SlotReader) -> SensorFrame:
-    return reader.read_synced(CLOCK.now_ns() + round(WAIT_S * 1e9))
-
-
-def end_of(reader: SlotReader) -> str:
-    deadline_ns = CLOCK.now_ns() + round(WAIT_S * 1e9)
-    while reader.slot.ended is None:
-        with contextlib.suppress(FrameStale):
-            reader.read_synced(deadline_ns)
-        assert CLOCK.now_ns() < deadline_ns, "it does not end"
-    return reader.slot.ended
 
 
 def test_an_h264_stream_and_its_end(

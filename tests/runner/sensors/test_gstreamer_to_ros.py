@@ -21,7 +21,8 @@ WAIT_NS = 60 * 10**9
 NETWORK = (
     '<CycloneDDS><Domain Id="any"><General><AllowMulticast>false</AllowMulticast>'
     '<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>'
-    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    "<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
     '<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>'
 )
 

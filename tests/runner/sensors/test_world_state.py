@@ -19,7 +19,7 @@ MS = 1_000_000
 START_NS = 10_000 * MS
 
 
-def joints(stamp_ns: int, position: float = 0.5) -> JointState:
+def joint_state(stamp_ns: int, position: float = 0.5) -> JointState:
     return JointState(name=("a",), position=(position,), stamp_ns=stamp_ns)
 
 
@@ -48,7 +48,7 @@ def test_without_a_joint_state_there_is_no_world_state(aggregator: WorldStateAgg
 
 
 def test_what_is_fresh_is_shown_with_its_frame_inline(aggregator: WorldStateAggregator) -> None:
-    aggregator.update_joint_state(joints(START_NS), START_NS)
+    aggregator.update_joint_state(joint_state(START_NS), START_NS)
     aggregator.update_image_frame(frame(START_NS), START_NS)
     seen = aggregator.snapshot(START_NS + 99 * MS)
     assert seen.diagnostics == {"front": "ok", "wrist": "stale", JOINT_STATE: "ok"}
@@ -62,7 +62,7 @@ def test_an_old_frame_is_not_served_and_returns_only_after_several_fresh_ones(
     aggregator: WorldStateAggregator,
 ) -> None:
     now = START_NS
-    aggregator.update_joint_state(joints(now), now)
+    aggregator.update_joint_state(joint_state(now), now)
     aggregator.update_image_frame(frame(now), now)
     now += 101 * MS
     seen = aggregator.snapshot(now)
@@ -78,7 +78,7 @@ def test_an_old_frame_is_not_served_and_returns_only_after_several_fresh_ones(
 
 
 def test_the_same_frame_again_is_no_fresh_one(aggregator: WorldStateAggregator) -> None:
-    aggregator.update_joint_state(joints(START_NS), START_NS)
+    aggregator.update_joint_state(joint_state(START_NS), START_NS)
     aggregator.lose("front", "the cable is out")
     now = START_NS + 10 * MS
     for _ in range(2 * RECOVERY_UPDATES):
@@ -88,7 +88,7 @@ def test_the_same_frame_again_is_no_fresh_one(aggregator: WorldStateAggregator) 
 
 
 def test_a_gap_during_recovery_begins_it_anew(aggregator: WorldStateAggregator) -> None:
-    aggregator.update_joint_state(joints(START_NS), START_NS)
+    aggregator.update_joint_state(joint_state(START_NS), START_NS)
     aggregator.lose("front", "gone")
     now = START_NS
     for gap_ms in (30, 30, 150, 30):
@@ -107,24 +107,24 @@ def test_a_bus_that_repeats_its_last_answer_does_not_look_alive(
     aggregator: WorldStateAggregator,
 ) -> None:
     for passed_ms in range(0, 120, 20):
-        aggregator.update_joint_state(joints(START_NS), START_NS + passed_ms * MS)
+        aggregator.update_joint_state(joint_state(START_NS), START_NS + passed_ms * MS)
     aggregator.note(JOINT_STATE, "no answer from motor 3")
     seen = aggregator.snapshot(START_NS + 120 * MS)
     assert seen.stale == ("front", JOINT_STATE, "wrist")
     assert "no answer from motor 3" in aggregator.why(JOINT_STATE)
-    assert seen.joint_state == joints(START_NS)  # what was measured, never zeros
+    assert seen.joint_state == joint_state(START_NS)  # what was measured, never zeros
 
 
 def test_a_slow_loop_is_not_a_stale_robot(aggregator: WorldStateAggregator) -> None:
     for tick in range(5):
         now = START_NS + tick * 400 * MS
-        aggregator.update_joint_state(joints(now), now)
+        aggregator.update_joint_state(joint_state(now), now)
         assert aggregator.snapshot(now).diagnostics[JOINT_STATE] == "ok"
 
 
 def test_a_stamp_of_another_clock_is_refused(aggregator: WorldStateAggregator) -> None:
-    aggregator.update_joint_state(joints(START_NS), START_NS)
-    aggregator.update_joint_state(joints(START_NS + 60_000 * MS, 9.0), START_NS + MS)
+    aggregator.update_joint_state(joint_state(START_NS), START_NS)
+    aggregator.update_joint_state(joint_state(START_NS + 60_000 * MS, 9.0), START_NS + MS)
     seen = aggregator.snapshot(START_NS + 2 * MS)
     assert JOINT_STATE in seen.stale
     assert seen.joint_state.position == (0.5,)
@@ -161,7 +161,7 @@ def test_no_history_serves_a_frame_older_than_allowed(story: list[tuple[int, int
     now = START_NS
     for passed_ms, age_ms, lost in story:
         now += passed_ms * MS
-        aggregator.update_joint_state(joints(now), now)
+        aggregator.update_joint_state(joint_state(now), now)
         if lost:
             aggregator.lose("front", "lost")
         aggregator.update_image_frame(frame(now - age_ms * MS), now)

@@ -14,7 +14,12 @@ spaces = pytest.importorskip("gymnasium.spaces")
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from vram_arbiter.runner.sim.gym_spaces import CHOICES_MAX, ActionRow, NoNumbers, leaves  # noqa: E402
+from vram_arbiter.runner.sim.gym_spaces import (  # noqa: E402
+    CHOICES_MAX,
+    ActionRow,
+    NoNumbers,
+    leaves,
+)
 
 FLOATS = ("float16", "float32", "float64")
 INTEGERS = ("int8", "uint8", "int32", "int64")

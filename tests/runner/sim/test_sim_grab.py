@@ -5,6 +5,7 @@ they say.
 import json
 import math
 import random
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -122,11 +123,14 @@ def test_grab_data_set_holds_whole_episodes(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "info.json").read_text())["units"] == "rad"
 
 
-def test_the_shipped_policy_grabs_and_can_drive_a_second_round(tmp_path: Path) -> None:
+def test_the_shipped_policy_grabs_and_can_drive_a_second_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("lerobot")
     import torch
 
     torch.set_num_threads(1)  # a second thread of so small a network only waits
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # lerobot leaves a file there
     policy = LoadedPolicy(CHECKPOINT)
     with SimEnv() as sim_env:
         done = [attempt(sim_env, policy, 700 + n, tries=2, error_m=0.015) for n in range(3)]

@@ -12,12 +12,13 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.recording.reader import read_frame
 from vram_arbiter.schemas.errors import UnknownSkill
+from vram_arbiter.schemas.plain import Message
 
 pytestmark = pytest.mark.heavy
 
@@ -36,7 +37,8 @@ embodiment_extra:
 sensors_required:
   - {modality: rgb, vla_feature_key: observation.images.front}
 actuators_required:
-  - {kind: joint_position, n_dof: 2, vla_action_key: action, control_mode_semantics: {mode: absolute}}
+  - {kind: joint_position, n_dof: 2, vla_action_key: action,
+     control_mode_semantics: {mode: absolute}}
 weights_uri: "local://models/none"
 chunk_size: 3
 latency_budget: {per_chunk_ms: 100.0, max_execution_s: 20.0}

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.clients.net.server import Message, Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
@@ -28,6 +28,7 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.schemas.manifest import RSkillManifest, parse_manifest
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.world import FrameEncoding, JointState, SensorFrame, WorldState
 
 pytestmark = pytest.mark.heavy  # arrays: numpy
@@ -47,7 +48,8 @@ embodiment_extra:
 sensors_required:
   - {modality: rgb, vla_feature_key: observation.images.front}
 actuators_required:
-  - {kind: joint_position, n_dof: 2, vla_action_key: action, control_mode_semantics: {mode: absolute}}
+  - {kind: joint_position, n_dof: 2, vla_action_key: action,
+     control_mode_semantics: {mode: absolute}}
 weights_uri: "local://models/none"
 chunk_size: 3
 latency_budget: {per_chunk_ms: 100.0, max_execution_s: 20.0}

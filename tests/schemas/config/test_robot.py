@@ -16,7 +16,8 @@ hal:
 
 FULL = """\
 robot_id: so101
-hal: {adapter: "lerobot:so101_follower", transport: {port: /dev/ttyACM0}, params: {calibration: mine}}
+hal: {adapter: "lerobot:so101_follower", transport: {port: /dev/ttyACM0},
+      params: {calibration: mine}}
 sensors:
   - {sensor_id: wrist, backend_params: {device: 0}}
   - sensor_id: front
@@ -28,7 +29,8 @@ sensors:
     publish_rate_hz: 5
 task: {id: grab, scene_id: table, instruction: grab the red cube}
 vla: {id: vram-arbiter/so101-grab, weights_uri: "local://configs/models/so101-grab"}
-safety: {max_joint_speed_factor: 0.5, workspace_box_min_xyz: [0, -0.3, 0], workspace_box_max_xyz: [0.5, 0.3, 0.5]}
+safety: {max_joint_speed_factor: 0.5, workspace_box_min_xyz: [0, -0.3, 0],
+         workspace_box_max_xyz: [0.5, 0.3, 0.5]}
 rate_hz: 30
 thumbnail_hz: 25
 deadline_overrun_policy: drop

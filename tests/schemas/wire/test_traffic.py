@@ -67,7 +67,7 @@ class RecordedClient(WireClient):
         return message
 
 
-def problems(name: str, message: dict[str, Any]) -> list[str]:
+def violations(name: str, message: dict[str, Any]) -> list[str]:
     """Return what a validator finds wrong with a message of a type."""
     validator = jsonschema.Draft202012Validator({**WIRE, "$ref": f"#/$defs/{name}"})
     return [
@@ -146,11 +146,11 @@ def test_every_message_is_valid_under_the_published_schemas(
     seen = {name for name, _ in messages}
     assert {cls.__name__ for cls in REPLIES.values()} <= seen
     assert {"RevokePush", "GrantedPush", "DeniedPush", "EventPush", "ErrorView"} <= seen
-    found = [problem for name, message in messages for problem in problems(name, message)]
+    found = [problem for name, message in messages for problem in violations(name, message)]
     assert not found, "\n".join(found)
 
 
 def test_the_validator_refuses_what_the_schemas_do_not_allow() -> None:
-    assert problems("Ping", {"op": "ping", "id": 1}) == []
-    assert problems("Ping", {"op": "ping"})
-    assert problems("RevokePush", {"push": "revoke", "lease_id": 7})
+    assert violations("Ping", {"op": "ping", "id": 1}) == []
+    assert violations("Ping", {"op": "ping"})
+    assert violations("RevokePush", {"push": "revoke", "lease_id": 7})

@@ -78,7 +78,6 @@ def test_it_detects_in_the_pixels_of_the_picture_sent(manifest, weights, png):
     assert reply["norm"] == 1000
     nothing = adapter.run(call.model_copy(update={"score_threshold": 1.0}))
     assert (nothing["ok"], nothing["detections"], nothing["answer"]) == (True, [], "")
-    adapter.unload()
     adapter.load("cpu")
     assert adapter.run(call) == reply, "loading again gives the same model"
 

@@ -1,5 +1,6 @@
 """Frames through the card: nothing moves, nothing is made up, no card is an error at the start."""
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +107,19 @@ def test_without_cameras_there_is_nothing_to_pass_on() -> None:
 
 
 @pytest.mark.parametrize("device", ["none", "cuda"])
-def test_without_a_card_it_does_not_start(device: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_card_it_does_not_start(
+    device: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Regression: a program that called `main` kept the sidecar's folder as its temporary
+    folder."""
     import torch
 
     if device == "cuda" and torch.cuda.is_available():
         pytest.skip("this machine has a card")
-    assert (
-        main(["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"])
-        == 1
-    )
+    before = tempfile.gettempdir()
+    flags = ["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"]
+    assert main([*flags, "--endpoint", f"ipc://{tmp_path}/passthrough.sock"]) == 1
+    assert tempfile.gettempdir() == before
     said = capsys.readouterr().err
     assert "card" in said or "GPU" in said
     assert "fake:FOLDER" in said

@@ -97,7 +97,6 @@ def test_what_is_missing_or_misshapen_is_named(adapter, observation):
 def test_reset_and_reload(adapter, observation):
     expected = act(adapter, observation)
     assert adapter.run(EndpointCall(endpoint="reset")) == {"ok": True}
-    adapter.unload()
     adapter.load("cpu")
     assert (act(adapter, observation) == expected).all()
 

@@ -87,7 +87,6 @@ def test_both_ways_to_send_pictures_are_judged_alike(shipped_adapter: RewardAdap
         num_bins=10,
     )
     assert shipped_adapter.run(raw) == score(shipped_adapter, *map(as_png, rgb))
-    shipped_adapter.unload()
     shipped_adapter.load("cpu")
     assert shipped_adapter.run(raw) == score(shipped_adapter, *map(as_png, rgb)), (
         "the same after a reload"

@@ -24,6 +24,5 @@ def test_it_answers_greedily_and_reloads(manifest, weights, png):
     assert adapter.run(call) == reply
     with pytest.raises(BadRequest, match="cannot be decoded"):
         adapter.run(call.model_copy(update={"image": b"no picture"}))
-    adapter.unload()
     adapter.load("cpu")
     assert adapter.run(call) == reply

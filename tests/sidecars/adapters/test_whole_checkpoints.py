@@ -14,7 +14,7 @@ import pytest
 
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.sidecars.checkpoints import load_lerobot, load_transformers
-from vram_arbiter.sidecars.weights import Weights
+from vram_arbiter.sidecars.weights import Weights, read_config
 
 pytestmark = pytest.mark.heavy
 
@@ -150,7 +150,7 @@ def load_policy(weights: Weights, device: str) -> Any:
 
     import vram_arbiter.sidecars.models.compact_act  # noqa: F401  registers itself
 
-    config = PreTrainedConfig.from_pretrained(weights.source)
+    config = read_config(PreTrainedConfig, weights)
     config.device = device
     return load_lerobot(get_policy_class(config.type), weights, config)
 
@@ -161,7 +161,7 @@ def load_reward(weights: Weights, device: str) -> Any:
 
     import vram_arbiter.sidecars.models.compact_progress  # noqa: F401  registers itself
 
-    config = RewardModelConfig.from_pretrained(weights.source)
+    config = read_config(RewardModelConfig, weights)
     config.device = device
     return load_lerobot(get_reward_model_class(config.type), weights, config)
 

@@ -60,7 +60,7 @@ def card_folder(tmp_path):
 
 
 @pytest.fixture
-def start(card_folder):
+def start_child(card_folder):
     children = []
 
     def start(code, *arguments):
@@ -89,9 +89,9 @@ def seconds_until(condition, deadline_s=60.0):
     return time.monotonic() - began
 
 
-def test_racing_processes_never_exceed_the_capacity(tmp_path, start, card_folder):
+def test_racing_processes_never_exceed_the_capacity(tmp_path, start_child, card_folder):
     make_card(card_folder, 1 * GIB, release_lag_s=0.01)
-    children = [start(CONTENDER, str(seed)) for seed in range(4)]
+    children = [start_child(CONTENDER, str(seed)) for seed in range(4)]
     refused = [int(child.communicate(timeout=60)[0]) for child in children]
     assert sum(refused) > 0, "the race was not tight enough to show anything"
     seconds_until(lambda: used(card_folder) == 0)
@@ -101,8 +101,8 @@ def test_racing_processes_never_exceed_the_capacity(tmp_path, start, card_folder
     assert 0.5 * GIB < report.peak_bytes <= GIB
 
 
-def test_a_killed_process_gives_its_memory_back_after_the_lag(start, card_folder):
-    holder = start(HOLDER)
+def test_a_killed_process_gives_its_memory_back_after_the_lag(start_child, card_folder):
+    holder = start_child(HOLDER)
     assert holder.stdout.readline() == "ready\n"
     assert used(card_folder) == 4 * GIB + 450 * MIB
     with pytest.raises(SimulatedOutOfMemory):
@@ -115,8 +115,8 @@ def test_a_killed_process_gives_its_memory_back_after_the_lag(start, card_folder
     assert check_log((card_folder / "log.jsonl").read_text()).problems == []
 
 
-def test_a_zombie_holds_nothing(start, card_folder):
-    holder = start(HOLDER)
+def test_a_zombie_holds_nothing(start_child, card_folder):
+    holder = start_child(HOLDER)
     holder.stdout.readline()
     os.kill(holder.pid, signal.SIGKILL)  # not reaped: it stays as a zombie
     seconds_until(lambda: used(card_folder) == 0)
@@ -144,19 +144,16 @@ def test_the_life_of_one_model(card_folder):
 def test_an_out_of_memory_while_filling_leaves_nothing_behind(card_folder):
     memory = FakeMemory(card_folder, "model", 0)
     with pytest.raises(OutOfMemory):
-        fill(memory, "weights", 9 * GIB, bytes_per_s=None, wait=lambda seconds: False)
+        fill(memory, "weights", 9 * GIB, bytes_per_s=None)
     memory.empty_cache()
     assert memory.used_bytes() == 0
 
 
-def test_filling_is_throttled_and_can_be_stopped():
+def test_filling_is_throttled():
     slept: list[float] = []
-    blocks = fill(
-        NoDevice(), "w", 300 * MIB, bytes_per_s=100 * MIB, wait=lambda s: slept.append(s) or False
-    )  # type: ignore[func-returns-value]
+    blocks = fill(NoDevice(), "w", 300 * MIB, bytes_per_s=100 * MIB, sleep=slept.append)
     assert sum(block.size_bytes for block in blocks) == 300 * MIB
     assert sum(slept) == pytest.approx(3.0)
-    assert len(fill(NoDevice(), "w", 300 * MIB, bytes_per_s=1, wait=lambda seconds: True)) == 1
 
 
 def test_threads_of_one_process_do_not_lose_each_others_bytes(card_folder):

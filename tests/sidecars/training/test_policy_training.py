@@ -18,6 +18,7 @@ from vram_arbiter.sidecars.training.policy import (
     main,
     train,
 )
+from vram_arbiter.sidecars.weights import Weights, read_config
 
 pytestmark = pytest.mark.heavy
 
@@ -72,7 +73,7 @@ def act(folder: Path, chunk_of: int) -> np.ndarray:
 
     import vram_arbiter.sidecars.models.compact_act  # noqa: F401  # registers the policy type
 
-    config = PreTrainedConfig.from_pretrained(folder)
+    config = read_config(PreTrainedConfig, Weights(str(folder), local=True))
     config.device = "cpu"
     policy = get_policy_class(config.type).from_pretrained(folder, config=config)
     before, after = make_pre_post_processors(config, pretrained_path=str(folder))

@@ -48,7 +48,7 @@ def test_it_learns_what_the_pictures_show_and_lerobot_loads_it(tmp_path: Path) -
     learn, kept = split(data)
     assert not {data.episode[index] for index in learn} & {data.episode[index] for index in kept}
     short = train(data, tmp_path / "short", steps=2, batch_size=8, seed=0, time_limit_s=600.0)
-    longer = train(data, tmp_path / "long", steps=40, batch_size=8, seed=0, time_limit_s=600.0)
+    longer = train(data, tmp_path / "long", steps=15, batch_size=8, seed=0, time_limit_s=600.0)
     assert longer["progress"] < short["progress"]
     figures = judge(data, tmp_path / "long")
     assert figures["held-out pictures"] == len(kept)

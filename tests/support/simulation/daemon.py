@@ -13,6 +13,7 @@ from typing import Any
 
 import msgpack
 
+from tests.support.full_check import check_arbiter
 from tests.support.simulation.card import Device, ProbeFaults, SimProber
 from tests.support.simulation.clock import Clock, ProcessLoop
 from tests.support.simulation.wire import Line, SimWire
@@ -23,10 +24,11 @@ from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.daemon import processes_of, try_records
 from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.host.journal import Journal
-from vram_arbiter.arbiter.host.records import check_record
+from vram_arbiter.arbiter.host.records import record_of, records_of
 from vram_arbiter.arbiter.inbox import Inbox
 from vram_arbiter.arbiter.rpc import words
-from vram_arbiter.arbiter.rpc.session import SessionSettings, SessionTable
+from vram_arbiter.arbiter.rpc.registry import SessionSettings
+from vram_arbiter.arbiter.rpc.session import SessionTable
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import JournalUnavailable
@@ -80,7 +82,7 @@ class SimDaemon:
     def __init__(self, machine: Machine, failed: Callable[[BaseException], None]) -> None:
         self.machine = machine
         self.clock = machine.clock
-        self.loop = ProcessLoop(machine.clock, "daemon")  # type: ignore[abstract]  # reason: its docstring
+        self.loop = ProcessLoop(machine.clock, "daemon")
         self.loop.on_failure = self._loop_failed
         self.journal_full = False
         self.on_crash: Callable[[], None] | None = None
@@ -105,7 +107,7 @@ class SimDaemon:
     def _start(self) -> None:
         machine, clock = self.machine, self.clock
         self.journal = Journal.open(
-            machine.folder, f"boot-{machine.boot}", check=check_record, at_least=1
+            machine.folder, f"boot-{machine.boot}", check=record_of, at_least=1
         )
         epoch = self.journal.opened.epoch
         assert not self.journal.problems, f"the journal is whole: {self.journal.problems}"
@@ -128,15 +130,15 @@ class SimDaemon:
                 boot_id=f"boot-{machine.boot}",
                 server="simulated",
                 heartbeat_s=d.HEARTBEAT_S,
-                grace_s=settings.fence_grace_s,
+                fence_grace_s=settings.fence_grace_s,
                 message_max_bytes=d.MESSAGE_MAX_BYTES,
                 sessions_max=d.SESSIONS_MAX,
                 processes_max=d.CONNECTIONS_MAX,
                 operator_reserve=d.OPERATOR_RESERVE,
                 user_share=d.USER_SHARE,
                 process_share=d.PROCESS_SHARE,
-                rate_per_s=d.RATE_PER_CLIENT_PER_S,
-                process_rate_per_s=d.RATE_PER_PROCESS_PER_S,
+                rate_per_client_per_s=d.RATE_PER_CLIENT_PER_S,
+                rate_per_process_per_s=d.RATE_PER_PROCESS_PER_S,
                 subscribers_max=d.SUBSCRIBERS_MAX,
                 operators_gid=None,
             ),
@@ -151,11 +153,11 @@ class SimDaemon:
             _Chronicle(machine, epoch),
             self._sample,
             self._post,
-            lambda event: None,
+            lambda event, trace: None,
             lambda process, kind: clock.say(f"{kind} for {process}"),
             words,
         )
-        records = self.journal.opened.records
+        records = records_of(self.journal.opened.records)
         clock.say(f"daemon starts, epoch {epoch}, {len(records)} records")
         if records:
             self._post(Recovered(records))
@@ -233,13 +235,13 @@ class SimDaemon:
             self.loop.call_soon(self.process_died, process)
 
     def take(self, process: ProcessKey, pidfd: int) -> bool:
-        """`arbiter.rpc.session.Watch`."""
+        """`arbiter.rpc.registry.Watch`."""
         new = process not in self._watched
         self.watch(process)
         return new
 
     def drop(self, process: ProcessKey) -> None:
-        """`arbiter.rpc.session.Watch`."""
+        """`arbiter.rpc.registry.Watch`."""
         self._watched.discard(process)
 
     def _died(self, process: ProcessKey) -> None:
@@ -269,7 +271,7 @@ class SimDaemon:
     def _perform(self, effects: Sequence[Effect]) -> None:
         self.handled += 1
         if self.handled % CHECK_ALL_EVERY == 0:
-            self.core.check_all()
+            check_arbiter(self.core)
         self._executor.perform(effects)
 
     def _sample(self, gpu: GpuId) -> None:

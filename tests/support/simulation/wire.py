@@ -43,7 +43,7 @@ class WireFaults:
 
 
 class Line:
-    """One connection as the daemon sees it; the shape of `arbiter.rpc.session.Connection`."""
+    """One connection as the daemon sees it, like `schemas.runtime.connection.Connection`."""
 
     def __init__(self, serial: int, link: "Link") -> None:
         self.serial = serial

@@ -150,7 +150,7 @@ class World:
             self._pids += 1
             pid = self._pids
         key = ProcessKey(pid, int(self.clock.now * 100))
-        loop = ProcessLoop(self.clock, f"{name}:{pid}")  # type: ignore[abstract]  # reason: its docstring
+        loop = ProcessLoop(self.clock, f"{name}:{pid}")
         process = SimProcess(key, name, loop, Peer(key, uid, uid, -1))
         loop.on_failure = lambda error: self.fail(
             f"{name} ({key}): {type(error).__name__}: {error}"
@@ -306,7 +306,7 @@ class World:
     def _check_wake_up(self, daemon: SimDaemon) -> None:
         core = state_of(daemon.core)
         for gpu in core.gpus.values():
-            head = gpu.queue.head()
+            head = gpu.queue.head
             if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
                 continue
             room = admission.measured_room_bytes(core, gpu)

@@ -110,12 +110,14 @@ class Gangs(RuleBasedStateMachine):
         who = self.mine[lease]
         spec = who.specs[lease]
         held = self.loaded.setdefault(who.process, {})
-        self.context[who.process] = max(self.context.get(who.process, 0), spec.residue_bytes)
-        held[lease] = max(spec.load_peak_bytes, spec.residue_bytes)
+        self.context[who.process] = max(
+            self.context.get(who.process, 0), spec.footprint.residue_bytes
+        )
+        held[lease] = max(spec.footprint.load_peak_bytes, spec.footprint.residue_bytes)
         self.show(who.process)
         self.fits()
         self.driver.advance(MOMENT_S)
-        held[lease] = max(spec.steady_bytes, spec.residue_bytes)
+        held[lease] = max(spec.footprint.steady_bytes, spec.footprint.residue_bytes)
         self.show(who.process)
         assert self.driver.state(lease) == "loading"
         who.ready(lease)
@@ -253,8 +255,9 @@ class Gangs(RuleBasedStateMachine):
         core = self.driver.arbiter.inspect()
         assert not core.users
         gangs = core.feature(features_gangs.Gangs)
-        assert not any((gangs.by_name, gangs.of, gangs.loading))
-        assert not any(gpu.ledger.reserved for gpu in core.gpus.values())
+        assert not gangs.by_name
+        assert not core.unqueued
+        assert not any(gpu.keeper or gpu.ledger.reserved for gpu in core.gpus.values())
 
 
 TestGangs = Gangs.TestCase

@@ -2,6 +2,8 @@
 shows that it is free.
 """
 
+from typing import Any
+
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer
@@ -28,15 +30,17 @@ def to_peak_and_down(who: Consumer, lease: LeaseId) -> None:
     """
     spec = who.specs[lease]
     who.driver.advance(MOMENT_S)
-    who.hold(spec.load_peak_bytes)
+    who.hold(spec.footprint.load_peak_bytes)
     who.driver.advance(MOMENT_S)
-    who.hold(spec.steady_bytes)
+    who.hold(spec.footprint.steady_bytes)
     who.ready(lease)
 
 
-def why_text(driver: CoreDriver, lease: LeaseId) -> str:
+def why(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
+    """Return why a lease is not running, as codes and values."""
     consumer = (driver.view(lease) or {})["consumer"]
-    return str(driver.why(consumer)["leases"][0]["text"])
+    (explained,) = driver.why(consumer)["leases"]
+    return explained
 
 
 @pytest.mark.parametrize("lists", [True, False])
@@ -48,9 +52,9 @@ def test_a_member_does_not_load_into_the_peak_of_the_one_before(lists: bool) -> 
     first, second = member(a, 5, 2.5), member(b, 4.5, 2.5)
     to_peak_and_down(a, first)
     assert driver.state(second) == "queued"
-    assert "waits for a fresh reading" in why_text(driver, second)
+    assert why(driver, second)["wait"] == "reading"
     driver.advance(0.1)
-    assert "measured memory is not free yet" in why_text(driver, second)
+    assert why(driver, second)["wait"] == "not_free"
     waited = driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
     assert 0.6 < waited < 0.8 + 2 * d.LOAD_PROBE_S
     assert sum(driver.card.shown(driver.now).values()) + int(4.5 * GIB) <= 8 * GIB
@@ -86,14 +90,13 @@ def test_memory_that_does_not_come_back_breaks_the_gang_in_time() -> None:
     a.load(first)
     driver.advance(2 * d.VERIFY_TIMEOUT_S)
     driver.card.failing = ""
-    driver.until(lambda: "measured memory is not free yet" in why_text(driver, second), limit_s=1.5)
+    driver.until(lambda: why(driver, second).get("wait") == "not_free", limit_s=1.5)
     driver.advance(d.VERIFY_TIMEOUT_S - 0.5)
     assert driver.state(second) == "queued"
     driver.advance(1.0)
     assert (driver.state(first), driver.state(second)) == ("held", "over")
     error = driver.pushes("denied", second)[0]["error"]
-    assert error["code"] == "gang_broken"
-    assert "measured memory did not come back" in error["message"]
+    assert (error["code"], error["details"]["why"]) == ("gang_broken", "not_freed")
     assert driver.gpu()["charged_bytes"] == 3 * GIB
 
 
@@ -110,7 +113,7 @@ def test_a_shortage_that_is_over_is_forgotten() -> None:
         driver.advance(0.7 * d.VERIFY_TIMEOUT_S)
         assert driver.state(after) == "queued"
         driver.card.set(SOMEBODY, 0, driver.now)
-        driver.until(lambda: driver.state(after) == "loading", limit_s=1.5)  # noqa: B023 - called at once
+        driver.until(lambda lease=after: driver.state(lease) == "loading", limit_s=1.5)
 
 
 def test_what_a_process_keeps_is_part_of_what_its_member_needs() -> None:

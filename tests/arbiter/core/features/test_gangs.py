@@ -8,7 +8,7 @@ import pytest
 from tests.support.core_driver import CoreDriver, answer, refusal
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.effects import Effect, Refuse
-from vram_arbiter.arbiter.core.features import gangs
+from vram_arbiter.arbiter.core.features import gang as gang_module
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -58,7 +58,8 @@ def test_nobody_is_granted_before_all_have_come(driver: CoreDriver) -> None:
         {"id": "g", "phase": "gathering", "members": 1, "size": 2},
         0,
     )
-    assert "1 of 2 have come" in driver.why("policy")["leases"][0]["text"]
+    (why,) = driver.why("policy")["leases"]
+    assert (why["condition"], why["gang"]["members"], why["gang"]["size"]) == ("gathering", 1, 2)
     assert driver.gpu()["charged_bytes"] == 0
     held(driver, "other", 1)
     b = Member(driver, "reward", 2, 2)
@@ -73,7 +74,7 @@ def test_they_load_one_after_the_other_and_nobody_comes_between(driver: CoreDriv
     small = driver.consumer("small").acquire(GIB)
     driver.advance(5.0)
     assert states_of(a, b) == ["loading", "queued"]
-    assert "its bytes are kept for it" in driver.why("reward")["leases"][0]["text"]
+    assert driver.why("reward")["leases"][0]["kept"] is True
     a.load()
     assert b.state == "loading", "in the same breath"
     driver.advance(1.0)
@@ -167,7 +168,7 @@ def test_victims_are_asked_only_if_the_whole_gang_then_fits(driver: CoreDriver) 
     a, b = Member(driver, "a", 2), Member(driver, "b", 2)
     assert driver.state(first) == "revoking"
     assert states_of(a, b) == ["queued", "queued"]
-    assert "room is being made for the whole gang" in driver.why("a")["leases"][0]["text"]
+    assert driver.why("a")["leases"][0]["wait"] == "making_room"
     idle.unload(first)
     driver.until(lambda: a.state == "loading")
     assert driver.notes("granted")[-1]["evicted"] == ["idle"]
@@ -181,9 +182,7 @@ def test_nobody_is_evicted_for_a_gang_that_would_not_fit_all_the_same(driver: Co
     driver.advance(3.0)
     assert driver.state(idle) == "held"
     assert states_of(a, b) == ["queued", "queued"]
-    assert (
-        "no holder that could make room for the whole gang" in driver.why("a")["leases"][0]["text"]
-    )
+    assert driver.why("a")["leases"][0]["wait"] == "no_victim"
     busy.use_end(lease)
     assert driver.state(lease) == "revoking"
     assert driver.state(idle) == "held", "the cheapest that covers it"
@@ -209,7 +208,13 @@ def test_nobody_of_a_gang_is_backfilled_alone(driver: CoreDriver) -> None:
     a, b = Member(driver, "a", 1), Member(driver, "b", 0.5)
     driver.advance(2.0)
     assert states_of(a, b) == ["queued", "queued"]
-    assert "as one of gang g behind big as number 2" in driver.why("b")["leases"][0]["text"]
+    (why,) = driver.why("b")["leases"]
+    assert (why["condition"], why["gang"]["id"], why["ahead"], why["position"]) == (
+        "behind",
+        "g",
+        "big",
+        2,
+    )
 
 
 def test_measured_memory_that_is_not_there_keeps_a_gang_waiting(driver: CoreDriver) -> None:
@@ -277,7 +282,7 @@ def test_an_exclusive_member_wants_a_card_of_its_own() -> None:
 
 
 def test_a_search_without_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gangs, "SEARCH_MAX", 1)
+    monkeypatch.setattr(gang_module, "SEARCH_MAX", 1)
     driver = CoreDriver(8 * GIB, cards=2)
     Member(driver, "a", 6)
     assert (
@@ -467,7 +472,7 @@ def test_memory_that_nobody_can_explain_is_not_free_for_a_gang(driver: CoreDrive
     a, b = Member(driver, "a", 3), Member(driver, "b", 2)
     driver.advance(1.5)
     assert states_of(a, b) == ["queued", "queued"]
-    assert "measured memory is not free yet" in driver.gpu()["blocked"]["text"]
+    assert driver.blocked() == "not_free"
     driver.card.set(ProcessKey(9, 9), 0, driver.now)
     driver.until(lambda: a.state == "loading", limit_s=2.0)
 
@@ -499,4 +504,5 @@ def test_a_gang_goes_ahead_of_a_waiter_for_which_another_card_is_being_emptied()
     a, b = Member(driver, "a", 1, gpu="0"), Member(driver, "b", 1, gpu="0")
     driver.advance(0.1)
     assert states_of(a, b) == ["loading", "queued"]
-    assert driver.view(b.lease)["gang"] == {"id": "g", "phase": "loading", "members": 2, "size": 2}  # type: ignore[index]
+    gang = driver.view(b.lease)["gang"]
+    assert gang == {"id": "g", "phase": "loading", "members": 2, "size": 2}

@@ -11,8 +11,7 @@ from tests.support.engine_state import state_of
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import OperatorAsked
-from vram_arbiter.arbiter.core.features.parking import HostRam
-from vram_arbiter.arbiter.core.features.standby import Standby
+from vram_arbiter.arbiter.core.features.standby import Absence, Standby
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
@@ -54,23 +53,19 @@ def ram(driver: CoreDriver) -> int:
 
 # -- the budget
 def test_the_budget_by_itself() -> None:
-    host = HostRam(10)
-    a, b = LeaseId("a"), LeaseId("b")
-    assert host.book(a, 6)
-    assert not host.book(b, 5)
-    assert not host.book(b, 0), "nothing to keep is nothing to book"
-    assert host.book(a, 9), "instead of what it has booked"
-    host.find(b, 5)
-    host.find(b, 7)
-    host.find(a, 1)
-    assert (host.used_bytes(), host.granted_bytes()) == (14, 9)
-    assert not host.book(b, 4)
-    host.drop(a)
-    assert host.book(b, 5)
-    assert host.granted_bytes() == 5
-    host.drop(b)
-    host.drop(b)
-    assert host.used_bytes() == 0
+    a, b = Absence(), Absence()
+    standby = Standby(10, {LeaseId("a"): a, LeaseId("b"): b})
+    assert standby.book(a, 6)
+    assert not standby.book(b, 5)
+    assert not standby.book(b, 0), "nothing to keep is nothing to book"
+    assert standby.book(a, 9), "instead of what it has booked"
+    b.parked_bytes, b.found = 5, True
+    assert standby.host_ram().parked_bytes == 14, "found after a restart, fitting or not"
+    assert not standby.book(b, 4)
+    a.parked_bytes = 0
+    assert standby.book(b, 5)
+    assert not b.found
+    assert standby.host_ram().parked_bytes == 5
 
 
 def test_room_is_kept_from_the_revoke_until_it_lets_go() -> None:
@@ -127,13 +122,13 @@ def test_parked_it_is_charged_its_residue_on_the_card_and_its_weights_in_ram() -
     assert view is not None
     assert (view["state"], view["charge_bytes"], view["parked_bytes"]) == ("parked", 0, 5 * GIB)
     assert driver.gpu()["charged_bytes"] == 5 * GIB + RESIDUE
-    assert driver.notes("parked")[-1]["reason"] == "comes back when its holder asks"
+    assert driver.notes("parked")[-1]["comes_back"] is False
     driver.advance(600.0)
     policy.unload(wanted)
     driver.advance(10.0)
     assert driver.state(lease) == "parked", "it is not on standby"
     (why,) = driver.why("vlm")["leases"]
-    assert why["text"] == "vlm: parked in host RAM until its holder asks for it"
+    assert (why["state"], why["back"]) == ("parked", "asked")
     assert answer(vlm.reacquire(lease))["state"] == "loading"
     assert driver.gpu()["charged_bytes"] == 5 * GIB, (
         "the load peak with the residue folded, as ever"
@@ -148,9 +143,9 @@ def test_parked_and_on_standby_it_comes_back_by_itself() -> None:
     driver = driver_with()
     vlm, lease, policy, wanted = parked(driver, standby=True)
     assert driver.state(lease) == "parked"
-    assert driver.notes("parked")[-1]["reason"] == "comes back by itself when there is room"
+    assert driver.notes("parked")[-1]["comes_back"] is True
     (why,) = driver.why("vlm")["leases"]
-    assert why["text"] == "vlm: parked until policy has left"
+    assert (why["state"], why["back"], why["ahead"]) == ("parked", "left_for", "policy")
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
     vlm.load(lease)
@@ -231,7 +226,7 @@ def test_an_operator_keeps_a_parked_one_from_coming_back_by_itself() -> None:
     vlm, lease, policy, wanted = parked(driver, standby=True)
     ops = driver.consumer("ops")
     driver.post(OperatorAsked(ops.client, driver.next_request(), "evict", lease, "ops", "test"))
-    assert driver.journal[f"lease:{lease}"]["comes_back"] is False
+    assert driver.journal[f"lease:{lease}"].get("comes_back", False) is False
     policy.unload(wanted)
     driver.advance(20.0)
     assert driver.state(lease) == "parked"
@@ -323,6 +318,6 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
 def test_the_invariant_of_the_budget() -> None:
     driver = driver_with(5)
     parked(driver)
-    driver.arbiter.inspect().feature(Standby).host.booked[LeaseId("x")] = 1
+    driver.arbiter.inspect().feature(Standby).absences[LeaseId("x")] = Absence(parked_bytes=1)
     with pytest.raises(InvariantViolation, match="bytes are parked, the budget is"):
         invariants.check(state_of(driver.arbiter))

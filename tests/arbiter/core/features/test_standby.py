@@ -33,10 +33,7 @@ def test_the_detector_returns_by_itself_after_the_grab() -> None:
     view = driver.view(lease)
     assert view is not None
     assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
-    assert (
-        driver.notes("granted")[-1]["reason"]
-        == "back from standby: there is room and nothing waits"
-    )
+    assert driver.notes("granted")[-1]["by_itself"] is True
     assert driver.notes("switch")[-1]["switched"] is False
 
 
@@ -53,7 +50,7 @@ def test_what_standby_looks_like() -> None:
     assert driver.state(lease) == "standby", "nobody has to renew it"
     assert answer(det.renew((lease, det.token(lease))))["alive"] == [lease]
     (why,) = driver.why("det")["leases"]
-    assert why["text"] == "det: on standby until policy has left"
+    assert (why["state"], why["back"], why["ahead"]) == ("standby", "left_for", "policy")
 
 
 def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
@@ -96,7 +93,7 @@ def test_it_asks_nobody_to_leave() -> None:
         "5 + 4 do not fit on 8"
     )
     (why,) = driver.why("det")["leases"]
-    assert why["text"] == "det: on standby until there is room; it asks no holder to leave"
+    assert (why["state"], why["back"]) == ("standby", "no_room")
 
 
 def test_it_never_delays_a_waiter() -> None:
@@ -112,7 +109,7 @@ def test_it_never_delays_a_waiter() -> None:
     assert driver.state(big) == "queued"
     assert driver.state(lease) == "standby", "5 would fit, but somebody waits"
     (why,) = driver.why("det")["leases"]
-    assert why["text"] == "det: on standby: big waits, and goes first"
+    assert (why["state"], why["back"], why["ahead"]) == ("standby", "behind", "big")
 
 
 def test_it_waits_until_the_card_has_been_quiet() -> None:
@@ -122,7 +119,8 @@ def test_it_waits_until_the_card_has_been_quiet() -> None:
     policy.unload(wanted)
     driver.advance(1.0)
     (why,) = driver.why("det")["leases"]
-    assert "comes back in 1." in why["text"]
+    assert why["back"] == "quiet"
+    assert 1.0 <= why["due_s"] < 2.0
     again = policy.acquire(5 * GIB)
     assert driver.state(again) == "loading", "the next goal does not wait for the detector"
     policy.load(again)
@@ -205,7 +203,7 @@ def test_a_small_one_does_not_take_the_place_of_the_one_before_it() -> None:
     assert driver.state(people["det"][1]) == "standby", "5.2 do not fit beside 2 and a stowaway"
     assert driver.state(people["tiny"][1]) == "standby", "2.4 would, but then the 5.2 never could"
     (why,) = driver.why("tiny")["leases"]
-    assert "after those before it" in why["text"]
+    assert why["back"] == "reading"
     other.unload(resident)
     driver.until(lambda: driver.state(people["det"][1]) == "loading", limit_s=2.0)
 
@@ -283,7 +281,7 @@ def test_a_blocked_card_brings_nobody_back() -> None:
     driver.advance(20.0)
     assert driver.state(lease) == "standby"
     (why,) = driver.why("det")["leases"]
-    assert "cannot be read" in why["text"]
+    assert (why["back"], why["block"]["code"]) == ("blocked", "unreadable")
     driver.card.failing = ""
     driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
 

@@ -7,6 +7,7 @@ import random
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.full_check import check_arbiter
 from vram_arbiter.arbiter.core.effects import Note, Refuse
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.schemas import defaults as d
@@ -69,11 +70,11 @@ class Crowd:
             case "loading" if (
                 chance < 0.2
             ):  # killed or asked here, it has a part of its bytes already
-                person.hold(person.specs[lease].steady_bytes // 2, gpu=view["gpu"])
+                person.hold(person.specs[lease].footprint.steady_bytes // 2, gpu=view["gpu"])
             case "loading":
                 person.load(lease)
             case "held" if "resizing" not in view and self.has_grown(person, lease):
-                person.hold(person.specs[lease].steady_bytes, gpu=view["gpu"])
+                person.hold(person.specs[lease].footprint.steady_bytes, gpu=view["gpu"])
             case "held" if view["uses"]:
                 person.use_end(lease)
             case "held" if chance < 0.4:
@@ -99,18 +100,18 @@ class Crowd:
         view = self.driver.view(lease)
         assert view is not None
         held = self.driver.cards[view["gpu"]].held[person.process]
-        return bool(view["charge_bytes"] >= person.specs[lease].steady_bytes > held)
+        return bool(view["charge_bytes"] >= person.specs[lease].footprint.steady_bytes > held)
 
     def resize(self, person: Consumer, lease: LeaseId, charge: int) -> None:
         size = charge + self.draw.choice([-GIB // 2, GIB // 2])
         spec = person.specs[lease]
-        if size < max(spec.residue_bytes, GIB // 4):
+        if size < max(spec.footprint.residue_bytes, GIB // 4):
             return
         view = self.driver.view(lease)
         assert view is not None
         if size < charge:
             person.hold(size, gpu=view["gpu"])
-        person.resize(lease, size, residue_bytes=spec.residue_bytes)
+        person.resize(lease, size, residue_bytes=spec.footprint.residue_bytes)
 
     def disturb(self) -> None:
         chance = self.draw.random()
@@ -169,7 +170,7 @@ class Crowd:
                 )
 
     def check(self) -> None:
-        self.driver.arbiter.check_all()
+        check_arbiter(self.driver.arbiter)
         for card in self.driver.cards.values():
             shown = card.shown(self.driver.now)
             assert sum(count for process, count in shown.items() if process != STRANGER) <= BUDGET

@@ -30,9 +30,7 @@ def test_only_the_last_measurements_count() -> None:
     assert prints.p95_bytes("det m", "residue") == 4
 
 
-def test_an_out_of_memory_counts_whatever_many_loads_measured_before_and_is_forgotten_in_the_end() -> (
-    None
-):
+def test_an_out_of_memory_outweighs_many_loads_before_and_is_forgotten_in_the_end() -> None:
     prints = Footprints()
     for _ in range(HISTORY_MAX):
         prints.measured("det m", "load_peak", 5)

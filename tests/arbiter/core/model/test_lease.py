@@ -2,7 +2,6 @@
 
 import pytest
 
-from vram_arbiter.arbiter.core.events import LeaseSpec
 from vram_arbiter.arbiter.core.model.lease import (
     AWAY,
     STORY_MAX,
@@ -12,12 +11,16 @@ from vram_arbiter.arbiter.core.model.lease import (
     LeaseState,
     Request,
 )
-from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 
 def lease(priority: int = 50, residue_bytes: int = 7) -> Lease:
     spec = LeaseSpec(
-        "det", ModelKey("m"), "any", False, 10, 10, residue_bytes, priority, True, 10.0, 2.0, False
+        consumer="det",
+        model_id="m",
+        footprint=Footprint(10, 10, residue_bytes),
+        priority=priority,
     )
     request = Request("n", 100.0, 1, 10, 10)
     return Lease(LeaseId("L1-1"), spec, ProcessKey(1, 1), ClientId("c"), request)

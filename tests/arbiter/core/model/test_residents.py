@@ -1,14 +1,12 @@
 """The sub-tables of a card's residents follow every change; the full invariant check compares them
 with the leases."""
 
-import pytest
-
+from tests.support import full_check
 from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.model.gpu import Residents
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
-from vram_arbiter.arbiter.core.model.residents import Residents
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import GpuId, LeaseId
-from vram_arbiter.schemas.wire.codes import Order
+from vram_arbiter.schemas.ids import GpuId
 
 
 def crowd(count: int) -> tuple[Residents, list[Lease]]:
@@ -25,20 +23,11 @@ def crowd(count: int) -> tuple[Residents, list[Lease]]:
 
 def test_a_lease_that_goes_is_in_no_table() -> None:
     residents, (one, two) = crowd(2)
-    two.pinned = Order("root", "")
-    residents.refresh(two)
-    del residents[two.id]
-    assert residents.in_state(*LeaseState) == [one]
-    assert not residents.pinned
+    residents.remove(two)
+    assert [lease for some in residents.by_state.values() for lease in some.values()] == [one]
+    assert list(residents) == [one.id]
     assert two.roster is None
-    assert residents.disagreement() == ""
-
-
-def test_taking_away_who_is_not_there() -> None:
-    residents, _ = crowd(1)
-    with pytest.raises(KeyError, match="L9-9"):
-        del residents[LeaseId("L9-9")]
-    assert residents.pop(LeaseId("L9-9"), None) is None
+    assert full_check.residents_disagree(residents) == ""
 
 
 def test_a_reading_sees_what_happened_before_it_began() -> None:

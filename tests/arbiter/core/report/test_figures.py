@@ -3,7 +3,7 @@
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.events import OperatorAsked
-from vram_arbiter.arbiter.core.report.figures import RESIDUES, STOWAWAYS, UNATTRIBUTED
+from vram_arbiter.arbiter.core.report.status import RESIDUES, STOWAWAYS, UNATTRIBUTED
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
 
@@ -24,12 +24,12 @@ def test_what_is_charged_and_measured_by_consumer() -> None:
     driver.card.set(person.process, 2 * GIB + MIB, driver.now)
     driver.advance(1.1)
     figures = driver.arbiter.figures()
-    assert figures["waiters"] == 1
-    (card,) = figures["gpus"]
-    assert (card["gpu"], card["capacity_bytes"]) == ("GPU-0", 8 * GIB)
-    assert card["charged"] == {"det": 3 * GIB, "vlm": 3 * GIB}
-    assert card["used_bytes"] == 6 * GIB + 65 * MIB
-    assert card["measured"] == {
+    assert figures.waiters == 1
+    (card,) = figures.gpus
+    assert (card.gpu, card.capacity_bytes) == ("GPU-0", 8 * GIB)
+    assert card.charged == {"det": 3 * GIB, "vlm": 3 * GIB}
+    assert card.used_bytes == 6 * GIB + 65 * MIB
+    assert card.measured == {
         "det": 3 * GIB + MIB,
         "vlm": 3 * GIB,
         STOWAWAYS: 64 * MIB,
@@ -47,36 +47,36 @@ def test_residues_have_no_consumer_and_shared_processes_both() -> None:
     driver.card.set(person.process, 512 * MIB, driver.now)
     driver.until(lambda: driver.state(lease) == "over")
     driver.advance(1.1)
-    (card,) = driver.arbiter.figures()["gpus"]
-    assert card["charged"] == {"vlm": GIB, "helper": GIB, RESIDUES: 512 * MIB}
-    assert card["used_bytes"] == 2 * GIB + 512 * MIB
-    assert card["measured"] == {"helper+vlm": 2 * GIB, RESIDUES: 512 * MIB}
+    (card,) = driver.arbiter.figures().gpus
+    assert card.charged == {"vlm": GIB, "helper": GIB, RESIDUES: 512 * MIB}
+    assert card.used_bytes == 2 * GIB + 512 * MIB
+    assert card.measured == {"helper+vlm": 2 * GIB, RESIDUES: 512 * MIB}
 
 
 def test_a_card_that_cannot_be_read_shows_no_bytes() -> None:
     driver = CoreDriver(8 * GIB, start=False)
-    assert driver.arbiter.figures()["gpus"][0]["measured"] is None, "not read yet"
+    assert driver.arbiter.figures().gpus[0].measured is None, "not read yet"
     driver.advance(0.01)
     driver.card.lists_processes = False
     held(driver, "det", 2)
-    assert driver.arbiter.figures()["gpus"][0]["measured"] == {UNATTRIBUTED: 2 * GIB}
+    assert driver.arbiter.figures().gpus[0].measured == {UNATTRIBUTED: 2 * GIB}
     driver.card.lists_processes, driver.card.knows_bytes = True, False
     driver.advance(1.1)
-    assert driver.arbiter.figures()["gpus"][0]["measured"] == {UNATTRIBUTED: 2 * GIB}, (
+    assert driver.arbiter.figures().gpus[0].measured == {UNATTRIBUTED: 2 * GIB}, (
         "listed, without their bytes"
     )
     driver.card.failing = "lost"
     driver.advance(1.1)
-    (card,) = driver.arbiter.figures()["gpus"]
-    assert (card["measured"], card["used_bytes"]) == (None, None)
-    assert card["charged"] == {"det": 2 * GIB}
+    (card,) = driver.arbiter.figures().gpus
+    assert (card.measured, card.used_bytes) == (None, None)
+    assert card.charged == {"det": 2 * GIB}
 
 
 def test_pressure_a_drain_and_the_time_of_the_reading() -> None:
     """An alert could not tell a drained daemon or one under pressure from an idle one."""
     driver = CoreDriver(8 * GIB)
     figures = driver.arbiter.figures()
-    assert (figures["drained"], figures["gpus"][0]["pressure_bytes"]) == (False, 0)
+    assert (figures.drained, figures.gpus[0].pressure_bytes) == (False, 0)
     person, _ = held(driver, "det", 2)
     event = OperatorAsked(
         person.client, driver.next_request(), "drain", "", "operator", "maintenance"
@@ -85,10 +85,11 @@ def test_pressure_a_drain_and_the_time_of_the_reading() -> None:
     driver.card.set(person.process, 8 * GIB, driver.now)
     driver.advance(1.1)
     figures = driver.arbiter.figures()
-    (card,) = figures["gpus"]
-    assert figures["drained"]
-    assert card["pressure_bytes"] == driver.gpu()["pressure_bytes"] > 0
-    assert driver.now - 1.1 <= card["read_at"] <= driver.now
+    (card,) = figures.gpus
+    assert figures.drained
+    assert card.pressure_bytes == driver.gpu()["pressure_bytes"] > 0
+    assert card.read_at is not None
+    assert driver.now - 1.1 <= card.read_at <= driver.now
 
 
 # -- traces

@@ -5,8 +5,7 @@ from typing import Any
 from tests.support.core_driver import CoreDriver
 from vram_arbiter.arbiter.core.arbiter import DUE_MAX
 from vram_arbiter.arbiter.core.events import Tick
-from vram_arbiter.arbiter.core.report.blockers import BLOCKERS_MAX
-from vram_arbiter.arbiter.core.report.explain import EXPLAINED_MAX
+from vram_arbiter.arbiter.core.report.why import BLOCKERS_MAX, EXPLAINED_MAX
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB

@@ -31,10 +31,8 @@ def test_holders_that_came_back_are_not_enough() -> None:
     waiter = driver.consumer("waiter").acquire(GIB)
     driver.advance(WAIT_S - 1.0)
     assert (driver.state(waiter), phase(driver)) == ("queued", "recovering")
-    assert (
-        "holders that the journal may not name must come back first"
-        in driver.gpu()["blocked"]["text"]
-    )
+    block = driver.gpu()["blocked"]
+    assert (block["code"], block.get("names")) == ("recovering", None), "they are not known"
     assert DOUBT_KEY in driver.journal, "the next start would doubt as well"
     driver.advance(2.0)
     assert (driver.state(waiter), phase(driver)) == ("loading", "serving")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, refusal
 from tests.support.scenes import held
-from vram_arbiter.arbiter.core.requests.refusals import AT_ONCE, PROCESSES_REMEMBERED
+from vram_arbiter.arbiter.core.requests.requests import AT_ONCE, PROCESSES_REMEMBERED
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -84,7 +84,7 @@ def test_timeouts_and_cancels_are_noted_too(full_queue: CoreDriver) -> None:
     (denied,) = full_queue.notes("denied")
     (cancelled,) = full_queue.notes("cancelled")
     assert (denied["consumer"], denied["code"]) == ("bounded", "wait_timeout")
-    assert (cancelled["consumer"], cancelled["reason"]) == ("fickle", "its holder gave up")
+    assert (cancelled["consumer"], cancelled["why"]) == ("fickle", "holder_gave_up")
 
 
 def test_a_flood_of_refusals_is_counted_instead(full_queue: CoreDriver) -> None:

@@ -8,9 +8,11 @@ import pytest
 from tests.support.core_driver import CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
 from vram_arbiter.arbiter.core.events import AcquireRequested
+from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token
 from vram_arbiter.schemas.wire.codes import Block
+from vram_arbiter.schemas.wire.notes import GrantedNote, QueuedNote
 
 GIB = d.GIB
 
@@ -31,12 +33,13 @@ def test_a_grant_is_journalled_before_it_is_told(driver: CoreDriver) -> None:
     assert isinstance(reply, Reply)
     assert isinstance(note, Note)
     assert put.key == "lease:L1-1"
-    assert put.record["state"] == "loading"
-    assert put.record["token"] == [1, 2]
+    assert isinstance(put.record, LeaseRecord)
+    assert (put.record.state, put.record.token) == ("loading", (1, 2))
     told = answer(effects)
     assert (told["state"], told["lease"]["token"]) == ("loading", [1, 2])
     assert told["lease"]["charge_bytes"] == 5 * GIB
-    assert (note.kind, note.data["evicted"]) == ("granted", [])
+    assert isinstance(note.body, GrantedNote)
+    assert note.body.evicted == ()
 
 
 def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: CoreDriver) -> None:
@@ -48,7 +51,9 @@ def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: Core
     assert answer(effects)["lease"]["token"] is None
     assert answer(effects)["lease"]["position"] == 1
     assert isinstance(effects[0], Note)
-    block = effects[0].data["block"]
+    assert isinstance(effects[0].body, QueuedNote)
+    block = effects[0].body.block
+    assert block is not None
     assert (block.code, block.names) == (Block.LOADING, ("det",))
     waiting = LeaseId(answer(effects)["lease"]["lease_id"])
     assert kinds(det.release(first)) == ["Sample", "JournalPut", "Note:released", "Reply"]
@@ -98,7 +103,7 @@ def test_beside_a_pinned_holder_a_request_waits(driver: CoreDriver, spec: dict[s
     driver.advance(4.0)
     assert (driver.state(bounded), driver.state(second)) == ("queued", "queued")
     (blocker,) = driver.why("big")["leases"][0]["blockers"]
-    assert (blocker["consumer"], blocker["text"]) == ("pin", "is pinned")
+    assert (blocker["consumer"], blocker["condition"]) == ("pin", "pinned")
     driver.advance(2.0)
     (denied,) = driver.pushes("denied", bounded)
     assert denied["error"]["code"] == "wait_timeout"

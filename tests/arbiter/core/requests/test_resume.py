@@ -9,6 +9,7 @@ from tests.support.scenes import held
 from vram_arbiter.arbiter.core.effects import Note, Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.codec import to_map
 
 GIB = d.GIB
 NIGHT_S = 8 * 3600.0
@@ -62,7 +63,7 @@ def test_a_reading_that_began_before_the_night_does_not_count() -> None:
 def newest(driver: CoreDriver, kind: str) -> Mapping[str, Any]:
     """The last note of a kind, found from the end: there are many after half an hour."""
     notes = (effect for effect in reversed(driver.effects) if isinstance(effect, Note))
-    return next(note.data for note in notes if note.kind == kind)
+    return next(to_map(note.body) for note in notes if note.kind == kind)
 
 
 def test_a_verification_begins_again() -> None:

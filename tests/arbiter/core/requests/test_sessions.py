@@ -50,7 +50,8 @@ def test_a_dropped_connection_loses_its_waits_and_uses_but_nothing_resident() ->
     det.leave("misconduct")
     assert (driver.state(held), driver.state(queued)) == ("held", "over")
     runner.leave("misconduct")
-    assert driver.notes("use_ended")[-1]["reason"] == "its client left: misconduct"
+    ended = driver.notes("use_ended")[-1]
+    assert (ended["why"], ended["by"]) == ("client_left", "misconduct")
 
 
 def test_a_use_that_was_repeated_on_a_new_connection_outlives_the_old_one() -> None:
@@ -107,7 +108,7 @@ def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() ->
     runner = driver.consumer("runner")
     runner.use_begin(vlm_lease, "goal", vlm.token(vlm_lease))
     runner.die()
-    assert driver.notes("use_ended")[-1]["reason"] == "its process died"
+    assert driver.notes("use_ended")[-1]["why"] == "process_died"
     assert (
         refusal(det.connect() + det.release(held, token=vlm.token(vlm_lease))).code == "lease_lost"
     )

@@ -32,7 +32,7 @@ def test_a_yielded_use_lets_the_holder_leave_before_the_job_has_ended(driver: Co
     assert driver.view(lease)["yielded"] == 1  # type: ignore[index]
     job.unload(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
-    assert [n["reason"] for n in driver.notes("use_ended")] == ["unloaded while it paused"]
+    assert [n["why"] for n in driver.notes("use_ended")] == ["paused"]
 
 
 def test_a_yielded_use_makes_an_idle_holder_that_may_be_asked(driver: CoreDriver) -> None:
@@ -88,7 +88,8 @@ def test_one_use_that_yields_beside_a_busy_one_changes_nothing_for_the_holder(
     effects = job.use_yield(lease, "u2")
     assert answer(effects)["uses"] == 1
     assert not [e for e in effects if isinstance(e, Push)]
-    assert "1 use running, 1 paused" in driver.why("job")["leases"][0]["text"]
+    holder = driver.why("job")["leases"][0]["holder"]
+    assert (holder["uses"], holder["paused"]) == (1, 1)
 
 
 def test_yielded_uses_count_to_the_limit(driver: CoreDriver) -> None:
@@ -105,10 +106,10 @@ def test_yielded_uses_end_with_their_process_and_with_their_client(driver: CoreD
     runner.use_begin(lease, "goal", job.token(lease))
     runner.use_yield(lease, "goal", job.token(lease))
     runner.die()
-    assert driver.notes("use_ended")[-1]["reason"] == "its process died"
+    assert driver.notes("use_ended")[-1]["why"] == "process_died"
     job.use_yield(lease)
     job.leave("dropped")
-    assert "its client left" in driver.notes("use_ended")[-1]["reason"]
+    assert driver.notes("use_ended")[-1]["why"] == "client_left"
     assert driver.state(lease) == "held"
 
 

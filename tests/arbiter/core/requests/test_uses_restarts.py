@@ -10,6 +10,7 @@ from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import held, shown
 from vram_arbiter.arbiter.core.effects import Effect, JournalPut, Reply
 from vram_arbiter.arbiter.core.events import ProcessDied, Resumed
+from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, Token
 
@@ -50,7 +51,8 @@ def live_on(
 def writes(effects: list[Effect]) -> list[list[str]]:
     """Of each write of a lease, the uses that it names."""
     put = [effect.record for effect in effects if isinstance(effect, JournalPut)]
-    return [[use for _, _, use, _ in record.get("users", [])] for record in put]
+    leases = [record for record in put if isinstance(record, LeaseRecord)]
+    return [[use for _, _, use, _ in record.users] for record in leases]
 
 
 # -- after a restart
@@ -76,7 +78,7 @@ def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder() -> None:
     runner.use_begin(lease, "goal", token)
     assert len(driver.notes("use_began")) == before, "a repeat is no news"
     runner.leave("gone")
-    assert "its client left" in driver.notes("use_ended")[-1]["reason"], "it is that client's now"
+    assert driver.notes("use_ended")[-1]["why"] == "client_left", "it is that client's now"
     sidecar.unload(lease)
     driver.until(lambda: driver.state(vlm) == "loading")
 
@@ -87,7 +89,7 @@ def test_a_user_that_dies_after_a_restart_leaves_the_holder_at_its_safe_point() 
     restarted(driver, sidecar, lease, token)
     driver.post(ProcessDied(runner.process))
     assert shown(driver, lease)["uses"] == 0
-    assert driver.notes("use_ended")[-1]["reason"] == "its process died"
+    assert driver.notes("use_ended")[-1]["why"] == "process_died"
     assert "users" not in driver.journal[f"lease:{lease}"]
 
 
@@ -113,7 +115,7 @@ def test_a_user_that_does_not_come_back_is_waited_for_as_long_as_a_silent_holder
     assert shown(driver, lease)["uses"] == 1
     driver.advance(0.001)
     assert shown(driver, lease)["uses"] == 0
-    assert "did not come back" in driver.notes("use_ended")[-1]["reason"]
+    assert driver.notes("use_ended")[-1]["why"] == "user_not_back"
     assert "users" not in driver.journal[f"lease:{lease}"]
     vlm = driver.consumer("vlm").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
@@ -177,7 +179,8 @@ def test_a_use_that_yields_after_a_restart_is_its_clients_own() -> None:
     assert answer(runner.use_yield(lease, "goal", token))["uses"] == 0
     assert "users" not in driver.journal[f"lease:{lease}"], "nobody waits for a use that pauses"
     runner.leave("gone")
-    assert driver.notes("use_ended")[-1]["reason"] == "its client left: gone"
+    ended = driver.notes("use_ended")[-1]
+    assert (ended["why"], ended["by"]) == ("client_left", "gone")
 
 
 def test_a_record_of_an_older_daemon_names_no_users() -> None:

@@ -149,7 +149,7 @@ def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(1.5)
     assert driver.state(waiter) == "queued"
-    assert "measured memory is not free yet" in driver.gpu()["blocked"]["text"]
+    assert driver.blocked() == "not_free"
     driver.card.set(STRANGER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
 

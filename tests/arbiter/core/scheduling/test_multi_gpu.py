@@ -6,6 +6,7 @@ import random
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.full_check import check_arbiter
 from tests.support.scenes import held, place
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
@@ -105,7 +106,7 @@ def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
     assert place(driver, waiter) == ONE
     assert driver.state(people[0][1]) == "held", "nobody is asked in vain on the other card"
-    assert all(len(gpu.queue) == 0 for gpu in driver.arbiter.inspect().gpus.values())
+    assert all(gpu.queue.head is None for gpu in driver.arbiter.inspect().gpus.values())
 
 
 def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_other() -> None:
@@ -271,7 +272,7 @@ def test_whoever_came_first_is_first_on_every_card() -> None:
     second = driver.consumer("second").acquire(6 * GIB)
     higher = driver.consumer("higher").acquire(6 * GIB, priority=60, gpu="1")
     driver.advance(0.1)
-    assert [driver.view(lease)["position"] for lease in (first, second, higher)] == [1, 2, 1]  # type: ignore[index]
+    assert [driver.view(lease)["position"] for lease in (first, second, higher)] == [1, 2, 1]
     for person, lease in people:
         person.use_end(lease)
         person.unload(lease)
@@ -555,7 +556,7 @@ def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -
             step(driver, random.Random(0), person, lease, willing=True)
         driver.advance(0.2)
     assert not [lease for lease in mine if driver.state(lease) == "queued"]
-    driver.arbiter.check_all()
+    check_arbiter(driver.arbiter)
 
 
 def step(

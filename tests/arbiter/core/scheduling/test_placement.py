@@ -164,7 +164,7 @@ def test_one_that_is_too_large_for_a_card_keeps_nobody_from_returning_to_it(
         policy = two_gpus.consumer(f"policy{index}")
         wanted = policy.acquire(7 * GIB, gpu=str(index))
         person.unload(lease)
-        two_gpus.until(lambda wanted=wanted: two_gpus.state(wanted) == "loading")  # type: ignore[misc]
+        two_gpus.until(lambda wanted=wanted: two_gpus.state(wanted) == "loading")
         policy.load(wanted)
         policy.use_begin(wanted)
         two_gpus.advance(0.1)

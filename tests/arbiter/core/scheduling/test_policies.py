@@ -5,7 +5,7 @@ from typing import get_args
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from vram_arbiter.arbiter.core.scheduling.policies import SCHEDULING
+from vram_arbiter.arbiter.core.settings import SCHEDULING
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.config.arbiter import SchedulingConfig
 from vram_arbiter.schemas.ids import LeaseId

@@ -410,9 +410,7 @@ def test_a_failed_reading_of_an_unknown_card_is_ignored() -> None:
 
 
 # -- expiry
-def test_expired_bytes_stay_charged_until_measured_gone_and_not_before_the_holder_fences_itself() -> (
-    None
-):
+def test_expired_bytes_stay_charged_until_measured_gone_after_the_holder_fenced_itself() -> None:
     driver = CoreDriver(8 * GIB)
     hung, lease = held(driver, "hung", 5, ttl_s=10.0, residue_bytes=450 * MIB)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -459,9 +457,7 @@ def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
     assert driver.gpu()["charged_bytes"] == 0
 
 
-def test_a_residue_of_a_process_that_is_listed_without_its_bytes_stays_until_the_card_shows_it_gone() -> (
-    None
-):
+def test_a_residue_of_a_process_listed_without_bytes_stays_until_a_reading_shows_it_gone() -> None:
     """Regression: WSL2 lists processes without their bytes, and the next reading after the verdict
     took that for none."""
     driver = CoreDriver(8 * GIB)

@@ -135,7 +135,6 @@ def change_places(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
     det.hold(0)
     det.release(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=0.1)
-    assert verdicts(driver) == [("verified", True)]
 
 
 def test_two_that_nobody_lists_change_places() -> None:
@@ -146,6 +145,8 @@ def test_two_that_nobody_lists_change_places() -> None:
     held(driver, "stays", 2)
     det, lease = held(driver, "det", 4)
     change_places(driver, det, lease)
+    assert verdicts(driver) == [("verified", True)]
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
 
 
 def test_one_that_comes_onto_the_list_has_not_grown() -> None:
@@ -167,6 +168,8 @@ def test_one_that_comes_onto_the_list_by_its_load_has_grown() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 3)
     change_places(driver, det, lease)
+    assert verdicts(driver) == [("verified", True)]
+    assert driver.gpu()["charged_bytes"] == 3 * GIB
 
 
 def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
@@ -195,9 +198,11 @@ def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     det, _ = held(driver, "det", 3)
     ledger = driver.arbiter.inspect().gpus[driver.card.gpu].ledger
     assert (
-        ledger.booked_by(ProcessKey(det.process.pid, 0)) == ledger.booked_by(det.process) == 3 * GIB
+        ledger.charged_to(ProcessKey(det.process.pid, 0))
+        == ledger.charged_to(det.process)
+        == 3 * GIB
     )
-    assert ledger.booked_by(BROWSER) == 0
+    assert ledger.charged_to(BROWSER) == 0
     reading = driver.card.read(driver.now)
     assert isinstance(reading, MemorySampled)
     assert ledger.unlisted_bytes(reading) == 0

@@ -158,7 +158,7 @@ def test_no_driver_no_card_unknown_card():
     with pytest.raises(NoGpu, match="--gpu fake:8GiB"):
         NvmlProbe(Driver(init_error=NVMLError("Driver Not Loaded")))
     empty = Driver()
-    with pytest.raises(NoGpu, match="knows no card"):
+    with pytest.raises(NoGpu, match="knows no GPU"):
         NvmlProbe(empty)
     assert empty.shutdowns == 1
     with pytest.raises(UnknownGpu):

@@ -22,7 +22,10 @@ READ = """
         "cards": [[c.id, c.index, c.name, c.total_bytes, c.reserved_bytes] for c in cards],
         "used": reading.used_bytes,
         "total": reading.total_bytes,
-        "processes": reading.processes and [[p.process.pid, p.process.start_ticks, p.used_bytes] for p in reading.processes],
+        "processes": reading.processes and [
+            [found.process.pid, found.process.start_ticks, found.used_bytes]
+            for found in reading.processes
+        ],
     }))
 """
 REFUSED = """
@@ -116,7 +119,7 @@ def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> Non
         ("", ["error init 9"], "NoGpu", "Driver Not Loaded"),
         ("", ["error memory 15"], "ProbeFailed", "GPU is lost"),
         ("", ["error memory 999"], "ProbeFailed", "Unknown Error"),
-        ("", ["error count 999"], "NoGpu", "cannot list its cards"),
+        ("", ["error count 999"], "NoGpu", "cannot list its GPUs"),
         ("mig", [], "ConfigError", "MIG mode"),
     ],
 )

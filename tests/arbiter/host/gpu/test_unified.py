@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.arbiter.daemon import budget, core_settings
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
 from vram_arbiter.arbiter.host.gpu.probe import Card
 from vram_arbiter.arbiter.host.gpu.unified import (
@@ -24,6 +23,7 @@ from vram_arbiter.arbiter.host.gpu.unified import (
     tegra_name,
 )
 from vram_arbiter.arbiter.host.journal import Opened
+from vram_arbiter.arbiter.settings import budget, core_settings
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId

@@ -55,12 +55,11 @@ def exported() -> dict[str, set[str]]:
         event = {
             "seq": 1,
             "at_wall_s": 1.8e9,
-            "kind": note.kind,
-            **words.event(note.kind, note.data),
+            **words.event(note),
         }
-        assert telemetry.observe(event) == {}
+        assert telemetry.observe(note, event) == {}
     numbers.wrote(0.001, failed=False)
-    figures = {**driver.arbiter.figures(), "journal_healthy": True}
+    figures = driver.arbiter.figures()
     numbers.watch(NeverCalled(), lambda: figures)  # type: ignore[arg-type]
     series: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(generate_latest(registry).decode()):

@@ -27,6 +27,7 @@ from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.wire.notes import ReadyNote, ServingNote
 
 GIB, MIB = d.GIB, d.MIB
 WALL_S = 1.8e9
@@ -70,10 +71,9 @@ class Listener:
             event = {
                 "seq": 1,
                 "at_wall_s": WALL_S + now,
-                "kind": note.kind,
-                **words.event(note.kind, note.data),
+                **words.event(note),
             }
-            self.ids.append((note.kind, dict(self.telemetry.observe(event))))
+            self.ids.append((note.kind, dict(self.telemetry.observe(note, event))))
 
     def spans(self, name: str | None = None) -> list[ReadableSpan]:
         return [s for s in self.exporter.get_finished_spans() if name is None or s.name == name]
@@ -460,9 +460,9 @@ def test_lines_of_the_log_name_the_span_that_they_belong_to(
 def test_the_wall_clock_may_be_set_back(driver: CoreDriver, heard: Listener) -> None:
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
-    granted = driver.notes("granted")[-1]
-    ready = {"seq": 2, "at_wall_s": 3.0, "kind": "ready", **granted, "measured_bytes": None}
-    heard.telemetry.observe(ready)
+    granted = [effect for effect in driver.effects if isinstance(effect, Note)][-1]
+    ready = Note(ReadyNote(2 * GIB, 2 * GIB, None, 0.0), granted.about)
+    heard.telemetry.observe(ready, {"seq": 2, "at_wall_s": 3.0, "kind": "ready"})
     assert driver.state(lease) == "loading"
     assert {seconds(span) for span in heard.spans()} == {0.0}
 
@@ -539,11 +539,6 @@ class Ticks:
         self.later.clear()
 
 
-def figures_of(driver: CoreDriver) -> dict[str, Any]:
-    """What the daemon hands on: the engine's figures and the journal's state."""
-    return {**driver.arbiter.figures(), "journal_healthy": True}
-
-
 @pytest.fixture
 def ticks() -> Iterator[Ticks]:
     made = Ticks()
@@ -556,7 +551,7 @@ def test_gauges_show_the_present_and_nothing_that_is_old(
 ) -> None:
     trusted = True
     held(driver, "det", 2)
-    heard.metrics.watch(ticks, lambda: figures_of(driver) if trusted else None)  # type: ignore[arg-type]
+    heard.metrics.watch(ticks, lambda: driver.arbiter.figures() if trusted else None)
     assert heard.numbers("vram.gpu.charged") == {("GPU-0", "det"): 2 * GIB}
     assert heard.numbers("vram.gpu.measured") == {("GPU-0", "det"): 2 * GIB}
     assert heard.numbers("vram.gpu.used") == {("GPU-0",): 2 * GIB}
@@ -587,7 +582,7 @@ def test_the_sum_over_consumers_is_what_the_gpu_holds(
     held(driver, "det", 2)
     driver.card.overhead_bytes = 300 * MIB
     driver.advance(1.1)
-    heard.metrics.watch(ticks, lambda: figures_of(driver))  # type: ignore[arg-type]
+    heard.metrics.watch(ticks, lambda: driver.arbiter.figures())  # type: ignore[arg-type]
     by_consumer = heard.numbers("vram.gpu.measured")
     assert ("GPU-0", "") not in by_consumer
     assert (
@@ -600,7 +595,7 @@ def test_the_sum_over_consumers_is_what_the_gpu_holds(
 def test_the_health_of_the_daemon_in_numbers(
     driver: CoreDriver, heard: Listener, ticks: Ticks
 ) -> None:
-    heard.metrics.watch(ticks, lambda: figures_of(driver))  # type: ignore[arg-type]
+    heard.metrics.watch(ticks, lambda: driver.arbiter.figures())  # type: ignore[arg-type]
     heard.telemetry.wrote(0.002, failed=False)
     heard.telemetry.wrote(0.1, failed=True)
     assert heard.numbers("vram.journal.healthy") == {(): 1}
@@ -643,9 +638,9 @@ def test_a_defect_in_telemetry_is_said_once_and_stops_nothing(
     body = {"push": "revoke", "lease_id": "L1"}
     harmless.outgoing([])
     assert harmless.revoke(body) is body
-    assert harmless.observe({"kind": "granted"}) == {}
+    assert harmless.observe(Note(ServingNote(1.0)), {}) == {}
     harmless.close()
     (said,) = [record for record in caplog.records if record.levelname == "ERROR"]
     assert "a defect of ours" in said.getMessage()
     assert Harmless(broken).revoke(body) is body
-    assert Harmless(broken).observe({"kind": "granted"}) == {}
+    assert Harmless(broken).observe(Note(ServingNote(1.0)), {}) == {}

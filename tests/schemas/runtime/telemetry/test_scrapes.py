@@ -27,7 +27,7 @@ SCRAPER, ATTACKER = 1, 2
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., ScrapeServer]]:
+def scrape_server() -> Iterator[Callable[..., ScrapeServer]]:
     made: list[ScrapeServer] = []
 
     def make(
@@ -71,8 +71,8 @@ class Users:
             return b"".join(iter(lambda: reader.recv(4096), b""))
 
 
-def test_a_page_is_answered_and_nothing_else_is(serve: Callable[..., ScrapeServer]) -> None:
-    port = serve().port
+def test_a_page_is_answered_and_nothing_else_is(scrape_server: Callable[..., ScrapeServer]) -> None:
+    port = scrape_server().port
     seen = []
     for method, target in (
         ("GET", "/metrics"),
@@ -89,12 +89,12 @@ def test_a_page_is_answered_and_nothing_else_is(serve: Callable[..., ScrapeServe
 
 
 def test_one_user_with_many_silent_connections_does_not_keep_the_scraper_out(
-    serve: Callable[..., ScrapeServer],
+    scrape_server: Callable[..., ScrapeServer],
 ) -> None:
     """Eight silent connections of any user shut the scraper out for 5 s, and for ever if they came
     again."""
     users = Users()
-    port = serve(lambda: users).port
+    port = scrape_server(lambda: users).port
     silent = [users.connect(ATTACKER, port) for _ in range(CONNECTIONS_PER_USER)]
     assert users.scrape(port).endswith(b"up 1\n")
     silent.append(users.connect(ATTACKER, port))
@@ -107,11 +107,11 @@ def test_one_user_with_many_silent_connections_does_not_keep_the_scraper_out(
 
 
 def test_a_reader_that_sends_a_byte_at_a_time_is_given_up(
-    serve: Callable[..., ScrapeServer],
+    scrape_server: Callable[..., ScrapeServer],
 ) -> None:
     """Every byte began the 5 s anew: eight connections with a byte every 4 s held all places for
     ever."""
-    port = serve(scrape_s=0.3).port
+    port = scrape_server(scrape_s=0.3).port
     with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as slow:
         deadline = time.monotonic() + PATIENCE_S
         with pytest.raises(OSError):  # noqa: PT012 - it ends at any of these calls
@@ -140,8 +140,8 @@ def test_a_reader_that_does_not_read_is_given_up() -> None:
         server.close()
 
 
-def test_a_request_without_an_end_is_hung_up_on(serve: Callable[..., ScrapeServer]) -> None:
-    port = serve().port
+def test_a_request_without_an_end_is_hung_up_on(scrape_server: Callable[..., ScrapeServer]) -> None:
+    port = scrape_server().port
     with (  # noqa: PT012
         socket.create_connection(("127.0.0.1", port), PATIENCE_S) as endless,
         pytest.raises(OSError),
@@ -154,7 +154,7 @@ def test_a_request_without_an_end_is_hung_up_on(serve: Callable[..., ScrapeServe
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_the_kernel_names_the_user_of_a_connection(
-    host: str, serve: Callable[..., ScrapeServer]
+    host: str, scrape_server: Callable[..., ScrapeServer]
 ) -> None:
     named: list[int | None] = []
     seen = threading.Event()
@@ -165,7 +165,7 @@ def test_the_kernel_names_the_user_of_a_connection(
         return named[-1]
 
     try:
-        server = serve(lambda: owner, host=host)
+        server = scrape_server(lambda: owner, host=host)
     except OSError as error:
         pytest.skip(f"no {host} here: {error}")
     with socket.create_connection((host, server.port), PATIENCE_S):

@@ -1,14 +1,18 @@
 """Order of waiters: priority, arrival, and ageing that never reorders equals."""
 
-from vram_arbiter.arbiter.core.events import LeaseSpec
+from vram_arbiter.arbiter.core.model.gpu import WaitQueue
 from vram_arbiter.arbiter.core.model.lease import Lease, Request
-from vram_arbiter.arbiter.core.scheduling.queue import WaitQueue
-from vram_arbiter.schemas.ids import ClientId, LeaseId, ModelKey, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 
 def waiter(arrival: int, at: float, priority: int = 50, need: int = 10) -> Lease:
     spec = LeaseSpec(
-        "c", ModelKey("m"), "any", False, need, need, 0, priority, True, 10.0, 0.0, False
+        consumer="c",
+        model_id="m",
+        footprint=Footprint(need, need, 0),
+        priority=priority,
+        min_residency_s=0.0,
     )
     return Lease(
         LeaseId(f"L1-{arrival}"),
@@ -33,7 +37,6 @@ def test_priority_then_arrival() -> None:
     ):
         queue.add(lease)
     assert arrivals(queue) == [3, 1, 2, 4]
-    assert [lease.request.arrival for lease in queue.behind_head()] == [1, 2, 4]
 
 
 def test_ageing_bounds_the_wait_behind_higher_priorities() -> None:
@@ -45,20 +48,20 @@ def test_ageing_bounds_the_wait_behind_higher_priorities() -> None:
     assert arrivals(queue) == [2, 1, 3]
     assert queue.position(old) == 2
     assert queue.ahead_of(old) == "L1-2"
-    head = queue.head()
+    head = queue.head
     assert head is not None
     assert queue.ahead_of(head) is None
 
 
 def test_taking_out_and_the_smallest_need() -> None:
     queue = WaitQueue(5.0)
-    assert queue.head() is None
+    assert queue.head is None
     a, b = waiter(1, 0.0, need=30), waiter(2, 0.0, need=20)
     queue.add(a)
     queue.add(b)
-    assert (len(queue), queue.smallest_need_bytes()) == (2, 20)
+    assert (len(list(queue)), queue.smallest_need_bytes()) == (2, 20)
     assert b in queue
     queue.discard(b)
     queue.discard(b)
     assert b not in queue
-    assert (len(queue), queue.smallest_need_bytes()) == (1, 30)
+    assert (len(list(queue)), queue.smallest_need_bytes()) == (1, 30)

@@ -1,6 +1,6 @@
 """Deadlines by name."""
 
-from vram_arbiter.arbiter.core.timers import SLACK, Timers
+from vram_arbiter.arbiter.core.model.state import TIMERS_SLACK, Timers
 
 
 def test_timers_come_in_their_order_and_once() -> None:
@@ -27,8 +27,8 @@ def test_renewing_moves_a_deadline_and_earlier_ones_win() -> None:
 def test_a_cleared_timer_never_fires() -> None:
     timers = Timers()
     timers.set(("ttl", "a"), 1.0)
-    timers.clear(("ttl", "a"))
-    timers.clear(("ttl", "a"))
+    timers.cancel(("ttl", "a"))
+    timers.cancel(("ttl", "a"))
     assert ("ttl", "a") not in timers
     assert timers.pop_due(9.0) is None
 
@@ -38,9 +38,9 @@ def test_cleared_timers_do_not_pile_up_until_they_would_be_due() -> None:
     with every one."""
     timers = Timers()
     timers.set(("ttl", "a"), 5.0)
-    for number in range(10 * SLACK):
+    for number in range(10 * TIMERS_SLACK):
         timers.set(("wait", f"L{number}"), 1e7 + number)
-        timers.clear(("wait", f"L{number}"))
-    assert len(timers._heap) <= SLACK + 2
+        timers.cancel(("wait", f"L{number}"))
+    assert len(timers._heap) <= TIMERS_SLACK + 2
     timers.set(("ttl", "b"), 3.0)
     assert [timers.pop_due(1e9) for _ in range(3)] == [("ttl", "b"), ("ttl", "a"), None]

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from vram_arbiter.arbiter.host import loop as fine
-from vram_arbiter.arbiter.host.loop import FineSelector, new_loop
+from vram_arbiter.arbiter.host import process as fine
+from vram_arbiter.arbiter.host.process import FineSelector, new_loop
 
 WAIT_S = 0.0021
 TRIES = 200

@@ -1,6 +1,6 @@
 """A suspend is what CLOCK_BOOTTIME saw and CLOCK_MONOTONIC did not. The clocks are the test's."""
 
-from vram_arbiter.arbiter.host.suspend import NOTICED_S, SuspendWatch
+from vram_arbiter.arbiter.inbox import NOTICED_S, SuspendWatch
 
 
 class Clocks:

@@ -1,7 +1,7 @@
 """Bytes of one card: folding of residues, debts, evidence, stowaways."""
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
+from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
@@ -16,6 +16,11 @@ def ledger() -> GpuLedger:
     )
 
 
+def driver_bytes(books: GpuLedger) -> int | None:
+    """The driver's own bytes; None while they were never seen."""
+    return books.driver_bytes if books.driver_seen else None
+
+
 def sample(at: float, used: int, *processes: tuple[ProcessKey, int | None]) -> MemorySampled:
     listed = tuple(ProcessUse(process, f"p{process.pid}", count) for process, count in processes)
     return MemorySampled(GPU, at, used, 1000, listed)
@@ -26,8 +31,8 @@ def test_a_residue_is_folded_into_the_next_lease_of_its_process() -> None:
     books.charge(LA, A, 500, 500, 1.0)
     assert books.drop(LA, 50, 50, 2.0) == 50
     assert books.total_bytes() == 50
-    assert books.total_if(joining={A: 300}) == 300, "not 350: the context is shared"
-    assert books.total_if(joining={B: 300}) == 350
+    assert books.total_if(joining=[(A, 300)]) == 300, "not 350: the context is shared"
+    assert books.total_if(joining=[(B, 300)]) == 350
     books.charge(LA2, A, 300, 300, 3.0)
     assert books.total_bytes() == 300
     assert books.drop(LA2, 0, 0, 4.0) == 50, "what was declared once stays while the process lives"
@@ -39,11 +44,10 @@ def test_two_leases_of_one_process_share_one_context() -> None:
     books.charge(LA2, A, 200, 200, 1.0)
     assert books.total_if({LA: 50}) == 200
     assert books.total_if({LA: 50, LA2: 50}) == 50
-    assert books.process_after_bytes(A, {LA: 50}, dead=False) == 200
-    assert books.process_after_bytes(A, {LA: 50, LA2: 50}, dead=False) == 50
-    assert books.process_after_bytes(A, {LA: 0, LA2: 0}, dead=True) == 0
-    assert books.process_after_bytes(C, {}, dead=True) == 0
-    assert books.total_after_bytes(C, {}, dead=True) == 500
+    assert books.after_bytes(A, {LA: 50}, dead=False) == (200, 200)
+    assert books.after_bytes(A, {LA: 50, LA2: 50}, dead=False) == (50, 50)
+    assert books.after_bytes(A, {LA: 0, LA2: 0}, dead=True) == (0, 0)
+    assert books.after_bytes(C, {}, dead=True) == (0, 500)
     assert books.drop(LA, 50, 50, 2.0) == 50
     assert books.total_bytes() == 200
 
@@ -61,14 +65,26 @@ def test_a_residue_is_never_more_than_what_was_charged() -> None:
     assert books.drop(LA, 450, 450, 2.0) == 40
 
 
-def test_debts_stay_charged_and_are_told_apart() -> None:
+def test_reserved_bytes_are_charged_and_not_there_yet() -> None:
     books = ledger()
     books.charge(LA, A, 300, 300, 1.0)
-    assert not books.charge_of(LA).debt
-    books.to_debt(LA)
-    assert books.charge_of(LA).debt
-    assert books.total_bytes() == 300
-    books.bury(A)
+    books.reserve(LA2, A, 200, 1.0)
+    assert (books.total_bytes(), books.accounts[A].granted_bytes, books.reserved) == (
+        500,
+        300,
+        {LA2},
+    )
+    assert books.after_bytes(A, {LA: 50}, dead=False) == (50, 50)
+    assert books.after_bytes(B, {}, dead=False) == (0, 300)
+    books.charge(LA2, A, 200, 200, 2.0)
+    assert (books.accounts[A].granted_bytes, books.reserved) == (500, set())
+    books.withdraw(LA2, 3.0)
+    assert books.total_bytes() == books.accounts[A].granted_bytes == 300
+
+
+def test_an_account_without_bytes_is_closed() -> None:
+    books = ledger()
+    books.charge(LA, A, 300, 300, 1.0)
     assert books.drop(LA, 0, 0, 2.0) == 0
     assert A not in books.accounts
 
@@ -77,9 +93,9 @@ def test_what_a_holder_says_beyond_its_grant_is_booked_but_not_approved() -> Non
     books = ledger()
     books.charge(LA, A, 500, 500, 1.0)
     books.recharge(LA, 700, 2.0)
-    assert (books.booked_bytes(), books.approved_bytes()) == (700, 500)
+    assert (books.charged_bytes, books.approved_bytes) == (700, 500)
     books.recharge(LA, 400, 3.0)
-    assert (books.booked_bytes(), books.approved_bytes()) == (400, 400)
+    assert (books.charged_bytes, books.approved_bytes) == (400, 400)
 
 
 def test_evidence_counts_only_above_the_booking_and_only_if_it_is_new() -> None:
@@ -91,9 +107,9 @@ def test_evidence_counts_only_above_the_booking_and_only_if_it_is_new() -> None:
     assert books.total_bytes() == 505
     books.observe(sample(12.0, 700, (A, 700)), quiet=True)
     assert books.total_bytes() == 700
-    assert books.drift_bytes(A) == 200
+    assert books.accounts[A].held_bytes - books.accounts[A].charged_bytes == 200
     assert books.total_if({LA: 0}) == 0
-    assert books.total_if(joining={B: 100}) == 800
+    assert books.total_if(joining=[(B, 100)]) == 800
     books.observe(sample(13.0, 0), quiet=True)
     assert books.total_bytes() == 500, "gone from the list: only the booking counts"
 
@@ -111,10 +127,10 @@ def test_pressure_is_what_exceeds_the_budget() -> None:
 def test_stowaways_are_named_and_leave_no_trace_once_they_lease() -> None:
     books = ledger()
     books.observe(sample(1.0, 240, (A, 200), (C, 40)), quiet=True)
-    assert {s.process: s.used_bytes for s in books.strangers.values()} == {A: 200, C: 40}
+    assert {s.process: s.held_bytes for s in books.stowaways.values()} == {A: 200, C: 40}
     assert books.total_bytes() == 240
-    assert books.total_if(joining={A: 500}) == 540, "its bytes become part of its lease"
-    assert books.total_if(joining={A: 100}) == 240
+    assert books.total_if(joining=[(A, 500)]) == 540, "its bytes become part of its lease"
+    assert books.total_if(joining=[(A, 100)]) == 240
     books.charge(LA, A, 500, 500, 2.0)
     assert books.total_bytes() == 540
 
@@ -123,44 +139,44 @@ def test_a_process_known_by_pid_alone_is_found() -> None:
     books = ledger()
     unknown_start = ProcessKey(A.pid, 0)
     books.observe(sample(1.0, 200, (unknown_start, 200)), quiet=True)
-    assert books.total_if(joining={A: 500}) == 500
+    assert books.total_if(joining=[(A, 500)]) == 500
     books.charge(LA, A, 500, 500, 2.0)
     books.observe(sample(3.0, 600, (unknown_start, 600), (ProcessKey(77, 0), 5)), quiet=True)
-    assert books.drift_bytes(A) == 100
-    assert [s.process.pid for s in books.strangers.values()] == [77]
+    assert books.accounts[A].held_bytes - books.accounts[A].charged_bytes == 100
+    assert [s.process.pid for s in books.stowaways.values()] == [77]
 
 
 def test_an_unexplained_rest_counts_only_while_nobody_loads() -> None:
     books = ledger()
     books.observe(sample(1.0, 400, (C, 100)), quiet=False)
-    assert (books.unnamed_bytes, books.overhead_bytes) == (0, None)
+    assert (books.unattributed_bytes, driver_bytes(books)) == (0, None)
     books.observe(sample(2.0, 400, (C, 100)), quiet=True)
-    assert (books.unnamed_bytes, books.overhead_bytes) == (200, 100), (
+    assert (books.unattributed_bytes, driver_bytes(books)) == (200, 100), (
         "100 of 300 lie within the fixed reserve"
     )
     books.observe(sample(3.0, 150, (C, 100)), quiet=True)
-    assert (books.unnamed_bytes, books.overhead_bytes) == (0, 50)
+    assert (books.unattributed_bytes, driver_bytes(books)) == (0, 50)
 
 
 def test_processes_without_byte_counts_are_taken_at_their_booking() -> None:
     books = ledger()
     books.charge(LA, A, 500, 500, 1.0)
     books.observe(sample(2.0, 800, (A, None), (C, None)), quiet=True)
-    assert books.unnamed_bytes == 200
-    assert books.overhead_bytes is None, "an incomplete list says nothing of the driver's own bytes"
-    assert books.strangers[C].used_bytes == 0
+    assert books.unattributed_bytes == 200
+    assert driver_bytes(books) is None, "an incomplete list says nothing of the driver's own bytes"
+    assert books.stowaways[C].held_bytes == 0
 
 
 def test_a_backend_without_lists_gives_totals_only() -> None:
     books = ledger()
     books.observe(MemorySampled(GPU, 1.0, 30, 1000, None), quiet=True)
-    assert (books.overhead_bytes, books.unnamed_bytes) == (30, 0)
+    assert (driver_bytes(books), books.unattributed_bytes) == (30, 0)
     books.charge(LA, A, 500, 500, 2.0)
     books.observe(MemorySampled(GPU, 3.0, 700, 1000, None), quiet=False)
-    assert books.unnamed_bytes == 0
+    assert books.unattributed_bytes == 0
     books.observe(MemorySampled(GPU, 4.0, 700, 1000, None), quiet=True)
-    assert books.unnamed_bytes == 100
-    assert books.overhead_bytes == 30
+    assert books.unattributed_bytes == 100
+    assert driver_bytes(books) == 30
 
 
 def test_bytes_of_a_process_in_a_reading() -> None:

@@ -6,8 +6,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import held, hidden_card
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.core.ledger.ledger import GpuLedger
-from vram_arbiter.arbiter.core.ledger.pending_free import PendingFree
+from vram_arbiter.arbiter.core.ledger import GpuLedger, PendingFree
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
@@ -71,7 +70,8 @@ def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(list
     def observe(at: float, used: int, pending_bytes: int) -> tuple[int, int | None]:
         sample = reading(at, used) if lists else MemorySampled(GPU, at, used, 1000, None)
         books.observe(sample, quiet=True, pending_bytes=pending_bytes)
-        return books.unnamed_bytes, books.overhead_bytes
+        seen = books.driver_bytes if books.driver_seen else None
+        return books.unattributed_bytes, seen
 
     assert observe(1.0, 400, 400) == (0, None), (
         "all of it may be going, and the driver's own was never seen"

@@ -1,0 +1,213 @@
+"""Processes of one model: forked from a server of imports, asked in turn, ended."""
+
+import asyncio
+import functools
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Iterator
+from multiprocessing import forkserver
+from pathlib import Path
+
+import pytest
+
+from tests.sidecars.conftest import PNG
+from tests.sidecars.echo_sidecar import adapter_for
+from tests.support.waiting import until
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.schemas.errors import BadRequest, ModelError, OutOfMemory, WaitTimeout
+from vram_arbiter.schemas.manifest import parse_manifest
+from vram_arbiter.schemas.wire.requests import Footprint
+from vram_arbiter.sidecars.model_process import ModelProcesses
+from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.weights import Weights
+
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+
+GB = 10**9
+WAIT_S = 60.0
+MANIFEST = """
+name: test/eye
+version: 0.1.0
+kind: detector
+embodiment_tags: [any]
+chunk_size: 1
+weights_uri: hf://test/eye
+description: sees nothing
+latency_budget: {per_chunk_ms: 100}
+actions: [detect]
+detector: {labels: [cube]}
+"""
+
+
+class Place:
+    """A simulated GPU, and a folder that tells the model what to do."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.card = folder / "fakegpu"
+        make_card(self.card, 8 * 2**30, release_lag_s=0.01)
+
+    def processes(self, steady: int = GB) -> ModelProcesses:
+        footprint = Footprint(load_peak_bytes=steady, steady_bytes=steady, residue_bytes=GB // 10)
+        settings = Settings(
+            "eye", parse_manifest(MANIFEST), Weights("test/eye"), footprint,
+            f"ipc://{self.folder}/eye.sock", f"fake:{self.card}", None
+        )  # fmt: skip
+        return ModelProcesses(settings, functools.partial(adapter_for, self.folder))
+
+    def used(self) -> int:
+        probe = FakeProbe([self.card])
+        return probe.sample(probe.cards()[0].id).used_bytes
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _server() -> Iterator[None]:
+    """This process's server of imports has a temporary folder that goes with these tests."""
+    config = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    with tempfile.TemporaryDirectory(prefix="vs") as folder:
+        config["tempdir"] = folder
+        yield
+        forkserver._forkserver._stop()  # type: ignore[attr-defined]
+        del config["tempdir"]
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Place:
+    return Place(tmp_path)
+
+
+def detect(query: str) -> dict[str, object]:
+    return {"op": "detect", "image": PNG, "query": query}
+
+
+async def ask(model, query: str, begin_s: float = WAIT_S, end_s: float = WAIT_S):
+    reply = await model.run(detect(query), begin_s=begin_s, end_s=end_s, begins=lambda: None)
+    return reply["answer"]
+
+
+async def holding(place: Place) -> None:
+    while not (place.folder / "holding").exists():
+        await asyncio.sleep(0.01)
+
+
+async def test_its_end_returns_every_byte(place: Place) -> None:
+    async with asyncio.timeout(WAIT_S):
+        model = await place.processes().start()
+        await model.prepare()
+        assert place.used() == 0, "preparing needs no device"
+        assert await model.load("") == GB
+        assert (await ask(model, "cube"))["answer"] == "cube"
+        await model.end()
+        await model.end()
+        assert model.ended.is_set()
+    until(lambda: place.used() == 0)
+
+
+async def test_errors_keep_their_type(place: Place) -> None:
+    async with asyncio.timeout(WAIT_S):
+        model = await place.processes(steady=9 * GB).start()
+        await model.prepare()
+        with pytest.raises(OutOfMemory, match="simulated"):
+            await model.load("")
+        await model.end()
+        model = await place.processes().start()
+        await model.prepare()
+        await model.load("")
+        with pytest.raises(ModelError, match="RuntimeError: the model fails as told"):
+            await ask(model, "fail")
+        with pytest.raises(BadRequest, match="not like that"):
+            await ask(model, "refuse")
+        assert (await ask(model, "cube"))["answer"] == "cube", "it lives on"
+        await model.end()
+
+
+async def test_a_request_that_could_not_begin_in_time_never_does(place: Place) -> None:
+    """Regression: a request behind one that hung in a decoder kept its use of the lease for
+    ever."""
+    async with asyncio.timeout(WAIT_S):
+        model = await place.processes().start()
+        await model.prepare()
+        await model.load("")
+        hanging = asyncio.create_task(ask(model, "hold go"))
+        await holding(place)
+        with pytest.raises(WaitTimeout, match="busy"):
+            await ask(model, "late", begin_s=0.05)
+        canceled = asyncio.create_task(ask(model, "x"))
+        await asyncio.sleep(0)
+        canceled.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await canceled
+        (place.folder / "go").touch()
+        assert (await hanging)["answer"] == "hold go"
+        assert (await ask(model, "next"))["answer"] == "next"
+        await model.end()
+
+
+async def test_a_request_that_does_not_end_is_ended_with_its_process(place: Place) -> None:
+    async with asyncio.timeout(WAIT_S):
+        model = await place.processes().start()
+        await model.prepare()
+        await model.load("")
+        with pytest.raises(ModelError, match="has not answered within"):
+            await ask(model, "hold for ever", end_s=0.2)
+        await model.ended.wait()
+        with pytest.raises(ModelError, match="ended by SIGKILL"):
+            await ask(model, "next")
+    until(lambda: place.used() == 0)
+
+
+async def test_a_caller_that_turns_away_leaves_the_model_in_order(place: Place) -> None:
+    """The answer of a canceled request is not taken for the next one's."""
+    async with asyncio.timeout(WAIT_S):
+        model = await place.processes().start()
+        await model.prepare()
+        await model.load("")
+        turning_away = asyncio.create_task(ask(model, "hold go"))
+        await holding(place)
+        turning_away.cancel()
+        await asyncio.sleep(0)
+        (place.folder / "go").touch()
+        with pytest.raises(asyncio.CancelledError):
+            await turning_away
+        assert (await ask(model, "next"))["answer"] == "next"
+        await model.end()
+
+
+async def test_a_load_that_is_not_wanted_any_more_is_ended_at_once(place: Place) -> None:
+    (place.folder / "slow_load").touch()
+    async with asyncio.timeout(WAIT_S):
+        model = await place.processes().start()
+        await model.prepare()
+        loading = asyncio.create_task(model.load(""))
+        while not place.used():
+            await asyncio.sleep(0.01)
+        await model.end(at_once=True)
+        with pytest.raises(ModelError, match="ended by SIGKILL"):
+            await loading
+    until(lambda: place.used() == 0)
+
+
+@pytest.mark.heavy
+async def test_the_server_of_imports_has_no_thread_and_no_device(place: Place) -> None:
+    """A fork copies one thread only: locks that others hold would stay locked. A CUDA context does
+    not survive a fork at all."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # the next one imports these
+    processes = place.processes()
+    processes.preload(("torch", "transformers", "lerobot.policies.factory"))
+    async with asyncio.timeout(4 * WAIT_S):
+        models = [await processes.start(), await processes.start()]
+        server, same = [parent(model.pid) for model in models]
+        imported = "libtorch" in Path(f"/proc/{server}/maps").read_text()
+        threads = os.listdir(f"/proc/{server}/task")
+        opened = [os.readlink(one) for one in Path(f"/proc/{server}/fd").iterdir()]
+        for model in models:
+            await model.end()
+    assert imported
+    assert server == same, "the imports are shared"
+    assert threads == [str(server)]
+    assert not [name for name in opened if "nvidia" in name]
+
+
+def parent(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])

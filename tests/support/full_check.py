@@ -1,0 +1,133 @@
+"""Every invariant over everything, and the tables that the check of each event relies on.
+
+The engine checks what an event changed (`core.invariants`). Drivers of tests and the simulation
+also check everything, in O(leases).
+"""
+
+from collections import Counter
+
+from tests.support.engine_state import state_of
+from vram_arbiter.arbiter.core import invariants
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.features.gangs import Gangs
+from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.ledger import GpuLedger
+from vram_arbiter.arbiter.core.model.gpu import Residents
+from vram_arbiter.arbiter.core.model.lease import LeaseState
+from vram_arbiter.arbiter.core.model.state import Client, Core, Turn
+from vram_arbiter.schemas.ids import ClientId, ProcessKey
+
+
+def check_arbiter(arbiter: Arbiter) -> None:
+    """Raise InvariantViolation if any record is unsound; number 0: a table is."""
+    check_all(state_of(arbiter))
+
+
+def check_all(core: Core) -> None:
+    """Raise InvariantViolation if any record is unsound; number 0: a table is."""
+    if problem := owners_disagree(core):
+        raise InvariantViolation(0, problem)
+    for gpu in core.gpus.values():
+        if problem := ledger_disagrees(gpu.ledger) or residents_disagree(gpu.residents):
+            raise InvariantViolation(0, f"{gpu.info.id}: {problem}")
+        gpu.ledger.touched.update(gpu.ledger.charges, gpu.residents)
+        for lease in gpu.residents.values():
+            in_use = lease.state in (LeaseState.HELD, LeaseState.REVOKING)
+            if not in_use and (uses := len(lease.all_uses())):
+                raise InvariantViolation(3, f"{lease.id} is {lease.state} with {uses} uses")
+    for feature in core.features:
+        if isinstance(feature, Gangs):
+            feature.settled.update(feature.by_name)
+        feature.check(core)
+    turn, core.turn = core.turn, Turn(granted=core.turn.granted)
+    core.turn.touched.update((gpu.info.index, gpu) for gpu in core.gpus.values())
+    invariants.check(core)
+    core.turn = turn
+    queues = [gpu.queue for gpu in core.gpus.values()]
+    unqueued = {
+        lease.id for lease in core.waiting.values() if not any(lease in queue for queue in queues)
+    }
+    if unqueued != core.unqueued.keys():
+        raise InvariantViolation(0, f"{sorted(unqueued)} wait in no queue, see {core.unqueued}")
+
+
+def owners_disagree(core: Core) -> str:
+    """Return where the tables of owners and the leases disagree, "" if nowhere."""
+    by_process = {lease_id: owner for owner, some in core._of_process.items() for lease_id in some}
+    by_client = {lease_id: owner for owner, some in core.of_client.items() for lease_id in some}
+    for lease in core.leases.values():
+        listed = (by_process.pop(lease.id, None), by_client.pop(lease.id, None))
+        if listed != (lease.process, lease.client):
+            return f"{lease.id} is not listed under its process and its client"
+    if by_process or by_client:
+        return f"{sorted({**by_process, **by_client})} are listed and gone"
+    for paused, table in ((False, core.users), (True, core.pausing)):
+        marked = {
+            (*use, lease.id)
+            for lease in core.leases.values()
+            for use in (lease.uses.paused if paused else lease.uses)
+        }
+        listed_uses = {(who, use, lease) for who, mine in table.items() for lease, use in mine}
+        if odd := marked ^ listed_uses:
+            return f"{sorted(odd)}: uses are listed otherwise than they are"
+    owners = Counter(
+        owner for lease in core.waiting.values() for owner in (lease.process, lease.request.uid)
+    )
+    if owners != core.waiters_of:
+        return f"waiters are {owners}, kept as {core.waiters_of}"
+    connected: dict[ProcessKey, dict[ClientId, Client]] = {}
+    for client in core.clients.values():
+        connected.setdefault(client.process, {})[client.id] = client
+    if connected != core.connected:
+        return f"{connected} are connected, kept as {core.connected}"
+    return ""
+
+
+def ledger_disagrees(ledger: GpuLedger) -> str:
+    """Return where the kept sums and the accounts disagree, "" if nowhere."""
+    charges, sums = {}, [0, 0, 0, 0]
+    for process, account in ledger.accounts.items():
+        charges.update(account.charges)
+        owed = account.charges.values()
+        booked = sum(charge.charged_bytes for charge in owed)
+        approved = sum(charge.approved_bytes for charge in owed)
+        reserved = sum(charge.charged_bytes for charge in owed if charge.reserved)
+        kept = (account.leased_bytes, account.leased_approved_bytes, account.reserved_bytes)
+        if (booked, approved, reserved) != kept:
+            return f"{process} is charged {(booked, approved, reserved)}, kept as {kept}"
+        for lease, charge in account.charges.items():
+            if charge.approved_bytes > charge.charged_bytes:
+                return (
+                    f"{lease} is booked {charge.charged_bytes} and approved {charge.approved_bytes}"
+                )
+        retained, measured = account.retained_bytes, account.measured_bytes
+        sums[0] += max(booked, retained)
+        sums[1] += max(approved, retained)
+        sums[2] += max(booked, retained, measured)
+        sums[3] += max(booked - reserved, retained, measured)
+    kept_sums = [
+        ledger.charged_bytes,
+        ledger.approved_bytes,
+        ledger._held_bytes,
+        ledger._present_bytes,
+    ]
+    if kept_sums != sums:
+        return f"the sums are {sums}, kept as {kept_sums}"
+    if ledger.charges != charges:
+        return f"the charges are {charges}, kept as {ledger.charges}"
+    if ledger.reserved != {lease for lease, charge in charges.items() if charge.reserved}:
+        return f"{ledger.reserved} are kept as reserved"
+    stowaways = sum(use.held_bytes for use in ledger.stowaways.values()) + ledger.unattributed_bytes
+    kept_bytes = ledger.stowaway_bytes
+    return "" if kept_bytes == stowaways else f"stowaways have {stowaways}, kept as {kept_bytes}"
+
+
+def residents_disagree(residents: Residents) -> str:
+    """Return where the tables and the leases of a GPU disagree, "" if nowhere."""
+    for state, table in residents.by_state.items():
+        if table.keys() != {lease.id for lease in residents.values() if lease.state is state}:
+            return f"{sorted(table)} are listed as {state}"
+    exclusive = {lease.id for lease in residents.values() if lease.spec.exclusive}
+    if residents.exclusive.keys() != exclusive:
+        return f"{sorted(residents.exclusive)} are listed as exclusive"
+    return ""
