@@ -91,7 +91,8 @@ class _Model:
         if gpu:
             memory.bind(gpu)
         memory.touch()
-        self._adapter.load(memory.torch_device)
+        self._adapter.load("cpu")
+        self._adapter.place(memory.torch_device)
         used = memory.used_bytes()
         if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
             return used  # a real model has its own bytes

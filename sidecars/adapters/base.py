@@ -1,25 +1,30 @@
-"""Interface of a model: prepare, load, run, unload.
+"""Interface of a model: prepare, load, place, run.
 
 An adapter knows its model and nothing of leases, sockets or bytes.
 """
 
-from typing import Literal, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
+
+if TYPE_CHECKING:
+    from torch.nn import Module
 
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 
 
 class ModelAdapter(Protocol):
-    """One model. All methods block, and run in the model's own process, one at a time.
+    """One model. All methods block, and are called one at a time.
 
-    `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no device (imports,
-    processors). `load` puts the weights onto `device` (`cpu`, `cuda:0`) and `unload` drops every
-    reference to them; both may be repeated. A load onto `meta` allocates nothing: it finds out
-    whether the checkpoint holds the whole model, as every load does. `run` raises a
-    `schemas.errors` type for the caller's mistakes; anything else that it raises is the model's own
-    failure.
+    `ops` are the ops or endpoints that `run` answers. `prepare` does what needs no weights
+    (imports, processors). `load` reads the weights into host RAM (`cpu`), in the precision in which
+    they run: cast, quantized and complete, or ModelError. A load onto `meta` allocates nothing: it
+    finds out whether the checkpoint holds the whole model, as every load does. `networks` are what
+    was loaded. `place` puts them onto `device` (`cpu`, `cuda:0`), in a process forked from the one
+    that loaded, and only there `run` is called. `run` raises a `schemas.errors` type for the
+    caller's mistakes; anything else that it raises is the model's own failure.
     """
 
     @property
@@ -35,6 +40,13 @@ class ModelAdapter(Protocol):
 
     def prepare(self) -> None: ...
 
-    def load(self, device: str) -> None: ...
+    def load(self, device: Literal["cpu", "meta"]) -> None: ...
+
+    @property
+    def networks(self) -> "Sequence[Module]":
+        """Networks whose parameters and buffers are the model's weights."""
+        ...
+
+    def place(self, device: str) -> None: ...
 
     def run(self, call: ModelCall) -> Message: ...

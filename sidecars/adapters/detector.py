@@ -66,6 +66,13 @@ class DetectorAdapter:
             AutoModelForZeroShotObjectDetection, self._weights, **options
         )
 
+    @property
+    def networks(self) -> Sequence[Any]:
+        return (self._model,)
+
+    def place(self, device: str) -> None:
+        self._model.to(device)
+
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, DetectOp)
         labels = split_query(call.query)

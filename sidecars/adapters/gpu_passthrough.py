@@ -63,7 +63,12 @@ class GpuPassthroughAdapter:
     def prepare(self) -> None:
         import torch  # noqa: F401  its import time belongs here
 
+    networks = ()
+
     def load(self, device: str) -> None:
+        pass
+
+    def place(self, device: str) -> None:
         self._device = device
 
     def run(self, call: ModelCall) -> Message:

@@ -1,7 +1,7 @@
 """Robot policies through lerobot's classes and processors: observation in, chunk of actions out."""
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
@@ -9,7 +9,7 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
-from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
+from vram_arbiter.sidecars.checkpoints import load_lerobot, need_statistics
 from vram_arbiter.sidecars.images import decode
 from vram_arbiter.sidecars.weights import Weights, model_type, read_config
 
@@ -64,19 +64,31 @@ class PolicyAdapter:
         self._policy_class = get_policy_class(self._config.type)
 
     def load(self, device: str) -> None:
-        from lerobot.policies.factory import make_pre_post_processors
-
         self._config.device = device
         self._config.pretrained_path = self._weights.source
         self._policy = load_lerobot(self._policy_class, self._weights, self._config)
+        self._make_processors("cpu")
+        need_statistics(self._before, self._config.input_features, self._weights.source)
+        need_statistics(self._after, self._config.output_features, self._weights.source)
+
+    @property
+    def networks(self) -> Sequence[Any]:
+        return (self._policy,)
+
+    def place(self, device: str) -> None:
+        self._config.device = device
+        self._policy.to(device)
+        self._make_processors(device)
+
+    def _make_processors(self, device: str) -> None:
+        from lerobot.policies.factory import make_pre_post_processors
+
         try:
             self._before, self._after = make_pre_post_processors(
                 self._config,
                 pretrained_path=self._weights.source,
                 pretrained_revision=self._weights.revision,
-                preprocessor_overrides={
-                    "device_processor": {"device": "cpu" if device == META else device}
-                },
+                preprocessor_overrides={"device_processor": {"device": device}},
             )
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
@@ -84,8 +96,6 @@ class PolicyAdapter:
                 f"{error}",
                 hint="check that the checkpoint is complete",
             ) from error
-        need_statistics(self._before, self._config.input_features, self._weights.source)
-        need_statistics(self._after, self._config.output_features, self._weights.source)
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, EndpointCall)

@@ -5,6 +5,7 @@ Pictures of a robot at work and its task in, progress and success out.
 
 import importlib
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
@@ -57,11 +58,23 @@ class RewardAdapter:
         self._model_class = get_reward_model_class(self._config.type)
 
     def load(self, device: str) -> None:
-        from lerobot.rewards.factory import make_reward_pre_post_processors
-
         self._config.device = device
         self._config.pretrained_path = self._weights.source
         self._model = load_lerobot(self._model_class, self._weights, self._config)
+        self._make_processor()
+
+    @property
+    def networks(self) -> Sequence[Any]:
+        return (self._model,)
+
+    def place(self, device: str) -> None:
+        self._config.device = device
+        self._model.to(device)
+        self._make_processor()
+
+    def _make_processor(self) -> None:
+        from lerobot.rewards.factory import make_reward_pre_post_processors
+
         try:
             self._before, _ = make_reward_pre_post_processors(self._config)
         except (ValueError, ImportError, OSError) as error:

@@ -3,6 +3,7 @@
 These are Qwen3.5 and others.
 """
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -56,6 +57,13 @@ class SceneVlmAdapter:
 
         options = model_options(self._manifest, self._weights, device)
         self._model = load_transformers(AutoModelForImageTextToText, self._weights, **options)
+
+    @property
+    def networks(self) -> Sequence[Any]:
+        return (self._model,)
+
+    def place(self, device: str) -> None:
+        self._model.to(device)
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, QueryOp)

@@ -40,6 +40,11 @@ class StillModel:
         pass
 
     def load(self, device: str) -> None:
+        pass
+
+    networks = ()
+
+    def place(self, device: str) -> None:
         self._while_there("slow_load")
         self._fail("fail_load")
 

@@ -39,6 +39,11 @@ class EchoAdapter:
         self._fail("prepare")
 
     def load(self, device: str) -> None:
+        pass
+
+    networks = ()
+
+    def place(self, device: str) -> None:
         self._last("load")
         self._fail("load")
         self._model = device

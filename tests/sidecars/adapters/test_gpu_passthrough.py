@@ -45,7 +45,7 @@ def adapter() -> GpuPassthroughAdapter:
     made = make_adapter(manifest, resolve(str(manifest.weights_uri), CONFIGS))
     assert isinstance(made, GpuPassthroughAdapter)
     made.prepare()
-    made.load("cpu")  # what a simulated card computes on
+    made.place("cpu")  # what a simulated card computes on
     return made
 
 
