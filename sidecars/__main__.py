@@ -139,6 +139,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         manifest=manifest,
         weights=weights,
         footprint=entry.on_wire(),
+        inference_peak_bytes=entry.inference_peak,
         endpoint=endpoint,
         device=device,
         arbiter=None
@@ -251,8 +252,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--footprint",
-        metavar="PEAK[,STEADY[,RESIDUE]]",
-        help="instead of the file, e.g. 5.3GB,5.3GB,450MiB",
+        metavar="PEAK[,STEADY[,RESIDUE[,INFERENCE_PEAK]]]",
+        help="instead of the file, e.g. 5.3GB,5.3GB,450MiB,6GB",
     )
     add(
         "--gpu",

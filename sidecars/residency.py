@@ -457,7 +457,8 @@ class Residency:
             self._model, self._prepared = model, None
             measured = await model.load("" if lease is None else lease.gpu)
             if lease is not None:
-                await lease.ready(measured)
+                charge = None if measured is None else self._settings.steady_charge(measured)
+                await lease.ready(charge)
             if model is not self._model or given_up() or (lease and lease.state == "gone"):
                 raise self._unwanted()  # it was unloaded while `ready` was sent
         except BaseException as error:

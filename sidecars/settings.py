@@ -3,8 +3,9 @@
 Put together from a manifest, the footprint file and flags.
 """
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
+from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.schemas.yamltext import read_yaml
@@ -25,16 +27,23 @@ WAIT_TIMEOUT_S = 120.0  # wait for the lease of a request without a time limit o
 # limit of work in the model; the field's clients wait as long for an answer
 REQUEST_TIMEOUT_S = 180.0
 GB = 10**9  # manifests count in 1000s
+_KEY = re.compile(rf"[^/\s]+/[^/\s]+(/({'|'.join(Dtype)}))?")
+"""Key of a footprint: a model, or a model in one number format."""
 
 
 class FootprintEntry(BaseModel):
-    """One entry of `configs/models/footprints.yaml`."""
+    """One entry of `configs/models/footprints.yaml`.
+
+    `inference_peak` is the most that the process takes while it answers (weights, context and
+    activations), 0 where it was never measured.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     stands_for: str = ""
     load_peak: ByteSize
     steady: ByteSize
     residue: ByteSize = d.RESIDUE_BYTES
+    inference_peak: ByteSize = 0
     throttle: Annotated[ByteSize, Field(gt=0)] | None = None
     source: str = ""
 
@@ -42,6 +51,8 @@ class FootprintEntry(BaseModel):
     def _ordered(self) -> Self:
         if not self.residue <= self.steady <= self.load_peak:
             raise ValueError("must be residue ≤ steady ≤ load_peak: each includes the context")
+        if 0 < self.inference_peak < self.steady:
+            raise ValueError("must be steady ≤ inference_peak: it includes the resident weights")
         return self
 
     def on_wire(self) -> Footprint:
@@ -61,6 +72,7 @@ class Settings:
     endpoint: str
     device: str  # fake:FOLDER | cuda[:N] | none
     arbiter: str | None
+    inference_peak_bytes: int = 0  # most while it answers; 0: not known
     stands_for: str = ""  # the production model of the simulated footprint
     throttle_bytes_per_s: int | None = None
     gpu: str = "any"
@@ -79,9 +91,23 @@ class Settings:
     def revision(self) -> str:
         return self.manifest.weights_revision or self.manifest.version
 
+    def steady_charge(self, resident_bytes: int) -> int:
+        """Return what the lease is charged while the model is resident.
+
+        That covers the inference peak: activations come and go within one answer, between two
+        readings of the GPU. Charged for its weights alone, a model would share the GPU with another
+        one until both answer at the same time, and one of them fails with `oom`.
+        """
+        return max(resident_bytes, self.inference_peak_bytes)
+
     def lease_spec(self) -> LeaseSpec:
-        """Nothing is retained after an unload: the model's process ends, and its context too."""
-        footprint = replace(self.footprint, residue_bytes=0)
+        """Return the lease of this model.
+
+        Nothing is retained after an unload: the model's process ends, and its context too.
+        """
+        steady = self.steady_charge(self.footprint.steady_bytes)
+        peak = max(self.footprint.load_peak_bytes, steady)
+        footprint = Footprint(load_peak_bytes=peak, steady_bytes=steady, residue_bytes=0)
         return LeaseSpec(
             consumer=self.name,
             model_id=self.manifest.name,
@@ -110,11 +136,17 @@ def read_footprints(path: Path) -> dict[str, FootprintEntry]:
     """Read all entries of a footprint file. Raises ConfigError naming file, line and problem."""
     document = read_yaml(path)
     if not isinstance(document.data, Mapping):
-        raise ConfigError(f"{path}: must be a map from manifest names to footprints")
+        raise ConfigError(f"{path}: must be a map from models to footprints")
     entries = {}
-    for name, value in document.data.items():
+    for key, value in document.data.items():
+        name = str(key)
+        if not _KEY.fullmatch(name):
+            raise ConfigError(
+                f"{path}:{document.line((name,))}: {name!r} names no model",
+                hint="write OWNER/NAME or OWNER/NAME/DTYPE, DTYPE one of " + ", ".join(Dtype),
+            )
         try:
-            entries[str(name)] = FootprintEntry.model_validate(value)
+            entries[name] = FootprintEntry.model_validate(value)
         except ValidationError as error:
             problem = error.errors()[0]
             where = (name, *problem["loc"])
@@ -126,16 +158,18 @@ def read_footprints(path: Path) -> dict[str, FootprintEntry]:
 
 
 def parse_footprint(text: str) -> FootprintEntry:
-    """Parse the flag `--footprint`: `PEAK[,STEADY[,RESIDUE]]`, each a size. Raises ConfigError."""
-    hint = "write PEAK,STEADY,RESIDUE, e.g. 5.3GB,5.3GB,450MiB"
+    """Parse the flag `--footprint`: `PEAK[,STEADY[,RESIDUE[,INFERENCE_PEAK]]]`, each a size.
+
+    Raises ConfigError.
+    """
+    hint = "write PEAK,STEADY,RESIDUE,INFERENCE_PEAK, e.g. 5.3GB,5.3GB,450MiB,6GB"
+    names = ("load_peak", "steady", "residue", "inference_peak")
     try:
-        peak, *rest = [parse_bytes(part) for part in text.split(",")]
-        if len(rest) > 2:
-            raise ValueError("at most three sizes")
-        steady = rest[0] if rest else peak
-        return FootprintEntry(
-            load_peak=peak, steady=steady, residue=rest[1] if len(rest) == 2 else d.RESIDUE_BYTES
-        )
+        sizes = [parse_bytes(part) for part in text.split(",")]
+        given = dict(zip(names, sizes, strict=False))
+        if len(sizes) > len(names):
+            raise ValueError(f"at most {len(names)} sizes")
+        return FootprintEntry.model_validate({"steady": given["load_peak"], **given})
     except ValueError as error:
         raise ConfigError(f"--footprint {text}: {_reason(error)}", hint=hint) from None
 
@@ -143,17 +177,23 @@ def parse_footprint(text: str) -> FootprintEntry:
 def footprint_for(
     manifest: RSkillManifest, entries: Mapping[str, FootprintEntry]
 ) -> FootprintEntry:
-    """Return the entry of a manifest, else the bytes that it declares for its number format.
+    """Return the footprint of a manifest: the entry of its model in its number format, by the
+    manifest's name, the repository of its weights or the one that these were made from, else the
+    entry of its name, else the bytes that it declares.
 
-    Raises ConfigError if neither exists.
+    Measured bytes go before declared ones: the field declares 2.5 GB where 3.3 are resident. Raises
+    ConfigError if none exists.
     """
-    if entry := entries.get(manifest.name):
-        return entry
+    sources = (manifest.name, *map(_repository, (manifest.weights_uri, manifest.source_repo)))
+    dtype = manifest.quantization.dtype
+    for key in (*(f"{source}/{dtype}" for source in sources if source), manifest.name):
+        if entry := entries.get(key):
+            return entry
     if manifest.declared_vram_gb is None:
         raise ConfigError(
-            f"no footprint is known for {manifest.name}",
-            hint="add it to configs/models/footprints.yaml, declare min_vram_gb for its dtype, or "
-            "pass --footprint",
+            f"no footprint is known for {manifest.name} in {dtype}",
+            hint="measure it with `vramctl calibrate`, add it to configs/models/footprints.yaml, "
+            "declare min_vram_gb for its dtype, or pass --footprint",
         )
     declared = round(manifest.declared_vram_gb * GB)
     return FootprintEntry(
@@ -162,6 +202,12 @@ def footprint_for(
         residue=min(declared, d.RESIDUE_BYTES),
         source="min_vram_gb",
     )
+
+
+def _repository(uri: str | None) -> str:
+    """Return OWNER/REPO of an address of the hub, else an empty text."""
+    scheme, _, rest = (uri or "").partition("://")
+    return rest.partition("@")[0] if scheme == "hf" else ""
 
 
 def _reason(error: ValueError) -> str:

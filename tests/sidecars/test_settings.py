@@ -42,17 +42,28 @@ def settings(*flags):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("5.3GB,5GB,450MiB", (5_300_000_000, 5_000_000_000, 450 * MIB)),
-        ("2GB,1GB", (2 * 10**9, 10**9, 450 * MIB)),
-        ("1GB", (10**9, 10**9, 450 * MIB)),
+        ("5.3GB,5GB,450MiB,6GB", (5_300_000_000, 5_000_000_000, 450 * MIB, 6 * 10**9)),
+        ("5.3GB,5GB,450MiB", (5_300_000_000, 5_000_000_000, 450 * MIB, 0)),
+        ("2GB,1GB", (2 * 10**9, 10**9, 450 * MIB, 0)),
+        ("1GB", (10**9, 10**9, 450 * MIB, 0)),
     ],
 )
 def test_the_footprint_flag(text, expected):
     entry = parse_footprint(text)
-    assert (entry.load_peak, entry.steady, entry.residue) == expected
+    assert (entry.load_peak, entry.steady, entry.residue, entry.inference_peak) == expected
 
 
-@pytest.mark.parametrize("text", ["much", "1GB,2GB", "1GB,1GB,1GB,1GB", "1GB,1GB,2GB", ""])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "much",
+        "1GB,2GB",
+        "1GB,1GB,1GB,1GB,1GB",
+        "1GB,1GB,2GB",
+        "2GB,2GB,1GB,1GB",  # an inference peak below the resident weights
+        "",
+    ],
+)
 def test_a_footprint_that_makes_no_sense(text):
     with pytest.raises(ConfigError, match="write PEAK,STEADY,RESIDUE"):
         parse_footprint(text)
@@ -70,11 +81,52 @@ def test_the_shipped_footprints_are_the_measured_ones():
     assert all(entry.source and entry.residue == 450 * MIB for entry in entries.values())
 
 
+def test_a_footprint_is_found_by_model_and_number_format():
+    """Regression: a field manifest of a model whose bytes are on file was charged the 2.5 GB that
+    it declares, where 3.3 GB are resident: entries were looked up by the manifest's name alone."""
+    entries = read_footprints(SHIPPED)
+    field = parse_manifest(
+        HEAD.replace("test/model", "OpenRAL/rskill-qwen35-4b-nf4")
+        + "kind: vlm\nrole: s2\nactions: [query]\nquantization: {dtype: int4}\n"
+        "min_vram_gb: {int4: 2.5}\nweights_uri: hf://OpenRAL/rskill-qwen35-4b-nf4\n"
+        "source_repo: hf://Qwen/Qwen3.5-4B@851bf6e8\n"
+    )
+    assert footprint_for(field, entries).steady == 3_300_000_000
+
+    manifest = parse_manifest(
+        DETECTOR.replace("name: test/model", "name: test/model\nsource_repo: hf://s/t@1")
+        + "min_vram_gb: {fp32: 9}\n"
+    )
+    keys = ["test/model/fp32", "a/b/fp32", "s/t/fp32", "test/model"]  # the nearest first
+    others = ["test/model/int4", "a/b/fp16", "s/t", "a/b"]
+    found = {
+        key: FootprintEntry(load_peak=number, steady=number, residue=number)
+        for number, key in enumerate(keys + others, 1)
+    }
+    for number in range(1, len(keys) + 1):
+        assert footprint_for(manifest, found).steady == number
+        del found[keys[number - 1]]
+    assert footprint_for(manifest, found).source == "min_vram_gb"
+
+
+def test_the_lease_covers_the_inference_peak(rskill):
+    """Two models that are charged their weights alone fit beside each other until both answer."""
+    flags = ("--name", "d", "--rskill", rskill, "--device", "none", "--footprint")
+    found = settings(*flags, "3GB,2GB,450MiB,4GB")
+    footprint = found.lease_spec().footprint
+    assert (footprint.load_peak_bytes, footprint.steady_bytes) == (4 * 10**9, 4 * 10**9)
+    assert found.footprint.steady_bytes == 2 * 10**9, "what a simulated GPU is filled with"
+    assert [found.steady_charge(size) for size in (10**9, 5 * 10**9)] == [4 * 10**9, 5 * 10**9]
+    footprint = settings(*flags, "3GB,2GB").lease_spec().footprint
+    assert (footprint.load_peak_bytes, footprint.steady_bytes) == (3 * 10**9, 2 * 10**9)
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
         ("a/b: {load_peak: 1GB, steady: 1GB, residu: 1}", "footprints.yaml:1: a/b.residu"),
         ("a/b:\n  load_peak: much\n  steady: 1GB\n", "footprints.yaml:2: a/b.load_peak"),
+        ("a/b/fp31: {load_peak: 1GB, steady: 1GB}", "footprints.yaml:1: 'a/b/fp31' names no model"),
         ("- 1", "must be a map"),
         ("a/b: [", "not valid YAML"),
     ],
