@@ -12,7 +12,7 @@ import contextlib
 import logging
 import os
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -58,12 +58,14 @@ class Peer:
     """Sender of a message: where to answer, and which process and user the kernel says it is.
 
     `identity` is the serial of its connection, never reused. `pid` is 0 for a process that cannot
-    be seen from here.
+    be seen from here. `envelope` is the message's own: a REQ that stopped waiting for an answer
+    tells by it that a late one is not for its next request.
     """
 
     identity: int
     pid: int
     uid: int
+    envelope: bytes = field(default=b"", compare=False)
 
 
 Handler = Callable[[Peer, Message], Awaitable[None]]
@@ -196,7 +198,7 @@ class RouterServer:
         """Answer or push. A peer that is gone gets nothing; one that does not read is hung
         up on."""
         client = self._clients.get(peer.identity)
-        if client is not None and not client.connection.send(pack(message)):
+        if client is not None and not client.connection.send(pack(message), peer.envelope):
             client.connection.close("it does not read its answers")
 
     # -- for the router
@@ -220,9 +222,10 @@ class RouterServer:
             connection.admit()
         waiting.count += 1
         waiting.size_bytes += size
-        task = asyncio.Task(
-            self._run(client.peer, message, waiting, size), loop=loop, eager_start=True
-        )
+        peer = client.peer
+        if connection.envelope:
+            peer = replace(peer, envelope=connection.envelope)
+        task = asyncio.Task(self._run(peer, message, waiting, size), loop=loop, eager_start=True)
         if not task.done():
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)

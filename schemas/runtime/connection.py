@@ -110,7 +110,8 @@ class Connection(asyncio.Protocol):
         self._wire = ServerConnection(
             WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes)
         )
-        self._delimiter = False
+        self.envelope = b""
+        """Of the last message received. Answers to it repeat it (`zmtp.Message.envelope`)."""
         self._resting = False  # over its rate
         self._clogged = False  # bytes wait for the peer to read
         self._finishing = False  # nothing more is sent
@@ -133,14 +134,14 @@ class Connection(asyncio.Protocol):
         self._wire.limits = WireLimits(limits.message_max_bytes, limits.skip_max_bytes)
         self._router.admitted(self)
 
-    def send(self, payload: bytes) -> bool:
-        """Queue one message, in the envelope of the last one received. False: the peer is gone or
-        does not read.
+    def send(self, payload: bytes, envelope: bytes | None = None) -> bool:
+        """Queue one message, in the envelope of the last one received unless another one is given.
+        False: the peer is gone or does not read.
         """
         transport = self._transport
         if transport is None or self._finishing or transport.is_closing():
             return False
-        frames = encode(payload, self._delimiter)
+        frames = encode(payload, self.envelope if envelope is None else envelope)
         if self._clogged:
             if not self._may_queue(len(frames)):
                 self._count_out()
@@ -232,7 +233,7 @@ class Connection(asyncio.Protocol):
         try:
             match event:  # 2
                 case Message() | Oversize() if self._router.receiving:
-                    self._delimiter = event.delimiter
+                    self.envelope = event.envelope
                     payload = event.payload if isinstance(event, Message) else event
                     within_rate = self._router.handler.received(self, payload)
                 case PeerReady():

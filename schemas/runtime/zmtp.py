@@ -23,8 +23,12 @@ bytes.
 CONTEXT_MAX_BYTES = 16
 """Longest context of a PING, which its PONG repeats (specification, "Connection heartbeating")."""
 FRAMES_MAX = 8
-"""Frames of one message. A DEALER sends one, a REQ two; a few more are answered, without end they
-are an attack.
+"""Frames of one message. A DEALER sends one, a REQ two, a REQ with a request id three, and each
+proxy on the way adds one; without end they are an attack.
+"""
+ENVELOPE_MAX_BYTES = 512
+"""Bytes of the frames before the payload, which the answer repeats. A request id has 4 bytes, a
+proxy's routing id at most 255.
 """
 PEER_TYPES = frozenset((b"DEALER", b"REQ"))
 
@@ -65,15 +69,15 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One complete message. `delimiter`: an empty frame stood before the payload, as a REQ sends it
-    and expects it back.
+    """One complete message. `envelope`: the frames up to an empty one, as they go over the wire;
+    a REQ expects them back before the answer.
 
-    `payload` is the last frame; empty where the frames were neither `[payload]` nor `["",
+    `payload` is the last frame; empty where the frames were neither `[payload]` nor `[…, "",
     payload]`.
     """
 
     payload: bytes | bytearray
-    delimiter: bool
+    envelope: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +88,7 @@ class Oversize:
 
     size: int
     limit: int
-    delimiter: bool
+    envelope: bytes = b""
 
 
 Event = PeerReady | Heartbeat | Message | Oversize
@@ -116,8 +120,8 @@ class ServerConnection:
         self._frames = 0
         self._size = 0
         self._skipping = False
-        self._delimiter = False
-        self._payload: bytes | bytearray = b""
+        self._envelope = b""
+        self._enveloped = 0  # number of the frame that ended the envelope; 0: none has
 
     def feed(self, data: bytes) -> None:
         """Take bytes from the peer, behind those that are unread."""
@@ -157,7 +161,7 @@ class ServerConnection:
                 event = self._end_frame()  # 4
         self.unread_bytes = len(self._data) - self._at
         body = 0 if self._body is None else len(self._body)
-        self.kept_bytes = self.unread_bytes + body + len(self._payload)
+        self.kept_bytes = self.unread_bytes + body + len(self._envelope)
         return event
 
     # -- greeting
@@ -217,7 +221,6 @@ class ServerConnection:
                 )
             if self._size > self.limits.message_max_bytes:
                 self._skipping = True
-                self._payload = b""
         return True
 
     def _end_frame(self) -> Event | None:
@@ -226,22 +229,32 @@ class ServerConnection:
         self._body = None
         if self._flags & COMMAND:
             return self._command(bytes(body))
-        more = bool(self._flags & MORE)
-        if self._frames == 1 and more and not body and not self._skipping:
-            self._delimiter = True
-        self._payload = b"" if self._skipping else body
-        if more:
+        if self._flags & MORE:
+            if not self._enveloped:
+                self._add_to_envelope(body)
             return None
-        form_known = self._frames == 1 or (self._frames == 2 and self._delimiter)
+        envelope = self._envelope if self._enveloped else b""
         event: Event
         if self._skipping:
-            event = Oversize(self._size, self.limits.message_max_bytes, self._delimiter)
+            event = Oversize(self._size, self.limits.message_max_bytes, envelope)
         else:
-            event = Message(self._payload if form_known else b"", self._delimiter)
-        self._frames = self._size = 0
-        self._skipping = self._delimiter = False
-        self._payload = b""
+            form_known = self._frames == self._enveloped + 1
+            event = Message(body if form_known else b"", envelope)
+        self._frames = self._size = self._enveloped = 0
+        self._skipping = False
+        self._envelope = b""
         return event
+
+    def _add_to_envelope(self, frame: bytes | bytearray) -> None:
+        """Keep a frame before the payload; an empty one ends the envelope."""
+        size = len(frame)
+        if self._skipping or size > 255 or len(self._envelope) + 2 + size > ENVELOPE_MAX_BYTES:
+            # not an envelope: no later frame is taken for one, or for the payload behind it
+            self._envelope, self._enveloped = b"", FRAMES_MAX
+            return
+        self._envelope += bytes((MORE, size)) + frame
+        if not size:
+            self._enveloped = self._frames
 
     # -- commands
     def _command(self, body: bytes) -> Event:
@@ -267,14 +280,11 @@ class ServerConnection:
         raise ZmtpError(f"an unexpected command {name[:32].decode('latin-1')!a}")
 
 
-def encode(payload: bytes, delimiter: bool) -> bytes:
-    """Return one message as it goes over the wire, behind an empty frame where the peer is a
-    REQ.
-    """
-    head = b"\x01\x00" if delimiter else b""
+def encode(payload: bytes, envelope: bytes = b"") -> bytes:
+    """Return one message as it goes over the wire, behind the envelope of what it answers."""
     if len(payload) < 256:
-        return head + bytes((0, len(payload))) + payload
-    return head + b"\x02" + _LONG_SIZE.pack(len(payload)) + payload
+        return envelope + bytes((0, len(payload))) + payload
+    return envelope + b"\x02" + _LONG_SIZE.pack(len(payload)) + payload
 
 
 def _check_properties(data: bytes) -> None:

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import atheris
 
-from vram_arbiter.schemas.plain import Message
-
 with atheris.instrument_imports(include=["vram_arbiter.schemas.runtime.zmtp"]):
     from vram_arbiter.schemas.runtime.zmtp import (
         COMMAND_MAX_BYTES,
+        ENVELOPE_MAX_BYTES,
         GREETING,
         READY,
         Event,
@@ -34,6 +33,7 @@ REQ = b"\x04&\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ\x08Identity\x00\x00\x00
 SEEDS = [
     GREETED + DEALER + b"\x00\x05hello\x04\x07\x04PING\x00\x00\x04\x05\x04PONG",
     GREETED + REQ + b"\x01\x00\x00\x05hello",
+    GREETED + REQ + b"\x01\x04\x00\x00\x00\x07\x01\x00\x00\x05hello",
     GREETED + DEALER + b"\x02" + (400).to_bytes(8) + bytes(400) + b"\x00\x00",
     GREETED + DEALER + b"\x01\x01a\x00\x01b\x01\x00\x01\x00\x00\x01b",
     GREETED + DEALER + b"\x03" + (200).to_bytes(8) + bytes(200) + b"\x00\xc8" + bytes(200),
@@ -50,13 +50,15 @@ def read(data: bytes, pieces: int) -> list[Event | str]:
         try:
             while (event := connection.next_event()) is not None:
                 found.append(
-                    Message(bytes(event.payload), event.delimiter)
+                    Message(bytes(event.payload), event.envelope)
                     if isinstance(event, Message)
                     else event
                 )
         except ZmtpError:
             return [*found, "error"]
-        if connection.kept_bytes > LIMITS.message_max_bytes + COMMAND_MAX_BYTES:
+        if connection.kept_bytes > (
+            LIMITS.message_max_bytes + COMMAND_MAX_BYTES + ENVELOPE_MAX_BYTES
+        ):
             raise AssertionError(f"{connection.kept_bytes} bytes are kept")
         if len(connection.outgoing()) > len(GREETING) + len(READY) + 2 * size:
             raise AssertionError("the answer is longer than the question")

@@ -69,7 +69,7 @@ def _hello(path: str) -> socket.socket:
         "instance": str(time.monotonic_ns()),
     }
     peer = shaken(path)
-    peer.sendall(encode(msgpack.packb(hello), False))
+    peer.sendall(encode(msgpack.packb(hello)))
     return peer
 
 
@@ -146,7 +146,7 @@ def unknown_keys(path: str, end_s: float) -> None:
         path,
         end_s,
         _hello,
-        cycle([encode(msgpack.packb({"op": "status", "id": 2, **keys}), False)]),
+        cycle([encode(msgpack.packb({"op": "status", "id": 2, **keys}))]),
     )
 
 
@@ -154,12 +154,12 @@ def empty_maps(path: str, end_s: float) -> None:
     """Requests of a mebibyte of empty maps."""
     listed = msgpack.packb({"op": "status", "id": 2, "x": []})[:-1]
     listed += b"\xdd" + (1_000_000).to_bytes(4) + b"\x80" * 1_000_000
-    _pour(path, end_s, _hello, cycle([encode(listed, False)]))
+    _pour(path, end_s, _hello, cycle([encode(listed)]))
 
 
 def slow_reader(path: str, end_s: float) -> None:
     """Requests with long answers, of which none is read."""
-    ask = encode(msgpack.packb({"op": "history", "id": 3, "after": 0, "limit": 1000}), False)
+    ask = encode(msgpack.packb({"op": "history", "id": 3, "after": 0, "limit": 1000}))
     _pour(path, end_s, _hello, cycle([ask * 100]))
 
 
@@ -170,9 +170,7 @@ def pings(path: str, end_s: float) -> None:
 
 def flood(path: str, end_s: float) -> None:
     """Small valid requests as fast as they go, answers unread until the connection is full."""
-    _pour(
-        path, end_s, _hello, cycle([encode(msgpack.packb({"op": "ping", "id": 4}), False) * 1000])
-    )
+    _pour(path, end_s, _hello, cycle([encode(msgpack.packb({"op": "ping", "id": 4})) * 1000]))
 
 
 ATTACKS: dict[str, Callable[[str, float], None]] = {

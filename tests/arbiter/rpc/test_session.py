@@ -527,13 +527,13 @@ def test_a_large_message_is_charged_for_its_size(session_bench: Bench) -> None:
     assert code(session_bench.ask("ping", pad="x" * 3000)) == "bad_request"  # 1 + 2
     assert sum(session_bench.ask("ping")["ok"] for _ in range(150)) == 96
     session_bench.now += 1
-    assert code(session_bench.raw(Oversize(1 << 30, 4096, delimiter=False))) == "message_too_large"
+    assert code(session_bench.raw(Oversize(1 << 30, 4096))) == "message_too_large"
     session_bench.now += 100
     assert code(session_bench.ask("ping")) == "limit_exceeded", "a gigabyte is paid for"
 
 
 def test_a_message_that_was_skipped_is_answered(session_bench: Bench) -> None:
-    refused = session_bench.raw(Oversize(70_000, 65_536, delimiter=False))
+    refused = session_bench.raw(Oversize(70_000, 65_536))
     assert code(refused) == "message_too_large"
     assert refused["error"]["details"] == {"size_bytes": 70_000, "limit_bytes": 65_536}
     assert "hello" in refused["error"]["hint"], "a stranger may send less than a client"
@@ -552,7 +552,7 @@ def test_one_over_the_rate_is_told_so_whatever_it_sent(session_bench: Bench) -> 
         (msgpack.packb([7]), None),
         (b"\xc1", None),
         (msgpack.packb({"op": "ping", "id": 8, "pad": "x" * 70_000}), None),
-        (Oversize(1 << 20, 4096, delimiter=False), None),
+        (Oversize(1 << 20, 4096), None),
     ):
         reply = session_bench.raw(payload)
         assert (code(reply), reply["re"]) == ("limit_exceeded", request)

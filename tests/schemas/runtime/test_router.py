@@ -118,7 +118,7 @@ class Raw:
         return self
 
     async def echo(self, payload: bytes) -> bytes:
-        self.writer.write(encode(payload, False))
+        self.writer.write(encode(payload))
         head = await self.reader.readexactly(2)
         return await self.reader.readexactly(head[1])
 
@@ -135,9 +135,13 @@ class Raw:
         self.writer.transport.abort()
 
 
-def ask_with_libzmq(path: Path, kind: int, *payloads: bytes) -> list[bytes]:
+def ask_with_libzmq(
+    path: Path, kind: int, *payloads: bytes, options: tuple[int, ...] = ()
+) -> list[bytes]:
     """What an unmodified libzmq client is answered. Blocks: for a thread."""
     with zmq.Context() as context, context.socket(kind) as peer:
+        for option in options:
+            peer.setsockopt(option, 1)
         peer.setsockopt(zmq.LINGER, 0)
         peer.setsockopt(zmq.RCVTIMEO, int(WAIT_S * 1000))
         peer.connect(f"ipc://{path}")
@@ -148,14 +152,27 @@ def ask_with_libzmq(path: Path, kind: int, *payloads: bytes) -> list[bytes]:
         return answers
 
 
-@pytest.mark.parametrize("kind", [zmq.DEALER, zmq.REQ])
-def test_an_unmodified_peer_is_answered(path: Path, kind: int) -> None:
-    payloads = (b"", b"a", b"b" * 255, b"c" * 256, b"d" * (1 << 20))
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (zmq.DEALER, ()),
+        (zmq.REQ, ()),
+        (zmq.REQ, (zmq.REQ_CORRELATE,)),
+        (zmq.REQ, (zmq.REQ_CORRELATE, zmq.REQ_RELAXED)),
+    ],
+    ids=["DEALER", "REQ", "REQ_CORRELATE", "REQ_RELAXED"],
+)
+def test_an_unmodified_peer_is_answered(path: Path, kind: int, options: tuple[int, ...]) -> None:
+    """A REQ with request ids was answered without them, discarded every answer and waited on."""
+    payloads = (b"", b"a", b"b" * 255, b"c" * 256, b"d" * ((1 << 20) - 4))
 
     async def scenario() -> None:
         handler = Echo()
         async with serving_router(path, handler):
-            assert await asyncio.to_thread(ask_with_libzmq, path, kind, *payloads) == list(payloads)
+            answers = await asyncio.to_thread(
+                ask_with_libzmq, path, kind, *payloads, options=options
+            )
+            assert answers == list(payloads)
             await comes_true(lambda: len(handler.ended) == 1)
 
     with_router(scenario)
@@ -238,10 +255,10 @@ def test_a_stranger_may_send_little_until_it_is_admitted(path: Path) -> None:
         async with serving_router(path, handler):
             raw = await (await Raw.connect(path)).ready()
             assert await raw.echo(b"hello") == b"hello"
-            raw.writer.write(encode(bytes(1 << 17), False))
-            assert await raw.reader.readexactly(2 + 15) == encode(b"oversize 131072", False)
+            raw.writer.write(encode(bytes(1 << 17)))
+            assert await raw.reader.readexactly(2 + 15) == encode(b"oversize 131072")
             next(iter(handler.open.values())).admit()
-            raw.writer.write(encode(bytes(1 << 17), False))
+            raw.writer.write(encode(bytes(1 << 17)))
             assert len(await raw.reader.readexactly(9 + (1 << 17))) == 9 + (1 << 17)
             raw.close()
 
@@ -255,7 +272,7 @@ def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(pa
         handler = Echo()
         async with serving_router(path, handler) as router:
             slow = await (await Raw.connect(path)).ready()
-            slow.writer.write(encode(bytes(1 << 19), False) * 64)
+            slow.writer.write(encode(bytes(1 << 19)) * 64)
             await comes_true(lambda: any(user.out_bytes for user in router._users.values()))
             connection = next(iter(handler.open.values()))
             handled = len(handler.received_from)
@@ -366,9 +383,7 @@ def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) 
             await comes_true(lambda: len(handler.open) == 2)
             flooder, other = handler.open
             reading = asyncio.create_task(flood.reader.read(-1))
-            flood.writer.write(
-                encode(b"", False) * 20_000
-            )  # both lie in their sockets from here on
+            flood.writer.write(encode(b"") * 20_000)  # both lie in their sockets from here on
             assert await honest.echo(b"now") == b"now"
             assert handler.received_from.index(other) < 2_000  # a turn of the flood, or two
             await comes_true(lambda: handler.received_from.count(flooder) == 20_000)
@@ -384,8 +399,8 @@ def test_a_connection_over_its_rate_rests_and_loses_nothing(path: Path) -> None:
         handler = Echo(within_rate=False)
         async with serving_router(path, handler):
             raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(encode(b"abc", False) * 20)
-            assert await raw.reader.readexactly(20 * 5) == encode(b"abc", False) * 20
+            raw.writer.write(encode(b"abc") * 20)
+            assert await raw.reader.readexactly(20 * 5) == encode(b"abc") * 20
             raw.close()
 
     with_router(scenario)
@@ -424,7 +439,7 @@ def test_a_defect_of_the_handler_costs_one_answer(path: Path) -> None:
     async def scenario() -> None:
         async with serving_router(path, Echo()):
             raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(encode(b"fail", False))
+            raw.writer.write(encode(b"fail"))
             assert await raw.echo(b"next") == b"next"
             raw.close()
 
@@ -451,7 +466,7 @@ def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) ->
         handler = Echo()
         async with serving_router(path, handler) as router:
             raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(encode(bytes(1 << 19), False))
+            raw.writer.write(encode(bytes(1 << 19)))
             await comes_true(lambda: bool(handler.received_from))
             ending = asyncio.create_task(router.aclose(WAIT_S))
             assert len(await raw.reader.read(-1)) == 9 + (1 << 19)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from vram_arbiter.schemas.runtime.zmtp import (
     COMMAND_MAX_BYTES,
+    ENVELOPE_MAX_BYTES,
     FRAMES_MAX,
     GREETING,
     READY,
@@ -29,6 +30,7 @@ DEALER_READY = b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity
 REQ_READY = b"\x04&\x05READY\x0bSocket-Type\x00\x00\x00\x03REQ\x08Identity\x00\x00\x00\x00"
 DEALER_HELLO = b"\x00\x05hello"
 REQ_HELLO = b"\x01\x00\x00\x05hello"
+CORRELATED_HELLO = b"\x01\x04\xa2\x1b\x07\x00\x01\x00\x00\x05hello"  # ZMQ_REQ_CORRELATE
 PING = b"\x04\x07\x04PING\x00\x00"
 
 
@@ -63,20 +65,24 @@ def ready(*properties: tuple[bytes, bytes]) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("recorded", "delimiter"),
-    [(DEALER_READY + DEALER_HELLO, False), (REQ_READY + REQ_HELLO, True)],
-    ids=["DEALER", "REQ"],
+    ("recorded", "envelope"),
+    [
+        (DEALER_READY + DEALER_HELLO, b""),
+        (REQ_READY + REQ_HELLO, b"\x01\x00"),
+        (REQ_READY + CORRELATED_HELLO, b"\x01\x04\xa2\x1b\x07\x00\x01\x00"),
+    ],
+    ids=["DEALER", "REQ", "REQ with a request id"],
 )
 @pytest.mark.parametrize("piece", [1, 7, 1000])
 def test_recorded_peers_are_understood_in_pieces_of_any_size(
-    recorded: bytes, delimiter: bool, piece: int
+    recorded: bytes, envelope: bytes, piece: int
 ) -> None:
     data = PEER_GREETING + recorded + PING
     connection = ServerConnection(LIMITS)
     found = [
         e for at in range(0, len(data), piece) for e in events(connection, data[at : at + piece])
     ]
-    assert found == [PeerReady(), Message(b"hello", delimiter), Heartbeat()]
+    assert found == [PeerReady(), Message(b"hello", envelope), Heartbeat()]
     assert connection.outgoing() == GREETING + READY + b"\x04\x05\x04PONG"
     assert connection.outgoing() == b""
     assert connection.kept_bytes == 0
@@ -155,18 +161,20 @@ def test_an_identity_of_the_peer_is_read_over() -> None:
     assert events(connection, data) == [PeerReady()]
 
 
-@pytest.mark.parametrize("delimiter", [False, True])
+@pytest.mark.parametrize("envelope", [b"", b"\x01\x00", b"\x01\x04abcd\x01\x00"])
 def test_a_message_over_the_limit_is_skipped_unkept_and_the_next_one_is_read(
-    delimiter: bool,
+    envelope: bytes,
 ) -> None:
     connection = greeted()
-    head = (b"\x01\x00" if delimiter else b"") + b"\x02" + (3000).to_bytes(8)
+    head = envelope + b"\x02" + (3000).to_bytes(8)
     assert events(connection, head) == []
     for _ in range(30):
-        assert connection.kept_bytes == 0
+        assert connection.kept_bytes == len(envelope)
         found = events(connection, bytes(100))
-    assert found == [Oversize(3000, 1000, delimiter)]
-    assert events(connection, DEALER_HELLO) == [Message(b"hello", False)]
+    size = 3000 + sum(envelope[1::6])  # the request id counts, too
+    assert found == [Oversize(size, 1000, envelope)]
+    assert events(connection, DEALER_HELLO) == [Message(b"hello", b"")]
+    assert connection.kept_bytes == 0
 
 
 def test_the_limit_counts_all_frames_of_a_message() -> None:
@@ -175,15 +183,28 @@ def test_the_limit_counts_all_frames_of_a_message() -> None:
     frame = b"\x03" + (600).to_bytes(8) + bytes(600)
     assert events(connection, frame + frame) == []
     assert connection.kept_bytes == 0
-    assert events(connection, b"\x00\x00") == [Oversize(1200, 1000, False)]
+    assert events(connection, b"\x00\x00") == [Oversize(1200, 1000, b"")]
 
 
-def test_an_envelope_of_another_form_arrives_as_an_empty_payload() -> None:
-    """The server answers it with a typed error instead of guessing which frame was meant."""
+@pytest.mark.parametrize(
+    ("frames", "found"),
+    [
+        (b"\x01\x01a\x00\x01b", (b"", b"")),  # no empty frame
+        (b"\x01\x00\x01\x00\x00\x01b", (b"", b"\x01\x00")),  # two payloads
+        (b"\x01\x01a\x01\x00\x01\x01b\x00\x01c", (b"", b"\x01\x01a\x01\x00")),
+        (b"\x01\xff" + bytes(255) + b"\x01\xff" + bytes(255) + REQ_HELLO, (b"", b"")),  # too long
+        (b"\x03" + (256).to_bytes(8) + bytes(256) + REQ_HELLO, (b"", b"")),
+        (b"\x01\x05proxy" + CORRELATED_HELLO, (b"hello", b"\x01\x05proxy" + CORRELATED_HELLO[:8])),
+    ],
+)
+def test_what_stands_before_the_payload_is_an_envelope_or_nothing_is_taken(
+    frames: bytes, found: tuple[bytes, bytes]
+) -> None:
+    """Another form arrives as an empty payload: the server answers it with a typed error instead of
+    guessing which frame was meant."""
     connection = greeted()
-    assert events(connection, b"\x01\x01a\x00\x01b") == [Message(b"", False)]
-    assert events(connection, b"\x01\x00\x01\x00\x00\x01b") == [Message(b"", True)]
-    assert events(connection, b"\x01\x00\x00\x01b") == [Message(b"b", True)]
+    assert events(connection, frames) == [Message(*found)]
+    assert events(connection, REQ_HELLO) == [Message(b"hello", b"\x01\x00")]
 
 
 def test_a_ping_is_answered_with_its_context_and_a_pong_is_not() -> None:
@@ -199,18 +220,21 @@ def test_a_ping_is_answered_with_its_context_and_a_pong_is_not() -> None:
 
 @given(
     payloads=st.lists(st.binary(max_size=700), max_size=6),
-    delimiter=st.booleans(),
+    request_ids=st.none() | st.lists(st.binary(min_size=1, max_size=80), max_size=5),
     pieces=st.lists(st.integers(1, 400), max_size=20),
 )
 def test_what_is_encoded_is_read_again(
-    payloads: list[bytes], delimiter: bool, pieces: list[int]
+    payloads: list[bytes], request_ids: list[bytes] | None, pieces: list[int]
 ) -> None:
-    data = b"".join(encode(payload, delimiter) for payload in payloads)
+    envelope = b""
+    for frame in () if request_ids is None else (*request_ids, b""):
+        envelope += bytes((1, len(frame))) + frame
+    data = b"".join(encode(payload, envelope) for payload in payloads)
     connection, found, at = greeted(), [], 0
     for piece in [*pieces, len(data)]:
         found += events(connection, data[at : at + piece])
         at += piece
-    assert found == [Message(payload, delimiter) for payload in payloads]
+    assert found == [Message(payload, envelope) for payload in payloads]
 
 
 @given(
@@ -218,7 +242,7 @@ def test_what_is_encoded_is_read_again(
         st.one_of(
             st.binary(max_size=80),
             st.sampled_from(
-                [PEER_GREETING, DEALER_READY, REQ_READY, DEALER_HELLO, REQ_HELLO, PING]
+                [PEER_GREETING, DEALER_READY, REQ_READY, DEALER_HELLO, REQ_HELLO, CORRELATED_HELLO]
             ),
             st.builds(lambda size: b"\x02" + size.to_bytes(8), st.integers(0, 5000)),
             st.builds(bytes, st.integers(0, 3000)),
@@ -234,7 +258,8 @@ def test_any_bytes_give_events_or_one_error_and_little_is_kept(data: list[bytes]
             for event in events(connection, piece):
                 if isinstance(event, Message):
                     assert len(event.payload) <= LIMITS.message_max_bytes
-            assert connection.kept_bytes <= LIMITS.message_max_bytes + COMMAND_MAX_BYTES
+            kept_max = LIMITS.message_max_bytes + COMMAND_MAX_BYTES + ENVELOPE_MAX_BYTES
+            assert connection.kept_bytes <= kept_max
             assert len(connection.outgoing()) <= len(GREETING) + len(READY) + 2 * len(piece)
     except ZmtpError:
         pass
