@@ -8,6 +8,8 @@ Op family (detector, scene VLM, reward)   {"op": "ping" | "load" | "detect" | "q
 Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "get_action" |
 "unload" | "shutdown", "data": …}
                                      → the result | {"error": "Type: message", "code": …, …}
+                                     without "id": `get_action` → [the result, {}], an error →
+                                     {"error": "Type: message"}, as the field's clients expect
 
 `detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the card, a
 load, another request) are not looked at. Every request may carry "id" (echoed as "re": a DEALER may

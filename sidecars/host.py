@@ -21,7 +21,7 @@ from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ModelProcesses
 from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings
-from vram_arbiter.sidecars.wires import Wire, error_reply
+from vram_arbiter.sidecars.wires import Wire, unread_reply
 
 _log = logging.getLogger("sidecars")
 
@@ -61,7 +61,9 @@ class SidecarHost:
                     AsyncClient(settings.name, endpoint=settings.arbiter)
                 )
             server = await stack.enter_async_context(
-                RouterServer(settings.endpoint, error_reply, work_share=WORK_SHARE)
+                RouterServer(
+                    settings.endpoint, unread_reply(self._adapter.ops), work_share=WORK_SHARE
+                )
             )
             self._processes.preload(self._adapter.modules)
             residency = self._residency = Residency(settings, self._processes.start, client)

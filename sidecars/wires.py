@@ -2,12 +2,17 @@
 
 Shapes are in `schemas.sidecar`; the host performs them. Every bad message gets a typed error; none
 ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decides.
+
+A request without `id` comes from a client of the field, which knows its family's shapes only: a
+policy's answer is `[actions, info]`, and an error of the endpoint family is a map of one key, which
+such a client tells by its size from a map of actions.
 """
 
+import functools
 import logging
 import time
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from pydantic import ValidationError
 
@@ -37,7 +42,9 @@ from vram_arbiter.schemas.sidecar import (
 
 PENDING_MAX = 32  # model requests that wait or run; with more, `ping` would have to wait too
 Call = OpRequest | EndpointCall
-Send = Callable[[Peer, Message], Awaitable[None]]
+Family = Literal["op", "endpoint"]
+type Reply = Message | list[Message]
+Send = Callable[[Peer, Reply], Awaitable[None]]
 _log = logging.getLogger("sidecars")
 
 
@@ -71,19 +78,23 @@ class Wire:
         self._pending = 0
 
     async def handle(self, peer: Peer, message: Message) -> None:
+        number, family = message.get("id"), family_of(message)
+        of_field = not isinstance(number, int)
+        reply: Reply
         try:
             call = parse(message, self._host.model_ops)
             reply = await self._answer(call, message)
+            if of_field and name_of(call) == "get_action":
+                reply = [reply, {}]
         except VramError as error:
-            reply = error_reply(error)
+            reply = error_reply(error, family, of_field=of_field)
         except Exception as error:  # noqa: BLE001  the outermost loop of a server
             _log.exception("internal error while answering")
-            reply = error_reply(
-                InternalError(
-                    f"{type(error).__name__}: {error}", hint="this is a defect; see the log"
-                )
+            defect = InternalError(
+                f"{type(error).__name__}: {error}", hint="this is a defect; see the log"
             )
-        if isinstance(number := message.get("id"), int):
+            reply = error_reply(defect, family, of_field=of_field)
+        if isinstance(reply, dict) and not of_field:
             reply = {**reply, "re": number}
         await self._send(peer, reply)
 
@@ -136,7 +147,7 @@ class Wire:
 def parse(message: Message, model_ops: frozenset[str]) -> Call:
     """Parse a decoded message. Raises UnknownOp (details.known) or BadRequest (details.fields)."""
     known = sorted({"ping", "load", "unload", "shutdown"} | model_ops)
-    family = "endpoint" if "endpoint" in message else "op"
+    family = family_of(message)
     name = message.get(family)
     if not isinstance(name, str):
         raise BadRequest(
@@ -170,11 +181,26 @@ def name_of(call: Call) -> str:
     return call.endpoint if isinstance(call, EndpointCall) else call.op
 
 
-def error_reply(error: VramError) -> Message:
-    """Return the field's `{"ok": false, "error": "Type: message"}` with code, hint and details
-    added."""
-    wire = error.to_wire()
-    return {"ok": False, **wire, "error": f"{type(error).__name__}: {error.message}"}
+def family_of(message: Message) -> Family:
+    return "endpoint" if "endpoint" in message else "op"
+
+
+def error_reply(error: VramError, family: Family, *, of_field: bool) -> Message:
+    """Return the field's `{"ok": false, "error": "Type: message"}`, without `ok` in the endpoint
+    family, with code, hint and details added where the client takes them."""
+    text = f"{type(error).__name__}: {error.message}"
+    if family == "op":
+        return {"ok": False, **error.to_wire(), "error": text}
+    if of_field:
+        return {"error": f"{text} ({error.hint})" if error.hint else text}
+    return {**error.to_wire(), "error": text}
+
+
+def unread_reply(model_ops: frozenset[str]) -> Callable[[VramError], Message]:
+    """Return how a host with these operations answers what it cannot read: as its clients expect an
+    error of their family."""
+    family: Family = "endpoint" if model_ops <= {"get_action", "reset"} else "op"
+    return functools.partial(error_reply, family=family, of_field=True)
 
 
 def _unpack(data: Any) -> Any:
@@ -203,7 +229,7 @@ def _timeout_s(call: Call) -> float | None:
     return None
 
 
-def _field(problem: JsonMap, family: str) -> str:
+def _field(problem: JsonMap, family: Family) -> str:
     where = (
         problem["loc"][1:] if family == "op" else problem["loc"]
     )  # a union puts its tag, the op, in front

@@ -2,10 +2,10 @@
 
 import msgpack
 
-from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.plain import JsonMap, Message
 
 
-def pack(message: JsonMap) -> bytes:
+def pack(message: JsonMap | list[Message]) -> bytes:
     """Texts that UTF-8 has no bytes for (halves of surrogate pairs: undecodable file names,
     arguments) are sent as `\\udcff`: an emergency stop is not lost for its words. Raises TypeError,
     ValueError and OverflowError for what msgpack does not carry."""

@@ -194,7 +194,7 @@ class RouterServer:
         finally:
             self._router.stop_receiving()
 
-    async def send(self, peer: Peer, message: Message) -> None:
+    async def send(self, peer: Peer, message: Message | list[Message]) -> None:
         """Answer or push. A peer that is gone gets nothing; one that does not read is hung
         up on."""
         client = self._clients.get(peer.identity)

@@ -12,7 +12,7 @@ from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
 from vram_arbiter.schemas.sidecar import PICTURES_MAX, DetectOp, EndpointCall, ScoreOp
 from vram_arbiter.sidecars.images import decode, within
-from vram_arbiter.sidecars.wires import PENDING_MAX, Wire, error_reply, parse
+from vram_arbiter.sidecars.wires import PENDING_MAX, Wire, parse, unread_reply
 
 PNG = b"\x89PNG\r\n\x1a\n"
 OPS = frozenset({"detect", "get_action", "reset"})
@@ -77,7 +77,7 @@ def test_both_families_reach_the_host():
         {"op": "load", "timeout_s": 2.0, "traceparent": "00-1-2-03"},
         {"endpoint": "load", "data": {"timeout_s": 3}},
         {"op": "detect", "image": PNG, "query": "cube", "mode": "fast", "token": [1, 2]},
-        {"endpoint": "get_action", "data": {"observation": {}, "options": None}, "api_token": None},
+        {"endpoint": "get_action", "id": 8, "data": {"observation": {}}, "api_token": None},
         {"endpoint": "unload"},
         {"op": "shutdown"},
     )
@@ -119,12 +119,12 @@ def test_both_families_reach_the_host():
         ({"op": "load", "timeout_s": float("inf")}, "bad_request", "timeout_s"),
         ({"endpoint": "load", "data": {"timeout_s": "soon"}}, "bad_request", "timeout_s"),
         ({"endpoint": "get_action", "data": [1]}, "bad_request", "data"),
-        ({"op": "ping", "id": "seven"}, "bad_request", "id"),
+        ({"op": "ping", "id": 1, "token": 7}, "bad_request", "token"),
     ],
 )
 def test_a_bad_message_gets_a_typed_error_that_names_the_field(message, code, told):
-    (reply,), host = talk(message)
-    assert (reply["ok"], reply["code"]) == (False, code)
+    (reply,), host = talk({"id": 1, **message})
+    assert (reply.get("ok", False), reply["code"]) == (False, code)
     assert told in reply["error"] + str(reply["details"])
     assert host.calls == []
 
@@ -151,11 +151,17 @@ def npy(array, **options):
     return {"__ndarray_class__": True, "as_npy": stream.getvalue()}
 
 
+def picture_array():
+    import numpy as np
+
+    return np.zeros((1, 1, 8, 8, 3), np.uint8)
+
+
 def test_arrays_go_both_ways_and_objects_never():
     np = pytest.importorskip("numpy")
     observation = {"state": npy(np.arange(3.0)), "task": "grab"}
     (reply,), host = talk(
-        {"endpoint": "get_action", "data": {"observation": observation}},
+        {"endpoint": "get_action", "data": {"observation": observation}, "id": 1},
         answer={"action": npy(np.zeros((2, 6), np.float32))},
     )
     assert (host.calls[0][1].data["observation"]["state"] == np.arange(3.0)).all()
@@ -170,7 +176,7 @@ def test_arrays_go_both_ways_and_objects_never():
         {"__ndarray_class__": True, "as_npy": bomb},
     ):
         (reply,), host = talk({"endpoint": "get_action", "data": {"observation": {"state": bad}}})
-        assert reply["code"] == "bad_request"
+        assert reply["error"].startswith("BadRequest: ")
         assert host.calls == []
 
 
@@ -216,8 +222,22 @@ def test_too_many_waiting_requests_are_refused_and_ping_still_answers():
     asyncio.run(run())
 
 
-def test_error_replies_have_the_fields_form():
-    assert error_reply(ModelError("no", hint="try"))["error"] == "ModelError: no"
+def test_clients_of_the_field_get_their_familys_shapes():
+    """The field's policy clients read a map of two keys as actions, and unpack a pair; both ended
+    in a KeyError far from its cause."""
+    act = {"endpoint": "get_action", "data": {"observation": {}, "options": None}}
+    replies, _ = talk(act, {**act, "id": 5}, answer={"action": [1.0]})
+    assert replies == [[{"action": [1.0]}, {}], {"action": [1.0], "re": 5}]
+    detect = {"op": "detect", "image": PNG, "query": "x"}
+    error = ModelError("no", hint="try")
+    replies, _ = talk(act, {"endpoint": "dance"}, {**act, "id": 5}, detect, answer=error)
+    policy, unknown, ours, detector = replies
+    assert policy == {"error": "ModelError: no (try)"}
+    assert list(unknown) == ["error"]
+    assert (ours["error"], ours["code"], ours["re"]) == ("ModelError: no", "model_error", 5)
+    assert (detector["ok"], detector["error"]) == (False, "ModelError: no")
+    assert unread_reply(OPS - {"detect"})(error) == policy
+    assert unread_reply(OPS)(error) == detector
 
 
 # -- pictures
@@ -291,29 +311,33 @@ def test_a_real_sidecar_survives_what_strangers_send(lone_box):
 
 @pytest.mark.e2e
 def test_req_clients_of_the_field_are_answered(lone_box):
+    """Strict ones, and those that number their requests, which waited for ever."""
     lone_box.start("detector", "--no-arbiter", device="none")
-    socket = zmq.Context.instance().socket(zmq.REQ)
-    socket.setsockopt(zmq.LINGER, 0)
-    socket.setsockopt(zmq.RCVTIMEO, 60_000)
-    try:
-        socket.connect(f"ipc://{lone_box.runtime}/detector.sock")
-        for message in (
-            {"op": "ping"},
-            {
-                "op": "detect",
-                "image": PNG,
-                "query": "cube",
-                "max_side": 512,
-                "mode": "hybrid",
-                "max_new_tokens": 1024,
-            },
-        ):
-            socket.send(msgpack.packb(message))
-            reply = msgpack.unpackb(socket.recv())
-            assert reply["ok"] is True
-            assert "re" not in reply
-    finally:
-        socket.close()
+    detect = {"image": PNG, "query": "cube", "max_side": 512, "mode": "hybrid"}
+    observation = {"video.image": npy(picture_array()), "annotation.task": ["grab"]}
+    for options in ((), (zmq.REQ_CORRELATE,), (zmq.REQ_CORRELATE, zmq.REQ_RELAXED)):
+        with zmq.Context.instance().socket(zmq.REQ) as socket:
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.setsockopt(zmq.RCVTIMEO, 60_000)
+            for option in options:
+                socket.setsockopt(option, 1)
+            socket.connect(f"ipc://{lone_box.runtime}/detector.sock")
+
+            def ask(socket=socket, **message):
+                socket.send(msgpack.packb(message))
+                return msgpack.unpackb(socket.recv())
+
+            assert ask(op="ping")["ok"]
+            assert ask(op="detect", max_new_tokens=1024, **detect)["answer"] == "cube"
+            assert ask(op="detect", **detect | {"query": ""})["ok"] is False
+            assert ask(endpoint="ping")["state"] == "resident"
+            assert ask(endpoint="reset", data={"options": None}, api_token=None)["ok"]
+            data = {"observation": observation, "options": None}
+            actions, info = ask(endpoint="get_action", data=data, api_token=None)
+            assert (actions["answer"], info) == ("get_action", {})
+            refused = ask(endpoint="get_modality_config")
+            assert list(refused) == ["error"]
+            assert "unknown endpoint 'get_modality_config'" in refused["error"]
 
 
 RAW = {
