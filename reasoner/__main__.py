@@ -38,7 +38,7 @@ from vram_arbiter.schemas.errors import (
     SidecarUnavailable,
     VramError,
 )
-from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, RSkillManifest
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
@@ -92,9 +92,9 @@ def _parser() -> argparse.ArgumentParser:
         " default: none, the arbiter decides)",
     )
     parser.add_argument(
-        "--allow-noncommercial",
+        LICENSE_FLAG,
         action="store_true",
-        help="also use models whose license forbids commercial use",
+        help=LICENSE_HELP,
     )
     parser.add_argument(
         "--listen", help="where to hear --say and --cancel (default: ipc://RUNTIME/reasoner.sock)"

@@ -303,13 +303,7 @@ def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:
         return "its manifest is still the template"
     if manifest.kind in EXECUTABLE_KINDS and manifest.role is not Role.S1:
         return f"its role is {manifest.role}, and only {Role.S1} acts"
-    weightless = manifest.weights_uri is None  # no weights, no license of weights
-    if not weightless and not allow_noncommercial and not manifest.is_commercial_use_allowed:
-        return (
-            f"its license ({manifest.license}) does not allow commercial use;"
-            " --allow-noncommercial lets it"
-        )
-    return ""
+    return manifest.license_refusal(allow_noncommercial=allow_noncommercial)
 
 
 def _names(skills: Mapping[str, Skill]) -> str:

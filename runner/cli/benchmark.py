@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli.common import (
+    add_license_flag,
     add_trace_flag,
     check_sidecars,
     connect_arbiter,
@@ -27,6 +28,7 @@ from vram_arbiter.runner.cli.common import (
     positive,
     positive_int,
     sidecars_given,
+    unlicensed,
     warm_up,
 )
 from vram_arbiter.runner.sim.config import CONTROL_HZ
@@ -113,6 +115,7 @@ def add_parser(
     bench.add_argument("--arbiter", help="the arbiter's endpoint")
     bench.add_argument("--no-arbiter", action="store_true", help="run without arbiter and leases")
     bench.add_argument("--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT")
+    add_license_flag(bench)
     add_trace_flag(bench)
     return bench
 
@@ -264,6 +267,7 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     given_task = TASKS[args.task] if args.task is not None else None
     policies = {name: policy_of(name) for name in dict.fromkeys(args.policy) if name != EXPERT}
     manifests = read_manifests(args.skills or [default_skills()]) if args.skill else []
+    refused = unlicensed(manifests, allow_noncommercial=args.allow_noncommercial)
     given = sidecars_given(args.sidecar)
     if args.skill:
         check_sidecars(given, manifests)
@@ -275,7 +279,7 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     for world in worlds_of(args):
         arm, environment = world.arm, world.environment
         makers = makers_of(world, given, arbiter, period_s=1.0 / CONTROL_HZ, wait_s=LOCKSTEP_WAIT_S)
-        catalogue = Catalogue(manifests, makers, body=world.body)
+        catalogue = Catalogue(manifests, makers, refused=refused, body=world.body)
         for name in dict.fromkeys(args.skill):
             _, make, manifest = catalogue.find(name)
             task = None if arm is None else given_task or task_of(manifest)

@@ -17,9 +17,10 @@ from vram_arbiter.clients.net.server import check_free
 from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Robot
 from vram_arbiter.runner.goals import frames
+from vram_arbiter.runner.goals.catalogue import EXECUTABLE
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
-from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, Kind, RSkillManifest
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.recording.recorder import DatasetRecorder
@@ -69,6 +70,20 @@ def add_trace_flag(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_license_flag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(LICENSE_FLAG, action="store_true", help=LICENSE_HELP)
+
+
+def unlicensed(manifests: Iterable[RSkillManifest], *, allow_noncommercial: bool) -> dict[str, str]:
+    """Return the skills whose license forbids running them, by name, with the reason."""
+    found = {
+        manifest.name: manifest.license_refusal(allow_noncommercial=allow_noncommercial)
+        for manifest in manifests
+        if manifest.kind in EXECUTABLE
+    }
+    return {name: why for name, why in found.items() if why}
+
+
 def add_serving_flags(parser: argparse.ArgumentParser) -> None:
     """Flags of every command that serves goals."""
     parser.add_argument(
@@ -93,6 +108,7 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value)"
         " where the machine allows it",
     )  # fmt: skip
+    add_license_flag(parser)
     add_trace_flag(parser)
     parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
 

@@ -83,11 +83,6 @@ def add_parser(
         action="store_true",
         help="check everything, print what would run, open nothing",
     )
-    deploy.add_argument(
-        "--allow-noncommercial",
-        action="store_true",
-        help="also run skills whose license forbids commercial use",
-    )
     add_serving_flags(deploy)
     return deploy
 

@@ -1,8 +1,7 @@
 """A deployment file, checked: robot, cameras, skills and task that fit together.
 
 Every mistake is reported by line and field before a device is opened, a model loads or anything
-moves. `runner.cli.deploy` composes the program. Licenses are checked here because a robot at work
-is commercial use unless the operator says otherwise.
+moves. `runner.cli.deploy` composes the program.
 """
 
 from __future__ import annotations
@@ -26,8 +25,6 @@ from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid, UnknownSki
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.yamltext import Path as FieldPath
 from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
-
-LICENSE_FLAG = "--allow-noncommercial"
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,11 +164,8 @@ def offered(
         found = misfits(file.robot, parts, manifest)
         if manifest.kind not in EXECUTABLE:
             kept.append(manifest)
-        elif not (allow_noncommercial or manifest.is_commercial_use_allowed):
-            refused[manifest.name] = (
-                f"its license, {manifest.license}, does not allow commercial use;"
-                f" {LICENSE_FLAG} allows it all the same"
-            )
+        elif why := manifest.license_refusal(allow_noncommercial=allow_noncommercial):
+            refused[manifest.name] = why
         elif found and wanted != manifest.name:
             refused[manifest.name] = "; ".join(problem for _, problem in found)
         else:

@@ -25,6 +25,7 @@ from vram_arbiter.runner.cli.common import (
     positive_int,
     record_into,
     sidecars_given,
+    unlicensed,
     warm_up,
 )
 from vram_arbiter.runner.control.thread import ControlThread
@@ -179,6 +180,7 @@ async def run(args: argparse.Namespace) -> int:
             Catalogue(
                 manifests,
                 makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s),
+                refused=unlicensed(manifests, allow_noncommercial=args.allow_noncommercial),
                 body=world.body,
             ),
             clock,

@@ -5,7 +5,7 @@ files (`load` does) and knows nothing of how a skill is run.
 """
 
 from collections.abc import Callable
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, JsonValue, StringConstraints, model_validator
 
@@ -65,6 +65,9 @@ WeightsUri = Annotated[
 HubUri = Annotated[str, StringConstraints(pattern=rf"^hf://{_REPO}{_REVISION}$")]
 WebUrl = Annotated[str, StringConstraints(pattern=r"^https?://\S+$")]
 
+LICENSE_FLAG: Final = "--allow-noncommercial"
+"""The flag by which an operator accepts licenses that forbid commercial use."""
+LICENSE_HELP: Final = "also run models whose license does not allow commercial use"
 _TEMPLATE_WORDS = ("TEMPLATE_ORG", "TEMPLATE_ID")
 
 
@@ -172,8 +175,21 @@ class RSkillManifest(Block):
     # -- what others ask
     @property
     def is_commercial_use_allowed(self) -> bool:
-        """Whether the licence of the weights allows commercial use; unknown ones do not."""
+        """Whether the license of the weights allows commercial use; unknown ones do not."""
         return self.license in COMMERCIAL_LICENSES
+
+    def license_refusal(self, *, allow_noncommercial: bool) -> str:
+        """Return why the license keeps this skill from being run; empty: it may run.
+
+        A robot at work, real or simulated, is commercial use unless the operator says otherwise. A
+        skill without weights has no license of weights.
+        """
+        if allow_noncommercial or self.weights_uri is None or self.is_commercial_use_allowed:
+            return ""
+        return (
+            f"its license ({self.license}) does not allow commercial use; {LICENSE_FLAG} allows it "
+            "all the same"
+        )
 
     @property
     def is_scaffold_placeholder(self) -> bool:

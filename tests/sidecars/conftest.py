@@ -18,6 +18,7 @@ PATIENCE_S = 60.0
 MANIFEST = """
 name: test/{name}
 version: 0.1.0
+license: mit
 kind: detector
 embodiment_tags: [any]
 chunk_size: 1

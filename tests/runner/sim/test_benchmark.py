@@ -18,13 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vram_arbiter.runner.__main__ import main
-from vram_arbiter.runner.cli.benchmark import add_parser, worlds_of
+from vram_arbiter.runner.cli.benchmark import add_parser, entries_of, worlds_of
 from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant, file_name, wilson
 from vram_arbiter.runner.sim.gym_config import GymConfig
 from vram_arbiter.runner.sim.gym_env import GymEnv
 from vram_arbiter.runner.sim.policies import Policy, policy_of
 from vram_arbiter.runner.sim.robot import sim_runner
-from vram_arbiter.schemas.errors import SidecarUnavailable
+from vram_arbiter.schemas.errors import SidecarUnavailable, UnknownSkill
 
 HERE = Path(__file__).parents[1]
 ROOT = HERE.parents[1]
@@ -327,6 +327,22 @@ def test_mistakes_are_said_in_one_line(
     told = capsys.readouterr().err
     assert said in told
     assert len(told.splitlines()) == 1
+
+
+@pytest.mark.heavy
+def test_a_skill_needs_a_license_that_allows_commercial_use(tmp_path: Path) -> None:
+    """Regression: `benchmark` ran what `deploy` refuses."""
+    grab = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
+    closed = grab.replace("apache-2.0", "nvidia_non_commercial")
+    assert closed != grab
+    (tmp_path / "rskill.yaml").write_text(closed, encoding="utf-8")
+    parser = argparse.ArgumentParser()
+    parser = add_parser(parser.add_subparsers())
+    flags = ["--skills", str(tmp_path), "--skill", "vram-arbiter/so101-grab", "--no-videos"]
+    with pytest.raises(UnknownSkill, match=r"license \(nvidia_non_commercial\)"):
+        entries_of(parser.parse_args(flags), None)
+    (entry,) = entries_of(parser.parse_args([*flags, "--allow-noncommercial"]), None)
+    assert entry.name == "vram-arbiter/so101-grab"
 
 
 @pytest.mark.heavy

@@ -28,6 +28,7 @@ POINT = "gym:tests.runner.gym_worlds:test/Point-v0"
 MANIFEST = """
 name: "test/point-seek"
 version: "1.0.0"
+license: mit
 kind: vla
 model_family: act
 embodiment_tags: [custom]
@@ -199,6 +200,8 @@ class Sidecar:
 def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
     (tmp_path / "world.yaml").write_text(WORLD, encoding="utf-8")
     (tmp_path / "rskill.yaml").write_text(MANIFEST, encoding="utf-8")
+    closed = MANIFEST.replace("mit", "nvidia_non_commercial").replace("/point", "/closed")
+    (tmp_path / "closed.yaml").write_text(closed, encoding="utf-8")
     argv = [
         *(
             sys.executable,
@@ -210,7 +213,8 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
             "--env-config",
             str(tmp_path / "world.yaml"),
         ),
-        *("--skills", str(tmp_path / "rskill.yaml"), "--no-arbiter", "--rate", "0"),
+        *("--skills", str(tmp_path / "rskill.yaml"), str(tmp_path / "closed.yaml")),
+        *("--no-arbiter", "--rate", "0"),
         *(
             "--sidecar",
             f"test/point-seek=ipc://{tmp_path}/policy.sock",
@@ -258,6 +262,8 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
             )
             with pytest.raises(UnknownSkill):
                 await client.send_goal("vram-arbiter/so101-grab", prompt="grab")
+            with pytest.raises(UnknownSkill, match="--allow-noncommercial"):
+                await client.send_goal("test/closed-seek", prompt="go there")
             await client.call("shutdown")
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
 PATIENCE_S = 180.0
 COMMON = (
-    "version: 0.1.0\nembodiment_tags: [any]\nchunk_size: 5\n"
+    "version: 0.1.0\nlicense: mit\nembodiment_tags: [any]\nchunk_size: 5\n"
     "description: a tiny model\nlatency_budget: {per_chunk_ms: 100}\n"
 )
 SKILLS = {
