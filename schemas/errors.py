@@ -178,6 +178,11 @@ class ConfigError(OperatorError):
     code = "config_error"  # details.fields: path, line, problem
 
 
+class UnsupportedQuantization(ConfigError):
+    # a number format that the device or this program cannot compute in: details.dtype, supported
+    code = "unsupported_quantization"
+
+
 class NoGpu(OperatorError):
     code = "no_gpu"
 
