@@ -7,7 +7,7 @@ environment are wrong: a person has to act.
 import argparse
 import asyncio
 import contextlib
-import importlib.util
+import json
 import os
 import sys
 import tempfile
@@ -18,31 +18,32 @@ from vram_arbiter.clients import cuda
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.net.server import path_of
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.errors import ConfigError, ModelError, NoGpu, VramError
-from vram_arbiter.schemas.fakegpu import CARD_FILE, FOLDER_VARIABLE, parse_config
-from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest
+from vram_arbiter.schemas.errors import ConfigError, VramError
+from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
+from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, ManifestError, RSkillManifest
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, program_endpoint
-from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
 from vram_arbiter.sidecars.adapters.choose import make_adapter
-from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
+from vram_arbiter.sidecars.adapters.gpu_passthrough import need_card
+from vram_arbiter.sidecars.check import Wanted, check, need_packages, report
+from vram_arbiter.sidecars.device.capacity import FAKE, simulated
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ENVIRONMENT
 from vram_arbiter.sidecars.settings import (
     NICE,
     REQUEST_TIMEOUT_S,
     WAIT_TIMEOUT_S,
+    FootprintEntry,
     Settings,
     footprint_for,
     parse_footprint,
     read_footprints,
     read_model,
 )
-from vram_arbiter.sidecars.weights import Weights, cached
 
 FOOTPRINTS = "models/footprints.yaml"
 
@@ -61,19 +62,17 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
     logs.set_up(service, flags.log_level, flags.log_format, human)
     try:
-        settings = settings_from(flags)
-        adapter = adapter_for(settings.manifest, settings.weights)
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
         if flags.check:
-            found = compare_weights(settings.manifest, settings.weights, adapter_for)
-            print(
-                f"ok: {settings.manifest.name} from {settings.weights.source} as {adapter.kind}; "
-                f"{found}"
-            )
-            return 0
+            return report(check(wanted_from(flags, adapter_for)), as_json=flags.as_json)
+        settings = settings_from(flags)
+        manifest = settings.manifest
+        if why := manifest.license_refusal(allow_noncommercial=flags.allow_noncommercial):
+            raise ConfigError(f"{manifest.name}: {why}")
+        adapter_for(manifest, settings.weights)  # refused before anything is served
         if adapter_for is make_adapter:
-            _need_packages(settings.manifest)
+            need_packages(manifest)
         from vram_arbiter.sidecars.host import SidecarHost
 
         with (
@@ -83,14 +82,12 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             _temporary_files_in(os.path.dirname(path_of(settings.endpoint))),
         ):
             asyncio.run(SidecarHost(settings, adapter_for).serve())
-    except (VramError, ManifestError) as error:
-        terminal.complain("vram-sidecar", error)
-        wrong = (
-            (ConfigError, ManifestError, ModelError)
-            if flags.check
-            else (ConfigError, ManifestError)
-        )
-        return 2 if isinstance(error, wrong) else 1
+    except VramError as error:
+        if flags.as_json:
+            print(json.dumps({"error": error.to_wire()}))
+        else:
+            terminal.complain("vram-sidecar", error)
+        return 2 if isinstance(error, (ConfigError, ManifestError)) else 1
     return 0
 
 
@@ -106,33 +103,11 @@ def _temporary_files_in(folder: str) -> Iterator[None]:
         tempfile.tempdir = before
 
 
-def _need_packages(manifest: RSkillManifest) -> None:
-    """Raise ConfigError where the model's libraries are not installed, before the first request."""
-    if not is_passthrough(manifest):
-        library = "lerobot" if manifest.kind is Kind.VLA else "transformers"
-        need(f"a model of kind {manifest.kind.value}", "torch", library, extra="sidecars")
-
-
 def settings_from(flags: argparse.Namespace) -> Settings:
     """Return flags, files and environment as settings. Raises ConfigError or ManifestError."""
-    if flags.standby and flags.idle_release_s is not None:
-        raise ConfigError(
-            "--standby returns by itself and --idle-release-s leaves by itself",
-            hint="choose one: --standby for the model that is resident between goals, "
-            "--idle-release-s for the models that make room for it",
-        )
-    configs = flags.configs or configs_folder(os.environ)
-    manifest, weights = read_model(shipped(flags.rskill, "rskills", configs), configs)
-    if flags.footprint:
-        entry = parse_footprint(flags.footprint)
-    else:
-        path = flags.footprints or configs / FOOTPRINTS
-        entry = footprint_for(
-            manifest, read_footprints(path) if path.exists() or flags.footprints else {}
-        )
-    endpoint = flags.endpoint or program_endpoint(flags.name, os.environ, os.getuid())
-    path_of(endpoint)  # refused before a model is read
-    device = _device(flags.device)
+    wanted = wanted_from(flags, make_adapter)
+    manifest, weights = read_model(wanted.rskill, wanted.configs)
+    entry, device, endpoint = wanted.footprint(manifest), wanted.device, _endpoint(flags)
     need_card(manifest, device)
     return Settings(
         name=flags.name,
@@ -159,26 +134,41 @@ def settings_from(flags: argparse.Namespace) -> Settings:
     )
 
 
-def compare_weights(manifest: RSkillManifest, weights: Weights, adapter_for: AdapterFor) -> str:
-    """Compare the checkpoint with the model that its config describes, on no device.
+def wanted_from(flags: argparse.Namespace, adapter_for: AdapterFor) -> Wanted:
+    """Return the model that the flags name. Raises ConfigError for flags that are wrong."""
+    if flags.standby and flags.idle_release_s is not None:
+        raise ConfigError(
+            "--standby returns by itself and --idle-release-s leaves by itself",
+            hint="choose one: --standby for the model that is resident between goals, "
+            "--idle-release-s for the models that make room for it",
+        )
+    if flags.as_json and not flags.check:
+        raise ConfigError("--json is for --check", hint="--log-format json is for the log")
+    _endpoint(flags)
+    configs: Path = flags.configs or configs_folder(os.environ)
 
-    Returns what was done, in words. Raises ModelError.
-    """
-    if is_passthrough(manifest):
-        return "it has no weights"
-    if importlib.util.find_spec("torch") is None:
-        return "weights not compared with the model: torch is not installed"
-    place = weights if weights.local else cached(weights)
-    if place is None:
-        return "weights not compared with the model: they are not in the hub's cache"
-    adapter = adapter_for(manifest, place)
-    with contextlib.redirect_stdout(sys.stderr):  # the loaders' own output is not the answer
-        try:
-            adapter.prepare()
-            adapter.load("meta")
-        except ImportError as error:
-            raise ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'") from error
-    return "the weights hold the whole model"
+    def footprint(manifest: RSkillManifest) -> FootprintEntry:
+        if flags.footprint:
+            return parse_footprint(flags.footprint)
+        path = flags.footprints or configs / FOOTPRINTS
+        known = read_footprints(path) if path.exists() or flags.footprints else {}
+        return footprint_for(manifest, known)
+
+    return Wanted(
+        rskill=shipped(flags.rskill, "rskills", configs),
+        configs=configs,
+        device=_device(flags.device),
+        footprint=footprint,
+        allow_noncommercial=flags.allow_noncommercial,
+        adapter_for=adapter_for,
+    )
+
+
+def _endpoint(flags: argparse.Namespace) -> str:
+    """Return the endpoint to serve. Raises ConfigError before a model is read."""
+    endpoint: str = flags.endpoint or program_endpoint(flags.name, os.environ, os.getuid())
+    path_of(endpoint)
+    return endpoint
 
 
 def _device(text: str | None) -> str:
@@ -206,16 +196,9 @@ def _gpu_of(device: str) -> str:
 
     Raises NoGpu.
     """
-    if not device.startswith("fake:"):
+    if not device.startswith(FAKE):
         return device.partition(":")[2] or "any" if cuda.VISIBLE not in os.environ else "any"
-    path = Path(device.removeprefix("fake:")) / CARD_FILE
-    try:
-        return parse_config(path.read_text()).uuid
-    except OSError as error:
-        raise NoGpu(  # a retry may succeed: the arbiter creates the GPU's folder at its start
-            f"{path} cannot be read: {error.strerror}",
-            hint="start the arbiter with --gpu fake:8GiB",
-        ) from error
+    return simulated(device).uuid
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -310,8 +293,10 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--check",
         action="store_true",
-        help="check manifest, footprint, flags and completeness of the weights, then end",
+        help="load nothing: check license, family, packages, weights, precision, footprint and GPU",
     )
+    add("--json", dest="as_json", action="store_true", help="print the findings of --check as JSON")
+    add(LICENSE_FLAG, action="store_true", help=LICENSE_HELP)
     return parser
 
 

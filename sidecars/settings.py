@@ -105,9 +105,7 @@ class Settings:
 
         Nothing is retained after an unload: the model's process ends, and its context too.
         """
-        steady = self.steady_charge(self.footprint.steady_bytes)
-        peak = max(self.footprint.load_peak_bytes, steady)
-        footprint = Footprint(load_peak_bytes=peak, steady_bytes=steady, residue_bytes=0)
+        footprint = lease_footprint(self.footprint, self.inference_peak_bytes)
         return LeaseSpec(
             consumer=self.name,
             model_id=self.manifest.name,
@@ -119,6 +117,13 @@ class Settings:
             min_residency_s=self.min_residency_s,
             standby=self.standby,
         )
+
+
+def lease_footprint(footprint: Footprint, inference_peak_bytes: int) -> Footprint:
+    """Return what a lease is charged for a model that takes `footprint` (`Settings.lease_spec`)."""
+    steady = max(footprint.steady_bytes, inference_peak_bytes)
+    peak = max(footprint.load_peak_bytes, steady)
+    return Footprint(load_peak_bytes=peak, steady_bytes=steady, residue_bytes=0)
 
 
 def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:

@@ -204,28 +204,6 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
         )
 
 
-def test_check_says_ok_or_what_is_wrong(rskill, tmp_path, capsys):
-    flags = [
-        "--name",
-        "d",
-        "--rskill",
-        str(rskill),
-        "--footprint",
-        "2GB",
-        "--device",
-        "none",
-        "--check",
-    ]
-    assert main(flags) == 0
-    assert "ok: test/model from a/b as detector; weights not compared" in capsys.readouterr().out
-    rskill.write_text(DETECTOR.replace("labels", "lables"))
-    assert main(flags) == 2
-    assert "lables" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as caught:
-        main([*flags, "--priority", "101"])
-    assert caught.value.code == 2
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -244,50 +222,26 @@ def test_what_no_sidecar_serves_is_said(text, told):
         make_adapter(parse_manifest(text), Weights("a/b"))
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "kind: playbook\nrole: s2\nactions: [plan]\n"
-        "playbook: {trigger: t, body_uri: ./P.md, composes_tools: [wait], done_predicate: d, "
-        "max_steps: 3}\n",
-        "kind: ros_action\nactions: [reach]\n"
-        "actuators_required: [{kind: joint_position, control_mode_semantics: {mode: absolute}}]\n"
-        "ros_integration: {package: p, interface_type: T, interface_name: /t, default_goal_json: "
-        "'{}'}\n",
-    ],
-)
-def test_a_kind_without_weights_is_no_sidecars_business(rskill, capsys, text):
-    rskill.write_text(HEAD + text)
-    flags = [
-        "--name",
-        "d",
-        "--rskill",
-        str(rskill),
-        "--footprint",
-        "2GB",
-        "--device",
-        "none",
-        "--check",
-    ]
-    assert main(flags) == 2
-    assert (
-        "has no weights (sidecars serve detector, vlm, vla and reward skills)"
-        in capsys.readouterr().err
-    )
-
-
 def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(
     rskill, tmp_path, capsys
 ):
     """systemd starts a sidecar again unless it ended with 2."""
-    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB", "--check"]
-    assert main([*flags, "--device", "none", "--standby", "--idle-release-s", "5"]) == 2
-    assert main([*flags, "--device", "gpu"]) == 2
-    assert main([*flags, "--device", "none", "--rskill", str(tmp_path / "none.yaml")]) == 2
+    flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB"]
+    for more in ([], ["--check"]):
+        assert main([*flags, *more, "--device", "none", "--standby", "--idle-release-s", "5"]) == 2
+        assert main([*flags, *more, "--device", "gpu"]) == 2
+        assert main([*flags, *more, "--device", "none", "--rskill", str(tmp_path / "none")]) == 2
+    rskill.write_text(DETECTOR.replace("labels", "lables"))
+    assert main([*flags, "--check", "--device", "none"]) == 2
+    assert "lables" in capsys.readouterr().err
+    rskill.write_text(DETECTOR)
     assert main([*flags, "--device", f"fake:{tmp_path}"]) == 1, (
         "the arbiter makes the card when it starts"
     )
     assert "start the arbiter with --gpu fake:8GiB" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as caught:
+        main([*flags, "--check", "--priority", "101"])
+    assert caught.value.code == 2
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a\nb", "x" * 1000])

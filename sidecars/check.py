@@ -1,0 +1,213 @@
+"""`vram-sidecar --check`: what keeps a model from being served, before anything is loaded.
+
+All findings are collected, not only the first. Nothing is downloaded, no GPU is used, and the model
+is built without bytes (`load("meta")`).
+"""
+
+import contextlib
+import importlib.util
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from vram_arbiter.schemas.defaults import RESERVE_BYTES
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, VramError
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.sidecars.adapters.base import ModelAdapter
+from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
+from vram_arbiter.sidecars.device.capacity import capacities
+from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.settings import FootprintEntry, lease_footprint, read_model
+from vram_arbiter.sidecars.weights import Weights, cached
+
+NOT_COMPARED = "not compared with the model"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line. `ok` None: not checked, or worth knowing. `retry`: time may mend it."""
+
+    what: str
+    ok: bool | None
+    says: str
+    retry: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is to be served. `footprint` raises ConfigError if none is known."""
+
+    rskill: Path
+    configs: Path
+    device: str  # fake:FOLDER | cuda[:N] | none
+    footprint: Callable[[RSkillManifest], FootprintEntry]
+    allow_noncommercial: bool
+    adapter_for: AdapterFor
+
+
+def check(wanted: Wanted) -> list[Finding]:
+    """Return all findings about one model. Raises ManifestError for a manifest that is wrong."""
+    manifest = load_manifest(wanted.rskill)
+    findings = [
+        Finding("manifest", True, f"{manifest.name} {manifest.version}, a {manifest.kind}"),
+        _license(manifest, wanted.allow_noncommercial),
+    ]
+    weights: Weights | None = None
+    try:
+        _, weights = read_model(wanted.rskill, wanted.configs)
+    except ConfigError as error:
+        findings.append(_bad("weights", error))
+    adapter: ModelAdapter | None = None
+    try:
+        adapter = wanted.adapter_for(manifest, weights or Weights(manifest.weights_uri or ""))
+        findings.append(Finding("family", True, f"served as {_family(manifest)}"))
+    except VramError as error:
+        findings.append(_bad("family", error))
+    findings.append(packages := _packages(manifest))
+    findings += _weights(manifest, weights, wanted.adapter_for if adapter and packages.ok else None)
+    return findings + _bytes(manifest, wanted)
+
+
+def report(findings: Sequence[Finding], *, as_json: bool) -> int:
+    """Print the findings and return the exit code: 0, 1 if time may mend them, 2 if a person must."""
+    bad = [finding for finding in findings if finding.ok is False]
+    if as_json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        marks = {True: "ok  ", False: "BAD ", None: "    "}
+        for finding in findings:
+            print(printable(f"{marks[finding.ok]} {finding.what:<10} {finding.says}"))
+        names = ", ".join(dict.fromkeys(finding.what for finding in bad))
+        print(f"not ok: {names}" if bad else "ok")
+    if not bad:
+        return 0
+    return 1 if all(finding.retry for finding in bad) else 2
+
+
+def _bad(what: str, error: VramError) -> Finding:
+    return Finding(what, False, str(error), retry=isinstance(error, NoGpu))
+
+
+def _license(manifest: RSkillManifest, allow_noncommercial: bool) -> Finding:
+    if why := manifest.license_refusal(allow_noncommercial=allow_noncommercial):
+        return Finding("license", False, why)
+    return Finding("license", True, str(manifest.license))
+
+
+def _family(manifest: RSkillManifest) -> str:
+    family = f" of family {manifest.model_family}" if manifest.model_family else ""
+    return f"{manifest.kind}{family} in {manifest.quantization.dtype}"
+
+
+def need_packages(manifest: RSkillManifest) -> None:
+    """Raise ConfigError where the model's libraries are not installed."""
+    if not is_passthrough(manifest):
+        lerobot = manifest.kind in (Kind.VLA, Kind.REWARD)
+        library = "lerobot" if lerobot else "transformers"
+        need(f"a model of kind {manifest.kind}", "torch", library, extra="sidecars")
+
+
+def _packages(manifest: RSkillManifest) -> Finding:
+    try:
+        need_packages(manifest)
+    except ConfigError as error:
+        return _bad("packages", error)
+    return Finding("packages", True, "installed")
+
+
+def _weights(
+    manifest: RSkillManifest, weights: Weights | None, adapter_for: AdapterFor | None
+) -> list[Finding]:
+    """Compare the checkpoint with the model that its config describes. Without an adapter, say only
+    whether it is here."""
+    if weights is None:
+        return []
+    if is_passthrough(manifest):
+        return [Finding("weights", True, "it has none")]
+    if importlib.util.find_spec("huggingface_hub") is None and not weights.local:
+        return [Finding("weights", None, f"{NOT_COMPARED}: the hub's package is not installed")]
+    place = weights if weights.local else cached(weights)
+    if place is None:
+        at = f" --revision {weights.revision}" if weights.revision else ""
+        return [
+            Finding(
+                "weights",
+                False,
+                f"weights are not here: {manifest.weights_uri} is not in the hub's cache "
+                f"(hf download {weights.source}{at})",
+            )
+        ]
+    if adapter_for is None:
+        return [Finding("weights", None, f"{NOT_COMPARED}: see above")]
+    try:
+        # what the loaders print is not the answer
+        with contextlib.redirect_stdout(sys.stderr), _offline():
+            adapter = adapter_for(manifest, place)
+            adapter.prepare()
+            adapter.load("meta")
+    except ImportError as error:
+        hint = "pip install 'vram-arbiter[sidecars]'"
+        return [Finding("packages", False, f"{error} ({hint})")]
+    except VramError as error:
+        return [_bad("weights", error)]
+    # any failure of a model's code is a finding
+    except Exception as error:  # noqa: BLE001
+        return [Finding("weights", False, f"{type(error).__name__}: {error}")]
+    return [Finding("weights", True, f"{place.source} holds the whole model")]
+
+
+@contextlib.contextmanager
+def _offline() -> Iterator[None]:
+    """Keep the libraries from downloading what is not in the hub's cache."""
+    from huggingface_hub import constants
+
+    before = constants.HF_HUB_OFFLINE
+    constants.HF_HUB_OFFLINE = True
+    try:
+        yield
+    finally:
+        constants.HF_HUB_OFFLINE = before
+
+
+def _bytes(manifest: RSkillManifest, wanted: Wanted) -> list[Finding]:
+    """Compare the lease with the GPU's capacity less what the arbiter keeps free by default."""
+    findings, needed = [], None
+    try:
+        entry = wanted.footprint(manifest)
+        lease = lease_footprint(entry.on_wire(), entry.inference_peak)
+        needed = lease.load_peak_bytes
+        findings.append(
+            Finding(
+                "footprint",
+                True,
+                f"load peak {format_bytes(needed)}, charged {format_bytes(lease.steady_bytes)} "
+                f"while resident ({entry.source or 'as given'})",
+            )
+        )
+    except ConfigError as error:
+        findings.append(_bad("footprint", error))
+    if wanted.device == "none":
+        try:
+            need_card(manifest, wanted.device)
+        except NoGpu as error:
+            return [*findings, _bad("gpu", error)]
+        return [*findings, Finding("gpu", None, "not checked: --device none")]
+    try:
+        found = capacities(wanted.device)
+    except (NoGpu, ConfigError) as error:
+        return [*findings, _bad("gpu", error)]
+    gpu, most = max(found.items(), key=lambda item: item[1])
+    has = f"{gpu} has {format_bytes(most)}"
+    if needed is None:
+        return [*findings, Finding("gpu", None, f"not compared: no footprint; {has}")]
+    room = most - RESERVE_BYTES
+    fits = needed <= room
+    says = f"{has}, {format_bytes(RESERVE_BYTES)} of it reserved: " + (
+        "it fits" if fits else f"{format_bytes(needed - room)} too small"
+    )
+    return [*findings, Finding("gpu", fits, says)]

@@ -1,0 +1,87 @@
+"""Capacity of the GPUs that `--device` names, read without using one."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vram_arbiter.clients import cuda
+from vram_arbiter.schemas.errors import NoGpu
+from vram_arbiter.schemas.fakegpu import CARD_FILE, CardConfig, parse_config
+
+FAKE = "fake:"
+
+
+def simulated(device: str) -> CardConfig:
+    """Return the configuration of `fake:FOLDER`. Raises NoGpu, ConfigError for a wrong file."""
+    path = Path(device.removeprefix(FAKE)) / CARD_FILE
+    try:
+        return parse_config(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise NoGpu(  # a retry may succeed: the arbiter creates the GPU's folder at its start
+            f"{path} cannot be read: {error.strerror}",
+            hint="start the arbiter with --gpu fake:8GiB",
+        ) from error
+
+
+def capacities(
+    device: str, environ: Mapping[str, str] = os.environ, nvml: Any = None
+) -> dict[str, int]:
+    """Return the bytes of the GPUs that `device` (`fake:FOLDER`, `cuda`, `cuda:N`) may mean.
+
+    Several for `cuda` alone: the arbiter chooses one. `nvml` is the module `pynvml` unless a test
+    brings its own. Raises NoGpu.
+    """
+    if device.startswith(FAKE):
+        card = simulated(device)
+        return {card.uuid: card.capacity_bytes}
+    if nvml is None:
+        import pynvml
+
+        nvml = pynvml
+    try:
+        nvml.nvmlInit()
+        try:
+            handles = _visible(nvml, environ)
+            number = device.partition(":")[2]
+            if number:
+                handles = handles[int(number) : int(number) + 1]
+            found = {
+                str(nvml.nvmlDeviceGetUUID(handle)): _bytes(nvml, handle) for handle in handles
+            }
+        finally:
+            nvml.nvmlShutdown()
+    except nvml.NVMLError as error:
+        raise NoGpu(
+            f"no NVIDIA driver answers: {error}",
+            hint="--device none checks everything but the GPU",
+        ) from error
+    if not found:
+        raise NoGpu(
+            f"the NVIDIA driver lists no GPU for --device {device}", hint="see nvidia-smi -L"
+        )
+    return found
+
+
+def _visible(nvml: Any, environ: Mapping[str, str]) -> list[Any]:
+    """Return the handles of the GPUs that CUDA would show, in its order."""
+    named = environ.get(cuda.VISIBLE)
+    if named is None:
+        return [
+            nvml.nvmlDeviceGetHandleByIndex(index) for index in range(nvml.nvmlDeviceGetCount())
+        ]
+    words = [word.strip() for word in named.split(",") if word.strip()]
+    return [
+        nvml.nvmlDeviceGetHandleByIndex(int(word))
+        if word.isdecimal()
+        else nvml.nvmlDeviceGetHandleByUUID(word)
+        for word in words
+    ]
+
+
+def _bytes(nvml: Any, handle: Any) -> int:
+    """Return a GPU's own memory, or the machine's where it has none of its own (Jetson, GB10)."""
+    try:
+        return int(nvml.nvmlDeviceGetMemoryInfo(handle).total)
+    except nvml.NVMLError_NotSupported:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
