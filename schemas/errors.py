@@ -216,6 +216,11 @@ class SidecarUnavailable(TransientError):
     code = "sidecar_unavailable"  # cannot be started or reached; details.exit_code, log
 
 
+class CalibrationFailed(OperatorError):
+    # a footprint could not be measured; details.exit_code and log of a program that ended early
+    code = "calibration_failed"
+
+
 # -- runner and reasoner
 class RunnerUnreachable(TransientError):
     code = "runner_unreachable"  # it does not answer: not running, or hanging

@@ -40,12 +40,14 @@ names users that may serve it beside root, yourself and vram-arbiter."""
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One line of the table. `passes_on`: another program parses the arguments."""
+    """One line of the table. `passes_on`: another program parses the arguments. `wraps`: what
+    follows `--` is another program's command line, in `args.program`."""
 
     module: str
     summary: str
     traced: bool = True
     passes_on: bool = False
+    wraps: bool = False
 
 
 COMMANDS: Mapping[str, Command] = {
@@ -60,6 +62,9 @@ COMMANDS: Mapping[str, Command] = {
     "resume": Command("operators", "grant again after a drain"),
     "release-dead": Command("operators", "end the lease of a holder that is not heard of"),
     "run": Command("run", "run a program under a lease: vramctl run --vram 5GiB -- COMMAND"),
+    "calibrate": Command(
+        "calibrate", "measure what a model or a program needs, for the footprint file", wraps=True
+    ),
     "doctor": Command("doctor", "check the installation, the daemon and its GPUs"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
     "simulate": Command("offline", "simulate a scenario under one policy or more", passes_on=True),
@@ -75,7 +80,7 @@ def run_main(argv: Sequence[str]) -> int:
     name, *rest = argv
     chosen = COMMANDS[name]
     module = import_module(f"vram_arbiter.clients.cli.{chosen.module}")
-    as_json = "--json" in rest and name != "run"  # what follows `run` is another program's
+    as_json = "--json" in _own(rest) and name != "run"  # what follows `run` is another program's
     try:
         with _span(name, traced=chosen.traced) as running:
             if chosen.passes_on:
@@ -99,9 +104,17 @@ def _parse_and_run(name: str, module: Any, arguments: Sequence[str]) -> int:
     )
     module.add_arguments(parser, name)
     add_version(parser)
-    args = parser.parse_args(arguments)
+    wraps = COMMANDS[name].wraps
+    args = parser.parse_args(_own(arguments) if wraps else arguments)
     args.command_name, args.parser = name, parser
+    if wraps:
+        args.program = list(arguments[len(_own(arguments)) + 1 :])
     return int(module.run(args))
+
+
+def _own(arguments: Sequence[str]) -> Sequence[str]:
+    """Return the arguments before `--`."""
+    return arguments[: arguments.index("--")] if "--" in arguments else arguments
 
 
 def _overview(argv: Sequence[str]) -> int:

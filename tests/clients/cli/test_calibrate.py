@@ -1,0 +1,531 @@
+"""`vramctl calibrate`: from readings to figures, from figures to the footprint file, and programs
+under observation on a simulated GPU."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.sidecars import echo_sidecar
+from tests.support.process import ArbiterProcess
+from vram_arbiter.arbiter.host.gpu.fake import make_card
+from vram_arbiter.clients.calibration import entry as entries
+from vram_arbiter.clients.calibration import measure
+from vram_arbiter.clients.calibration.gpu import FakeGpu, NvmlGpu, Reading, open_gpu
+from vram_arbiter.clients.calibration.measure import Basis, OwnBytes, Pace, Sampler, measure_program
+from vram_arbiter.clients.calibration.requests import noise_png
+from vram_arbiter.clients.calibration.series import Figures, Series, of_life
+from vram_arbiter.clients.cli.main import run_main
+from vram_arbiter.clients.sync import Client
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.defaults import RESIDUE_BYTES, VERIFY_TOLERANCE_BYTES
+from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, NoGpu, ProbeFailed
+from vram_arbiter.sidecars.images import header
+from vram_arbiter.sidecars.settings import read_footprints
+
+MIB, GIB = 2**20, 2**30
+QUICK = Pace(rate_hz=200.0, rest_s=0.05)
+FLAGS = ("--rate", "200", "--rest", "0.05")
+PATIENCE_S = 60.0
+
+
+def series_of(*levels: tuple[float, int]) -> Series:
+    """Return a series of (seconds, MiB): a reading every 10 ms for so long."""
+    series, at_s = Series(), 0.0
+    for lasts_s, size in levels:
+        for _ in range(round(lasts_s * 100)):
+            series.add(at_s, size * MIB)
+            at_s += 0.01
+    return series
+
+
+# -- series → figures
+def test_the_figures_of_a_life() -> None:
+    series = series_of(
+        (1, 0), (0.1, 300), (0.05, 2000), (2, 1500), (0.02, 1700), (0.4, 1500), (1, 0)
+    )
+    assert of_life(series, 300 * MIB, 0) == Figures(
+        context=300 * MIB,
+        load_peak=2000 * MIB,
+        steady=1500 * MIB,
+        inference_peak=1700 * MIB,
+        retained=None,
+        after_exit=0,
+    )
+    assert series.rate_hz == pytest.approx(100)
+    assert len(series.levels) == 7, "kept where they change"
+
+
+def test_a_program_that_stays_until_the_last_reading_has_figures() -> None:
+    found = of_life(series_of((0.5, 0), (1, 700)), 300 * MIB, 700 * MIB)
+    assert found is not None
+    assert (found.load_peak, found.steady, found.freed) == (700 * MIB, 700 * MIB, 0)
+
+
+def test_no_bytes_are_no_figures() -> None:
+    """Noise of the used bytes below 1 MiB is not a program's."""
+    series = series_of((1, 0))
+    series.add(2.0, MIB // 2)
+    assert of_life(series, 0, 0) is None
+    assert of_life(Series(), 0, 0) is None
+
+
+def test_bytes_are_at_rest_while_they_hardly_change() -> None:
+    series = series_of((1, 500), (1, 900))
+    series.add(2.5, 900 * MIB + MIB // 2)
+    assert series.rested_s() == pytest.approx(1.5)
+    series.add(2.6, 901 * MIB + MIB)
+    assert series.rested_s() == 0.0
+    assert Series().rested_s() == 0.0
+
+
+def test_the_sampler_dates_a_reading_by_its_end_and_keeps_its_error() -> None:
+    now = [10.0]
+    answers: list[int | ProbeFailed] = [5, 5, 7, ProbeFailed("gone")]
+
+    def read() -> int:
+        now[0] += 0.5
+        answer = answers.pop(0)
+        if isinstance(answer, ProbeFailed):
+            raise answer
+        return answer
+
+    sampler = Sampler(read, period_s=0.0, clock=lambda: now[0])
+    with sampler:
+        sampler._thread.join(PATIENCE_S)  # the failed reading ends it
+    assert (sampler.series.since_s, sampler.series.levels) == ([10.5, 11.5], [5, 7])
+    assert sampler.series.readings == 3
+    with pytest.raises(ProbeFailed, match="gone"):
+        sampler.check()
+
+
+def test_bytes_of_the_tree_are_its_own_also_when_a_parent_has_ended() -> None:
+    listed: dict[int, int] = {}
+    gpu: Any = SimpleNamespace(read=lambda: Reading(9 * GIB, listed))
+    own = OwnBytes(gpu, Basis(listed=True, context_bytes=0, baseline_bytes=0))
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD_OF_A_CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdin is not None
+        below = int(child.stdout.readline())
+        listed.update({os.getppid(): 4 * GIB, child.pid: MIB, below: 2 * MIB})
+        assert own() == 3 * MIB
+        child.stdin.write(b"\n")
+        child.stdin.flush()
+        child.wait(PATIENCE_S)
+        del listed[child.pid]
+        assert own() == 2 * MIB, "adopted by another process, and ours all the same"
+    with pytest.raises(ProbeFailed, match="stopped listing"):
+        OwnBytes(
+            SimpleNamespace(read=lambda: Reading(1, None)),
+            Basis(True, 0, 0),  # type: ignore[arg-type]
+        )()
+
+
+CHILD_OF_A_CHILD = """
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=0)
+print(child.pid, flush=True)
+sys.stdin.readline()
+"""
+
+
+# -- figures → the footprint file
+FILE = """\
+# Bytes by model.
+
+one/model:
+  stands_for: ""
+  load_peak: 5.3GB # of a query
+  steady: 5GB
+  residue: 450MiB
+  throttle: 2GB # cold disk
+  source: by hand
+
+# the other
+two/model: {load_peak: 1GB, steady: 1GB}
+"""
+FIGURES = Figures(
+    context=300 * MIB + 1,
+    load_peak=6000 * MIB,
+    steady=1000 * MIB,
+    inference_peak=1100 * MIB,
+    retained=0,
+    after_exit=0,
+)
+
+
+def test_a_load_that_takes_what_was_measured_shows_no_drift() -> None:
+    """The arbiter notes a drift of more than the tolerance, above and below the declared."""
+    for count in (0, 1, 500 * MIB, 3 * GIB, 80 * GIB):
+        assert count <= entries.with_margin(count) < count + VERIFY_TOLERANCE_BYTES
+    assert entries.with_margin(1000 * MIB) == 1020 * MIB
+
+
+def test_an_entry_keeps_what_a_person_wrote(tmp_path: Path) -> None:
+    path = tmp_path / "footprints.yaml"
+    path.write_text(FILE)
+    path.chmod(0o640)
+    entry = entries.entry_of(FIGURES, "measured 2026-01-02 on a GPU: 20 requests")
+    entries.write(path, "one/model", entry)
+    assert path.read_text() == FILE.replace("5.3GB", "6048MiB").replace("5GB", "1020MiB").replace(
+        "450MiB", "301MiB"
+    ).replace("by hand", '"measured 2026-01-02 on a GPU: 20 requests"\n  inference_peak: 1122MiB')
+    assert path.stat().st_mode & 0o777 == 0o640
+    entries.write(path, "three/model/nf4", entry)
+    assert path.read_text().endswith("two/model: {load_peak: 1GB, steady: 1GB}\n\nthree/model/nf4:\n"
+        "  load_peak: 6048MiB\n  steady: 1020MiB\n  residue: 301MiB\n  inference_peak: 1122MiB\n"
+        '  source: "measured 2026-01-02 on a GPU: 20 requests"\n')  # fmt: skip
+    found = read_footprints(path)
+    assert found["one/model"].throttle == 2 * 10**9
+    assert found["three/model/nf4"].steady == 1020 * MIB
+    assert os.listdir(tmp_path) == ["footprints.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (FILE, "two/model"),
+        ("a/b: &x\n  steady: 1GB\nc/d: *x\n", "c/d"),
+        ("- a\n", "a/b"),
+        ("a/b: 1\n", "a/b"),
+        ("a/b: [", "a/b"),
+    ],
+)
+def test_a_file_of_another_form_is_not_changed(text: str, key: str, tmp_path: Path) -> None:
+    path = tmp_path / "footprints.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError):
+        entries.write(path, key, {"steady": "1MiB"})
+    assert path.read_text() == text
+    assert os.listdir(tmp_path) == ["footprints.yaml"]
+
+
+def test_figures_that_contradict_each_other_stay_in_order() -> None:
+    """A program that frees its weights is smaller than an empty context: the file's rule is residue
+    ≤ steady ≤ load peak, and steady ≤ inference peak."""
+    small = Figures(450 * MIB, 90 * MIB, 100 * MIB, 80 * MIB, None, 0)
+    entry = entries.entry_of(small, "x")
+    assert set(entry.values()) == {"102MiB", "x"}
+
+
+# -- readings
+class NvmlFault(Exception):
+    pass
+
+
+class NotSupported(NvmlFault):
+    pass
+
+
+def nvml(**changes: Any) -> Any:
+    """Return a module like pynvml with one GPU."""
+
+    def listed(pid: int, size: int | None) -> Any:
+        return SimpleNamespace(pid=pid, usedGpuMemory=size)
+
+    functions: dict[str, Any] = {
+        "NVMLError": NvmlFault,
+        "NVMLError_NotSupported": NotSupported,
+        "NVMLError_FunctionNotFound": NotSupported,
+        "nvmlMemory_v2": 2,
+        "nvmlInit": lambda: None,
+        "nvmlDeviceGetCount": lambda: 1,
+        "nvmlDeviceGetHandleByIndex": lambda index: index,
+        "nvmlDeviceGetUUID": lambda handle: "GPU-1",
+        "nvmlDeviceGetName": lambda handle: b"Test GPU",
+        "nvmlSystemGetDriverVersion": lambda: "600.1",
+        "nvmlDeviceGetMemoryInfo": lambda handle, version=1: SimpleNamespace(used=7 - version),
+        "nvmlDeviceGetMigMode": lambda handle: fails(NotSupported("no MIG")),
+        "nvmlDeviceGetComputeRunningProcesses": lambda handle: [listed(1, 10), listed(2, None)],
+        "nvmlDeviceGetGraphicsRunningProcesses": lambda handle: [listed(1, 11), listed(3, 5)],
+    }
+    return SimpleNamespace(**{**functions, **changes})
+
+
+def fails(error: Exception) -> Any:
+    raise error
+
+
+def test_a_reading_of_nvml() -> None:
+    gpu = NvmlGpu(0, nvml())
+    assert gpu.read() == Reading(5, {1: 11, 3: 5})
+    assert (gpu.name, gpu.device, gpu.environ["CUDA_VISIBLE_DEVICES"]) == (
+        "Test GPU", "cuda", "GPU-1",
+    )  # fmt: skip
+    unlisted = nvml(nvmlDeviceGetComputeRunningProcesses=lambda handle: fails(NvmlFault("no")))
+    assert NvmlGpu(0, unlisted).read() == Reading(5, None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"nvmlInit": lambda: fails(NvmlFault("library missing"))}, NoGpu, "library missing"),
+        ({"nvmlDeviceGetCount": lambda: 0}, NoGpu, "knows 0 GPUs"),
+        (
+            {"nvmlDeviceGetMemoryInfo": lambda handle, version=1: fails(NotSupported("x"))},
+            NoGpu,
+            "no memory of its own",
+        ),
+        ({"nvmlDeviceGetMigMode": lambda handle: (1, 1)}, ConfigError, "MIG"),
+    ],
+)
+def test_a_gpu_that_cannot_be_measured(
+    changes: dict[str, Any], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        NvmlGpu(0, nvml(**changes))
+
+
+def test_devices_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="write fake:FOLDER"):
+        open_gpu("gpu0", {})
+    with pytest.raises(NoGpu, match="no simulated GPU"):
+        open_gpu(None, {fakegpu.FOLDER_VARIABLE: str(tmp_path)})
+
+
+def test_noise_is_a_picture() -> None:
+    assert header(noise_png(64)).width == 64
+
+
+# -- programs
+PROGRAM = """
+import os, sys, time
+from pathlib import Path
+from vram_arbiter.sidecars.device.fake import FakeMemory
+
+seen, began = Path(sys.argv[1]), time.monotonic()
+
+def phase(count):
+    while not (seen / str(count)).exists():  # until it was read
+        time.sleep(0.002)
+
+memory = FakeMemory(Path(os.environ["VRAM_FAKE_GPU"]), "program", 200 << 20)
+memory.touch()
+phase(200)
+memory.allocate("weights", 800 << 20)
+block = memory.allocate("copy", 500 << 20)
+phase(1500)
+memory.free(block)
+memory.empty_cache()
+phase(1000)
+steady = time.monotonic()
+while time.monotonic() - steady < 4 * (steady - began):  # most of its life
+    time.sleep(0.002)
+print("has worked")
+"""
+"""Goes on to the next phase when the present one was read."""
+
+
+class Watched(FakeGpu):
+    """A simulated GPU that tells a program in a folder which sizes, in MiB, were read."""
+
+    def __init__(self, card: Path, seen: Path) -> None:
+        super().__init__(card)
+        self.seen = seen
+
+    def read(self) -> Reading:
+        reading = super().read()
+        for count in (*(reading.processes or {}).values(), reading.used_bytes):
+            (self.seen / str(count // MIB)).touch()
+        return reading
+
+
+@pytest.fixture
+def card(tmp_path: Path) -> Path:
+    make_card(tmp_path / "gpu", 8 * GIB, release_lag_s=0.0)
+    return tmp_path / "gpu"
+
+
+@pytest.fixture
+def gpu(card: Path) -> Watched:
+    (card.parent / "seen").mkdir()
+    return Watched(card, card.parent / "seen")
+
+
+def command(gpu: Watched, program: str = PROGRAM) -> list[str]:
+    return [sys.executable, "-c", program, str(gpu.seen)]
+
+
+def hide(card: Path) -> None:
+    config = fakegpu.parse_config((card / fakegpu.CARD_FILE).read_text())
+    hidden = config.model_copy(update={"faults": fakegpu.Faults(hide_processes=True)})
+    (card / fakegpu.CARD_FILE).write_text(fakegpu.dump_config(hidden))
+
+
+@pytest.mark.e2e
+@pytest.mark.anyio
+@pytest.mark.parametrize("listed", [True, False], ids=["listed", "hidden"])
+async def test_a_program_under_observation(
+    listed: bool, gpu: Watched, card: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    if not listed:
+        hide(card)
+    measured = await measure_program(gpu, QUICK, command(gpu), None, print)
+    assert measured.basis.listed is listed
+    assert measured.figures == Figures(
+        context=RESIDUE_BYTES,
+        load_peak=1500 * MIB,
+        steady=1000 * MIB,
+        inference_peak=1000 * MIB,
+        retained=None,
+        after_exit=0,
+    )
+    assert "has worked" in capfd.readouterr().err
+
+
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_programs_without_figures(
+    gpu: Watched, card: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def run(program: str) -> CalibrationFailed:
+        with pytest.raises(CalibrationFailed) as caught:
+            await measure_program(gpu, QUICK, command(gpu, program), None, print)
+        return caught.value
+
+    died = await run("import sys; print('loading'); sys.exit('out of luck')")
+    assert died.details == {"exit_code": 1, "log": "loading\nout of luck"}
+    killed = await run("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    assert "SIGKILL" in killed.message
+    assert "no bytes" in (await run("pass")).message
+    with pytest.raises(CalibrationFailed, match="cannot start"):
+        await measure_program(gpu, QUICK, ["/no/such/program"], None, print)
+    hide(card)
+    monkeypatch.setattr(measure, "VERIFY_TIMEOUT_S", 0.1)
+    disturbed = await run(
+        "import os; from pathlib import Path; Path(os.environ['VRAM_FAKE_GPU'], 'other.json')"
+        '.write_text(\'{"pid": 1, "context_bytes": 1000000000}\')'
+    )
+    assert "another program used it meanwhile" in disturbed.message
+
+
+# -- the command
+MANIFEST = """
+name: test/eye
+version: 0.1.0
+kind: detector
+embodiment_tags: [any]
+chunk_size: 1
+weights_uri: hf://test/eye
+description: an echo
+latency_budget: {per_chunk_ms: 100}
+actions: [detect]
+detector: {labels: [cube]}
+"""
+
+
+@pytest.fixture
+def rskill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A model without weights, served by the echo."""
+    (tmp_path / "rskill.yaml").write_text(MANIFEST)
+    echo = (sys.executable, str(echo_sidecar.__file__), str(tmp_path), "--footprint")
+    monkeypatch.setattr(measure, "SIDECAR", (*echo, "1200MiB,1GiB,300MiB"))
+    return tmp_path / "rskill.yaml"
+
+
+@pytest.fixture
+def calibrate(
+    arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., int]:
+    """`vramctl calibrate` in this process, beside a real daemon."""
+    monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(arbiter_daemon.runtime))
+    monkeypatch.setenv(fakegpu.FOLDER_VARIABLE, str(arbiter_daemon.card))
+    return lambda *words: run_main(["calibrate", *FLAGS, *words])
+
+
+@pytest.mark.e2e
+def test_a_model_beside_a_running_arbiter(
+    calibrate: Callable[..., int],
+    rskill: Path,
+    arbiter_daemon: ArbiterProcess,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    written = rskill.parent / "footprints.yaml"
+    words = ["--requests", "3", "--json", "--write", str(written), "--rest", "0.8", "--rate", "50"]
+    assert calibrate(str(rskill), *words) == 0  # memory is back 0.5 s after it was freed
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["bytes"] == {
+        "context": RESIDUE_BYTES,
+        "load_peak": 1200 * MIB,
+        "steady": GIB,
+        "inference_peak": GIB,
+        "retained": 0,
+        "freed": GIB,
+        "after_exit": 0,
+    }
+    assert answer["written"] == str(written)
+    assert "3 requests" in answer["entry"]["source"]
+    (entry,) = read_footprints(written).values()
+    assert entry.steady == 1045 * MIB
+    with Client("looker", endpoint=arbiter_daemon.endpoint) as client:
+        assert client.status().leases == ()
+        (granted,) = client.history(kinds=["granted"]).events
+    assert granted.consumer == f"vramctl calibrate {answer['key']}"
+
+
+@pytest.mark.e2e
+def test_a_robot_goes_first(
+    calibrate: Callable[..., int],
+    gpu: Watched,
+    arbiter_daemon: ArbiterProcess,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A request of a higher priority ends the calibration and its program; nothing is written."""
+    waiting = subprocess.Popen(
+        [sys.executable, "-c", REQUEST, arbiter_daemon.endpoint, str(gpu.seen)],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    program = "import sys, pathlib, signal; pathlib.Path(sys.argv[1], 'up').touch(); signal.pause()"
+    assert calibrate("--", *command(gpu, program)) == 1
+    assert "the GPU is needed" in capsys.readouterr().err
+    assert waiting.communicate(timeout=PATIENCE_S)[0] == "granted\n"
+
+
+REQUEST = """
+import sys, time
+from pathlib import Path
+from vram_arbiter.clients.sync import Client
+
+while not Path(sys.argv[2], "up").exists():
+    time.sleep(0.005)
+with Client("robot", endpoint=sys.argv[1]) as client, client.lease(vram="1GiB", priority=60):
+    print("granted", flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ([], 2, "expected either MANIFEST or `-- COMMAND`"),
+        (["so101-detector", "--", "true"], 2, "expected either MANIFEST or `-- COMMAND`"),
+        (["so101-detector", "--seconds", "3"], 2, "belong to `-- COMMAND`"),
+        (["--rate", "10", "--", "true"], 2, "expected a number, 20 to 1000"),
+        (["no-such-skill"], 2, "cannot be read"),
+        (["so101-navigate", "--no-arbiter"], 2, "which no sidecar serves"),
+        (["so101-detector", "--write", "/no/such/place.yaml"], 2, "is not a directory"),
+        (["so101-detector", "--write", "configs/models/footprints.yaml"], 2, "stands for"),
+    ],
+)
+def test_refused_before_anything_is_measured(
+    words: list[str],
+    code: int,
+    said: str,
+    card: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv(fakegpu.FOLDER_VARIABLE, str(card))
+    monkeypatch.chdir(Path(__file__).parents[3])
+    try:
+        found = run_main(["calibrate", *words])
+    except SystemExit as ended:
+        found = int(ended.code or 0)
+    assert (found, said in capsys.readouterr().err) == (code, True)
