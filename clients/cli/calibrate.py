@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -52,6 +53,7 @@ PRIORITY = 40
 """As `vramctl run`: a robot's models go first."""
 RATE_MIN_HZ = 20.0
 PATIENCE_S = 1.0
+KEY = re.compile(r"[^/\s]+/[^/\s]+")
 FIGURES = (
     ("context", "an empty context, which no unload gives back"),
     ("load_peak", "the most while it loads"),
@@ -90,7 +92,12 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         metavar="S",
         help="end COMMAND after so long, for a server (default: it ends by itself)",
     )
-    add("--name", type=arguments.name, help="key of COMMAND's entry (default: local/PROGRAM)")
+    add(
+        "--name",
+        type=arguments.name,
+        metavar="OWNER/NAME",
+        help="key of COMMAND's entry (default: local/PROGRAM)",
+    )
     add(
         "--rate",
         type=arguments.at_least(RATE_MIN_HZ, 1000.0),
@@ -107,6 +114,11 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     )
     add("--write", type=Path, metavar="FILE", help="put the entry into this footprint file")
     add("--configs", type=Path, metavar="DIR", help="folder of shipped skills and models")
+    add(
+        "--allow-noncommercial",
+        action="store_true",
+        help="measure a model whose license does not allow commercial use",
+    )
     add("--no-arbiter", action="store_true", help="without a lease, where no arbiter runs")
     add(
         "--wait",
@@ -141,6 +153,8 @@ def run(args: argparse.Namespace) -> int:
         if target.manifest is None:
             return await measure_program(gpu, pace, args.program, args.seconds, _say)
         words = ["--rskill", str(target.rskill), "--configs", str(configs)]
+        if args.allow_noncommercial:
+            words.append("--allow-noncommercial")
         if not gpu.device.startswith("fake:"):
             words += ["--footprint", "0B,0B,0B"]  # its own bytes, without ballast
         return await measure_model(
@@ -161,7 +175,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _target(args: argparse.Namespace, configs: Path) -> Target:
     if args.program:
-        return Target(args.name or f"local/{printable(Path(args.program[0]).name)}", None)
+        key = args.name or "local/" + re.sub(r"\s", "-", printable(Path(args.program[0]).name))
+        if not KEY.fullmatch(key):
+            args.parser.error(f"--name: expected OWNER/NAME, got {key!r}")
+        return Target(key, None)
     if args.name or args.seconds:
         args.parser.error("--name and --seconds belong to `-- COMMAND`")
     rskill = shipped(Path(args.manifest), "rskills", configs)
@@ -285,7 +302,7 @@ async def _exclusive(
     finally:
         over.set()
         with contextlib.suppress(VramError):
-            await lease.release(exiting=True)
+            await lease.release()
 
 
 async def _room(client: AsyncClient, gpu: Gpu) -> int:
