@@ -22,6 +22,7 @@ from vram_arbiter.sidecars.adapters.base import ModelAdapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
 from vram_arbiter.sidecars.device.capacity import capacities
 from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.quantization import check_precision
 from vram_arbiter.sidecars.settings import FootprintEntry, lease_footprint, read_model
 from vram_arbiter.sidecars.weights import Weights, cached
 
@@ -69,7 +70,12 @@ def check(wanted: Wanted) -> list[Finding]:
     except VramError as error:
         findings.append(_bad("family", error))
     findings.append(packages := _packages(manifest))
-    findings += _weights(manifest, weights, wanted.adapter_for if adapter and packages.ok else None)
+    precision = Finding("precision", None, "not checked: packages are missing")
+    if packages.ok:
+        precision = _precision(manifest, wanted.device)
+    findings.append(precision)
+    comparable = adapter is not None and packages.ok and precision.ok
+    findings += _weights(manifest, weights, wanted.adapter_for if comparable else None)
     return findings + _bytes(manifest, wanted)
 
 
@@ -100,8 +106,7 @@ def _license(manifest: RSkillManifest, allow_noncommercial: bool) -> Finding:
 
 
 def _family(manifest: RSkillManifest) -> str:
-    family = f" of family {manifest.model_family}" if manifest.model_family else ""
-    return f"{manifest.kind}{family} in {manifest.quantization.dtype}"
+    return f"{manifest.kind} {manifest.model_family or ''}".rstrip()
 
 
 def need_packages(manifest: RSkillManifest) -> None:
@@ -118,6 +123,14 @@ def _packages(manifest: RSkillManifest) -> Finding:
     except ConfigError as error:
         return _bad("packages", error)
     return Finding("packages", True, "installed")
+
+
+def _precision(manifest: RSkillManifest, device: str) -> Finding:
+    try:
+        check_precision(manifest, device)
+    except VramError as error:
+        return _bad("precision", error)
+    return Finding("precision", True, str(manifest.quantization.dtype))
 
 
 def _weights(

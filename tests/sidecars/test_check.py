@@ -209,6 +209,10 @@ def test_every_finding_is_collected(check: Check, tmp_path: Path) -> None:
     code, findings, _ = check(closed, "--device", gpu, "--allow-noncommercial")
     assert (code, bad(findings)) == (2, {"weights", "footprint"})
     assert findings["gpu"]["ok"] is None
+    eighths = closed + "quantization: {dtype: int8}\n"
+    code, findings, _ = check(eighths, "--device", gpu, "--footprint", "1GB", adapter=make_adapter)
+    assert (code, bad(findings)) == (2, {"license", "weights", "precision"})
+    assert "quantization.dtype 'int8' is not served" in findings["precision"]["says"]
     local = DETECTOR.replace("hf://test/model", "local://models/none")
     code, findings, _ = check(local, "--device", gpu, "--footprint", "1GB", adapter=make_adapter)
     assert (code, bad(findings)) == (2, {"weights"})
