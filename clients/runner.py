@@ -206,7 +206,7 @@ class RunnerClient:
     # -- steps -------------------------------------------------------------------------------------
     async def _exchange(self, op: str, fields: JsonMap, timeout_s: float) -> Message:
         try:
-            reply = await self._rpc.exchange({"op": op, **fields}, timeout_s)
+            reply: Message = await self._rpc.exchange({"op": op, **fields}, timeout_s)
         except TimeoutError:
             raise RunnerUnreachable(
                 f"no runner answers {op} at {self.endpoint} within {timeout_s:g} s",

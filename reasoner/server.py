@@ -112,7 +112,7 @@ async def send(endpoint: str, request: Message, *, timeout_s: float = SEND_S) ->
 
     client = RpcClient(endpoint, program="reasoner", lost=lost)
     try:
-        reply = await client.exchange(request, timeout_s)
+        reply: Message = await client.exchange(request, timeout_s)
     except TimeoutError:
         raise ReasonerUnreachable(
             f"no reasoner answers at {endpoint} within {timeout_s:g} s", hint="does an episode run?"

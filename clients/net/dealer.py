@@ -8,7 +8,7 @@ where heartbeats would take seconds. The module must not know what messages mean
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import anyio
 import anyio.lowlevel
@@ -16,9 +16,10 @@ import msgpack
 import zmq
 
 from vram_arbiter.clients._protocol.codec import pack
-from vram_arbiter.clients.net.link import Link
-from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.clients.net.link import MESSAGE_LIMIT_BYTES, Link
+from vram_arbiter.schemas.errors import MessageTooLarge, ModelError, VramError
 from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.runtime.msgpack_codec import count_values
 from vram_arbiter.schemas.runtime.trust import Program
 
 log = logging.getLogger(__name__)
@@ -27,6 +28,7 @@ DRAIN_MAX: Final = 256  # messages in one go, then other tasks get their turn
 RETRY_S: Final = 0.02  # the first pause before another connection is tried …
 RETRY_MAX_S: Final = 0.5  # … and the longest
 UNSENT_MAX: Final = 1000  # messages kept until there is a connection
+ANSWER_VALUES_MAX: Final = 65_536  # keys, list items and what they hold, of one answer
 
 
 class Dealer:
@@ -35,19 +37,25 @@ class Dealer:
     `run` tries until a server of a trusted user listens (`clients.net.link`), sends what was queued
     by then, and calls `received(message)` for each message. It ends after `hung_up()` or
     `refused(error)` (UntrustedServer), and where its task is canceled.
+
+    `enveloped`: the server may be one of the field. Messages stand behind an empty frame, answers
+    need not be maps, and the connection is `refused` with ModelError at one that is not msgpack: it
+    belonged to a request, which would wait for it in vain.
     """
 
     def __init__(
         self,
         endpoint: str,
-        received: Callable[[Message], None],
+        received: Callable[[Any], None],
         hung_up: Callable[[], None],
         refused: Callable[[VramError], None],
         *,
         program: Program,
+        enveloped: bool = False,
     ) -> None:
         self._endpoint = endpoint
         self._program: Program = program
+        self._enveloped = enveloped
         self._received = received
         self._hung_up = hung_up
         self._refused = refused
@@ -55,9 +63,16 @@ class Dealer:
         self._link: Link | None = None  # while it is open
         self._reading: anyio.CancelScope | None = None  # while the reader waits
 
-    def send(self, message: Message) -> bool:
-        """Queue one message. False: the queue is full, the server does not read."""
+    def send(self, message: Message, max_bytes: int = MESSAGE_LIMIT_BYTES) -> bool:
+        """Queue one message. False: the queue is full, the server does not read. Raises
+        MessageTooLarge."""
         payload = pack(message)
+        if len(payload) > max_bytes:
+            raise MessageTooLarge(
+                f"the request has {len(payload)} bytes, the limit is {max_bytes}",
+                hint="send fewer or smaller pictures",
+                details={"size_bytes": len(payload), "limit_bytes": max_bytes},
+            )
         if self._link is None or self._link.state != "open":
             if len(self._unsent) >= UNSENT_MAX:
                 return False
@@ -87,7 +102,9 @@ class Dealer:
         """Return an open link. Raises UntrustedServer."""
         pause_s = RETRY_S
         while True:
-            link = Link(zmq.Context.instance(), self._endpoint, self._program)
+            link = Link(
+                zmq.Context.instance(), self._endpoint, self._program, enveloped=self._enveloped
+            )
             try:
                 while link.advance() == "connecting":
                     await anyio.wait_readable(link.monitor.fileno())
@@ -139,15 +156,23 @@ class Dealer:
             if payload is None:
                 return False
             try:
+                if self._enveloped and count_values(payload, ANSWER_VALUES_MAX) > ANSWER_VALUES_MAX:
+                    raise ValueError(f"more than {ANSWER_VALUES_MAX} values")
                 message = msgpack.unpackb(payload, raw=False, strict_map_key=False)
             except (ValueError, msgpack.UnpackException) as error:
+                if self._enveloped:
+                    raise ModelError(
+                        f"the answer of {self._endpoint} is not a msgpack value: {error}",
+                        hint="is this the endpoint of a sidecar? see its log",
+                        details={"endpoint": self._endpoint, "size_bytes": len(payload)},
+                    ) from None
                 log.warning("dropped a frame that is not msgpack: %s", error)
                 continue
-            if isinstance(message, dict):
+            if self._enveloped or isinstance(message, dict):
                 self._hand_on(message)
         return True
 
-    def _hand_on(self, message: Message) -> None:
+    def _hand_on(self, message: Any) -> None:
         try:
             self._received(message)
         except Exception:

@@ -4,8 +4,8 @@ libzmq connects in its own thread and would reconnect without a word, to whateve
 So its own reconnect is put off, and no message is given to it before its monitor names the
 connection's descriptor, whose user the kernel names (SO_PEERCRED). The number of a descriptor is
 reused, so the first frame has to carry the same user (libzmq's `Peer-Address`, read from the
-connection itself). A link that has ended is replaced. It needs no event loop and must not know what
-messages mean.
+connection itself; a port has none). A link that has ended is replaced. It needs no event loop and
+must not know what messages mean.
 """
 
 import math
@@ -17,9 +17,15 @@ from typing import Any, Final, Literal
 
 import zmq
 
-from vram_arbiter.schemas.errors import InternalError, VramError
-from vram_arbiter.schemas.runtime.endpoints import socket_path
-from vram_arbiter.schemas.runtime.trust import Program, check_uid, frame_uid, server_uid
+from vram_arbiter.schemas.errors import ConfigError, InternalError, VramError
+from vram_arbiter.schemas.runtime.endpoints import loopback_port, socket_path
+from vram_arbiter.schemas.runtime.trust import (
+    Program,
+    check_uid,
+    frame_uid,
+    port_uids,
+    server_uid,
+)
 
 MESSAGE_LIMIT_BYTES: Final = 64 * 1024 * 1024  # a reply is never near it; libzmq hangs up beyond
 
@@ -37,25 +43,32 @@ class Link:
     """Connects at construction; `advance` when `monitor` is readable, until `state` is `open`. Then
     `send` and `receive`.
 
-    Raises ConfigError for an endpoint that is not one.
+    `enveloped` messages stand behind an empty frame, which a server with a REP socket demands and
+    a ROUTER repeats. Raises ConfigError for an endpoint that is not one.
     """
 
     def __init__(
-        self, context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, program: Program
+        self,
+        context: "zmq.Context[zmq.Socket[bytes]]",
+        endpoint: str,
+        program: Program,
+        *,
+        enveloped: bool = False,
     ) -> None:
-        path = socket_path(endpoint)
+        address = _address(endpoint, program)
         self.state: State = "connecting"
         self._endpoint = endpoint
+        self._port = loopback_port(endpoint)
         self._program: Program = program
-        self._heard = False
+        self._enveloped = enveloped
+        self._heard = self._port is not None
         self.socket: zmq.Socket[bytes] = context.socket(zmq.DEALER)
         self.socket.setsockopt(zmq.LINGER, 0)
         self.socket.setsockopt(zmq.RECONNECT_IVL, NEVER_MS)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES)
         self.monitor: zmq.Socket[bytes] = self.socket.get_monitor_socket(_WATCHED)
         self.monitor.setsockopt(zmq.LINGER, 0)
-        # bytes: a path need not be text
-        self.socket.connect(b"ipc://" + os.fsencode(path))  # type: ignore[arg-type]
+        self.socket.connect(address)  # type: ignore[arg-type]
 
     def advance(self) -> State:
         """Read what became of the connection. Raises UntrustedServer; the link has ended then."""
@@ -83,6 +96,8 @@ class Link:
         is `open`."""
         assert self.state == "open", "nothing is said before the server is known"
         try:
+            if self._enveloped:
+                self.socket.send(b"", zmq.NOBLOCK | zmq.SNDMORE)
             self.socket.send(payload, zmq.NOBLOCK)
         except zmq.Again:
             return False
@@ -117,14 +132,20 @@ class Link:
     def _connected(self, descriptor: int) -> None:
         """Ask the kernel before anything is said. libzmq may have closed the descriptor by now."""
         try:
-            with socket.socket(
-                socket.AF_UNIX, socket.SOCK_STREAM, fileno=os.dup(descriptor)
-            ) as connection:
-                uid = server_uid(connection)
+            with socket.socket(fileno=os.dup(descriptor)) as connection:
+                if self._port is None:
+                    uids = {server_uid(connection)}
+                elif connection.getpeername()[:2] == ("127.0.0.1", self._port):
+                    uids = port_uids(connection)
+                else:
+                    uids = set()  # the descriptor is another connection's by now
         except OSError:
+            uids = set()
+        if not uids:
             self.state = "ended"
             return
-        self._check(uid)
+        for uid in sorted(uids, reverse=True):
+            self._check(uid)
         self.state = "open"
 
     def _check(self, uid: int) -> None:
@@ -133,6 +154,21 @@ class Link:
         except VramError:
             self.state = "ended"
             raise
+
+
+def _address(endpoint: str, program: Program) -> str | bytes:
+    """What libzmq connects to. Raises ConfigError. Only a sidecar may be a server of the field,
+    which listens on a port."""
+    if program == "sidecar" and endpoint.startswith("tcp://"):
+        port = loopback_port(endpoint)
+        if port is None:
+            raise ConfigError(
+                f"{endpoint} is refused: only a server on this machine has a user to be checked",
+                hint="write ipc://PATH, or tcp://127.0.0.1:PORT for a server of the field",
+                details={"endpoint": endpoint},
+            )
+        return f"tcp://127.0.0.1:{port}"
+    return b"ipc://" + os.fsencode(socket_path(endpoint))  # bytes: a path need not be text
 
 
 def ms_until(deadline: float) -> int:

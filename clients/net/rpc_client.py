@@ -2,22 +2,31 @@
 
 The connection is made by the first request and again by the first one after a loss of contact. The
 module must not know what requests and replies mean.
+
+Our servers repeat a request's `id` as `re`. A server of the field, with a REP socket, does not:
+`in_order` says which of both was met, by the first answer of the connection. To be understood by
+both, a request stands behind an empty frame, so that a wrong guess cannot be made, nor waited for.
 """
 
 import asyncio
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.dealer import Dealer
+from vram_arbiter.clients.net.link import MESSAGE_LIMIT_BYTES
+from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, KIB
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.trust import Program
 
+REQUEST_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * KIB  # our servers refuse more, without `re`
+
 
 class RpcClient:
     """`lost(reason)` makes the error that requests fail with when contact is lost;
-    `pushed(message)` gets what is not a reply."""
+    `pushed(message)` gets what is not a reply. `enveloped` as in `Dealer`."""
 
     def __init__(
         self,
@@ -26,28 +35,37 @@ class RpcClient:
         program: Program,
         lost: Callable[[str], VramError],
         pushed: Callable[[Message], None] = lambda message: None,
+        enveloped: bool = False,
     ) -> None:
         self.proven = False
         """Whether the present connection was answered once."""
+        self.in_order: bool | None = None if enveloped else False
+        """Whether replies come without `re`, to one request at a time; None before the first."""
+        self._enveloped = enveloped
         self._endpoint = endpoint
         self._program: Program = program
         self._lost = lost
         self._pushed = pushed
         self._ids = itertools.count(1)
-        self._waiting: dict[int, Answer[Message]] = {}
+        self._waiting: dict[int, Answer[Any]] = {}
         self._dealer: Dealer | None = None
         self._running: asyncio.Task[None] | None = None
 
-    async def exchange(self, request: JsonMap, timeout_s: float) -> Message:
-        """Return the reply to a request, which gets an `id` here.
+    async def exchange(self, request: JsonMap, timeout_s: float) -> Any:
+        """Return the reply to a request, which gets an `id` here. A map where the server is ours.
 
-        Raises: TimeoutError; UntrustedServer before anything is sent; the error of `lost`.
+        Unless `in_order` is False, callers make one exchange after the other, and `drop` the
+        connection where they gave one up: its late reply would pass for the next one's.
+
+        Raises: TimeoutError; UntrustedServer before anything is sent; the error of `lost`;
+        MessageTooLarge; ModelError for a reply that is not msgpack, where `enveloped`.
         """
         dealer = self._connected()
         request_id = next(self._ids)
-        answer = self._waiting[request_id] = Answer[Message]()
+        answer = self._waiting[request_id] = Answer[Any]()
         try:
-            if not dealer.send({**request, "id": request_id}):
+            limit = REQUEST_MAX_BYTES if self.in_order is False else MESSAGE_LIMIT_BYTES
+            if not dealer.send({**request, "id": request_id}, limit):
                 raise self._lost("it takes no more requests; restart it")
             return await answer.within(timeout_s)
         finally:
@@ -57,27 +75,41 @@ class RpcClient:
         """Close the connection; requests that wait fail with `error`. Idempotent."""
         running, self._running, self._dealer = self._running, None, None
         self.proven = False
+        self.in_order = None if self._enveloped else False
         if running is not None:
             running.cancel()
-        for answer in self._waiting.values():
+        waiting, self._waiting = self._waiting, {}
+        for answer in waiting.values():
             answer.fail(error)
 
     def _connected(self) -> Dealer:
         if self._dealer is None:
             self._dealer = Dealer(
-                self._endpoint, self._received, self._hung_up, self.drop, program=self._program
+                self._endpoint,
+                self._received,
+                self._hung_up,
+                self.drop,
+                program=self._program,
+                enveloped=self._enveloped,
             )
             self._running = asyncio.get_running_loop().create_task(
                 self._dealer.run(), name=f"socket to {self._program}"
             )
         return self._dealer
 
-    def _received(self, message: Message) -> None:
-        self.proven = True
-        if answer := self._waiting.get(message.get("re", -1)):
+    def _received(self, message: Any) -> None:
+        of_map = message if isinstance(message, dict) else {}
+        number = of_map.get("re")
+        if isinstance(number, int) and (answer := self._waiting.get(number)):
+            self.proven, self.in_order = True, False
             answer.set(message)
-        elif "push" in message:
-            self._pushed(message)
+        elif "push" in of_map:
+            self._pushed(of_map)
+        elif self.in_order is not False and len(self._waiting) == 1:
+            if "error" not in of_map:  # our servers, too, refuse without `re` what they cannot read
+                self.proven, self.in_order = True, True
+            (answer,) = self._waiting.values()
+            answer.set(message)
 
     def _hung_up(self) -> None:
         self.drop(self._lost("it hung up"))

@@ -112,15 +112,15 @@ class RewardClient(SidecarClient):
         """How far along the task one camera's pictures show the robot to be; the newest
         `PICTURES_MAX` are sent. Raises as `DetectorClient.detect`."""
         fields = {"images": list(images_png)[-PICTURES_MAX:], "task": task}
-        sent = len(fields["images"])
         reply = await self.call("score", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
         try:
+            sent = reply.get("n", len(fields["images"]))  # a server of the field takes fewer
             found = Judgement(
                 tuple(float(value) for value in reply["progress"]),
                 tuple(float(value) for value in reply["success"]),
                 float(reply["success_threshold"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ModelError(f"the reward model's answer has a wrong shape: {error!r}") from error
         values = (*found.progress, *found.success, found.success_threshold)
         if not found.progress or not all(0.0 <= value <= 1.0 for value in values):

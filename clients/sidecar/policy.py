@@ -15,6 +15,18 @@ class PolicyClient(SidecarClient):
 
     family = "endpoint"
 
+    async def modality_config(self, *, timeout_s: float | None = None) -> Message:
+        """What a server of the field says about its inputs and outputs: `video`, `state`, `action`
+        and `language`, each with `modality_keys` and `delta_indices`. Raises UnknownOp, for our
+        servers: their manifest says it."""
+        found = await self.call("get_modality_config", timeout_s=timeout_s)
+        if not isinstance(found, dict):
+            raise ModelError(f"get_modality_config answered a {type(found).__name__}, not a map")
+        return {
+            name: config.get("as_json", config) if isinstance(config, dict) else config
+            for name, config in found.items()
+        }
+
     async def reset(
         self,
         data: JsonMap | None = None,

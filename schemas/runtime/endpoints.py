@@ -2,6 +2,7 @@
 made here."""
 
 import os
+import re
 import stat
 from collections.abc import Mapping
 
@@ -90,6 +91,14 @@ def check_endpoint(endpoint: str) -> str:
             "folder"
         )
     return endpoint
+
+
+def loopback_port(endpoint: str) -> int | None:
+    """The port of `tcp://127.0.0.1:PORT`, where only a server of the field is asked; None for any
+    other endpoint."""
+    found = re.fullmatch(r"tcp://(?:127\.0\.0\.1|localhost):([0-9]{1,5})", endpoint)
+    port = int(found[1]) if found else 0
+    return port if 0 < port < 65536 else None
 
 
 def socket_path(endpoint: str) -> str:

@@ -2,8 +2,9 @@
 
 A client trusts root, its own user, the unit's user for the program it asks (`SERVICE_USERS`) and
 the users named in `VRAM_ARBITER_SERVER_USERS`. A folder that others may write, or a socket left by
-another user, is then no danger: the check is about the process that listens, not about files. It
-must not know what is said on the socket.
+another user, is then no danger: the check is about the process that listens, not about files. A
+loopback port, where the servers of the field listen, is looked up in the kernel's table of sockets.
+It must not know what is said on the socket.
 """
 
 import os
@@ -28,6 +29,11 @@ SERVICE_USERS: Final[Mapping[Program, str]] = {
 """The users of configs/systemd. Only root can make a user of such a name."""
 
 _UCRED = struct.Struct("iII")  # pid, uid, gid
+_TABLES: Final = ("/proc/self/net/tcp", "/proc/self/net/tcp6")
+_NOT_ACCEPTED: Final = ("01", "03")  # established, its handshake
+_LISTEN: Final = "0A"
+_LOOPBACK: Final = ("0100007F", "0000000000000000FFFF00000100007F")
+_ANY: Final = ("00000000", "0" * 32)
 
 
 def check_server(connected: socket.socket, program: Program, where: str) -> None:
@@ -47,6 +53,35 @@ def server_uid(connected: socket.socket) -> int:
         connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size)
     )
     return int(uid)
+
+
+def port_uids(connected: socket.socket) -> set[int]:
+    """The users of the process at the other end of a connection to a port of 127.0.0.1.
+
+    That is the owner of the other end; while no process has accepted it, of every socket that
+    listens there. Empty: there is no other end any more. Raises OSError.
+    """
+    here, there = connected.getsockname(), connected.getpeername()
+    ours = [f"{address}:{here[1]:04X}" for address in _LOOPBACK]
+    theirs = [f"{address}:{there[1]:04X}" for address in _LOOPBACK]
+    listens = theirs + [f"{address}:{there[1]:04X}" for address in _ANY]
+    listening: set[int] = set()
+    waiting = False
+    for table in _TABLES:
+        try:
+            with open(table, encoding="ascii") as file:
+                lines = file.read().splitlines()[1:]
+        except FileNotFoundError:  # a kernel without IPv6
+            continue
+        for line in lines:
+            _, local, remote, state, _, _, _, uid, _, inode, *_ = line.split()
+            if local in theirs and remote in ours:
+                if inode != "0":
+                    return {int(uid)}
+                waiting |= state in _NOT_ACCEPTED
+            elif state == _LISTEN and local in listens:
+                listening.add(int(uid))
+    return listening if waiting else set()
 
 
 def frame_uid(peer_address: object) -> int | None:

@@ -118,6 +118,37 @@ def test_nothing_is_said_to_a_false_server(
         assert heard() == []
 
 
+LISTENER = """
+import os, socket, sys
+os.setuid(int(sys.argv[1]))
+server = socket.create_server(("127.0.0.1", 0))
+print(server.getsockname()[1], flush=True)
+if sys.argv[2] == "accepts":
+    connection, _ = server.accept()
+    print(connection.recv(1), flush=True)
+    while data := connection.recv(4096):
+        print(data, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("how", ["accepts", "waits"])
+def test_nothing_is_said_to_a_false_server_on_a_port(how: str) -> None:
+    """A port has no permissions: any user may listen where a server of the field is expected."""
+    nobody = pwd.getpwnam("nobody").pw_uid
+    command = [sys.executable, "-c", LISTENER, str(nobody), how]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout is not None
+        port = int(child.stdout.readline())
+        with pytest.raises(UntrustedServer, match=r"served by uid \d+ \(nobody\)"):
+            asyncio.run(ask_sidecar(f"tcp://127.0.0.1:{port}"))
+        said, _ = child.communicate()
+    assert "get_action" not in said
+    assert "ping" not in said
+
+
 def test_vramctl_says_who_serves_there(short_folder: Path) -> None:
     """Regression: clients believed any process that served the path."""
     environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{short_folder}/s"}
