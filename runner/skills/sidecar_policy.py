@@ -40,6 +40,7 @@ from vram_arbiter.schemas.errors import (
     NotResident,
     StaleToken,
     UnknownLease,
+    UnknownOp,
     VramError,
     WaitTimeout,
 )
@@ -296,7 +297,9 @@ class SidecarPolicy(SkillBase):
         """
         try:
             if self._loaded:
-                await self._client.unload()
+                # a server of the field has no unload: the lease is that of `vramctl run`
+                with contextlib.suppress(UnknownOp):
+                    await self._client.unload()
         finally:
             await self._client.close()
 

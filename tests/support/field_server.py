@@ -125,7 +125,12 @@ class FieldServer:
         raise ValueError(f"Unknown endpoint: {endpoint}")
 
     def _act(self, observation: dict[str, Any], options: dict[str, Any] | None = None) -> Any:
-        return [{**self.action, "action.x": observation["state.x"] + 1}, {"options": options}]
+        moved = {
+            key.replace("state", "action"): value + 1
+            for key, value in observation.items()
+            if key.startswith("state.")
+        }
+        return [{**moved, **self.action}, {"options": options}]
 
     def _reset(self, options: dict[str, Any] | None = None) -> dict[str, Any]:
         return {"options": options}

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.field_server import FieldServer
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.policy import PolicyClient
@@ -247,6 +248,30 @@ def scenario(run_async: Run, policy_bench: Bench, play: Callable[[Bench], Any]) 
 
 
 GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=20.0)
+
+
+def test_a_server_of_the_field_plays_a_goal_without_a_lease(
+    policy_bench: Callable[..., Bench], run_async: Run
+) -> None:
+    """It knew neither `load` nor our requests, so that no goal began."""
+    import numpy as np
+
+    bench = policy_bench(arbiter := Arbiter())
+
+    async def play() -> None:
+        with FieldServer(bench.client.endpoint) as server:
+            server.action = {"action": np.full((1, 3, 2), 0.25, dtype=np.float32)}
+            await bench.skill.start(GOAL)
+            rows, _ = await bench.play()
+            await bench.skill.finish()
+            await bench.skill.release()
+        assert rows == [(0.25, 0.25)] * 7
+        asked = [request["endpoint"] for request in server.heard]
+        assert asked == ["ping", "reset", "get_action", "get_action", "get_action"]
+        assert server.heard[1]["data"] == {"options": {"task": GOAL.prompt}}
+
+    run_async(play())
+    assert arbiter.asked == []
 
 
 def test_a_goal_is_one_use_and_its_chunks_play_in_order(
