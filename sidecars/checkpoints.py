@@ -7,13 +7,21 @@ answers. On the device `meta` the model is built without bytes and compared, whi
 """
 
 import contextlib
+import copy
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import ModelError
-from vram_arbiter.sidecars.weights import Weights, from_pretrained, is_quantized
+from vram_arbiter.sidecars.quantization import Nf4, load_bitsandbytes, read_packed, settle
+from vram_arbiter.sidecars.weights import (
+    Weights,
+    fitting,
+    from_pretrained,
+    quantization_config,
+    safetensors_files,
+)
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
@@ -21,6 +29,7 @@ if TYPE_CHECKING:
 
 META = "meta"
 NAMES_SHOWN = 4
+_REMOTE_CODE = ("trust_remote_code", "code_revision")
 
 
 @dataclass(slots=True)
@@ -53,20 +62,107 @@ class Differences:
             )
 
 
-def load_transformers(cls: Any, weights: Weights, **options: Any) -> Any:
-    """Call `cls.from_pretrained` of transformers.
+def load_transformers(cls: Any, weights: Weights, *, nf4: Nf4 | None = None, **options: Any) -> Any:
+    """Call `cls.from_pretrained` of transformers with `weights.model_options`.
 
-    transformers knows which names are renamed, tied, quantized or known leftovers, so its own
-    account of the load is compared.
+    transformers knows which names are renamed, tied or known leftovers, so its own account of the
+    load is compared. It gives none of quantized layers: a quantized model is first compared on
+    `meta`, without bytes. Layers that the checkpoint holds quantized stay as they are.
 
-    Raises: ModelError if the checkpoint does not fit the class or does not hold the whole model.
+    Raises: ModelError if the checkpoint does not fit the class or does not hold the whole model,
+    ConfigError or UnsupportedQuantization if it cannot be quantized as asked.
     """
-    if options.get("device_map") == {"": META} and is_quantized(weights):
-        options["device_map"] = {"": "cpu"}  # the statistics of a quantized weight are in its bytes
+    if nf4 is None:
+        return _compared(cls, weights, options)
+    on_meta = options | {"device_map": {"": META}}
+    if quantization_config(weights) is not None:
+        outline, options["config"] = _packed_outline(cls, weights, nf4, on_meta)
+    else:
+        outline = _compared(cls, weights, on_meta)
+        options["quantization_config"] = nf4.for_transformers(nf4.chosen(outline))
+    if options["device_map"] == {"": META}:
+        return outline
+    del outline
+    load_bitsandbytes()
+    model = _compared(cls, weights, options)
+    settle(model)
+    return model
+
+
+def _packed_outline(
+    cls: Any, weights: Weights, nf4: Nf4, options: Mapping[str, Any]
+) -> tuple[Any, Any]:
+    """Compare a quantized checkpoint with its model on `meta`, by its headers alone.
+
+    Return the model, and a configuration by which transformers takes as quantized just the layers
+    that the checkpoint holds quantized: transformers 4 and 5 read the skip list in its own
+    differently. Raises: ModelError.
+    """
+    import torch
+    from transformers import AutoConfig
+
+    remote = {key: options[key] for key in _REMOTE_CODE if key in options}
+    config = from_pretrained(AutoConfig, weights, **remote)
+    plain = copy.deepcopy(config)
+    del plain.quantization_config
+    with fitting(cls, weights):
+        header = read_packed(safetensors_files(weights))
+        with torch.device(META):
+            kind = type(cls.from_config(plain, **remote)) if hasattr(cls, "from_config") else cls
+        model, account = kind.from_pretrained(
+            None,
+            config=plain,
+            state_dict=header.tensors,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+            **{key: value for key, value in options.items() if key not in remote},
+        )
+    found = _differences(account)
+    found.missing |= header.missing
+    found.misshapen |= header.misshapen
+    found.refuse(weights.source)
+    with fitting(cls, weights):
+        chosen = [_loaded_as(name, model).removesuffix(".weight") for name in header.quantized]
+    others = [name for name in chosen if type(model.get_submodule(name)) is not torch.nn.Linear]
+    if others:
+        raise ModelError(
+            f"{weights.source}: {_first(others)} are quantized and no linear layers",
+            hint="use the checkpoint before quantization",
+        )
+    config.quantization_config = nf4.for_transformers(chosen).to_dict() | {
+        "bnb_4bit_quant_storage": config.quantization_config["bnb_4bit_quant_storage"]
+    }
+    return model.eval(), config
+
+
+def _loaded_as(name: str, model: Any) -> str:
+    """Return the model's name of a checkpoint's parameter, by transformers' renaming."""
+    from transformers.core_model_loading import WeightRenaming, rename_source_key
+
+    renamings = [
+        entry for entry in model._weight_conversions or () if isinstance(entry, WeightRenaming)
+    ]
+    found, _ = rename_source_key(
+        name, renamings, [], model.base_model_prefix, model.state_dict(keep_vars=True)
+    )
+    return str(found)
+
+
+def _compared(cls: Any, weights: Weights, options: Mapping[str, Any]) -> Any:
+    """Load, and raise ModelError for what transformers filled, dropped or cut."""
     model, account = from_pretrained(
         cls, weights, output_loading_info=True, ignore_mismatched_sizes=True, **options
     )
-    found = Differences(
+    try:
+        _differences(account).refuse(weights.source)
+    except ModelError:
+        del model  # the error is kept for `ping`, and this frame with it
+        raise
+    return model.eval()
+
+
+def _differences(account: Mapping[str, Any]) -> Differences:
+    return Differences(
         missing=set(account["missing_keys"]),
         foreign=set(account["unexpected_keys"]),
         misshapen={
@@ -74,12 +170,6 @@ def load_transformers(cls: Any, weights: Weights, **options: Any) -> Any:
             for name, has, needs in account["mismatched_keys"]
         },
     )
-    try:
-        found.refuse(weights.source)
-    except ModelError:
-        del model  # the error is kept for `ping`, and this frame with it
-        raise
-    return model.eval()
 
 
 def load_lerobot(cls: Any, weights: Weights, config: Any) -> Any:

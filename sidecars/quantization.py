@@ -5,19 +5,25 @@ quantized in host RAM, then copied. What cannot be done is refused. Must not kno
 """
 
 import importlib.util
+import json
 import logging
+import math
+import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.schemas.errors import ConfigError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype, QuantizationBackend
+from vram_arbiter.schemas.plain import JsonMap
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
     from torch.nn import Module
 
 _log = logging.getLogger(__name__)
@@ -85,6 +91,26 @@ class Nf4:
             )
         return found
 
+    def for_transformers(self, chosen: Iterable[str]) -> Any:
+        """Return transformers' configuration for quantizing exactly the `chosen` layers."""
+        from transformers import BitsAndBytesConfig
+
+        return BitsAndBytesConfig(
+            load_in_4bit=True,
+            bnb_4bit_quant_type="nf4",
+            bnb_4bit_compute_dtype=self.compute_type,
+            llm_int8_skip_modules=all_but(chosen),
+        )
+
+
+def all_but(chosen: Iterable[str]) -> list[str]:
+    """Return transformers' `llm_int8_skip_modules` that leaves exactly the `chosen` modules.
+
+    transformers takes an entry as a pattern from a name's beginning, or as its end: `visual` skips
+    nothing of `model.visual.blocks.0`, and `layers.1` skips `layers.10`.
+    """
+    return [f"(?!(?:{'|'.join(map(re.escape, chosen))})$)"]
+
 
 def _within(name: str, part: str) -> bool:
     """Return whether a module is `part` or inside of it: whole words of its dotted path."""
@@ -134,6 +160,29 @@ def nf4_of(manifest: RSkillManifest) -> Nf4 | None:
             details={"dtype": "int4", "supported": [*map(str, TORCH_NAMES)]},
         )
     return nf4
+
+
+def check_checkpoint(manifest: RSkillManifest, config: JsonMap | None) -> None:
+    """Refuse a checkpoint that is quantized in another way than its manifest says.
+
+    `config` is the checkpoint's own `quantization_config`. Raises: UnsupportedQuantization.
+    """
+    if config is None:
+        return
+    dtype = manifest.quantization.dtype
+    is_nf4 = (
+        config.get("quant_method") == "bitsandbytes"
+        and config.get("load_in_4bit") is True
+        and config.get("bnb_4bit_quant_type") == "nf4"
+    )
+    if not is_nf4 or dtype is not Dtype.INT4:
+        method = "NF4 of bitsandbytes" if is_nf4 else config.get("quant_method", "unknown")
+        raise UnsupportedQuantization(
+            f"{manifest.name}: the checkpoint is quantized ({method}), and quantization.dtype is "
+            f"{dtype.value!r}",
+            hint="write dtype: int4" if is_nf4 else "use the checkpoint before quantization",
+            details={"dtype": dtype.value, "checkpoint": str(method)},
+        )
 
 
 def _read(manifest: RSkillManifest) -> Nf4:
@@ -227,6 +276,79 @@ def nf4_layers(model: "Module") -> dict[str, Any]:
     """Return the quantized linear layers of a model by name."""
     kind = load_bitsandbytes().nn.Linear4bit
     return {name: layer for name, layer in model.named_modules() if isinstance(layer, kind)}
+
+
+@dataclass(slots=True)
+class PackedHeader:
+    """Names and shapes of a checkpoint with NF4 weights, as if it were not quantized.
+
+    `tensors` are on `meta`; `quantized` are the names among them that the checkpoint holds packed.
+    """
+
+    tensors: "dict[str, Tensor]" = field(default_factory=dict)
+    quantized: list[str] = field(default_factory=list)
+    missing: set[str] = field(default_factory=set)
+    misshapen: dict[str, str] = field(default_factory=dict)
+
+
+_BLOB: Final = ".quant_state.bitsandbytes__nf4"  # JSON: shape, block size
+_NESTED: Final = ("nested_absmax", "nested_quant_map")  # statistics of the statistics
+_STATISTICS: Final = ("absmax", "quant_map", *_NESTED)
+_BYTES: Final = {"U8": 1, "F16": 2, "BF16": 2, "F32": 4}  # of an element, as safetensors names it
+_CODES: Final = 16
+_NESTED_CODES: Final = 256
+
+
+def read_packed(files: Iterable[Path]) -> PackedHeader:
+    """Read the headers of safetensors files, and of each packed weight the bytes that tell its
+    shape. Raises what safetensors and JSON raise for a file that is not whole."""
+    import torch
+    from safetensors import safe_open
+
+    shapes: dict[str, list[int]] = {}
+    types: dict[str, str] = {}
+    states: dict[str, JsonMap] = {}
+    for path in files:
+        with safe_open(path, "pt") as file:
+            for name in file.keys():  # noqa: SIM118  not a mapping
+                part = file.get_slice(name)
+                shapes[name], types[name] = part.get_shape(), part.get_dtype()
+                if name.endswith(_BLOB):
+                    blob = bytes(file.get_tensor(name).tolist())
+                    states[name.removesuffix(_BLOB)] = json.loads(blob)
+    found = PackedHeader()
+    for name, shape in shapes.items():
+        weight, _, last = name.rpartition(".")
+        if last in _STATISTICS and (weight in shapes or weight in states):
+            if weight not in states:
+                found.missing.add(weight + _BLOB)
+        elif not name.endswith(_BLOB) and name not in states:
+            found.tensors[name] = torch.empty(shape, device="meta")
+    for weight, state in states.items():
+        expected = _sizes_of(weight, state)
+        found.missing |= expected.keys() - shapes.keys() - {weight}
+        for name in expected.keys() & shapes.keys():
+            size = math.prod(shapes[name]) * _BYTES.get(types[name], 0)
+            if size != expected[name]:
+                found.misshapen[name] = f"{size} bytes, not {expected[name]}"
+        if weight in shapes:
+            found.tensors[weight] = torch.empty(state["shape"], device="meta")
+            found.quantized.append(weight)
+    return found
+
+
+def _sizes_of(weight: str, state: JsonMap) -> dict[str, int]:
+    """Return the bytes of a packed weight and of its statistics, by name."""
+    count = math.prod(state["shape"])
+    blocks = -(-count // state["blocksize"])
+    sizes = {weight: -(-count // 2), f"{weight}.quant_map": 4 * _CODES}
+    if "nested_blocksize" not in state:
+        return sizes | {f"{weight}.absmax": 4 * blocks}
+    return sizes | {
+        f"{weight}.absmax": blocks,
+        f"{weight}.nested_absmax": 4 * -(-blocks // state["nested_blocksize"]),
+        f"{weight}.nested_quant_map": 4 * _NESTED_CODES,
+    }
 
 
 def load_bitsandbytes() -> Any:

@@ -6,6 +6,8 @@ Must not know devices' bytes or leases.
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,8 +15,8 @@ from typing import Any, Final
 from vram_arbiter.clients.configs import CONFIGS_VARIABLE
 from vram_arbiter.schemas.errors import ConfigError, ModelError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
-from vram_arbiter.schemas.manifest.vocabulary import Dtype
-from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.sidecars.quantization import check_checkpoint, nf4_of, torch_type
 
 CONFIG_FILE: Final = "config.json"
 
@@ -91,8 +93,15 @@ def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
         options["local_files_only"] = True
     elif weights.revision:
         options["revision"] = weights.revision
-    try:
+    with fitting(cls, weights):
         return cls.from_pretrained(weights.source, **options)
+
+
+@contextmanager
+def fitting(cls: Any, weights: Weights) -> Iterator[None]:
+    """Raise a library's failure to load as ModelError."""
+    try:
+        yield
     except VramError:
         raise
     except Exception as error:
@@ -110,14 +119,9 @@ def read_config(cls: Any, weights: Weights) -> Any:
     ModelError.
     """
     import draccus
-    from huggingface_hub import hf_hub_download
 
     try:
-        if weights.local:
-            path = Path(weights.source) / CONFIG_FILE
-        else:
-            path = Path(hf_hub_download(weights.source, CONFIG_FILE, revision=weights.revision))
-        fields = json.loads(path.read_text(encoding="utf-8"))
+        fields = json.loads(_config_file(weights).read_text(encoding="utf-8"))
         kind = cls.get_choice_class(fields.pop("type"))
         with draccus.config_type("json"):
             return draccus.decode(kind, fields)
@@ -133,54 +137,65 @@ def _unfit(cls: Any, weights: Weights, error: Exception) -> ModelError:
 
 
 def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> Message:
-    """Return options for loading a transformers model onto `device` as in production.
+    """Return `load_transformers`' options for a model in its manifest's precision.
 
-    On the CPU: none, float32 as saved. On CUDA: shards go straight to the GPU, one after the other
-    (never the whole model twice), in the manifest's number format; `int4` is NF4 through
-    bitsandbytes, unless the checkpoint is quantized already.
+    `device` is where the weights are put, `cpu` or `meta`; their precision does not depend on it.
+
+    Raises: UnsupportedQuantization, ConfigError, and ModelError if the checkpoint's configuration
+    cannot be read.
     """
-    os.environ.setdefault(
-        "HF_DEACTIVATE_ASYNC_LOAD", "1"
-    )  # transformers then loads shard by shard: a lower peak
-    if device == "meta":
-        return {"device_map": {"": device}}
-    if not device.startswith("cuda"):
-        return {}
-    import torch
-
-    dtype = manifest.quantization.dtype
-    options: Message = {"device_map": {"": device}, "low_cpu_mem_usage": True}
-    options["dtype"] = {Dtype.FP32: torch.float32, Dtype.FP16: torch.float16}.get(
-        dtype, torch.bfloat16
-    )
-    if dtype is Dtype.INT4 and not is_quantized(weights):
-        from transformers import BitsAndBytesConfig
-
-        options["quantization_config"] = BitsAndBytesConfig(
-            load_in_4bit=True,
-            bnb_4bit_quant_type="nf4",
-            bnb_4bit_compute_dtype=torch.bfloat16,
-            llm_int8_skip_modules=unquantized_modules(manifest),
-        )
-    return options
+    # shard by shard: a lower peak, and no thread that a fork would lose
+    os.environ.setdefault("HF_DEACTIVATE_ASYNC_LOAD", "1")
+    nf4 = nf4_of(manifest)
+    check_checkpoint(manifest, quantization_config(weights))
+    options: Message = {"device_map": {"": device}}
+    if nf4 is None:
+        return options | {"dtype": torch_type(manifest.quantization.dtype)}
+    return options | {"dtype": nf4.compute_type, "nf4": nf4}
 
 
-def unquantized_modules(manifest: RSkillManifest) -> list[str]:
-    """Return the modules that keep their precision: `quantization.extra.skip_modules`.
+def quantization_config(weights: Weights) -> JsonMap | None:
+    """Return how a checkpoint says that its weights are quantized; None if they are not.
 
-    Raises ConfigError for anything but a list of names.
+    Raises: ModelError.
     """
-    names = manifest.quantization.extra.get("skip_modules", ["lm_head", "visual"])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ConfigError(
-            f"quantization.extra.skip_modules is {names!r}",
-            hint="give a list of module names, e.g. [lm_head, visual]",
+    try:
+        fields = json.loads(_config_file(weights).read_text(encoding="utf-8"))
+        found: JsonMap | None = fields.get("quantization_config")
+    except Exception as error:
+        raise ModelError(
+            f"{weights.source}: its {CONFIG_FILE} cannot be read: {type(error).__name__}: {error}",
+            hint="check that the checkpoint is complete",
+        ) from error
+    return found
+
+
+def safetensors_files(weights: Weights) -> list[Path]:
+    """Return the files of a checkpoint's weights, fetched from the hub if need be.
+
+    Raises: ModelError if there are none.
+    """
+    from huggingface_hub import snapshot_download
+
+    folder = Path(weights.source)
+    if not weights.local:
+        folder = Path(
+            snapshot_download(
+                weights.source,
+                revision=weights.revision,
+                allow_patterns=["*.json", "*.safetensors"],
+            )
         )
-    return [str(name) for name in names]
+    whole, index = folder / "model.safetensors", folder / "model.safetensors.index.json"
+    if whole.is_file() or not index.is_file():
+        return [whole]
+    parts = json.loads(index.read_text(encoding="utf-8"))["weight_map"].values()
+    return [folder / name for name in dict.fromkeys(parts)]
 
 
-def is_quantized(weights: Weights) -> bool:
-    """Return whether the checkpoint's own configuration says how it is quantized."""
-    from transformers import AutoConfig
+def _config_file(weights: Weights) -> Path:
+    from huggingface_hub import hf_hub_download
 
-    return getattr(from_pretrained(AutoConfig, weights), "quantization_config", None) is not None
+    if weights.local:
+        return Path(weights.source) / CONFIG_FILE
+    return Path(hf_hub_download(weights.source, CONFIG_FILE, revision=weights.revision))

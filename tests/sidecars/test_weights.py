@@ -1,19 +1,23 @@
 """Where weights come from."""
 
+import json
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from vram_arbiter.clients.configs import configs_folder
-from vram_arbiter.schemas.errors import ConfigError, ModelError
+from vram_arbiter.schemas.errors import ConfigError, ModelError, UnsupportedQuantization
+from vram_arbiter.schemas.manifest.contracts import Quantization
 from vram_arbiter.schemas.manifest.load import load_manifest
+from vram_arbiter.sidecars.quantization import Nf4
 from vram_arbiter.sidecars.weights import (
     Weights,
     from_pretrained,
+    model_options,
     read_config,
     resolve,
-    unquantized_modules,
 )
 
 
@@ -63,14 +67,49 @@ def test_hub_and_folder_take_the_same_call(tmp_path):
         from_pretrained(Model, Weights("broken"))
 
 
-def test_modules_that_stay_unquantized_are_a_list_of_names():
-    """A bare text would be taken apart into its letters, and every module would be quantized."""
+def asking(dtype: str) -> Any:
     manifest = load_manifest(configs_folder({}) / "rskills" / "so101-grab" / "rskill.yaml")
-    assert unquantized_modules(manifest) == ["lm_head", "visual"]
-    extra = {"skip_modules": "lm_head"}
-    wrong = manifest.quantization.model_copy(update={"extra": extra})
-    with pytest.raises(ConfigError, match="give a list of module names"):
-        unquantized_modules(manifest.model_copy(update={"quantization": wrong}))
+    asked = Quantization.model_validate({"dtype": dtype})
+    return manifest.model_copy(update={"quantization": asked})
+
+
+@pytest.mark.heavy
+def test_the_precision_is_the_manifests_whatever_the_device(tmp_path):
+    """Regression: on the CPU every model was float32, and int8 was bf16 on a GPU."""
+    torch = pytest.importorskip("torch")
+    (tmp_path / "config.json").write_text("{}")
+    weights = Weights(str(tmp_path), local=True)
+    types = {"fp32": torch.float32, "fp16": torch.float16, "bf16": torch.bfloat16}
+    for device in ("cpu", "meta"):
+        for dtype, found in types.items():
+            options = model_options(asking(dtype), weights, device)
+            assert options == {"device_map": {"": device}, "dtype": found}
+        options = model_options(asking("int4"), weights, device)
+        assert options == {"device_map": {"": device}, "dtype": torch.bfloat16, "nf4": Nf4()}
+        for dtype in ("int8", "fp8", "fp4_nvfp4"):
+            with pytest.raises(UnsupportedQuantization):
+                model_options(asking(dtype), weights, device)
+
+
+@pytest.mark.heavy
+def test_a_quantized_checkpoint_is_loaded_by_a_manifest_that_says_so_only(tmp_path):
+    nf4 = {"quant_method": "bitsandbytes", "load_in_4bit": True, "bnb_4bit_quant_type": "nf4"}
+    weights = Weights(str(tmp_path), local=True)
+
+    def options(dtype, **quantized):
+        (tmp_path / "config.json").write_text(json.dumps({"quantization_config": quantized}))
+        return model_options(asking(dtype), weights, "cpu")
+
+    assert options("int4", **nf4)["nf4"] == Nf4()
+    with pytest.raises(UnsupportedQuantization, match=r"NF4 of bitsandbytes.*is 'bf16'.*int4"):
+        options("bf16", **nf4)
+    with pytest.raises(UnsupportedQuantization, match=r"quantized \(gptq\)"):
+        options("int4", quant_method="gptq")
+    with pytest.raises(UnsupportedQuantization, match=r"quantized \(bitsandbytes\)"):
+        options("int4", **nf4 | {"bnb_4bit_quant_type": "fp4"})
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(ModelError, match=r"its config\.json cannot be read"):
+        model_options(asking("int4"), weights, "cpu")
 
 
 @pytest.mark.heavy

@@ -15,6 +15,7 @@ import pytest
 
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.sidecars.checkpoints import load_lerobot, load_transformers
+from vram_arbiter.sidecars.quantization import Nf4
 from vram_arbiter.sidecars.weights import Weights, read_config
 
 pytestmark = pytest.mark.heavy
@@ -145,6 +146,23 @@ def load_vlm(weights: Weights, device: str) -> Any:
     return load_transformers(AutoModelForImageTextToText, weights, device_map={"": device})
 
 
+def load_vlm_nf4(weights: Weights, device: str) -> Any:
+    """Quantize while loading."""
+    from transformers import AutoModelForImageTextToText
+
+    return load_transformers(
+        AutoModelForImageTextToText, weights, device_map={"": device}, nf4=Nf4(min_params=0)
+    )
+
+
+def load_detector_nf4(weights: Weights, device: str) -> Any:
+    from transformers import AutoModelForZeroShotObjectDetection
+
+    return load_transformers(
+        AutoModelForZeroShotObjectDetection, weights, device_map={"": device}, nf4=Nf4()
+    )
+
+
 def load_policy(weights: Weights, device: str) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
@@ -188,6 +206,7 @@ str]] = {  # how it is loaded, and a part that it does not work without
     "owlv2": (load_detector, "class_head"),
     "grounding_dino": (load_detector, "bbox_embed"),
     "qwen": (load_vlm, "lm_head"),
+    "qwen nf4": (load_vlm_nf4, "mlp.down_proj"),
     "shipped detector": (load_detector, "box_head"),
     "shipped vlm": (load_vlm, "layers.0"),
 }  # fmt: skip
@@ -200,7 +219,7 @@ def saved(weights: Any, tmp_path_factory: Any) -> Callable[[str], Path]:
 
     def saved(name: str) -> Path:
         if name not in OTHERS:
-            return Path(weights(name).source)
+            return Path(weights(name.removesuffix(" nf4")).source)
         place: Path = folder / name
         if not place.exists():
             place.mkdir()
@@ -278,27 +297,52 @@ def test_a_checkpoint_in_parts_needs_all_of_them(tmp_path: Path, device: str) ->
 def test_a_quantized_checkpoint_is_compared_with_its_statistics(
     saved: Callable[[str], Path], tmp_path: Path, device: str
 ) -> None:
-    """Regression: `--check` would have refused every checkpoint written by bitsandbytes."""
-    pytest.importorskip("bitsandbytes")
+    """Regression: `--check` read the whole of such a checkpoint, transformers does not tell wrong
+    shapes of quantized models, and a weight without any statistics was loaded as it was."""
+    import torch
     from safetensors.torch import load_file, save_file
     from transformers import AutoModelForZeroShotObjectDetection, BitsAndBytesConfig
 
-    nf4 = BitsAndBytesConfig(load_in_4bit=True, bnb_4bit_quant_type="nf4")
+    nf4 = BitsAndBytesConfig(
+        load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_use_double_quant=True
+    )
     quantized = AutoModelForZeroShotObjectDetection.from_pretrained(
         saved("owlvit"), quantization_config=nf4, device_map={"": "cpu"}
     )
     quantized.save_pretrained(tmp_path)
-    load_detector(Weights(str(tmp_path), local=True), device)
+    model = load_detector_nf4(Weights(str(tmp_path), local=True), device)
+    assert {tensor.device.type for tensor in model.parameters()} == {device}
     tensors = load_file(tmp_path / WHOLE)
-    weight = next(key for key in tensors if key.endswith(".absmax")).removesuffix(".absmax")
-    for dropped in (
-        [weight],
-        [f"{weight}.absmax"],
-        [key for key in tensors if key.startswith(weight)],
-    ):
-        kept = {key: tensor for key, tensor in tensors.items() if key not in dropped}
-        save_file(kept, tmp_path / WHOLE, metadata={"format": "pt"})
-        refusal_of(load_detector, tmp_path, device)
+    names = [key.removesuffix(".absmax") for key in tensors if key.endswith(".weight.absmax")]
+    weight = next(name for name in names if "vision_model" in name)
+    statistics = [key for key in tensors if key.startswith(f"{weight}.")]
+    assert len(statistics) == 5
+
+    def damaged(content: dict[str, Any]) -> ModelError:
+        save_file(content, tmp_path / WHOLE, metadata={"format": "pt"})
+        return refusal_of(load_detector_nf4, tmp_path, device)
+
+    def without(*dropped: str) -> dict[str, Any]:
+        return {key: tensor for key, tensor in tensors.items() if key not in dropped}
+
+    for one in (weight, f"{weight}.absmax", f"{weight}.nested_quant_map"):
+        error = damaged(without(one))
+        assert (error.details["missing"], error.details["foreign"]) == (1, 0), one
+        assert f"1 missing from it ({one})" in error.message
+    layer = [key for key in tensors if "text_model.encoder.layers.0" in key]
+    parameters = [key for key in layer if key.endswith((".weight", ".bias"))]
+    assert damaged(without(*layer)).details["missing"] == len(parameters) > 10
+    error = damaged(without(*statistics))
+    assert error.details["misshapen"] == 1
+    assert weight in error.message
+    error = damaged(tensors | {f"{weight}.absmax": torch.zeros(3, dtype=torch.uint8)})
+    assert "absmax 3 bytes, not " in error.message
+    assert damaged(tensors | {"another.weight": torch.zeros(3)}).details["foreign"] == 1
+    bias = f"{weight.removesuffix('.weight')}.bias"
+    assert damaged(tensors | {bias: torch.zeros(3)}).details["misshapen"] == 1
+    content = (tmp_path / WHOLE).read_bytes()
+    (tmp_path / WHOLE).write_bytes(content[: len(content) // 2])
+    refusal_of(load_detector_nf4, tmp_path, device)
 
 
 def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Path) -> None:
