@@ -153,7 +153,7 @@ class PingResult(TypedDict):
     rskill: str
     pid: int
     boot_id: str
-    state: Literal["unloaded", "waiting", "loading", "resident", "unloading"]
+    state: Literal["unloaded", "waiting", "loading", "resident", "parking", "parked", "unloading"]
     lease_id: NotRequired[str | None]
     token: NotRequired[list[int] | None]
     standby: NotRequired[bool]  # evicted, and it comes back by itself when there is room

@@ -7,6 +7,7 @@ environment are wrong: a person has to act.
 import argparse
 import asyncio
 import contextlib
+import functools
 import json
 import os
 import sys
@@ -60,7 +61,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         f"vram-sidecar-{flags.name}"
     )
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
-    logs.set_up(service, flags.log_level, flags.log_format, human)
+    set_up_log = functools.partial(logs.set_up, service, flags.log_level, flags.log_format, human)
+    set_up_log()
     try:
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
@@ -81,7 +83,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             ),
             _temporary_files_in(os.path.dirname(path_of(settings.endpoint))),
         ):
-            asyncio.run(SidecarHost(settings, adapter_for).serve())
+            asyncio.run(SidecarHost(settings, adapter_for, set_up_log).serve())
     except VramError as error:
         if flags.as_json:
             print(json.dumps({"error": error.to_wire()}))

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import os
 import signal
+from collections.abc import Callable
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import RouterServer
@@ -29,16 +30,26 @@ _log = logging.getLogger("sidecars")
 WORK_SHARE = 0.5
 
 
+def _no_log() -> None:
+    """Leave the log as it is."""
+
+
 class SidecarHost:
     """Server of one model until `stop`, SIGTERM or SIGINT.
 
     Then it finishes the op in progress, unloads, releases and returns.
     """
 
-    def __init__(self, settings: Settings, adapter_for: AdapterFor) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        adapter_for: AdapterFor,
+        set_up_log: Callable[[], None] = _no_log,
+    ) -> None:
+        """`set_up_log`: sets up the log of the model's processes; they can be told its name."""
         self._settings = settings
         self._adapter = adapter_for(settings.manifest, settings.weights)
-        self._processes = ModelProcesses(settings, adapter_for)
+        self._processes = ModelProcesses(settings, adapter_for, set_up_log)
         self._stopping = asyncio.Event()
         self._residency: Residency | None = None
         self._refused: NoGpu | None = None
@@ -66,7 +77,7 @@ class SidecarHost:
                 )
             )
             self._processes.preload(self._adapter.modules)
-            residency = self._residency = Residency(settings, self._processes.start, client)
+            residency = self._residency = Residency(settings, self._processes, client)
             background = [
                 asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")
             ]

@@ -1,19 +1,25 @@
-"""A model's process: one request after the other from its host, until that closes the socket.
+"""A sidecar's processes beside its host: the keeper of the weights, and the model it forks.
 
-`prepare` does what needs no device, `load` puts the weights onto the GPU, `run` answers a request
-of the sidecar's wire. Every failure is answered as a typed error. The process ends without
-ceremony: the kernel and the driver take everything back.
+The keeper reads the weights into host RAM and touches no device. For each residency it forks a
+model process, which copies them onto the GPU (`load`), answers requests of the sidecar's wire
+(`run`), and ends without ceremony: the kernel and the driver take everything back. Both answer one
+request after the other from their host until it closes the socket. Every failure is answered as a
+typed error.
 """
 
+import contextlib
 import gc
+import io
 import logging
 import os
 import select
 import signal
 import socket
 import struct
+import sys
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import Final, NoReturn
 
 import msgpack
@@ -22,6 +28,7 @@ from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.schemas.errors import ModelError, OutOfMemory, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
+from vram_arbiter.sidecars import host_weights
 from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
 from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
 from vram_arbiter.sidecars.device.open import open_memory
@@ -33,22 +40,117 @@ type AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 """Makes a model's adapter; a function of a module, so that a process can be told its name."""
 
 LENGTH: Final = struct.Struct(">I")
+THREADS_VARIABLE: Final = "OMP_NUM_THREADS"
 
 
-def main(settings: Settings, adapter_for: AdapterFor, host_pid: int, host: socket.socket) -> None:
-    """Serve the host until it closes the socket or ends."""
+def keep(
+    settings: Settings,
+    adapter_for: AdapterFor,
+    set_up_log: Callable[[], None],
+    threads: int,
+    host_pid: int,
+    host: socket.socket,
+    births: socket.socket,
+) -> None:
+    """Serve the host as the keeper of its weights, until it closes the socket or ends.
+
+    `births` brings the socket of each model process before its `fork` is asked for. `threads`: of a
+    model process; the keeper itself has one only, because a fork copies no other, and locks that
+    others hold would stay locked.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the host ends this process
-    threading.Thread(target=_end_with, args=(host_pid,), name="host", daemon=True).start()
-    model = _Model(settings, adapter_for(settings.manifest, settings.weights))
+    set_up_log()
+    keeper = _Keeper(settings, adapter_for(settings.manifest, settings.weights))
     with host, host.makefile("rwb") as stream:
-        while header := stream.read(LENGTH.size):
-            (length,) = LENGTH.unpack(header)
-            reply = msgpack.packb(model.answer(msgpack.unpackb(stream.read(length))))
-            stream.write(LENGTH.pack(len(reply)) + reply)
-            stream.flush()
+        while message := _receive(stream):
+            if message["do"] == "fork":
+                ours = socket.socket(fileno=socket.recv_fds(births, 1, 1)[1][0])
+                keeper_pid = os.getpid()
+                pid = os.fork()
+                if pid == 0:
+                    stream.close()
+                    host.close()
+                    births.close()
+                    _live(settings, keeper.adapter, threads, (host_pid, keeper_pid), ours)
+                ours.close()
+                _send(stream, {"pid": pid})
+            else:
+                with _ending_with(host_pid):
+                    reply = keeper.answer(message)
+                _send(stream, reply)
+        os._exit(0)  # a million objects of imported code need no tidying
+
+
+class _Keeper:
+    def __init__(self, settings: Settings, adapter: ModelAdapter) -> None:
+        self.adapter = adapter
+        self._settings = settings
+
+    def answer(self, message: Message) -> Message:
+        try:
+            match message["do"]:
+                case "prepare":
+                    self.adapter.prepare()
+                    return {}
+                case "load":
+                    return {"bytes": self._load()}
+                case "drop":
+                    host_weights.drop(self.adapter.networks)
+                    gc.collect()
+                    return {}
+                case "reap":
+                    _, status = os.waitpid(message["pid"], 0)
+                    return {"code": os.waitstatus_to_exitcode(status)}
+        # any failure inside a model is an answer to the caller
+        except Exception as error:  # noqa: BLE001
+            return {"error": _typed(error).to_wire()}
+        raise AssertionError(f"the host asked for {message['do']}")
+
+    def _load(self) -> int:
+        """Read the weights into shared memory. Return their bytes: those of the production model
+        where they stand for one, and at the pace of its disk."""
+        settings = self._settings
+        if (torch := sys.modules.get("torch")) is not None:
+            torch.set_num_threads(1)
+        self.adapter.load("cpu")
+        count = host_weights.share(self.adapter.networks, settings.name)
+        gc.collect()
+        gc.freeze()  # collections need not walk the imported code, nor copy its pages after a fork
+        if not count or not _stands_in(settings):
+            return count
+        if settings.throttle_bytes_per_s:
+            time.sleep(settings.footprint.steady_bytes / settings.throttle_bytes_per_s)
+        return max(count, settings.footprint.steady_bytes)
+
+
+def _live(
+    settings: Settings,
+    adapter: ModelAdapter,
+    threads: int,
+    others: tuple[int, ...],
+    host: socket.socket,
+) -> NoReturn:
+    """Serve the host as a model process; ends with the host or the keeper (`others`: their pids),
+    through which the arbiter knows that its bytes are the sidecar's."""
+    code = 1
+    try:
+        threading.Thread(target=_end_with, args=others, name="others", daemon=True).start()
+        os.environ[THREADS_VARIABLE] = str(threads)
+        if (torch := sys.modules.get("torch")) is not None:
+            torch.set_num_threads(threads)
+        model = _Model(settings, adapter)
+        with host, host.makefile("rwb") as stream:
+            while message := _receive(stream):
+                _send(stream, model.answer(message))
         model.close()
         logging.shutdown()
-        os._exit(0)  # a million objects of imported code need no tidying
+        code = 0
+    except OSError as error:
+        logging.getLogger("sidecars").error("the model's process lost its host: %s", error)
+    except BaseException:
+        logging.getLogger("sidecars").exception("the model's process failed")
+    finally:
+        os._exit(code)
 
 
 class _Model:
@@ -60,11 +162,8 @@ class _Model:
     def answer(self, message: Message) -> Message:
         try:
             match message["do"]:
-                case "prepare":
-                    self._memory = open_memory(self._settings)
-                    self._adapter.prepare()
-                    gc.collect()
-                    gc.freeze()  # later collections need not walk the imported code
+                case "check":
+                    open_memory(self._settings)
                     return {}
                 case "load":
                     return {"used_bytes": self._load(message["gpu"])}
@@ -83,25 +182,24 @@ class _Model:
             self._memory.close()
 
     def _load(self, gpu: str) -> int | None:
-        """Load the weights, then ballast up to the footprint where they stand for a larger model,
-        at the pace of a real load. Return the bytes on the GPU."""
+        """Copy the weights onto the device, then ballast up to the footprint where they stand for a
+        larger model. Return the bytes on the GPU."""
         settings, footprint = self._settings, self._settings.footprint
-        memory = self._memory
-        assert memory is not None, "a model is prepared before it is loaded"
+        memory = self._memory = open_memory(settings)
         if gpu:
             memory.bind(gpu)
         memory.touch()
-        self._adapter.load("cpu")
+        if memory.torch_device == "cpu":  # simulated, or none: a copy all the same
+            host_weights.own(self._adapter.networks)
         self._adapter.place(memory.torch_device)
         used = memory.used_bytes()
-        if used is None or not (settings.device.startswith("fake:") or settings.stands_for):
+        if used is None or not _stands_in(settings):
             return used  # a real model has its own bytes
-        paces = (settings.throttle_bytes_per_s, memory.throttle_bytes_per_s())
         fill(
             memory,
             "weights",
             footprint.steady_bytes - used,
-            bytes_per_s=min((pace for pace in paces if pace), default=None),
+            bytes_per_s=memory.throttle_bytes_per_s(),
         )
         if footprint.load_peak_bytes > footprint.steady_bytes:
             memory.free(
@@ -109,6 +207,25 @@ class _Model:
             )
             memory.empty_cache()
         return memory.used_bytes()
+
+
+def _stands_in(settings: Settings) -> bool:
+    return bool(settings.stands_for) or settings.device.startswith("fake:")
+
+
+def _receive(stream: io.BufferedRWPair) -> Message | None:
+    """Return the next request; None where the host has closed the socket."""
+    if not (header := stream.read(LENGTH.size)):
+        return None
+    (length,) = LENGTH.unpack(header)
+    message: Message = msgpack.unpackb(stream.read(length))
+    return message
+
+
+def _send(stream: io.BufferedRWPair, message: Message) -> None:
+    packed = msgpack.packb(message)
+    stream.write(LENGTH.pack(len(packed)) + packed)
+    stream.flush()
 
 
 def _typed(error: BaseException) -> VramError:
@@ -123,12 +240,36 @@ def _typed(error: BaseException) -> VramError:
     return ModelError(f"{type(error).__name__}: {error}", hint="see the sidecar's log")
 
 
-def _end_with(host_pid: int) -> NoReturn:
-    """End this process when its host ends, also in the middle of its work: no program would use
-    the memory, and no lease covers it any more."""
+def _end_with(*pids: int) -> NoReturn:
+    """End this process when another one ends, also in the middle of its work: no program would use
+    its memory, and no lease covers it any more."""
     try:
-        host = os.pidfd_open(host_pid)
+        others = [os.pidfd_open(pid) for pid in pids]
     except ProcessLookupError:
         os._exit(1)
-    select.select([host], [], [])
+    select.select(others, [], [])
     os._exit(1)
+
+
+@contextlib.contextmanager
+def _ending_with(host_pid: int) -> Iterator[None]:
+    """End this process when its host ends, inside the block only: no thread is left after it."""
+    done, finish = os.pipe()
+
+    def watch() -> None:
+        try:
+            host = os.pidfd_open(host_pid)
+        except ProcessLookupError:
+            os._exit(1)
+        if host in select.select([host, done], [], [])[0]:
+            os._exit(1)
+        os.close(host)
+
+    watching = threading.Thread(target=watch, name="host", daemon=True)
+    watching.start()
+    try:
+        yield
+    finally:
+        os.close(finish)
+        watching.join()
+        os.close(done)

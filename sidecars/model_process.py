@@ -1,10 +1,10 @@
-"""One process for each residency of a model. It owns the weights and the device's context, and its
-end returns every byte of both.
+"""Processes of one sidecar's model, as its host sees them.
 
-A server (`multiprocessing`'s forkserver) imports the model's libraries once, without touching a
-device; a model process is forked from it within milliseconds. The host speaks to it over a socket
-pair, one msgpack map each way at a time (`model_main`). Whatever goes wrong in it is a typed error
-here, never the end of the host. Must not know leases, wires or torch.
+A server (`multiprocessing`'s forkserver) imports the model's libraries once. The *keeper*, forked
+from it, holds the weights in host RAM and touches no device. A *model process*, forked from the
+keeper for each residency, owns the device's context; its end returns every byte of it. The host
+speaks to both over socket pairs, one msgpack map each way at a time (`model_main`). Whatever goes
+wrong in them is a typed error here, never the end of the host. Must not know leases, wires or torch.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from functools import partial
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Final, Protocol
@@ -27,7 +27,7 @@ from vram_arbiter.schemas.errors import ModelError, WaitTimeout, from_wire
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.sidecars import model_main
 from vram_arbiter.sidecars.adapters.choose import make_adapter
-from vram_arbiter.sidecars.model_main import LENGTH
+from vram_arbiter.sidecars.model_main import LENGTH, THREADS_VARIABLE
 from vram_arbiter.sidecars.settings import NICE_VARIABLE, Settings
 
 END_S: Final = 5.0
@@ -50,12 +50,9 @@ class Model(Protocol):
     ended: asyncio.Event
     """The process is gone, and its memory with it."""
 
-    async def prepare(self) -> None:
-        """Do what needs no device. Repeatable. Raises ModelError."""
-        ...
-
     async def load(self, gpu: str) -> int | None:
-        """Load onto a GPU (its UUID; "": the only one). Return the bytes on it, None if unknown.
+        """Copy the weights onto a GPU (its UUID; "": the only one). Return the bytes on it, None if
+        unknown.
 
         Raises OutOfMemory, NoGpu or ModelError; end the process then.
         """
@@ -80,38 +77,99 @@ class Model(Protocol):
         ...
 
 
-class ModelProcess:
-    """A `Model` in a process of its own."""
+class Models(Protocol):
+    """The weights of a model and the processes that use them, as `residency` needs them."""
+
+    async def prepare(self) -> None:
+        """Do what needs neither weights nor a device. Repeatable. Raises ModelError or NoGpu."""
+        ...
+
+    async def load(self) -> int:
+        """Read the weights into host RAM, if they are not there. Return their bytes.
+
+        Raises ModelError or ConfigError.
+        """
+        ...
+
+    async def start(self) -> Model:
+        """Start a process that can copy them onto a GPU. Raises as `load`."""
+        ...
+
+    async def drop(self) -> None:
+        """Free the host RAM of the weights. Never raises."""
+        ...
+
+    async def end(self) -> None:
+        """End everything. Idempotent."""
+        ...
+
+
+class _Channel:
+    """Requests to one process, answered in turn."""
 
     def __init__(
         self,
-        process: ForkServerProcess,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
+        gone: Callable[[], Awaitable[str]],
     ) -> None:
-        self.ended = asyncio.Event()
-        self._process = process
         self._reader = reader
         self._writer = writer
+        self._gone = gone
         self._turn = asyncio.Lock()
-        self._prepared = False
-        self._sentinel = process.sentinel
-        asyncio.get_running_loop().add_reader(self._sentinel, self._on_end)
 
-    @property
-    def pid(self) -> int:
-        assert self._process.pid is not None, "it was started"
-        return self._process.pid
+    async def ask(self, message: Message) -> Message:
+        """Raises the process's typed error, or ModelError with the text of `gone`. A caller that is
+        canceled leaves the exchange to itself: the answer is not taken for the next one's."""
+        exchange = asyncio.create_task(self._exchange(message), name="ask")
+        exchange.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return await asyncio.shield(exchange)
 
-    async def prepare(self) -> None:
+    async def _exchange(self, message: Message) -> Message:
+        packed = msgpack.packb(message)
         async with self._turn:
-            if not self._prepared:
-                await self._ask({"do": "prepare"})
-                self._prepared = True
+            try:
+                self._writer.write(LENGTH.pack(len(packed)) + packed)
+                await self._writer.drain()
+                (length,) = LENGTH.unpack(await self._reader.readexactly(LENGTH.size))
+                reply: Message = msgpack.unpackb(await self._reader.readexactly(length))
+            except (OSError, asyncio.IncompleteReadError):
+                raise ModelError(await self._gone(), hint="see the sidecar's log") from None
+        if (error := reply.get("error")) is not None:
+            raise from_wire(error)
+        return reply
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class ModelProcess:
+    """A `Model` in a process of its own. `reap` returns its exit code once it has ended."""
+
+    def __init__(
+        self,
+        pid: int,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        reap: Callable[[int], Awaitable[int | None]],
+    ) -> None:
+        self.ended = asyncio.Event()
+        self.pid = pid
+        self._channel = _Channel(reader, writer, self._told)
+        self._reap = reap
+        self._code: int | None = None
+        self._turn = asyncio.Lock()
+        self._pidfd = os.pidfd_open(pid)  # it is not reaped before its end was seen here
+        self._ending: asyncio.Task[None] | None = None
+        asyncio.get_running_loop().add_reader(self._pidfd, self._on_end)
+
+    async def check(self) -> None:
+        """Open the device, and allocate nothing. Raises NoGpu or ConfigError."""
+        await self._channel.ask({"do": "check"})
 
     async def load(self, gpu: str) -> int | None:
         async with self._turn:
-            used: int | None = (await self._ask({"do": "load", "gpu": gpu}))["used_bytes"]
+            used: int | None = (await self._channel.ask({"do": "load", "gpu": gpu}))["used_bytes"]
             return used
 
     async def run(
@@ -127,7 +185,9 @@ class ModelProcess:
             ) from None
         try:
             begins()
-            answering = asyncio.create_task(self._ask({"do": "run", "call": call}), name="answer")
+            answering = asyncio.create_task(
+                self._channel.ask({"do": "run", "call": call}), name="answer"
+            )
             try:
                 await asyncio.wait({answering}, timeout=end_s)
             except asyncio.CancelledError:  # the model works on: nothing else begins meanwhile
@@ -151,7 +211,7 @@ class ModelProcess:
         if at_once:
             self.kill()
         async with self._turn:
-            self._writer.close()  # the process frees its memory and ends
+            self._channel.close()  # the process frees its memory and ends
             try:
                 async with asyncio.timeout(END_S):
                     await self.ended.wait()
@@ -162,79 +222,198 @@ class ModelProcess:
 
     def kill(self) -> None:
         """End the process in the middle of its work; its memory comes back all the same."""
-        if not self.ended.is_set():
+        if self._ending is None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
+                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
 
-    async def _ask(self, message: Message) -> Message:
-        """Raises the process's typed error, or ModelError where the process is gone."""
-        packed = msgpack.packb(message)
+    def _on_end(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._pidfd)
+        os.close(self._pidfd)
+        self._ending = asyncio.create_task(self._end(), name="reap")
+
+    async def _end(self) -> None:
+        self._code = await self._reap(self.pid)
+        self._channel.close()
+        self.ended.set()
+
+    async def _told(self) -> str:
+        await self.ended.wait()
+        return f"the model's process ended{_how(self._code)}"
+
+
+class _Keeper:
+    """The process that holds the weights, and from which model processes are forked."""
+
+    def __init__(
+        self,
+        process: ForkServerProcess,
+        streams: tuple[asyncio.StreamReader, asyncio.StreamWriter],
+        births: socket.socket,
+    ) -> None:
+        self.ended = asyncio.Event()
+        self.weights_bytes: int | None = None
+        self._process = process
+        self._channel = _Channel(*streams, self._told)
+        self._births = births
+        self._sentinel = process.sentinel
+        asyncio.get_running_loop().add_reader(self._sentinel, self._on_end)
+
+    async def prepare(self) -> None:
+        await self._channel.ask({"do": "prepare"})
+        model = await self.fork()
         try:
-            self._writer.write(LENGTH.pack(len(packed)) + packed)
-            await self._writer.drain()
-            (length,) = LENGTH.unpack(await self._reader.readexactly(LENGTH.size))
-            reply: Message = msgpack.unpackb(await self._reader.readexactly(length))
-        except (OSError, asyncio.IncompleteReadError):
+            await model.check()
+        finally:
+            await model.end()
+
+    async def load(self) -> int:
+        if self.weights_bytes is None:
+            self.weights_bytes = (await self._channel.ask({"do": "load"}))["bytes"]
+        return self.weights_bytes
+
+    async def drop(self) -> None:
+        if self.weights_bytes is not None:
+            self.weights_bytes = None
+            await self._channel.ask({"do": "drop"})
+
+    async def fork(self) -> ModelProcess:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            socket.send_fds(self._births, [b"."], [theirs.fileno()])
+        try:
+            pid = (await self._channel.ask({"do": "fork"}))["pid"]
+            reader, writer = await asyncio.open_connection(sock=ours)
+        except BaseException:
+            ours.close()
+            raise
+        return ModelProcess(pid, reader, writer, self._reap)
+
+    async def end(self) -> None:
+        if not self.ended.is_set():
+            self._process.kill()
             await self.ended.wait()
-            raise ModelError(
-                f"the model's process ended{self._how()}", hint="see the sidecar's log"
-            ) from None
-        if (error := reply.get("error")) is not None:
-            raise from_wire(error)
-        return reply
+
+    async def _reap(self, pid: int) -> int | None:
+        try:
+            code: int = (await self._channel.ask({"do": "reap", "pid": pid}))["code"]
+        except ModelError:  # the keeper is gone: the process was reaped by another one
+            return None
+        return code
 
     def _on_end(self) -> None:
         asyncio.get_running_loop().remove_reader(self._sentinel)
         self._process.join()  # its end is known already
-        self._writer.close()
+        self._channel.close()
+        self._births.close()
         self.ended.set()
 
-    def _how(self) -> str:
-        code = self._process.exitcode
-        if code is None or code >= 0:
-            return "" if not code else f" with {code}"
-        return f" by {signal.Signals(-code).name}"
+    async def _told(self) -> str:
+        await self.ended.wait()
+        return f"the process that keeps the weights ended{_how(self._process.exitcode)}"
 
 
 class ModelProcesses:
-    """Starts the processes of one model. The server of imports ends with this program."""
+    """`Models` in processes. The server of imports ends with this program."""
 
-    def __init__(self, settings: Settings, adapter_for: "model_main.AdapterFor") -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        adapter_for: "model_main.AdapterFor",
+        set_up_log: Callable[[], None],
+    ) -> None:
         self._settings = settings
         self._adapter_for = adapter_for
+        self._set_up_log = set_up_log
         self._context: ForkServerContext = multiprocessing.get_context("forkserver")
+        self._threads = int(os.environ.get(THREADS_VARIABLE) or len(os.sched_getaffinity(0)))
+        self._turn = asyncio.Lock()
+        self._keeper: _Keeper | None = None
 
     def preload(self, modules: Iterable[str]) -> None:
         """Name the modules that the server imports. One that is missing is told by `prepare`."""
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
+        os.environ[THREADS_VARIABLE] = "1"  # of the server and the keeper, whatever is set here
         os.environ[NICE_VARIABLE] = str(self._settings.nice)
         self._context.set_forkserver_preload(["vram_arbiter.sidecars.preload", *modules])
+
+    async def prepare(self) -> None:
+        async with self._turn:
+            await self._prepared()
+
+    async def load(self) -> int:
+        async with self._turn:
+            return await (await self._prepared()).load()
+
+    async def start(self) -> ModelProcess:
+        async with self._turn:
+            keeper = await self._prepared()
+            await keeper.load()  # they may have been dropped since
+            return await keeper.fork()
+
+    async def drop(self) -> None:
+        async with self._turn:
+            if self._keeper is not None:
+                with contextlib.suppress(ModelError):  # gone, and the weights with it
+                    await self._keeper.drop()
+
+    async def end(self) -> None:
+        async with self._turn:
+            if self._keeper is not None:
+                await self._keeper.end()
+
+    async def _prepared(self) -> _Keeper:
+        """Return the keeper, another one where it has died."""
+        keeper = self._keeper
+        if keeper is None or keeper.ended.is_set():
+            keeper = await self._start()
+            try:
+                await keeper.prepare()
+            except BaseException:
+                await keeper.end()
+                raise
+            self._keeper = keeper
+        return keeper
+
+    async def _start(self) -> _Keeper:
+        """Fork the keeper; the first one waits for the imports."""
+        (ours, theirs), (births, births_there) = socket.socketpair(), socket.socketpair()
+        process = self._context.Process(
+            target=model_main.keep,
+            args=(
+                self._settings,
+                self._adapter_for,
+                self._set_up_log,
+                self._threads,
+                os.getpid(),
+                theirs,
+                births_there,
+            ),
+            name=f"weights of {self._settings.name}",
+            daemon=True,
+        )
+        try:
+            await _in_a_thread(partial(self._fork, process))
+            streams = await asyncio.open_connection(sock=ours)
+        except BaseException:
+            ours.close()
+            births.close()
+            raise
+        finally:
+            theirs.close()
+            births_there.close()
+        return _Keeper(process, streams, births)
 
     def _fork(self, process: ForkServerProcess) -> None:
         shipped = self._adapter_for is make_adapter  # else the script itself may define it
         with _main_unnamed() if shipped else contextlib.nullcontext():
             process.start()
 
-    async def start(self) -> ModelProcess:
-        """Fork a process; the first one waits for the imports."""
-        ours, theirs = socket.socketpair()
-        arguments = (self._settings, self._adapter_for, os.getpid(), theirs)
-        process = self._context.Process(
-            target=model_main.main,
-            args=arguments,
-            name=f"model of {self._settings.name}",
-            daemon=True,
-        )
-        try:
-            await _in_a_thread(partial(self._fork, process))
-        except BaseException:
-            ours.close()
-            raise
-        finally:
-            theirs.close()
-        reader, writer = await asyncio.open_connection(sock=ours)
-        return ModelProcess(process, reader, writer)
+
+def _how(code: int | None) -> str:
+    if code is None or code >= 0:
+        return "" if not code else f" with {code}"
+    return f" by {signal.Signals(-code).name}"
 
 
 @contextlib.contextmanager

@@ -1,18 +1,23 @@
 """Residency of one model: acquire, load, use, unload, in step with the lease.
 
-States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded. One model,
-one lease at a time, and one process for each residency (`model_process`), whose end returns all of
-its memory. The lease's own protocol (revoke, quiesce, release, fencing) is the client library's,
-which calls `_unload` when the bytes must go. A lease on standby is unloaded and not over: the
-arbiter grants it again when there is room (`_restore` loads then), and a request calls it back as
-a waiter. Must not know sockets, wires or processes.
+States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded, or parking →
+parked: off the GPU, with the weights in host RAM. One model, one lease at a time, and one process
+for each residency (`model_process`), whose end returns all of its memory on the GPU. The lease's
+own protocol (revoke, quiesce, release, fencing) is the client library's, which calls `_unload` or
+`_park` when the bytes must go. A lease that is parked or on standby is not over: a request calls it
+back as a waiter, and the arbiter grants one on standby again when there is room (`_restore` loads
+then). Must not know sockets, wires or processes.
+
+Weights are in host RAM while the model is wanted, resident or parked. The arbiter grants the room
+for parked ones (`park_bytes`); where its budget is too small for them at all, they are dropped as
+soon as they are on the GPU.
 """
 
 import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from typing import Final, Literal
 
 from vram_arbiter.clients.client import AsyncClient
@@ -38,21 +43,24 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.sidecars.model_process import Model
+from vram_arbiter.sidecars.model_process import Model, Models
 from vram_arbiter.sidecars.settings import Settings
 
-State = Literal["unloaded", "waiting", "loading", "resident", "unloading"]
+State = Literal["unloaded", "waiting", "loading", "resident", "parking", "parked", "unloading"]
 TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
     "unloaded": frozenset({"waiting", "loading"}),  # loading: its lease came back by itself
     "waiting": frozenset({"loading", "unloaded"}),
     "loading": frozenset({"resident", "unloading", "unloaded"}),  # unloaded: its process died
-    "resident": frozenset({"unloading", "unloaded"}),
+    "resident": frozenset({"parking", "unloading", "unloaded"}),
+    "parking": frozenset({"parked", "unloaded"}),
+    "parked": frozenset({"waiting", "loading", "unloading"}),
     "unloading": frozenset({"unloaded"}),
 }
 """State → states that may follow."""
 Token = tuple[int, int]
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
 _LEAVING = ("revoking", "unloading")
+_AWAY = ("standby", "parked")
 _log = logging.getLogger("sidecars")
 
 
@@ -65,17 +73,18 @@ class Residency:
     def __init__(
         self,
         settings: Settings,
-        start: Callable[[], Awaitable[Model]],
+        models: Models,
         client: AsyncClient | None,
     ) -> None:
         self._settings = settings
-        self._start = start
+        self._models = models
         self._client = client
         self._turn = asyncio.Lock()  # one attempt to become resident at a time
-        self._model: Model | None = None  # prepared at least, or being prepared
-        self._prepared: asyncio.Task[Model] | None = None
-        self._unloaded = asyncio.Event()  # the unload in progress is over
-        self._warm = False  # the libraries are imported: a process is prepared in no time
+        self._model: Model | None = None
+        self._prepared: asyncio.Task[None] | None = None
+        self._weights: asyncio.Task[int] | None = None  # on their way into host RAM, or there
+        self._weights_bytes: int | None = None  # in host RAM, when they were there the last time
+        self._left = asyncio.Event()  # the unload or parking in progress is over
         self._ending = False
         self._running = 0
         self._last_use_s = time.monotonic()
@@ -85,19 +94,25 @@ class Residency:
         # the call that brings a standby lease back
         self._calling: asyncio.Task[VramError | None] | None = None
         self._watching: asyncio.Task[None] | None = None  # the process's end
+        self._dropping: set[asyncio.Task[None]] = set()
+        self._keeping: asyncio.Task[None] | None = None  # asks whether the weights may stay
         self.lease: AsyncLease | None = None
         self.state: State = "unloaded"
         self.last_error: VramError | None = None
 
     # -- what the wire asks
     def prepare(self) -> None:
-        """Begin the work (a process, imports, processors) that needs no lease. Repeats only after a
-        failure, or where the process has died since."""
-        ready = self._prepared
-        if ready is None or (
-            ready.done() and (ready.exception() is not None or ready.result().ended.is_set())
-        ):
-            self._prepared = asyncio.create_task(self._make_ready(), name="prepare")
+        """Begin the work (imports, processors) that needs neither weights nor a lease. Repeats only
+        after a failure, or where the process has died since."""
+        if self._prepared is None or self._prepared.done():
+            self._prepared = asyncio.create_task(self._models.prepare(), name="prepare")
+
+    def _fetch(self) -> asyncio.Task[int]:
+        """Begin to read the weights into host RAM, if they are not there."""
+        if self._weights is None or self._weights.done():
+            self._weights = asyncio.create_task(self._models.load(), name="weights")
+            self._weights.add_done_callback(_look_at)
+        return self._weights
 
     async def prepared(self) -> None:
         """Wait for the work that `prepare` began. Raises what ended it."""
@@ -197,7 +212,7 @@ class Residency:
     @property
     def on_standby(self) -> bool:
         """Whether the model is evicted and returns by itself."""
-        return self.lease is not None and self.lease.state == "standby"
+        return self.lease is not None and self.lease.state in _AWAY and self._settings.standby
 
     @property
     def wanted(self) -> bool:
@@ -208,13 +223,14 @@ class Residency:
     async def leave(self) -> None:
         """End of the program: after the op in progress, free everything."""
         self._ending = True
-        lease, prepared = self.lease, self._prepared
-        if prepared is not None and not prepared.done():
-            prepared.cancel()
-            await asyncio.wait({prepared})
-        elif prepared is not None and prepared.exception() is None:
-            await prepared.result().end()
+        lease = self.lease
+        under_way = {task for task in (self._prepared, self._weights) if task and not task.done()}
+        for task in under_way:
+            task.cancel()
+        if under_way:
+            await asyncio.wait(under_way)
         await self._unload()
+        await self._models.end()
         if lease is not None:
             await lease.release(exiting=True)
 
@@ -236,8 +252,8 @@ class Residency:
                     _log.debug("in use by another process: not idle")
                     self._last_use_s = time.monotonic()
                 else:
-                    _log.info("idle for %.1f s: releasing", idle_s)
-                    await self.unload()
+                    _log.info("idle for %.1f s: leaving the GPU", idle_s)
+                    await self._leave_the_gpu()
             await asyncio.sleep(max(left, 0.05, idle_s / 10))
 
     async def _used_by_others(self) -> bool:
@@ -249,16 +265,6 @@ class Residency:
             _log.info("uses of the lease are unknown (%s): staying", error.code)
             return True
         return any(view.lease_id == self.lease.lease_id and view.uses for view in status.leases)
-
-    async def _make_ready(self) -> Model:
-        model = await self._start()
-        try:
-            await model.prepare()
-        except BaseException:
-            await model.end(at_once=True)  # also in the middle of its work: it holds nothing yet
-            raise
-        self._warm = True
-        return model
 
     def _to(self, state: State) -> None:
         """Go to another state; the only place that writes it."""
@@ -275,7 +281,6 @@ class Residency:
         self._refuse_if_ending()
         if unloads != self._unloads:
             raise self._unwanted()
-        self.prepare()
         self._to("waiting")
         self._obtaining = asyncio.create_task(self._obtain(deadline), name="obtain")
         try:
@@ -290,6 +295,8 @@ class Residency:
         except BaseException as error:
             if self.state != "unloaded":
                 self._to("unloaded")
+            if not isinstance(error, WaitTimeout):  # asked again, it need not read them again
+                self._drop()
             if (
                 isinstance(error, asyncio.CancelledError)
                 and unloads != self._unloads
@@ -336,15 +343,15 @@ class Residency:
                 continue
             try:
                 async with asyncio.timeout(_left_s(deadline)):
-                    if seen != "standby":
+                    if seen not in _AWAY:
                         await lease.wait_change(seen)
                     elif (refused := await asyncio.shield(self._called_back(lease))) is not None:
                         raise refused
             except TimeoutError:
-                if lease.state == "standby":
+                if lease.state in _AWAY:
                     raise WaitTimeout(
-                        f"{self._settings.name} is on standby, and there was no room for it in "
-                        "time",
+                        f"{self._settings.name} is evicted ({lease.state}), and there was no room "
+                        "for it in time",
                         hint=f"`vramctl why {self._settings.name}` names the holder; it returns as "
                         "soon as it may",
                     ) from None
@@ -372,13 +379,15 @@ class Residency:
 
         Returns the reason why the arbiter refuses even the wait.
         """
-        _log.info("requested: calling the lease back from standby")
+        away = lease.state
+        _log.info("requested: calling the lease back from %s", away)
+        self._fetch()
         try:
             await lease.reacquire()
         except BadState:  # it returns by itself in this moment
-            await lease.wait_change("standby")
+            await lease.wait_change(away)
         except VramError as error:
-            if lease.state == "standby":
+            if lease.state in _AWAY:
                 return error
         return None
 
@@ -389,7 +398,7 @@ class Residency:
         """
         if self._ending:
             return  # `leave` releases it
-        _log.info("back from standby: loading")
+        _log.info("back from %s: loading", "parking" if self.state == "parked" else "standby")
         self._to("loading")
         try:
             await self._load(lease)
@@ -405,14 +414,14 @@ class Residency:
     async def _obtain(self, deadline: float | None) -> AsyncLease | None:
         """Wait for a lease; `unload` cancels it and leaves the queue.
 
-        The first imports take half a minute and more on a busy machine; the lease is waited for
-        from then on, for the time that was left before. Later a process is ready in less time than
-        another model needs to leave: it prepares meanwhile.
+        The first imports and the first read of the weights take half a minute and more on a busy
+        machine; the lease is waited for from then on, for the time that was left before, and the
+        arbiter is told how much host RAM they take. Later they are read meanwhile.
         """
-        assert self._prepared is not None
         wait_s = _left_s(deadline)
-        if not self._warm:
-            await asyncio.shield(self._prepared)
+        weights = self._fetch()
+        if self._weights_bytes is None:
+            self._weights_bytes = await asyncio.shield(weights)
         if self._client is None:
             return None
         if wait_s == 0.0:
@@ -420,9 +429,10 @@ class Residency:
                 f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"
             )
         return await self._client.acquire(
-            self._settings.lease_spec(),
+            self._settings.lease_spec(park_bytes=self._weights_bytes),
             wait_s,
             unload=self._unload,
+            park=self._park,
             restore=self._restore,
             on_lost=self._on_lost,
         )
@@ -449,12 +459,10 @@ class Residency:
             return unloads != self._unloads if lease is None else lease.given_up
 
         try:
-            self.prepare()
-            assert self._prepared is not None, "it was just begun"
-            model = await asyncio.shield(self._prepared)
+            self._weights_bytes = await asyncio.shield(self._fetch())
+            model = self._model = await self._models.start()
             if given_up() or (lease and lease.state == "gone"):
-                raise self._unwanted()  # before a byte was loaded; the process stays prepared
-            self._model, self._prepared = model, None
+                raise self._unwanted()  # before a byte was loaded
             measured = await model.load("" if lease is None else lease.gpu)
             if lease is not None:
                 charge = None if measured is None else self._settings.steady_charge(measured)
@@ -475,13 +483,34 @@ class Residency:
         self._last_use_s = self._resident_since_s = time.monotonic()
         self._to("resident")
         self._watching = asyncio.create_task(self._watch(model, lease), name="watch the model")
+        if self._client is not None and self._weights_bytes:
+            self._keeping = asyncio.create_task(self._keep_or_drop(self._client), name="host RAM")
         _log.info("resident after %.2f s: %s bytes on the GPU", time.monotonic() - began, measured)
+
+    def _drop(self) -> None:
+        """Free the host RAM of the weights, after what is asked of them now. A later `_fetch` reads
+        them again."""
+        task = asyncio.create_task(self._models.drop(), name="drop the weights")
+        self._dropping.add(task)
+        task.add_done_callback(self._dropping.discard)
+
+    async def _keep_or_drop(self, client: AsyncClient) -> None:
+        """Drop the weights from host RAM where the arbiter could never let them stay for a parked
+        lease."""
+        try:
+            budget_bytes = (await client.status()).host_ram.budget_bytes
+        except VramError as error:
+            _log.info("the budget of host RAM is unknown (%s): the weights stay", error.code)
+            return
+        if (self._weights_bytes or 0) > budget_bytes and self.state == "resident":
+            self._drop()
 
     async def _take_back(self, lease: AsyncLease | None, error: BaseException) -> None:
         """Undo a failed load. Whatever else fails in it, the lease ends: it would be renewed for
         ever."""
         try:
             await self._end_model(at_once=True)
+            self._drop()
             if lease is not None and isinstance(error, OutOfMemory) and not lease.given_up:
                 requested = int(
                     error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
@@ -499,22 +528,43 @@ class Residency:
     # -- unloading
     async def _unload(self) -> None:
         """Unload: called by the lease (revoked, lost, given up) or at the end of the program."""
-        if self.state == "unloading":
-            await self._unloaded.wait()
-        if self.state not in ("loading", "resident"):
+        if self.state in ("unloading", "parking"):
+            await self._left.wait()
+        if self.state not in ("loading", "resident", "parked"):
             return
         began, loading = time.monotonic(), self.state == "loading"
         self._to("unloading")
-        self._unloaded.clear()
+        self._left.clear()
         try:
             with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
                 await self._end_model(at_once=loading)
         finally:
             self._to("unloaded")
-            self._unloaded.set()
+            self._left.set()
         _log.info("unloaded in %.2f s", time.monotonic() - began)
-        if self._settings.standby and not self._ending:
-            self.prepare()  # for its return
+        self._drop()
+
+    async def _park(self) -> None:
+        """Leave the GPU and keep the weights in host RAM: called by the lease."""
+        if self.state != "resident":
+            return
+        began = time.monotonic()
+        self._to("parking")
+        self._left.clear()
+        try:
+            with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
+                await self._end_model(at_once=False)
+        finally:
+            self._to("parked")
+            self._left.set()
+        _log.info("parked in %.2f s", time.monotonic() - began)
+
+    async def _leave_the_gpu(self) -> None:
+        """Park where the arbiter has host RAM for the weights, else unload."""
+        if self.lease is not None and self.lease.spec.park_bytes:
+            await self.lease.park()
+        else:
+            await self.unload()
 
     async def _end_model(self, *, at_once: bool) -> None:
         """End the model's process. `at_once`: also in the middle of a load."""
@@ -534,6 +584,7 @@ class Residency:
             hint="the next request loads it again; see the sidecar's log",
         )
         _log.error("%s", self.last_error)
+        self._drop()
         if lease is not None:
             try:
                 await lease.release()
@@ -598,6 +649,12 @@ class Residency:
                 hint="ask again about a new one: the model is there now",
                 details={"waited_s": waited_s},
             )
+
+
+def _look_at(task: asyncio.Task[int]) -> None:
+    """Take note of a failure, also where the request that wanted the weights has ended."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        _log.debug("the weights could not be read: %s", error)
 
 
 def _being_cancelled() -> bool:

@@ -100,10 +100,11 @@ class Settings:
         """
         return max(resident_bytes, self.inference_peak_bytes)
 
-    def lease_spec(self) -> LeaseSpec:
-        """Return the lease of this model.
+    def lease_spec(self, park_bytes: int = 0) -> LeaseSpec:
+        """Return the spec of a lease. `park_bytes`: host RAM of its weights while it is parked.
 
-        Nothing is retained after an unload: the model's process ends, and its context too.
+        Nothing is retained on the GPU after an unload: the model's process ends, and its context
+        too.
         """
         footprint = lease_footprint(self.footprint, self.inference_peak_bytes)
         return LeaseSpec(
@@ -116,6 +117,7 @@ class Settings:
             evictable=self.evictable,
             min_residency_s=self.min_residency_s,
             standby=self.standby,
+            park_bytes=park_bytes,
         )
 
 

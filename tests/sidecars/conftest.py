@@ -65,13 +65,15 @@ class Sidecar:
         return self.process.wait(PATIENCE_S)
 
     def model_pid(self):
-        """Pid of the model's process, which was forked from the server of imports."""
+        """Pid of the model's process: forked from the keeper of the weights, which was forked from
+        the server of imports."""
         (server,) = [
             pid
             for pid in children(self.process.pid)
             if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text()
         ]
-        (model,) = children(server)
+        (keeper,) = children(server)
+        (model,) = children(keeper)
         return model
 
     @property

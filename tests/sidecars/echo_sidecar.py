@@ -39,7 +39,7 @@ class EchoAdapter:
         self._fail("prepare")
 
     def load(self, device: str) -> None:
-        pass
+        self._fail("read")
 
     networks = ()
 

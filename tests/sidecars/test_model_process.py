@@ -4,8 +4,9 @@ import asyncio
 import functools
 import multiprocessing
 import os
+import signal
 import tempfile
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from multiprocessing import forkserver
 from pathlib import Path
 
@@ -13,18 +14,21 @@ import pytest
 
 from tests.sidecars.conftest import PNG
 from tests.sidecars.echo_sidecar import adapter_for
+from tests.support.matrix_model import matrix_for
 from tests.support.waiting import until
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
 from vram_arbiter.schemas.errors import BadRequest, ModelError, OutOfMemory, WaitTimeout
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
-from vram_arbiter.sidecars.model_process import ModelProcesses
+from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.model_process import ModelProcess, ModelProcesses
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.weights import Weights
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 GB = 10**9
+MATRIX_BYTES = 64 * 2**20
 WAIT_S = 60.0
 MANIFEST = """
 name: test/eye
@@ -47,14 +51,21 @@ class Place:
         self.folder = folder
         self.card = folder / "fakegpu"
         make_card(self.card, 8 * 2**30, release_lag_s=0.01)
+        self.made: list[ModelProcesses] = []
 
-    def processes(self, steady: int = GB) -> ModelProcesses:
+    def processes(self, steady: int = GB, adapter: AdapterFor | None = None) -> ModelProcesses:
         footprint = Footprint(load_peak_bytes=steady, steady_bytes=steady, residue_bytes=GB // 10)
         settings = Settings(
             "eye", parse_manifest(MANIFEST), Weights("test/eye"), footprint,
             f"ipc://{self.folder}/eye.sock", f"fake:{self.card}", None
         )  # fmt: skip
-        return ModelProcesses(settings, functools.partial(adapter_for, self.folder))
+        echo = functools.partial(adapter_for, self.folder)
+        made = ModelProcesses(settings, adapter or echo, no_log)
+        self.made.append(made)
+        return made
+
+    async def start(self, steady: int = GB) -> ModelProcess:
+        return await self.processes(steady).start()
 
     def used(self) -> int:
         probe = FakeProbe([self.card])
@@ -73,8 +84,15 @@ def _server() -> Iterator[None]:
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Place:
-    return Place(tmp_path)
+async def place(tmp_path: Path) -> AsyncIterator[Place]:
+    place = Place(tmp_path)
+    yield place
+    for processes in place.made:
+        await processes.end()
+
+
+def no_log() -> None:
+    """Leave the log as it is."""
 
 
 def detect(query: str) -> dict[str, object]:
@@ -93,9 +111,8 @@ async def holding(place: Place) -> None:
 
 async def test_its_end_returns_every_byte(place: Place) -> None:
     async with asyncio.timeout(WAIT_S):
-        model = await place.processes().start()
-        await model.prepare()
-        assert place.used() == 0, "preparing needs no device"
+        model = await place.start()
+        assert place.used() == 0, "a process has nothing on the GPU before its load"
         assert await model.load("") == GB
         assert (await ask(model, "cube"))["answer"] == "cube"
         await model.end()
@@ -106,13 +123,11 @@ async def test_its_end_returns_every_byte(place: Place) -> None:
 
 async def test_errors_keep_their_type(place: Place) -> None:
     async with asyncio.timeout(WAIT_S):
-        model = await place.processes(steady=9 * GB).start()
-        await model.prepare()
+        model = await place.start(steady=9 * GB)
         with pytest.raises(OutOfMemory, match="simulated"):
             await model.load("")
         await model.end()
-        model = await place.processes().start()
-        await model.prepare()
+        model = await place.start()
         await model.load("")
         with pytest.raises(ModelError, match="RuntimeError: the model fails as told"):
             await ask(model, "fail")
@@ -126,8 +141,7 @@ async def test_a_request_that_could_not_begin_in_time_never_does(place: Place) -
     """Regression: a request behind one that hung in a decoder kept its use of the lease for
     ever."""
     async with asyncio.timeout(WAIT_S):
-        model = await place.processes().start()
-        await model.prepare()
+        model = await place.start()
         await model.load("")
         hanging = asyncio.create_task(ask(model, "hold go"))
         await holding(place)
@@ -146,8 +160,7 @@ async def test_a_request_that_could_not_begin_in_time_never_does(place: Place) -
 
 async def test_a_request_that_does_not_end_is_ended_with_its_process(place: Place) -> None:
     async with asyncio.timeout(WAIT_S):
-        model = await place.processes().start()
-        await model.prepare()
+        model = await place.start()
         await model.load("")
         with pytest.raises(ModelError, match="has not answered within"):
             await ask(model, "hold for ever", end_s=0.2)
@@ -160,8 +173,7 @@ async def test_a_request_that_does_not_end_is_ended_with_its_process(place: Plac
 async def test_a_caller_that_turns_away_leaves_the_model_in_order(place: Place) -> None:
     """The answer of a canceled request is not taken for the next one's."""
     async with asyncio.timeout(WAIT_S):
-        model = await place.processes().start()
-        await model.prepare()
+        model = await place.start()
         await model.load("")
         turning_away = asyncio.create_task(ask(model, "hold go"))
         await holding(place)
@@ -177,8 +189,7 @@ async def test_a_caller_that_turns_away_leaves_the_model_in_order(place: Place) 
 async def test_a_load_that_is_not_wanted_any_more_is_ended_at_once(place: Place) -> None:
     (place.folder / "slow_load").touch()
     async with asyncio.timeout(WAIT_S):
-        model = await place.processes().start()
-        await model.prepare()
+        model = await place.start()
         loading = asyncio.create_task(model.load(""))
         while not place.used():
             await asyncio.sleep(0.01)
@@ -188,26 +199,66 @@ async def test_a_load_that_is_not_wanted_any_more_is_ended_at_once(place: Place)
     until(lambda: place.used() == 0)
 
 
-@pytest.mark.heavy
-async def test_the_server_of_imports_has_no_thread_and_no_device(place: Place) -> None:
-    """A fork copies one thread only: locks that others hold would stay locked. A CUDA context does
-    not survive a fork at all."""
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # the next one imports these
+async def test_the_keeper_may_die_and_the_next_one_begins_anew(place: Place) -> None:
+    """A model process ends with its keeper: the arbiter knows its bytes by the tree of processes
+    that it stands in."""
     processes = place.processes()
+    async with asyncio.timeout(WAIT_S):
+        model = await processes.start()
+        await model.load("")
+        os.kill(parent(model.pid), signal.SIGKILL)
+        await model.ended.wait()
+        until(lambda: place.used() == 0)
+        (place.folder / "fail_read").touch()
+        with pytest.raises(ModelError, match="read fails as told"):
+            await processes.load()
+        (place.folder / "fail_read").unlink()
+        model = await processes.start()
+        assert await model.load("") == GB
+        await model.end()
+
+
+@pytest.mark.heavy
+async def test_the_keeper_has_one_thread_and_no_device_before_each_fork(place: Place) -> None:
+    """A fork copies one thread only: locks that others hold would stay locked. A CUDA context does
+    not survive a fork at all. The weights are in host RAM once, whatever is forked."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # the next one imports these
+    processes = place.processes(adapter=functools.partial(matrix_for, MATRIX_BYTES))
     processes.preload(("torch", "transformers", "lerobot.policies.factory"))
     async with asyncio.timeout(4 * WAIT_S):
-        models = [await processes.start(), await processes.start()]
-        server, same = [parent(model.pid) for model in models]
-        imported = "libtorch" in Path(f"/proc/{server}/maps").read_text()
-        threads = os.listdir(f"/proc/{server}/task")
-        opened = [os.readlink(one) for one in Path(f"/proc/{server}/fd").iterdir()]
-        for model in models:
+        assert await processes.load() == GB, "the weights stand for those of a production model"
+        answers = []
+        for _ in range(2):
+            model = await processes.start()
+            await model.load("")
+            answers.append(await ask(model, "sum"))
+            keeper = parent(model.pid)
+            threads = os.listdir(f"/proc/{keeper}/task")
+            opened = [os.readlink(one) for one in Path(f"/proc/{keeper}/fd").iterdir()]
+            shared = shared_bytes(keeper)
             await model.end()
+        server = parent(keeper)
+        imported = "libtorch" in Path(f"/proc/{server}/maps").read_text()
+        assert os.listdir(f"/proc/{server}/task") == [str(server)]
+        await processes.drop()
+        dropped = shared_bytes(keeper)
+        await processes.end()
+    assert answers[0] == answers[1], "each process copied the same weights"
     assert imported
-    assert server == same, "the imports are shared"
-    assert threads == [str(server)]
+    assert threads == [str(keeper)]
     assert not [name for name in opened if "nvidia" in name]
+    assert (shared, dropped) == (MATRIX_BYTES, 0)
 
 
 def parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def shared_bytes(pid: int) -> int:
+    """Size of the memory that a process shares for weights."""
+    spans = [
+        line.split()[0].split("-")
+        for line in Path(f"/proc/{pid}/maps").read_text().splitlines()
+        if "/memfd:weights" in line
+    ]
+    return sum(int(end, 16) - int(begin, 16) for begin, end in spans)

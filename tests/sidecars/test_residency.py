@@ -38,9 +38,6 @@ class Model:
         self._box = box
         self.ended = asyncio.Event()
 
-    async def prepare(self):
-        pass
-
     async def load(self, gpu):
         self._box.loads += 1
         loaded = asyncio.create_task(self._box.may_load.wait())
@@ -64,17 +61,33 @@ class Model:
 
 
 class Models:
-    """Starts them."""
+    """Starts them. Counts how often the weights, of so many bytes, were read into host RAM."""
 
-    def __init__(self):
-        self.loads = 0
+    def __init__(self, weights_bytes=0):
+        self.weights_bytes = weights_bytes
+        self.in_host_ram = False
+        self.reads = self.loads = 0
         self.started = []
         self.may_load = asyncio.Event()
         self.may_load.set()
 
+    async def prepare(self):
+        pass
+
+    async def load(self):
+        self.reads += not self.in_host_ram
+        self.in_host_ram = True
+        return self.weights_bytes
+
     async def start(self):
         self.started.append(Model(self))
         return self.started[-1]
+
+    async def drop(self):
+        self.in_host_ram = False
+
+    async def end(self):
+        self.in_host_ram = False
 
 
 class Client(AsyncClient):
@@ -108,7 +121,7 @@ async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon)
     and the model was loaded."""
     models = Models()
     async with Client(arbiter_daemon.endpoint) as client, asyncio.timeout(WAIT_S):
-        residency = Residency(settings(arbiter_daemon), models.start, client)
+        residency = Residency(settings(arbiter_daemon), models, client)
         client.at_the_grant = residency.unload
         with pytest.raises(NotResident):
             await residency.load()
@@ -125,7 +138,7 @@ async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too
     """Regression: there was no lease to give up and nothing resident to unload yet, so it was
     answered and the model stayed."""
     models = Models()
-    residency = Residency(settings(arbiter_daemon), models.start, None)
+    residency = Residency(settings(arbiter_daemon), models, None)
     models.may_load.clear()
     async with asyncio.timeout(WAIT_S):
         loading = asyncio.create_task(residency.load())
@@ -142,7 +155,7 @@ async def test_each_residency_has_a_model_of_its_own(arbiter_daemon):
     models = Models()
     async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
         async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models.start, client)
+            residency = Residency(settings(arbiter_daemon), models, client)
             await residency.load()
             await residency.unload()
             assert models.started[0].ended.is_set()
@@ -153,11 +166,75 @@ async def test_each_residency_has_a_model_of_its_own(arbiter_daemon):
             assert models.started[1].ended.is_set()
 
 
+async def test_weights_stay_in_host_ram_while_the_arbiter_has_room_for_them(arbiter_daemon):
+    """A parked model comes back without reading its weights again, and an unload frees them."""
+    models = Models(weights_bytes=GB)
+    async with (
+        AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client,
+        asyncio.timeout(WAIT_S),
+    ):
+        residency = Residency(settings(arbiter_daemon), models, client)
+        assert await residency.load()
+        await parked_for_another(residency, arbiter_daemon.endpoint)
+        assert models.started[0].ended.is_set()
+        assert (await residency.run("detect", None, "look"))["answer"] == "look"
+        assert (residency.state, models.reads, models.loads) == ("resident", 1, 2)
+        await parked_for_another(residency, arbiter_daemon.endpoint)
+        await residency.unload()
+        assert residency.state == "unloaded"
+        while models.in_host_ram or (await client.status()).leases:
+            await asyncio.sleep(0.02)
+        assert await residency.load()
+        assert models.reads == 2
+        await residency.leave()
+
+
+async def parked_for_another(residency, endpoint):
+    """Have the model evicted; the other one leaves again at once."""
+    async with AsyncClient("other", endpoint=endpoint) as other, other.lease(vram=8 * GB):
+        view = (await other.status()).leases[0]
+        assert (residency.state, view.state, view.parked_bytes) == ("parked", "parked", GB)
+
+
+async def test_weights_leave_host_ram_where_the_arbiter_has_no_room_for_them(make_arbiter):
+    """They would lie there unaccounted as long as the model is resident."""
+    arbiter = make_arbiter(config="host: {park_budget_bytes: 1MB}")
+    arbiter.start()
+    models = Models(weights_bytes=GB)
+    async with AsyncClient("eye", endpoint=arbiter.endpoint) as client, asyncio.timeout(WAIT_S):
+        residency = Residency(settings(arbiter), models, client)
+        assert await residency.load()
+        while models.in_host_ram:
+            await asyncio.sleep(0.01)
+        other = AsyncClient("other", endpoint=arbiter.endpoint)
+        async with other, other.lease(vram=8 * GB):
+            assert residency.state == "unloaded"
+        assert await residency.load()
+        assert models.reads == 2
+        await residency.leave()
+
+
+async def test_an_idle_model_is_parked(arbiter_daemon):
+    models = Models(weights_bytes=GB)
+    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
+        async with asyncio.timeout(WAIT_S):
+            residency = Residency(settings(arbiter_daemon), models, client)
+            await residency.load()
+            idle = asyncio.create_task(residency.release_when_idle(0.0))
+            while residency.state != "parked":
+                await asyncio.sleep(0.01)
+            idle.cancel()
+            assert models.in_host_ram
+            assert await residency.load()
+            assert models.reads == 1
+            await residency.leave()
+
+
 async def test_a_model_that_dies_ends_its_lease_and_the_next_request_loads_another(arbiter_daemon):
     models = Models()
     async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
         async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models.start, client)
+            residency = Residency(settings(arbiter_daemon), models, client)
             with pytest.raises(ModelError, match="SIGKILL"):
                 await residency.run("detect", None, "die")
             while residency.state != "unloaded" or (await client.status()).leases:
@@ -167,27 +244,12 @@ async def test_a_model_that_dies_ends_its_lease_and_the_next_request_loads_anoth
             await residency.leave()
 
 
-async def test_a_process_that_died_while_it_waited_is_not_used(arbiter_daemon):
-    """A process is prepared ahead. It may die before its model is wanted: the next load would have
-    failed, although nothing was wrong with the model."""
-    models = Models()
-    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
-        async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models.start, client)
-            residency.prepare()
-            await residency.prepared()
-            models.started[0].ended.set()
-            assert await residency.load()
-            assert (len(models.started), residency.state) == (2, "resident")
-            await residency.leave()
-
-
 async def test_a_request_behind_an_unload_is_evicted_not_answered(arbiter_daemon):
     """Regression: an op that was queued before an unload ran after it."""
     models = Models()
     async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
         async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models.start, client)
+            residency = Residency(settings(arbiter_daemon), models, client)
             await residency.load()
             token = residency.token()
             await residency.unload()
