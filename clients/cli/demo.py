@@ -51,8 +51,8 @@ DESCRIPTIONS = {
 SEED_MAX = 2**31 - 1
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
 BUDGET = "8GiB"
-# of the simulated card: about what safetensors' load_file reaches from the page cache
-LOAD_BYTES_PER_S = 2_500_000_000
+# of the simulated GPU: a copy from ordinary host RAM over PCIe 4.0
+COPY_BYTES_PER_S = 6_000_000_000
 BOOT_S = 240.0
 LOOP_S = (
     400.0  # it takes one or two minutes; a machine with other work on its cores has time as well
@@ -196,7 +196,7 @@ def _make_card(folder: Path, capacity_bytes: int) -> None:
         uuid=f"GPU-fake-{uuid.uuid4()}",
         capacity_bytes=capacity_bytes,
         boot_id=boot_id,
-        throttle_bytes_per_s=LOAD_BYTES_PER_S,
+        throttle_bytes_per_s=COPY_BYTES_PER_S,
     )
     (folder / fakegpu.CARD_FILE).write_text(fakegpu.dump_config(config))
 
