@@ -130,9 +130,15 @@ def _packages(manifest: RSkillManifest) -> Finding:
     return Finding("packages", True, "installed")
 
 
+def need_precision(manifest: RSkillManifest, device: str) -> None:
+    """Raise UnsupportedQuantization where the model cannot be run in its number format."""
+    if not is_passthrough(manifest):
+        check_precision(manifest, device)
+
+
 def _precision(manifest: RSkillManifest, device: str) -> Finding:
     try:
-        check_precision(manifest, device)
+        need_precision(manifest, device)
     except VramError as error:
         return _bad("precision", error)
     return Finding("precision", True, str(manifest.quantization.dtype))
