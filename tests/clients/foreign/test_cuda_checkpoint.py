@@ -1,6 +1,8 @@
 """Suspending and resuming CUDA processes: the steps with a simulated driver, and what a machine
 must have."""
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -185,3 +187,53 @@ def test_the_drivers_calls() -> None:
 def test_a_driver_that_is_too_old() -> None:
     with pytest.raises(CheckpointUnsupported, match=r"driver 570.*CUDA 12\.4"):
         CudaDriver(Api(12040, SimulatedDriver())).check()
+
+
+# -- a real driver
+COUNTER = """
+import os, sys, torch
+kept = torch.arange(64 << 20, dtype=torch.int32, device="cuda")
+for line in sys.stdin:
+    kept += 1
+    print(int(kept[0]), int(kept[-1]) - int(kept[0]) == kept.numel() - 1, flush=True)
+"""
+"""256 MiB on the GPU, changed with every line."""
+
+
+@pytest.mark.gpu
+@pytest.mark.heavy
+def test_a_real_program_is_suspended_and_goes_on() -> None:
+    """NVML shows no byte of it meanwhile, and its tensors are what they were."""
+    action = CheckpointAction(CudaDriver(), 60.0)
+    try:
+        action.check()
+    except CheckpointUnsupported as error:
+        pytest.skip(str(error))
+    pynvml = pytest.importorskip("pynvml")
+    pynvml.nvmlInit()
+
+    def listed() -> bool:
+        gpus = map(pynvml.nvmlDeviceGetHandleByIndex, range(pynvml.nvmlDeviceGetCount()))
+        found = [one for gpu in gpus for one in pynvml.nvmlDeviceGetComputeRunningProcesses(gpu)]
+        return program.pid in [one.pid for one in found]
+
+    with subprocess.Popen(
+        [sys.executable, "-c", COUNTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as program:
+        assert program.stdin is not None
+        assert program.stdout is not None
+
+        def count() -> None:
+            program.stdin.write("\n")
+            program.stdin.flush()
+
+        count()
+        assert program.stdout.readline() == "1 True\n"
+        assert listed()
+        action.free([program.pid])
+        assert not listed()
+        count()  # waits in its CUDA call
+        action.restore([program.pid])
+        assert program.stdout.readline() == "2 True\n"
+        program.stdin.close()
+        assert program.wait(60) == 0
