@@ -119,6 +119,8 @@ async def test_every_operation_of_the_endpoint_family(server: FieldServer) -> No
     [
         ("fail", ModelError, "ValueError: as asked"),
         ("garbage", ModelError, "not a msgpack value"),
+        ("many", ModelError, "more than 65536 values"),
+        ("huge", SidecarUnavailable, "hung up"),
         ("list", ModelError, "answered with list"),
         ("die", SidecarUnavailable, "no answer to detect|hung up"),
     ],
