@@ -40,11 +40,13 @@ TAIL_LINES = 20
 class Pace:
     """How often the GPU is read, and how long bytes must be unchanged to be at rest.
 
-    `rest_s` is longer than drivers take to return memory (0.5 to 1.5 s).
+    `rest_s` is longer than drivers take to return memory (0.5 to 1.5 s). What is not at rest within
+    `limit_s` more never is.
     """
 
     rate_hz: float = 50.0
     rest_s: float = 2.0
+    limit_s: float = VERIFY_TIMEOUT_S
 
     @property
     def period_s(self) -> float:
@@ -217,7 +219,7 @@ async def _returned(gpu: Gpu, baseline_bytes: int, pace: Pace) -> None:
     """Wait until the used bytes are back where they were. Raises CalibrationFailed: then others
     used the GPU meanwhile."""
     most = baseline_bytes + VERIFY_TOLERANCE_BYTES
-    deadline_s = time.monotonic() + VERIFY_TIMEOUT_S
+    deadline_s = time.monotonic() + pace.limit_s
     while True:
         used = gpu.read().used_bytes
         if used <= most or time.monotonic() > deadline_s:
@@ -234,7 +236,7 @@ async def _returned(gpu: Gpu, baseline_bytes: int, pace: Pace) -> None:
 async def _rest(read: Callable[[], int], pace: Pace) -> int | None:
     """Return a value that has not changed for `rest_s`; None: it does not come to rest."""
     series = Series()
-    deadline_s = time.monotonic() + pace.rest_s + VERIFY_TIMEOUT_S
+    deadline_s = time.monotonic() + pace.rest_s + pace.limit_s
     while time.monotonic() < deadline_s:
         series.add(time.monotonic(), read())
         if series.rested_s() >= pace.rest_s:
@@ -291,16 +293,17 @@ async def measure_model(
     requests: int,
     pictures: Path | None,
     say: Callable[[str], None],
+    sidecar: Sequence[str] = SIDECAR,
 ) -> Measured:
     """Load a model in a sidecar of its own, ask it, unload it and end it.
 
-    `arguments` name the model for `vram-sidecar`. Raises the sidecar's typed errors.
+    `sidecar` is its command, and `arguments` name the model for `vram-sidecar`. Raises the sidecar's typed errors.
     """
     client_for = client_type(manifest)
     with tempfile.TemporaryDirectory(prefix="vc") as folder:
         endpoint = f"ipc://{folder}/calibrate.sock"
         argv = [
-            *SIDECAR, "--name", "calibrate", "--no-arbiter", "--device", gpu.device,
+            *sidecar, "--name", "calibrate", "--no-arbiter", "--device", gpu.device,
             "--endpoint", endpoint, *arguments,
         ]  # fmt: skip
         spawn = SpawnSpec(argv, dict(gpu.environ), Path(folder) / "log")
@@ -345,7 +348,7 @@ async def _settled(sampler: Sampler, pace: Pace, *, gone: bool = False) -> int:
     """Return the program's bytes once they are at rest; `gone`: or all gone. Raises
     CalibrationFailed."""
     since_s = sampler.clock()
-    deadline_s = since_s + pace.rest_s + VERIFY_TIMEOUT_S
+    deadline_s = since_s + pace.rest_s + pace.limit_s
     while (now_s := sampler.clock()) < deadline_s:
         sampler.check()
         series = sampler.series

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 MIB = 1024 * 1024
 REST_BYTES = MIB
@@ -14,34 +15,35 @@ LAST_PART = 0.25
 class Series:
     """Readings in the order of time, kept where they change."""
 
-    since_s: list[float] = field(default_factory=list)
-    levels: list[int] = field(default_factory=list)
+    levels: list[tuple[float, int]] = field(default_factory=list)
+    """(since, bytes): one list, because one thread adds to it and another one reads."""
     end_s: float = 0.0
     readings: int = 0
 
     def add(self, at_s: float, count: int) -> None:
-        if not self.levels or count != self.levels[-1]:
-            self.since_s.append(at_s)
-            self.levels.append(count)
+        if not self.levels or count != self.last:
+            self.levels.append((at_s, count))
         self.end_s = at_s
         self.readings += 1
 
     @property
     def last(self) -> int:
-        return self.levels[-1] if self.levels else 0
+        return self.levels[-1][1] if self.levels else 0
 
     @property
     def rate_hz(self) -> float:
         """Readings per second, as they were really made."""
-        span_s = self.end_s - self.since_s[0] if self.levels else 0.0
+        span_s = self.end_s - self.levels[0][0] if self.levels else 0.0
         return (self.readings - 1) / span_s if span_s > 0 else 0.0
 
     def rested_s(self) -> float:
         """Return how long the newest level has lasted."""
-        at = len(self.levels)
-        while at and abs(self.levels[at - 1] - self.last) <= REST_BYTES:
-            at -= 1
-        return self.end_s - self.since_s[at] if self.levels else 0.0
+        last, since_s = self.last, self.end_s
+        for at_s, level in reversed(self.levels):
+            if abs(level - last) > REST_BYTES:
+                break
+            since_s = at_s
+        return self.end_s - since_s
 
     def peak(self, from_s: float, to_s: float) -> int:
         """Return the most within an interval; its first moment has the level from before it."""
@@ -59,23 +61,24 @@ class Series:
 
     def presence(self) -> tuple[float, float] | None:
         """Return the time of the first bytes and that after the last; None: none were seen."""
-        shown = [at for at, level in enumerate(self.levels) if level > REST_BYTES]
+        shown = [at for at, (_, level) in enumerate(self.levels) if level > REST_BYTES]
         if not shown:
             return None
-        after = shown[-1] + 1
-        return self.since_s[shown[0]], self.since_s[after] if after < len(
-            self.levels
-        ) else self.end_s
+        return self.levels[shown[0]][0], self._until_s(shown[-1])
+
+    def _until_s(self, at: int) -> float:
+        return self.levels[at + 1][0] if at + 1 < len(self.levels) else self.end_s
 
     def _within(self, from_s: float, to_s: float) -> list[tuple[int, float]]:
         """Return (level, seconds) in the order of time."""
         found = []
-        first = max(0, bisect_right(self.since_s, from_s) - 1)
+        first = max(0, bisect_right(self.levels, from_s, key=itemgetter(0)) - 1)
         for at in range(first, len(self.levels)):
-            if (since_s := self.since_s[at]) > to_s:
+            since_s, level = self.levels[at]
+            if since_s > to_s:
                 break
-            until_s = self.since_s[at + 1] if at + 1 < len(self.levels) else self.end_s
-            found.append((self.levels[at], max(0.0, min(until_s, to_s) - max(since_s, from_s))))
+            lasted_s = min(self._until_s(at), to_s) - max(since_s, from_s)
+            found.append((level, max(0.0, lasted_s)))
         return found
 
 

@@ -3,9 +3,12 @@ under observation on a simulated GPU."""
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,16 +19,24 @@ from tests.sidecars import echo_sidecar
 from tests.support.process import ArbiterProcess
 from vram_arbiter.arbiter.host.gpu.fake import make_card
 from vram_arbiter.clients.calibration import entry as entries
-from vram_arbiter.clients.calibration import measure
 from vram_arbiter.clients.calibration.gpu import FakeGpu, NvmlGpu, Reading, open_gpu
-from vram_arbiter.clients.calibration.measure import Basis, OwnBytes, Pace, Sampler, measure_program
+from vram_arbiter.clients.calibration.measure import (
+    Basis,
+    OwnBytes,
+    Pace,
+    Sampler,
+    measure_model,
+    measure_program,
+)
 from vram_arbiter.clients.calibration.requests import noise_png
 from vram_arbiter.clients.calibration.series import Figures, Series, of_life
+from vram_arbiter.clients.cli.calibrate import source_of
 from vram_arbiter.clients.cli.main import run_main
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, NoGpu, ProbeFailed
+from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.sidecars.images import header
 from vram_arbiter.sidecars.settings import read_footprints
 
@@ -99,7 +110,7 @@ def test_the_sampler_dates_a_reading_by_its_end_and_keeps_its_error() -> None:
     sampler = Sampler(read, period_s=0.0, clock=lambda: now[0])
     with sampler:
         sampler._thread.join(PATIENCE_S)  # the failed reading ends it
-    assert (sampler.series.since_s, sampler.series.levels) == ([10.5, 11.5], [5, 7])
+    assert sampler.series.levels == [(10.5, 5), (11.5, 7)]
     assert sampler.series.readings == 3
     with pytest.raises(ProbeFailed, match="gone"):
         sampler.check()
@@ -329,7 +340,7 @@ class Watched(FakeGpu):
 
     def __init__(self, card: Path, seen: Path) -> None:
         super().__init__(card)
-        self.seen = seen
+        self.folder, self.seen = card, seen
 
     def read(self) -> Reading:
         reading = super().read()
@@ -383,12 +394,10 @@ async def test_a_program_under_observation(
 
 @pytest.mark.e2e
 @pytest.mark.anyio
-async def test_programs_without_figures(
-    gpu: Watched, card: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def run(program: str) -> CalibrationFailed:
+async def test_programs_without_figures(gpu: Watched, card: Path) -> None:
+    async def run(program: str, pace: Pace = QUICK) -> CalibrationFailed:
         with pytest.raises(CalibrationFailed) as caught:
-            await measure_program(gpu, QUICK, command(gpu, program), None, print)
+            await measure_program(gpu, pace, command(gpu, program), None, print)
         return caught.value
 
     died = await run("import sys; print('loading'); sys.exit('out of luck')")
@@ -399,15 +408,22 @@ async def test_programs_without_figures(
     with pytest.raises(CalibrationFailed, match="cannot start"):
         await measure_program(gpu, QUICK, ["/no/such/program"], None, print)
     hide(card)
-    monkeypatch.setattr(measure, "VERIFY_TIMEOUT_S", 0.1)
-    disturbed = await run(
-        "import os; from pathlib import Path; Path(os.environ['VRAM_FAKE_GPU'], 'other.json')"
-        '.write_text(\'{"pid": 1, "context_bytes": 1000000000}\')'
-    )
+    disturbed = await run(STOWAWAY, replace(QUICK, limit_s=0.1))
     assert "another program used it meanwhile" in disturbed.message
 
 
-# -- the command
+STOWAWAY = """
+import os
+from pathlib import Path
+
+card = Path(os.environ["VRAM_FAKE_GPU"])
+(card / "other.new").write_text('{"pid": 1, "context_bytes": 1000000000}')
+(card / "other.new").rename(card / "other.json")
+"""
+"""Leaves a gigabyte of a process of nobody's concern."""
+
+
+# -- models
 MANIFEST = """
 name: test/eye
 version: 0.1.0
@@ -423,15 +439,41 @@ detector: {labels: [cube]}
 """
 
 
-@pytest.fixture
-def rskill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A model without weights, served by the echo."""
-    (tmp_path / "rskill.yaml").write_text(MANIFEST)
-    echo = (sys.executable, str(echo_sidecar.__file__), str(tmp_path), "--footprint")
-    monkeypatch.setattr(measure, "SIDECAR", (*echo, "1200MiB,1GiB,300MiB"))
-    return tmp_path / "rskill.yaml"
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_a_model_in_a_sidecar_of_its_own(gpu: Watched) -> None:
+    """Its load peak is seen although it is freed at once: memory comes back later."""
+    config = fakegpu.parse_config((gpu.folder / fakegpu.CARD_FILE).read_text())
+    slow = config.model_copy(update={"release_lag_s": 0.3})
+    (gpu.folder / fakegpu.CARD_FILE).write_text(fakegpu.dump_config(slow))
+    (gpu.seen / "rskill.yaml").write_text(MANIFEST)
+    measured = await measure_model(
+        gpu,
+        replace(QUICK, rate_hz=50.0, rest_s=0.6),
+        load_manifest(gpu.seen / "rskill.yaml"),
+        ("--rskill", str(gpu.seen / "rskill.yaml"), "--footprint", "1200MiB,1GiB,300MiB"),
+        3,
+        None,
+        print,
+        (sys.executable, str(echo_sidecar.__file__), str(gpu.seen)),
+    )
+    assert measured.figures == Figures(
+        context=RESIDUE_BYTES,
+        load_peak=1200 * MIB,
+        steady=GIB,
+        inference_peak=GIB,
+        retained=0,
+        after_exit=0,
+    )
+    source = source_of(gpu, measured, datetime(2026, 1, 2, tzinfo=UTC))
+    assert re.fullmatch(
+        r"measured 2026-01-02 on Simulated GPU \(driver simulated\), bytes of its processes, "
+        r"\d+ readings/s, 3 requests, margin 2 % up to 48 MiB",
+        source,
+    )
 
 
+# -- the command
 @pytest.fixture
 def calibrate(
     arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
@@ -443,34 +485,43 @@ def calibrate(
 
 
 @pytest.mark.e2e
-def test_a_model_beside_a_running_arbiter(
+def test_the_command_beside_a_running_arbiter(
     calibrate: Callable[..., int],
-    rskill: Path,
     arbiter_daemon: ArbiterProcess,
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    written = rskill.parent / "footprints.yaml"
-    words = ["--requests", "3", "--json", "--write", str(written), "--rest", "0.8", "--rate", "50"]
-    assert calibrate(str(rskill), *words) == 0  # memory is back 0.5 s after it was freed
+    """It holds the whole GPU meanwhile; then it is free again."""
+    path = tmp_path / "footprints.yaml"
+    words = ["--name", "acme/thing", "--json", "--write", str(path)]
+    assert calibrate(*words, "--", sys.executable, "-c", HOLDING) == 0
     answer = json.loads(capsys.readouterr().out)
-    assert answer["bytes"] == {
-        "context": RESIDUE_BYTES,
-        "load_peak": 1200 * MIB,
-        "steady": GIB,
-        "inference_peak": GIB,
-        "retained": 0,
-        "freed": GIB,
-        "after_exit": 0,
-    }
-    assert answer["written"] == str(written)
-    assert "3 requests" in answer["entry"]["source"]
-    (entry,) = read_footprints(written).values()
-    assert entry.steady == 1045 * MIB
+    assert answer["bytes"]["steady"] == 900 * MIB
+    assert answer["written"] == str(path)
+    (entry,) = read_footprints(path).values()
+    assert (entry.steady, entry.residue) == (918 * MIB, RESIDUE_BYTES)
+    assert entry.source == answer["entry"]["source"]
     with Client("looker", endpoint=arbiter_daemon.endpoint) as client:
         with client.lease(vram="6GiB", wait_timeout_s=PATIENCE_S):
-            pass  # the whole GPU is free again
+            pass
         granted = client.history(kinds=["granted"]).events[0]
-    assert granted["consumer"] == f"vramctl calibrate {answer['key']}"
+    assert granted["consumer"] == "vramctl calibrate acme/thing"
+    assert calibrate("--", sys.executable, "-c", HOLDING) == 0
+    assert "steady          900 MiB" in capsys.readouterr().out
+
+
+HOLDING = """
+import os, time
+from pathlib import Path
+from vram_arbiter.clients.net.request import ask
+from vram_arbiter.sidecars.device.fake import FakeMemory
+
+(lease,) = ask("status", {})["leases"]
+assert lease["state"] == "held" and lease["charge_bytes"] > 7 << 30, lease
+memory = FakeMemory(Path(os.environ["VRAM_FAKE_GPU"]), "program", 200 << 20)
+memory.allocate("weights", 700 << 20)
+time.sleep(0.2)  # ten readings
+"""
 
 
 @pytest.mark.e2e
