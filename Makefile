@@ -26,7 +26,7 @@ WORKERS ?= 2
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core nightly mutation lint format chaos sim bench \
+.PHONY: help setup setup-core demo test test-gpu test-core nightly mutation lint format chaos sim bench \
 	schemas install-units clean
 
 help: ## this list
@@ -42,7 +42,10 @@ demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8Gi
 	$(BIN)/vramctl demo --seed $(SEED) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)
 
 test: setup ## the whole product; ARGS goes to pytest
-	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) $(ARGS)
+	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not gpu" $(ARGS)
+
+test-gpu: setup ## what needs an NVIDIA GPU, alone on it; skipped with the reason elsewhere
+	$(BIN)/pytest -q -rsP tests/gpu $(ARGS)
 
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not heavy and not e2e and not gpu" $(ARGS)
