@@ -310,6 +310,7 @@ class Action(_Frozen):
     """One step (`horizon` 1) or a chunk of steps for one control mode.
 
     Exactly the field of `PAYLOAD_OF_MODE` is set, with `horizon` rows; rows are equally long.
+    Joint positions may come with `body_twist`: a robot that drives while its arm moves.
     `gripper` runs from 0 (closed) to 1 (open). `joint_names` says which joints the columns move;
     without it they are all joints in the robot's order.
     """
@@ -342,7 +343,8 @@ class Action(_Frozen):
             for name in dict.fromkeys(PAYLOAD_OF_MODE.values())
             if getattr(self, name) is not None
         ]
-        if given != [wanted]:
+        driving = self.control_mode is ControlMode.JOINT_POSITION and "body_twist" in given
+        if given != [wanted] and not (driving and given == [wanted, "body_twist"]):
             raise ValueError(
                 f"control_mode {self.control_mode} is carried by {wanted} alone, not by "
                 f"{', '.join(given) or 'nothing'}"
@@ -350,6 +352,8 @@ class Action(_Frozen):
         rows = self.rows
         if len(rows) != self.horizon:
             raise ValueError(f"{wanted} has {len(rows)} rows, horizon says {self.horizon}")
+        if driving and len(self.body_twist or ()) != self.horizon:
+            raise ValueError(f"body_twist must have {self.horizon} rows, as horizon says")
         widths = {len(row) for row in rows if isinstance(row, tuple)}
         if len(widths) > 1:
             raise ValueError(f"the rows of {wanted} have different lengths: {sorted(widths)}")

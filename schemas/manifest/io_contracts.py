@@ -13,6 +13,8 @@ from vram_arbiter.schemas.manifest.vocabulary import (
     JOINT_SPACE_LAYOUTS,
     TASK_SPACE_LAYOUTS,
     ActionRepresentation,
+    GripperConvention,
+    Rotation,
 )
 
 FileUri = Annotated[
@@ -77,9 +79,40 @@ class StateBindings(Block):
     quaternion_convention: Literal["xyzw", "wxyz"] = "xyzw"
 
 
+class StatePart(Block):
+    """One stretch of a state vector. Joints left out are all of the robot's, grippers included.
+
+    `ee` is an end effector or a frame of the robot; its pose is expressed in `frame`. `rotation`
+    left out: the position alone.
+    """
+
+    kind: Literal["joint_positions", "joint_velocities", "ee_pose", "base_pose", "base_twist"]
+    joints: tuple[str, ...] = ()
+    ee: str | None = None
+    frame: str | None = None
+    rotation: Rotation | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        rules = {
+            "joints": "-" if self.kind.startswith("joint_") else "F",
+            "ee": "R" if self.kind == "ee_pose" else "F",
+            "frame": {"ee_pose": "R", "base_pose": "R"}.get(self.kind, "F"),
+            "rotation": "-" if self.kind.endswith("_pose") else "F",
+        }
+        problems = []
+        for field, rule in rules.items():
+            given = bool(getattr(self, field))
+            if (rule == "R" and not given) or (rule == "F" and given):
+                verb = "is required for" if rule == "R" else "is not allowed for"
+                problems.append(Problem((field,), f"{verb} {self.kind!r}"))
+        raise_if(problems)
+        return self
+
+
 class StateContract(Block):
-    """The proprioception that the checkpoint was trained on: a named layout, a width, and bindings
-    for task-space layouts."""
+    """The proprioception that the checkpoint was trained on: a named layout with bindings for
+    task-space layouts, or its `parts` in order; and its width."""
 
     layout: (
         Annotated[
@@ -92,11 +125,14 @@ class StateContract(Block):
     ) = None
     dim: PositiveInt | None = None
     bindings: StateBindings | None = None
+    parts: Annotated[tuple[StatePart, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         needed = TASK_SPACE_LAYOUTS.get(self.layout or "", ())
         problems = []
+        if self.parts is not None and self.layout is not None:
+            problems.append(Problem(("parts",), "is not allowed beside layout: give one of them"))
         if self.bindings is None:
             if needed:
                 problems.append(
@@ -133,15 +169,31 @@ _SLOT_RULES: tuple[tuple[frozenset[ControlMode], str, str, str], ...] = (
 )
 
 
+_OF_A_COMMAND = (
+    "control_mode",
+    "ee",
+    "frame",
+    "joint_names",
+    "rotation",
+    "gripper_convention",
+    "input_bounds",
+)
+
+
 class ActionSlot(Block):
-    """A slice of the action vector, both ends inclusive, and where it goes; `discard` drops it."""
+    """A slice of the action vector, both ends inclusive, and where it goes. `discard` drops it;
+    `terminate` ends the goal once its one value is above 0.5. The policy's numbers are clipped to
+    `input_bounds` before they are scaled, as robosuite's controllers do."""
 
     range: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
     control_mode: ControlMode | None = None
     discard: bool = False
+    terminate: bool = False
     ee: str | None = None
     frame: str | None = None
     joint_names: tuple[str, ...] = ()
+    rotation: Rotation | None = None
+    gripper_convention: GripperConvention | None = None
     input_bounds: tuple[Finite, Finite] | None = None
 
     @property
@@ -158,12 +210,19 @@ class ActionSlot(Block):
                     ("range",), f"must be [first, last] with last ≥ first, not {list(self.range)}"
                 )
             )
-        if self.discard:
+        if self.discard or self.terminate:
+            kind = "discarded" if self.discard else "terminate"
             problems += [
-                Problem((field,), "is not allowed in a discarded slot")
-                for field in ("control_mode", "ee", "frame", "joint_names", "input_bounds")
+                Problem((field,), f"is not allowed in a {kind} slot")
+                for field in _OF_A_COMMAND
                 if getattr(self, field)
             ]
+            if self.terminate and self.discard:
+                problems.append(Problem(("terminate",), "is not allowed in a discarded slot"))
+            if self.terminate and self.width > 1:
+                problems.append(
+                    Problem(("range",), f"must cover one value for terminate, not {self.width}")
+                )
         elif self.control_mode is None:
             problems.append(Problem(("control_mode",), "is required unless the slot is discarded"))
         else:
@@ -183,6 +242,12 @@ class ActionSlot(Block):
                 if (rule == "R" and not given) or (rule == "F" and given):
                     verb = "is required for" if rule == "R" else "is not allowed for"
                     problems.append(Problem((field,), f"{verb} {mode.value!r}"))
+        for field, allowed in (
+            ("rotation", frozenset({ControlMode.CARTESIAN_POSE})),
+            ("gripper_convention", GRIPPER_MODES),
+        ):
+            if getattr(self, field) is not None and mode not in allowed:
+                problems.append(Problem((field,), f"is not allowed for {mode.value!r}"))
         if self.joint_names and len(self.joint_names) != self.width > 0 and not problems:
             problems.append(
                 Problem(
@@ -215,7 +280,9 @@ class ActionContract(Block):
     representation: ActionRepresentation | None = None
     slots: Annotated[tuple[ActionSlot, ...], Field(min_length=1)] | None = None
     cartesian_delta_scale: tuple[Annotated[float, Field(gt=0)], ...] | None = None
-    joint_units: Literal["degrees", "radians"] | None = None
+    joint_units: Literal["degrees", "radians", "range_m100_100"] | None = None
+    """Of joint positions, in actions and states. `range_m100_100` runs over the joint's range, as
+    lerobot's motor buses do without degrees."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -175,6 +175,8 @@ class GripperConvention(StrEnum):
 
     NORMALIZED_OPEN_UNIT = "normalized_open_unit"  # 0 closed, 1 open
     NORMALIZED_OPEN_SYMMETRIC = "normalized_open_symmetric"  # -1 closed, 1 open
+    NORMALIZED_CLOSE_SYMMETRIC = "normalized_close_symmetric"  # -1 open, 1 closed
+    PERCENT_OPEN = "percent_open"  # 0 closed, 100 open
     BINARY_CLOSE_ONE = "binary_close_one"  # 0 open, 1 closed
     RAW_JOINT_RAD = "raw_joint_rad"
     WIDTH_METERS = "width_meters"
@@ -189,6 +191,21 @@ class ActionRepresentation(StrEnum):
     DELTA_EE_6D = "delta_ee_6d"
     DELTA_EE_3D_PLUS_GRIPPER = "delta_ee_3d_plus_gripper"
     CARTESIAN_POSE = "cartesian_pose"
+
+
+class Rotation(StrEnum):
+    """How an orientation is written. Quaternions have w ≥ 0, angles are in rad."""
+
+    QUAT_XYZW = "quat_xyzw"
+    QUAT_WXYZ = "quat_wxyz"
+    ROT6D = "rot6d"  # first two rows of the rotation matrix
+    AXIS_ANGLE = "axis_angle"  # axis times angle
+    EULER_XYZ = "euler_xyz"  # roll, pitch, yaw about the fixed axes
+
+    @property
+    def width(self) -> int:
+        """Number of values."""
+        return {"quat": 4, "rot6": 6}.get(self.value[:4], 3)
 
 
 class DetectorEngine(StrEnum):
