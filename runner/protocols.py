@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NoReturn, Protocol, runtime_checkable
 
 from vram_arbiter.schemas.errors import TransientError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.world import (
     Action,
     CameraModel,
@@ -98,21 +99,26 @@ class Act:
     """Apply this one-step action now.
 
     `prefetched` comes with the first action of a chunk: whether the chunk was there when it was
-    due. None: unknown.
+    due. None: unknown. `problem` says how the action falls short of what was asked for.
     """
 
     action: Action
     chunk_index: int | None = None
     inference_ms: float = 0.0
     prefetched: bool | None = None
+    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Nothing to apply this tick (an answer is under way): keep the pose."""
+    """Nothing to apply this tick (an answer is under way): keep the pose.
+
+    `withheld`: there was an action, and it cannot be carried out; `reason` is a violation.
+    """
 
     reason: str
     inference_ms: float = 0.0
+    withheld: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,21 +251,55 @@ class SafetyGate(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One joint of a robot: its range (rad) and the greatest speed that its motor makes (rad/s)."""
+    """One joint of a robot: its range (rad) and the greatest speed that its motor makes (rad/s).
+
+    A gripper is closed at its lower end and open at its upper one. All numbers of a `linear` joint
+    are m and m/s.
+    """
 
     name: str
     lower_rad: float
     upper_rad: float
     max_speed_rad_s: float
     gripper: bool = False
+    linear: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class MobileBase:
-    """A platform that drives on a plane: its greatest speed (m/s) and turn (rad/s)."""
+    """A platform that drives on a plane: its greatest speed (m/s) and turn (rad/s).
+
+    Its pose is that of `frame` in `world_frame`; `joints` are what manifests call its x, y and yaw.
+    The arm's model begins at `mount_m` in `frame`.
+    """
 
     max_speed_m_s: float
     max_turn_rad_s: float
+    frame: str = "base_link"
+    world_frame: str = "map"
+    joints: tuple[str, str, str] = ("base_x", "base_y", "base_yaw")
+    mount_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tells_twist: bool = False  # whether the world state has its velocity
+
+
+@dataclass(frozen=True, slots=True)
+class EndEffector:
+    """What a manifest calls an end effector: its frame in the robot's model, and its gripper."""
+
+    name: str
+    frame: str
+    gripper: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyUnits:
+    """Units of skills made for this robot whose manifests do not state them.
+
+    `cartesian_delta_scale`: m and rad per unit of a cartesian delta.
+    """
+
+    cartesian_delta_scale: tuple[float, ...] | None = None
+    gripper_convention: GripperConvention | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,6 +314,10 @@ class RobotDescription:
         False  # whether its joint state has efforts: limits of torque and force are kept by them
     )
     base: MobileBase | None = None
+    model: str = ""  # an MJCF file, or the built-in "so101"; without it there are no frames
+    ends: tuple[EndEffector, ...] = ()
+    frames: Mapping[str, str] = field(default_factory=dict)  # other names of the model's frames
+    units: PolicyUnits = PolicyUnits()
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -283,7 +327,8 @@ class RobotDescription:
 class Hal(Protocol):
     """Hardware of one robot, or its twin. All calls on the control thread; joint units are rad.
 
-    `send_action` takes one-step joint-position actions that have passed the safety gate. `estop`
+    `send_action` takes one-step actions that have passed the safety gate: joint positions, a body
+    twist for a robot with a base, or both. `estop`
     stops the motors as fast as the hardware can, latches, and always raises
     `schemas.errors.EstopRequested`; from then on `send_action` raises it too.
     """

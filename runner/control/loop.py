@@ -44,7 +44,6 @@ from vram_arbiter.runner.protocols import (
     TickSink,
 )
 from vram_arbiter.runner.safety.estop_latch import EstopLatch
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import EstopRequested, InternalError
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -407,7 +406,7 @@ def _base_command(world: WorldState, action: Action | None) -> tuple[float, floa
     """Return what the base was told (m/s, m/s, rad/s); None for a robot without a base."""
     if world.base_pose is None:
         return None
-    if action is None or action.control_mode is not ControlMode.BODY_TWIST:
+    if action is None or action.body_twist is None:
         return (0.0, 0.0, 0.0)  # a base without a command stands still
-    vx, vy, _, _, _, wz = action.rows[0]
+    vx, vy, _, _, _, wz = action.body_twist[0]
     return (vx, vy, wz)

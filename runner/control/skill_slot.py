@@ -185,11 +185,15 @@ class SkillSlot:
         decision.inference_ms = (self._clock.now_s() - asked_s) * 1e3
         meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms, self.labels)
         match outcome:
-            case Act(action=action, chunk_index=chunk_index, prefetched=prefetched):
+            case Act(action=action, chunk_index=chunk_index, prefetched=prefetched, problem=short):
                 decision.chunk_index = chunk_index
                 if prefetched is not None:
                     self._count_chunk(active, prefetched)
-                self._check(active, action, world, decision)
+                self._check(active, action, world, decision, short)
+            case Hold(reason=reason, withheld=True):
+                decision.violations = (reason,)
+                self.violations.append(reason)
+                self._refused(active, reason)
             case Hold(reason=reason):
                 active.detail = reason
             case Done(data=data):
@@ -208,12 +212,14 @@ class SkillSlot:
         self.total.count_chunk(in_time)
 
     def _check(
-        self, active: _Active, action: Action, world: WorldState, decision: Decision
+        self, active: _Active, action: Action, world: WorldState, decision: Decision, short: str
     ) -> None:
         checked_s = self._clock.now_s()
         with tracing.span(telemetry.SPAN_SAFETY):
             decision.action, problems = active.gate.check(action, world)
         decision.safety_ms = (self._clock.now_s() - checked_s) * 1e3
+        if short:
+            problems = (*problems, short)
         decision.violations = problems
         self.violations.extend(problems)
         if problems:

@@ -27,7 +27,7 @@ from vram_arbiter.runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
-from vram_arbiter.schemas.world import Action, WorldState
+from vram_arbiter.schemas.world import Action, Twist, WorldState
 
 MAX_STATE_AGE_S = 0.2  # an older joint state is not the robot's any more
 # steps are measured from the last target while it is this young, else from the robot's pose
@@ -174,9 +174,10 @@ class RobotGate:
         self._fresh(world)
         if action.horizon != 1:
             raise _Withheld(f"{action.horizon} steps at once: the gate passes one at a time")
-        if action.control_mode is ControlMode.BODY_TWIST:
-            self._base_speed(action)
-            return action
+        if action.body_twist is not None:
+            self._base_speed(action.body_twist[0])
+            if action.control_mode is ControlMode.BODY_TWIST:
+                return action
         names = action.joint_names or self._robot.joint_names
         if len(set(names)) != len(names):
             raise _Withheld("a joint is commanded twice")
@@ -218,10 +219,10 @@ class RobotGate:
         if age_s > MAX_STATE_AGE_S:
             raise _Withheld(f"the joint state is stale: {age_s:.2f} s old")
 
-    def _base_speed(self, action: Action) -> None:
+    def _base_speed(self, twist: Twist) -> None:
         if self._robot.base is None:
             raise _Withheld(f"{self._robot.name} has no base to drive")
-        vx, vy, vz, wx, wy, wz = action.rows[0]
+        vx, vy, vz, wx, wy, wz = twist
         if vz or wx or wy:
             raise _Withheld(f"{self._robot.name} drives on a plane: vz, wx and wy must be 0")
         speed, turn = math.hypot(vx, vy), abs(wz)

@@ -255,10 +255,13 @@ def _commands(
     """Arm target by joint name and base velocity of an action; (None, None) holds."""
     if action is None:
         return None, None
+    base = None
+    if action.body_twist is not None:
+        twist = action.body_twist[0]
+        base = twist[0], twist[1], twist[5]
     if action.control_mode is ControlMode.BODY_TWIST:
-        twist = action.rows[0]
-        return None, (twist[0], twist[1], twist[5])
+        return None, base
     names = action.joint_names
     if names is None:
         raise InternalError("a joint action reached the simulator without joint names")
-    return dict(zip(names, action.rows[0], strict=True)), None
+    return dict(zip(names, action.rows[0], strict=True)), base

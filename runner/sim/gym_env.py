@@ -51,7 +51,9 @@ class SpaceGate:
         """Return the action to apply, clamped where the excess is small, or None; and the
         violations.
         """
-        if action.control_mode is not self.mode:
+        if action.control_mode is not self.mode or (
+            action.body_twist is not None and self.mode is not ControlMode.BODY_TWIST
+        ):
             return None, (f"this environment takes {self.mode}, not {action.control_mode}",)
         if action.horizon != 1:
             return None, (f"one step at a time, not {action.horizon}",)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from vram_arbiter.runner.goals.catalogue import Maker, sidecar_endpoint
-from vram_arbiter.runner.protocols import GoalData, MobileBase, Skill
+from vram_arbiter.runner.protocols import GoalData, MobileBase, RobotDescription, Skill
 from vram_arbiter.runner.robots.body import SIMULATED
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
@@ -39,8 +39,8 @@ OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
 class World:
     """One choice of `--env`.
 
-    `cameras` None: those of the environment. `arm`, `scene` and `environment` are those of our own
-    scene. `joints` are what a policy sees and moves, in the policy's order; `rest` is its start
+    `cameras` None: those of the environment. `arm`, `scene`, `environment` and `robot` are those of
+    our own scene. `joints` are what a policy sees and moves, in the policy's order; `rest` is its start
     (rad), None: wherever a reset leaves the world.
     """
 
@@ -56,6 +56,7 @@ class World:
     scene: SceneConfig | None = None
     arm: SimEnv | None = None
     environment: ArmEnvironment | None = None
+    robot: RobotDescription | None = None
 
 
 def so101_world(scene_file: Path | None) -> World:
@@ -63,7 +64,8 @@ def so101_world(scene_file: Path | None) -> World:
     scene = SceneConfig.load(scene_file)
     arm = SimEnv(scene)  # renders only on the control thread, from its first reset on
     cameras = tuple(name for name in OBSERVATION_CAMERAS if name in scene.cameras)
-    robot = so101(simulated=True, base=MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S))
+    base = MobileBase(MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, mount_m=scene.mount_in_base_m)
+    robot = so101(simulated=True, base=base)
     environment = ArmEnvironment(arm, robot, kinematics=kinematics_for(robot), cameras=cameras)
     return World(
         name=SO101,
@@ -80,6 +82,7 @@ def so101_world(scene_file: Path | None) -> World:
         scene=scene,
         arm=arm,
         environment=environment,
+        robot=robot,
     )
 
 
@@ -140,10 +143,10 @@ def makers_of(
                 hint="name them in the environment's file: `joints`, `actions`,"
                 " control_mode joint_position",
             )
-        wiring = wire_up(manifest, world.joints, world.rest)
+        wiring = wire_up(manifest, world.robot or world.joints, world.rest)
         client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
         speeds, sent = None, None
-        if world.environment is not None and wiring.rollout.targets_lead:
+        if world.environment is not None and wiring.stepwise:
             speeds, sent = (
                 world.environment.limits_for(manifest).speeds_rad_s,
                 world.environment.sent,

@@ -11,7 +11,7 @@ import pytest
 from tests.runner.small_robots import FedCamera, Nod, Twin
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
-from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, SafetyGate, Skill, SkillEnded
+from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, Hold, SafetyGate, Skill, SkillEnded
 from vram_arbiter.runner.robots.hardware import (
     FIRST_DATA_SLICE_S,
     FIRST_STATE_TRIES,
@@ -29,6 +29,7 @@ from vram_arbiter.schemas.errors import (
     EstopRequested,
     FrameStale,
     LimitExceeded,
+    ModelError,
     RobotFault,
     StateStale,
 )
@@ -108,6 +109,24 @@ def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
     assert not tick(runner, clock).action_applied  # without a skill nothing is sent
     runner.deactivate()
     assert twin.story == ["connect", "disconnect"]
+
+
+def test_what_a_skill_cannot_carry_out_is_withheld_and_fails_the_goal_if_it_lasts(
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+) -> None:
+    """A tool step that the arm cannot reach is as good as one that the gate forbids."""
+    runner = make_runner()
+    runner.activate()
+    skill = nod()
+    skill._step = lambda world: Hold("the hand stops 9 mm short", withheld=True)
+    ended = begin(runner, skill)
+    result = tick(runner, clock)
+    assert not result.action_applied
+    assert result.safety_violations == ("the hand stops 9 mm short",)
+    tick(runner, clock, WITHHELD_IN_A_ROW_MAX)
+    assert isinstance(ended[0].error, ModelError)
+    assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
+    assert not twin.sent
 
 
 @pytest.mark.parametrize("cause", ["hangs", "ends", "is not there"])

@@ -585,6 +585,15 @@ def test_a_base_drives_as_fast_as_it_may_and_not_faster() -> None:
     assert (allowed, problems) == (None, ("planar drives on a plane: vz, wx and wy must be 0",))
 
 
+def test_an_arm_that_moves_while_its_base_drives_keeps_the_limits_of_both() -> None:
+    both = to_row(*HERE, body_twist=((0.1, 0.0, 0.0, 0.0, 0.0, 0.2),))
+    assert driving().check(both, at(*HERE)) == (both, ())
+    fast = to_row(*HERE, body_twist=((9.0, 0.0, 0.0, 0.0, 0.0, 0.0),))
+    assert driving().check(fast, at(*HERE))[0] is None
+    leap = both.model_copy(update={"joint_targets": ((9.0, 1.0, 0.5),)})
+    assert driving().check(leap, at(*HERE))[0] is None
+
+
 def test_an_envelope_slows_the_base_and_never_speeds_it_up() -> None:
     slow = driving(max_base_linear_speed_m_s=0.2, max_base_angular_speed_rad_s=9.0)
     assert (slow.limits.base_speed_m_s, slow.limits.base_turn_rad_s) == (0.2, 1.2)

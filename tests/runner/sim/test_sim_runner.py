@@ -285,6 +285,14 @@ def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: A
         runner.tick()
 
 
+def test_an_arm_moves_while_its_base_drives(make_runner: Make, env: Any) -> None:
+    driving = ((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),)
+    both = joints(0.1).model_copy(update={"body_twist": driving})
+    play_script(make_runner(rate_hz=0), [Act(both)], 2)
+    assert env.steps[0][0]["shoulder_pan"] == 0.1
+    assert env.steps[0][1] == (0.3, 0.0, 0.1)
+
+
 # -- the skill at the arm
 def test_actions_reach_the_robot_in_order_and_done_ends_the_skill(
     make_runner: Make, env: Any
