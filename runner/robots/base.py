@@ -22,7 +22,7 @@ from vram_arbiter.schemas.errors import (
     RobotFault,
     VramError,
 )
-from vram_arbiter.schemas.world import Action, JointState
+from vram_arbiter.schemas.world import Action, JointState, Twist
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +56,13 @@ class HalBase(ABC):
 
         Other joints keep theirs.
         """
+
+    def _roll(self, twist: Twist | None) -> None:
+        """Drive the base at a velocity in its own frame; None stops it.
+
+        Called with every command of a robot whose description has a base.
+        """
+        raise InternalError(f"{self.description.name} has no base to drive")
 
     @abstractmethod
     def _halt(self) -> str:
@@ -105,7 +112,13 @@ class HalBase(ABC):
         if self._estop is not None:
             raise self._estop
         self._require_connected()
-        self._sent.update(self._drive(self._targets_of(action)))
+        targets = {}
+        if action.control_mode is not ControlMode.BODY_TWIST or self.description.base is None:
+            targets = self._targets_of(action)
+        if self.description.base is not None or action.body_twist is not None:
+            self._roll(action.body_twist[0] if action.body_twist is not None else None)
+        if targets:
+            self._sent.update(self._drive(targets))
 
     def sent(self) -> Mapping[str, float]:
         """Return the last target (rad) that the motors really got, by joint; empty at first."""

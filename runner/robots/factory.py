@@ -6,26 +6,39 @@ Every mistake is a ConfigError that names the field (`hal.params.start_pose_rad.
 from __future__ import annotations
 
 import dataclasses
+import os
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.runner.control.clock import Clock
-from vram_arbiter.runner.protocols import Joint, RobotDescription
+from vram_arbiter.runner.protocols import (
+    EndEffector,
+    Joint,
+    MobileBase,
+    PolicyUnits,
+    RobotDescription,
+)
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
 from vram_arbiter.runner.robots.lerobot_robot import POSITION, Estop, LerobotHal, can_switch_off
+from vram_arbiter.runner.robots.models import frames_of, load_model
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.units import JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
+from vram_arbiter.schemas.yamltext import Path as FieldPath
+from vram_arbiter.schemas.yamltext import Problem, config_error, did_you_mean, dotted
 
 LEROBOT = "lerobot:"
 MUJOCO = "so101_mujoco"
 KINEMATIC = "so101_kinematic"
-ADAPTERS = (MUJOCO, KINEMATIC, LEROBOT + "TYPE")
+MODEL = "mujoco"
+ADAPTERS = (MUJOCO, KINEMATIC, MODEL, LEROBOT + "TYPE")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -65,7 +78,61 @@ class JointParams(_Params):
         return self
 
 
-class LerobotParams(_Params):
+class EndParams(_Params):
+    """An end effector: its frame in the model, and the joint that is its gripper."""
+
+    frame: str
+    gripper: str | None = None
+
+
+class UnitParams(_Params):
+    """Units of skills made for this robot whose manifests do not state them."""
+
+    cartesian_delta_scale: tuple[Positive, ...] | None = None
+    gripper_convention: GripperConvention | None = None
+
+
+class ModelParams(_Params):
+    """What manifests may speak of: the frames of an MJCF, and the robot's end effectors.
+
+    `model` is a file, or the name of a shipped one; `frames` gives the model's frames other names.
+    """
+
+    model: str = ""
+    ends: dict[str, EndParams] = {}
+    frames: dict[str, str] = {}
+    units: UnitParams = UnitParams()
+
+
+class BaseParams(_Params):
+    """A base that drives on a plane, by three joints of the model: x, y and yaw."""
+
+    max_speed_m_s: Positive
+    max_turn_rad_s: Positive
+    frame: str = "base_link"
+    world_frame: str = "odom"
+    joints: tuple[str, str, str] = ("base_x", "base_y", "base_yaw")
+
+
+class ModelJointParams(_Params):
+    """A joint of a model, whose range may be narrowed. Of a slide all numbers are m."""
+
+    max_speed_rad_s: Positive
+    lower_rad: Finite | None = None
+    upper_rad: Finite | None = None
+    gripper: bool = False
+
+
+class ModelTwinParams(ModelParams):
+    """`params` of `mujoco`."""
+
+    joints: Annotated[dict[str, ModelJointParams], Field(min_length=1)]
+    base: BaseParams | None = None
+    rest_pose_rad: dict[str, Finite] = {}
+    start_pose_rad: dict[str, Finite] = {}
+
+
+class LerobotParams(ModelParams):
     """`params` of `lerobot:TYPE`. `so101_follower` needs none of them."""
 
     joints: dict[str, JointParams] = {}
@@ -83,12 +150,14 @@ def make_hal(
     name = config.adapter
     if name in (MUJOCO, KINEMATIC):
         return _twin(config, clock, source)
+    if name == MODEL:
+        return _model_twin(config, clock, source)
     if name.startswith(LEROBOT):
         return _lerobot(config, clock, source)
     raise _wrong(source, ("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
 
 
-def _wrong(source: str, path: Path, problem: str) -> ConfigError:
+def _wrong(source: str, path: FieldPath, problem: str) -> ConfigError:
     return config_error(source, [Problem(0, dotted(("hal", *path)), problem)])
 
 
@@ -98,16 +167,18 @@ def _params[T: _Params](kind: type[T], config: HalConfig, source: str) -> T:
     except ValidationError as error:
         problems = []
         for finding in error.errors(include_url=False, include_context=False):
-            path: Path = ("hal", "params", *finding["loc"])
+            path: FieldPath = ("hal", "params", *finding["loc"])
             text = finding["msg"].removeprefix("Value error, ")
             if finding["type"] == "extra_forbidden":
-                known = JointParams if len(path) > 3 else kind
-                text = f"unknown key{did_you_mean(str(path[-1]), list(known.model_fields))}"
+                fields = list(kind.model_fields) if len(path) == 3 else []
+                if len(path) == 5 and path[2] == "joints":
+                    fields = list(JointParams.model_fields)
+                text = f"unknown key{did_you_mean(str(path[-1]), fields)}"
             problems.append(Problem(0, dotted(path), text))
         raise config_error(source, problems) from error
 
 
-def _joints_are_known(given: JsonMap, names: tuple[str, ...], path: Path, source: str) -> None:
+def _joints_are_known(given: JsonMap, names: tuple[str, ...], path: FieldPath, source: str) -> None:
     problems = [
         Problem(
             0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"
@@ -152,6 +223,143 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     return So101MujocoTwin(start_pose_rad=start, clock=clock)
 
 
+# -- robots with a model
+def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
+    if config.transport:
+        raise _wrong(
+            source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
+        )
+    params = _params(ModelTwinParams, config, source)
+    if not params.model:
+        raise _wrong(source, ("params", "model"), "give the robot's MJCF file")
+    names = tuple(params.joints)
+    base = params.base
+    poses = {"rest_pose_rad": params.rest_pose_rad, "start_pose_rad": params.start_pose_rad}
+    for field, given in poses.items():
+        _joints_are_known(given, names, (field,), source)
+    bare = RobotDescription(
+        "", tuple(Joint(name, 0.0, 0.0, 0.0) for name in names), {}, model=_file(params, source)
+    )
+    model = _loaded(bare, source)
+    joints = []
+    for name, joint in params.joints.items():
+        found = model.joint(name)
+        low, high = (float(end) for end in found.range)
+        low = low if joint.lower_rad is None else max(low, joint.lower_rad)
+        high = high if joint.upper_rad is None else min(high, joint.upper_rad)
+        if low >= high:
+            raise _wrong(
+                source,
+                ("params", "joints", name),
+                f"the range [{low}, {high}] is empty: the model's, narrowed by the file's",
+            )
+        linear = _is_slide(found)
+        joints.append(Joint(name, low, high, joint.max_speed_rad_s, joint.gripper, linear))
+    description = RobotDescription(
+        model.names[: model.names.index(b"\0")].decode() or MODEL,
+        tuple(joints),
+        params.rest_pose_rad,
+        simulated=True,
+        base=None
+        if base is None
+        else MobileBase(
+            base.max_speed_m_s,
+            base.max_turn_rad_s,
+            frame=base.frame,
+            world_frame=base.world_frame,
+            joints=base.joints,
+            tells_twist=True,
+        ),
+        **_modelled(params, names, bare.model, source),
+    )
+    _has_actuators(model, description, source)
+    from vram_arbiter.runner.robots.mujoco_twin import MujocoTwin
+
+    return MujocoTwin(
+        description,
+        lambda: load_model(description),
+        start_pose_rad=params.start_pose_rad,
+        clock=clock,
+    )
+
+
+def _file(params: ModelParams, source: str) -> str:
+    """Return the path of the model, or an empty text. Raises ConfigError: there is no such file."""
+    if not params.model:
+        return ""
+    shipped = configs_folder(os.environ) / "robots" / "models" / f"{params.model}.xml"
+    for path in (Path(params.model), shipped):
+        if path.is_file():
+            return str(path.resolve())
+    raise _wrong(
+        source,
+        ("params", "model"),
+        f"no such file: {params.model}; give a full path, or the name of a shipped model",
+    )
+
+
+def _loaded(description: RobotDescription, source: str) -> Any:
+    try:
+        return load_model(description)
+    except ConfigError as error:
+        hint = f"; {error.hint}" if error.hint else ""
+        raise _wrong(source, ("params", "model"), f"{error.message}{hint}") from error
+
+
+def _modelled(
+    params: ModelParams, joints: tuple[str, ...], model: str, source: str
+) -> dict[str, Any]:
+    """Return the fields of a description that come from the model's parameters."""
+    for name, end in params.ends.items():
+        if end.gripper is not None and end.gripper not in joints:
+            raise _wrong(
+                source,
+                ("params", "ends", name, "gripper"),
+                f"no such joint{did_you_mean(end.gripper, joints)}",
+            )
+    if params.ends and not model:
+        raise _wrong(source, ("params", "model"), "give the MJCF file that has the ends' frames")
+    ends = tuple(EndEffector(name, end.frame, end.gripper) for name, end in params.ends.items())
+    known = RobotDescription("", (), {}, model=model)
+    if model:
+        frames = frames_of(_loaded(known, source))
+        for path, frame in (
+            *((("ends", name, "frame"), end.frame) for name, end in params.ends.items()),
+            *((("frames", name), frame) for name, frame in params.frames.items()),
+        ):
+            if frame not in frames and frame not in params.frames:
+                raise _wrong(
+                    source,
+                    ("params", *path),
+                    f"the model has no frame {frame!r}{did_you_mean(frame, frames)}",
+                )
+    return {
+        "model": model,
+        "ends": ends,
+        "frames": params.frames,
+        "units": PolicyUnits(params.units.cartesian_delta_scale, params.units.gripper_convention),
+    }
+
+
+def _is_slide(joint: Any) -> bool:
+    import mujoco
+
+    return int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _has_actuators(model: Any, robot: RobotDescription, source: str) -> None:
+    import mujoco
+
+    wanted = [*robot.joint_names, *(robot.base.joints if robot.base else ())]
+    kind = mujoco.mjtObj.mjOBJ_ACTUATOR
+    if missing := [name for name in wanted if mujoco.mj_name2id(model, kind, name) < 0]:
+        raise _wrong(
+            source,
+            ("params", "model"),
+            f"no position actuator of the name of {', '.join(missing)}",
+        )
+
+
 # -- lerobot
 def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     params = _params(LerobotParams, config, source)
@@ -185,7 +393,17 @@ def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     if problems:
         raise config_error(source, problems)
     rest = {**(known.rest_pose_rad if known else {}), **params.rest_pose_rad}
-    description = RobotDescription(known.name if known else config.adapter, tuple(joints), rest)
+    given: dict[str, Any] = {}
+    if known is not None:
+        given = {"model": known.model, "ends": known.ends}
+    if params.model or params.ends or params.frames:
+        given = _modelled(params, names, _file(params, source), source)
+    given["units"] = PolicyUnits(
+        params.units.cartesian_delta_scale, params.units.gripper_convention
+    )
+    description = RobotDescription(
+        known.name if known else config.adapter, tuple(joints), rest, **given
+    )
     return LerobotHal(robot, description, scales, estop=params.estop, clock=clock)
 
 

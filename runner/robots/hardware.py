@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -19,6 +20,7 @@ from vram_arbiter.runner.protocols import (
     DeadlinePolicy,
     GoalData,
     Hal,
+    MobileBase,
     SafetyGate,
     SensorReader,
     SkillEnded,
@@ -39,7 +41,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.world import Action, TickResult, WorldState
+from vram_arbiter.schemas.world import Action, Pose, TickResult, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +105,13 @@ class HardwareRobot:
         for _ in range(FIRST_STATE_TRIES):
             if self._read_joints():
                 break
-        self.world = self.aggregator.snapshot(self._clock.now_ns())
+        self.world = self._snapshot()
+
+    def _snapshot(self) -> WorldState:
+        """Return the world state, with the base's odometry where the joint state has it."""
+        world = self.aggregator.snapshot(self._clock.now_ns())
+        base = self.hal.description.base
+        return world if base is None else with_base(world, base)
 
     def _await_first(
         self, reader: SensorReader, deadline_ns: int, stopping: threading.Event
@@ -174,7 +182,7 @@ class HardwareRobot:
             self._read_joints()
         sensed_s = self._clock.now_s()
         with tracing.span(telemetry.SPAN_WORLD):
-            self.world = self.aggregator.snapshot(self._clock.now_ns())
+            self.world = self._snapshot()
         return Sensed(
             sensors_ms=(sensed_s - started_s) * 1e3,
             world_state_ms=(self._clock.now_s() - sensed_s) * 1e3,
@@ -275,6 +283,29 @@ class HardwareRobot:
                 f"unknown camera {camera!r}", hint=f"choose from {', '.join(self._readers)}"
             )
         return FramePicture(self._readers[camera].read_latest(max_age_s * 1e3))
+
+
+def with_base(world: WorldState, base: MobileBase) -> WorldState:
+    """Return the world state with pose and velocity of a base whose joints are in its joint state.
+
+    Unchanged where they are not: a base that is not measured has no pose.
+    """
+    state = world.joint_state
+    place = {name: index for index, name in enumerate(state.name)}
+    if not all(name in place for name in base.joints):
+        return world
+    x, y, yaw = (state.position[place[name]] for name in base.joints)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    twist = None
+    if state.velocity:
+        vx, vy, wz = (state.velocity[place[name]] for name in base.joints)
+        twist = (cosine * vx + sine * vy, cosine * vy - sine * vx, 0.0, 0.0, 0.0, wz)
+    pose = Pose(
+        xyz=(x, y, 0.0),
+        quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
+        frame_id=base.world_frame,
+    )
+    return world.model_copy(update={"base_pose": pose, "base_twist": twist})
 
 
 HardwareRunner = ControlLoop[HardwareRobot]

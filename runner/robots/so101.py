@@ -6,12 +6,13 @@ servos are Feetech STS3215.
 
 from __future__ import annotations
 
-from vram_arbiter.runner.protocols import Joint, MobileBase, RobotDescription
+from vram_arbiter.runner.protocols import EndEffector, Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
 
 NAME = "so101"
 SERVO_SPEED_RAD_S = 4.7  # STS3215 without load, by its data sheet: 0.222 s for 60 degrees
 GRIPPER = "gripper"
+TOOL = "grasp"  # the point between the fingers, a site of the model
 
 RANGES_RAD = {
     "shoulder_pan": (-1.91986, 1.91986),
@@ -36,4 +37,6 @@ def so101(*, simulated: bool, base: MobileBase | None = None) -> RobotDescriptio
         rest_pose_rad=dict(zip(ARM_JOINTS, REST_POSE, strict=True)),
         simulated=simulated,
         base=base,
+        model=NAME,
+        ends=(EndEffector(GRIPPER, TOOL, GRIPPER),),
     )

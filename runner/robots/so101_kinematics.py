@@ -15,6 +15,7 @@ from vram_arbiter.runner.robots.so101 import NAME
 from vram_arbiter.runner.safety.limits import Kinematics, Vector3
 from vram_arbiter.runner.sim.config import ARM_JOINTS
 from vram_arbiter.runner.sim.scene import GRASP_SITE, arm_spec, load_mujoco
+from vram_arbiter.runner.skills.kinematics import ArmModel
 
 BODIES = {"elbow": "lower_arm", "wrist": "wrist", "gripper": "gripper"}
 
@@ -48,7 +49,12 @@ class So101Kinematics:
 
 
 def kinematics_for(robot: RobotDescription) -> Kinematics | None:
-    """Return the kinematics of a known robot; None for another one, and without MuJoCo."""
-    if robot.name != NAME or importlib.util.find_spec("mujoco") is None:
+    """Return the kinematics of a robot with a model and a tool; None without, or without MuJoCo.
+
+    Raises ConfigError for a model that cannot be read.
+    """
+    if importlib.util.find_spec("mujoco") is None:
         return None
-    return So101Kinematics()
+    if robot.name == NAME:
+        return So101Kinematics()
+    return ArmModel(robot) if robot.model and robot.ends else None

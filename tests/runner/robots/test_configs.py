@@ -31,10 +31,13 @@ def test_its_envelope_can_be_kept(name: str) -> None:
     from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
 
     robot = load_robot((FOLDER / name).read_text(encoding="utf-8"), name)
-    known = (
-        "so101" in robot.hal.adapter
-    )  # drivers are not installed everywhere: the description will do
-    description = so101(simulated=False) if known else RobotDescription(robot.hal.adapter, (), {})
+    # drivers are not installed everywhere: the description will do
+    description = RobotDescription(robot.hal.adapter, (), {})
+    if "so101" in robot.hal.adapter:
+        description = so101(simulated=False)
+    elif robot.hal.adapter == "mujoco":
+        description = make_hal(robot.hal).description
+    known = bool(description.model)
     gate = RobotGate(
         description,
         rate_hz=robot.rate_hz,

@@ -12,6 +12,8 @@ from vram_arbiter.runner.robots.units import JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 
+PANDA_JOINT = {"panda_joint1": {"max_speed_rad_s": 2.0}}
+
 
 def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
     with pytest.raises(ConfigError) as caught:
@@ -74,6 +76,50 @@ def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
             "sign",
         ),
         ("lerobot:so101_follower", {"params": {"estop": "pray"}}, "hal.params.estop", "hold"),
+        (
+            "mujoco",
+            {"params": {"joints": PANDA_JOINT}},
+            "hal.params.model",
+            "give the robot's MJCF",
+        ),
+        (
+            "mujoco",
+            {"params": {"joints": PANDA_JOINT, "model": "pandas"}},
+            "hal.params.model",
+            "no such file: pandas",
+        ),
+        pytest.param(
+            "mujoco",
+            {"params": {"joints": {"elbow": {"max_speed_rad_s": 1}}, "model": "panda_mobile"}},
+            "hal.params.model",
+            "has no joint elbow",
+            marks=pytest.mark.heavy,
+        ),
+        pytest.param(
+            "mujoco",
+            {
+                "params": {
+                    "joints": {"panda_joint1": {"max_speed_rad_s": 1, "lower_rad": 3}},
+                    "model": "panda_mobile",
+                }
+            },
+            "hal.params.joints.panda_joint1",
+            "is empty",
+            marks=pytest.mark.heavy,
+        ),
+        pytest.param(
+            "mujoco",
+            {
+                "params": {
+                    "joints": PANDA_JOINT,
+                    "model": "panda_mobile",
+                    "ends": {"hand": {"frame": "panda_hend"}},
+                }
+            },
+            "hal.params.ends.hand.frame",
+            "panda_hand",
+            marks=pytest.mark.heavy,
+        ),
     ],
 )
 def test_each_mistake_names_its_field(adapter: str, sections: Any, field: str, said: str) -> None:
