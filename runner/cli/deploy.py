@@ -80,6 +80,7 @@ def add_parser(
     )
     deploy.add_argument(
         "--dry-run",
+        "--check",
         action="store_true",
         help="check everything, print what would run, open nothing",
     )
@@ -107,15 +108,15 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
 
             description = parts.hal.description
-            wiring = wire_up(manifest, description.joint_names, description.rest_pose_rad)
-            limits = parts.gate.for_skill(manifest, ()).limits
+            wiring = wire_up(manifest, description, description.rest_pose_rad)
+            speeds = parts.gate.for_skill(manifest, ()).limits.speeds_rad_s
             return SidecarPolicy(
                 manifest,
                 wiring,
                 PolicyClient(sidecar_endpoint(manifest.name, given, os.environ)),
                 arbiter,
                 period_s=1.0 / file.robot.rate_hz,
-                speeds_rad_s=limits.speeds_rad_s if wiring.rollout.targets_lead else None,
+                speeds_rad_s=speeds if wiring.stepwise else None,
                 sent=parts.hal.sent,
             )
 

@@ -21,8 +21,8 @@ from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE
 from vram_arbiter.runner.skills.sidecar_policy import wire_up
 from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
-from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid, UnknownSkill
-from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.errors import ConfigError, UnknownSkill
+from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest
 from vram_arbiter.schemas.yamltext import Path as FieldPath
 from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
 
@@ -142,6 +142,17 @@ def unkept(parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
     return tuple(found)
 
 
+def contracts(parts: Parts, catalogue: Catalogue) -> list[str]:
+    """Return what the policies' vectors are on this robot, and what of them changes nothing."""
+    found = []
+    for manifest in catalogue.executable():
+        if manifest.kind is Kind.VLA:
+            wiring = wire_up(manifest, parts.hal.description, None)
+            widths = f"{wiring.actions.dim} actions from a state of {wiring.state.width}"
+            found += [f"{manifest.name}: {text}" for text in (widths, *wiring.actions.notes)]
+    return found
+
+
 # -- skills
 def offered(
     file: DeploymentFile,
@@ -204,7 +215,7 @@ def _folder_of(name: str) -> str:
 def misfits(
     robot: RobotEnvironment, parts: Parts, manifest: RSkillManifest
 ) -> list[tuple[str, str]]:
-    """Return what of a skill does not fit this robot: its envelope, and a policy's joints and
+    """Return what of a skill does not fit this robot: its envelope, and a policy's contracts and
     cameras.
     """
     problems = []
@@ -215,20 +226,10 @@ def misfits(
     if manifest.kind is not Kind.VLA:
         return problems
     description = parts.hal.description
-    joints = description.joint_names
-    for actuator in manifest.actuators_required:
-        order = actuator.control_mode_semantics.joint_order
-        if order is not None and order != joints:
-            problems.append(
-                (
-                    "vla.id",
-                    f"{manifest.name} moves {', '.join(order)}; the robot has {', '.join(joints)}",
-                )
-            )
     try:
-        wiring = wire_up(manifest, joints, description.rest_pose_rad)
-    except ManifestInvalid as error:
-        return [*problems, ("vla.id", str(error))]
+        wiring = wire_up(manifest, description, description.rest_pose_rad)
+    except ManifestError as error:
+        return [*problems, *(("vla.id", found.at(manifest.name)) for found in error.problems)]
     there = [sensor.sensor_id for sensor in robot.sensors]
     if missing := [name for name in wiring.cameras if name not in there]:
         problems.append(
@@ -316,6 +317,7 @@ def plan(
         lines.append(("safety", "none given: only the joints' own ranges and speeds are limits"))
     lines += [("NOT KEPT", text) for text in unkept(parts, catalogue)]
     lines += [("skill", text) for text in catalogue.summary()]
+    lines += [("contract", text) for text in contracts(parts, catalogue)]
     if robot.task is not None and robot.vla is not None:
         limit = f", at most {robot.task.max_steps} ticks" if robot.task.max_steps else ""
         skill = skill_named(robot.vla, catalogue.executable())

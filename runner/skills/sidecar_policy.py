@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import importlib
 import logging
 import math
 from collections import deque
@@ -22,20 +23,33 @@ from typing import Any, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.protocols import (
+    Act,
+    Done,
+    Goal,
+    Hold,
+    Joint,
+    RobotDescription,
+    StepOutcome,
+)
 from vram_arbiter.runner.sensors.pictures import as_rgb
+from vram_arbiter.runner.skills.actions import ActionPlan, Stepper, Twist, plan_actions
+from vram_arbiter.runner.skills.actions import needs_frames as actions_need_frames
 from vram_arbiter.runner.skills.base import SkillBase
-from vram_arbiter.runner.skills.chunks import ChunkPlayer, Row
+from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played, Row
+from vram_arbiter.runner.skills.kinematics import ArmModel
 from vram_arbiter.runner.skills.motion import JointRamp, bounded, is_at, joint_positions
-from vram_arbiter.schemas.control import ControlMode
+from vram_arbiter.runner.skills.states import StatePlan, plan_state
+from vram_arbiter.runner.skills.states import needs_frames as state_needs_frames
+from vram_arbiter.schemas.control import JOINT_MODES, ControlMode
 from vram_arbiter.schemas.errors import (
     BadState,
+    ConfigError,
     Evicted,
     FrameStale,
     LeaseExpired,
     LeaseLost,
     LeaseRevoking,
-    ManifestInvalid,
     ModelError,
     NotResident,
     StaleToken,
@@ -44,7 +58,8 @@ from vram_arbiter.schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest import ManifestError, RSkillManifest
+from vram_arbiter.schemas.manifest.problems import Problem
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
@@ -120,55 +135,141 @@ class Rollout(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Map from a manifest's features to this robot: cameras, joint order, start pose (rad)."""
+    """Map from a manifest's features to this robot: cameras, joints, start pose (rad), and what
+    its vectors mean. `model` where a contract speaks of frames.
+    """
 
     cameras: Mapping[str, str]
-    joints: tuple[str, ...]
+    robot: RobotDescription
     start_pose: Mapping[str, float] | None  # None: it begins where the robot stands
-    degrees: bool
+    actions: ActionPlan
+    state: StatePlan
+    model: ArmModel | None
     steps_per_chunk: int | None
     rollout: Rollout
     rollout_s: float
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Return the joints that are commanded, in the order of their targets."""
+        return self.actions.joints
+
+    @property
+    def stepwise(self) -> bool:
+        """Return whether rows are approached, or are steps themselves."""
+        return self.rollout.targets_lead or not self.actions.direct
+
 
 def wire_up(
-    manifest: RSkillManifest, joints: tuple[str, ...], rest: Mapping[str, float] | None
+    manifest: RSkillManifest,
+    robot: RobotDescription | tuple[str, ...],
+    rest: Mapping[str, float] | None,
 ) -> Wiring:
-    """Read the manifest. Raises ManifestInvalid without inputs, or if it does not fit the
-    joints.
+    """Read the manifest. `robot` may be its joints' names alone.
+
+    Raises ManifestError with a finding for each part that this robot cannot do or tell.
+    """
+    if isinstance(robot, tuple):
+        robot = RobotDescription(
+            "this world", tuple(Joint(name, -math.inf, math.inf, math.inf) for name in robot), {}
+        )
+    problems: list[Problem] = []
+    cameras = _cameras(manifest)
+    if not cameras:
+        problems.append(
+            Problem(
+                ("sensors_required",),
+                f"names no camera: give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
+            )
+        )
+    order, found = _joint_order(manifest, robot)
+    model, lost = _model(manifest, robot)
+    problems += found
+    problems += lost
+    actions, found = plan_actions(manifest, robot, order, model)
+    state, others = plan_state(manifest, robot, order, model)
+    if not lost:  # else all of them say the same
+        problems += [*found, *others]
+    start = rest
+    if manifest.starting_pose is not None:
+        if len(manifest.starting_pose) != len(order):
+            problems.append(Problem(("starting_pose",), f"must give {len(order)} joints"))
+        else:
+            start = dict(zip(order, manifest.starting_pose, strict=True))
+    rollout = Rollout()
+    try:
+        rollout = Rollout.model_validate(manifest.policy_extras)
+    except ValidationError as error:
+        problems.append(Problem(("policy_extras",), error.errors()[0]["msg"]))
+    if problems:
+        raise ManifestError(manifest.name, problems)
+    rollout_s = manifest.latency_budget.max_execution_s or ROLLOUT_S
+    return Wiring(
+        cameras,
+        robot,
+        start,
+        actions,
+        state,
+        model,
+        manifest.n_action_steps,
+        rollout,
+        rollout_s,
+    )
+
+
+def _cameras(manifest: RSkillManifest) -> dict[str, str]:
+    """Return the key of each of the robot's cameras: the sidecar renames it to what the checkpoint
+    calls it.
     """
     aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
     robot_name = {model: robot for robot, model in aliases.items()}
-    cameras: dict[str, str] = {}
+    cameras = {}
     for sensor in manifest.sensors_required:
         if sensor.modality == "rgb" and sensor.vla_feature_key:
             name = sensor.vla_feature_key.rpartition(".")[2]
             camera = robot_name.get(name, name)
-            cameras[camera] = (
-                IMAGES_PREFIX + camera
-            )  # the sidecar renames it to what the checkpoint calls it
-    if not cameras:
-        raise ManifestInvalid(
-            f"{manifest.name} names no camera",
-            hint=f"give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
-        )
-    dim = manifest.action_contract.dim if manifest.action_contract else None
-    if dim is not None and dim != len(joints):
-        raise ManifestInvalid(f"{manifest.name} commands {dim} joints, the robot has {len(joints)}")
-    degrees = bool(manifest.action_contract and manifest.action_contract.joint_units == "degrees")
-    start = rest
-    if manifest.starting_pose is not None:
-        if len(manifest.starting_pose) != len(joints):
-            raise ManifestInvalid(f"{manifest.name}: starting_pose must give {len(joints)} joints")
-        start = dict(zip(joints, manifest.starting_pose, strict=True))
+            cameras[camera] = IMAGES_PREFIX + camera
+    return cameras
+
+
+def _joint_order(
+    manifest: RSkillManifest, robot: RobotDescription
+) -> tuple[tuple[str, ...], list[Problem]]:
+    """Return the joints in the policy's order, the robot's where the manifest gives none."""
+    for index, actuator in enumerate(manifest.actuators_required):
+        order = actuator.control_mode_semantics.joint_order
+        if order is None or actuator.kind not in JOINT_MODES:
+            continue
+        path = ("actuators_required", index, "control_mode_semantics", "joint_order")
+        if set(order) <= set(robot.joint_names) and len(set(order)) == len(order):
+            return order, []
+        return robot.joint_names, [
+            Problem(
+                path,
+                f"moves {', '.join(order)}; the robot has {', '.join(robot.joint_names)}",
+            )
+        ]
+    return robot.joint_names, []
+
+
+def _model(
+    manifest: RSkillManifest, robot: RobotDescription
+) -> tuple[ArmModel | None, list[Problem]]:
+    """Return the robot's model if a contract speaks of frames and there is one."""
+    solving = actions_need_frames(manifest)
+    if not robot.model or not (solving or state_needs_frames(manifest.state_contract)):
+        return None, []
+    path = ("action_contract",) if solving else ("state_contract",)
     try:
-        rollout = Rollout.model_validate(manifest.policy_extras)
-    except ValidationError as error:
-        raise ManifestInvalid(
-            f"{manifest.name}: policy_extras: {error.errors()[0]['msg']}"
-        ) from error
-    rollout_s = manifest.latency_budget.max_execution_s or ROLLOUT_S
-    return Wiring(cameras, joints, start, degrees, manifest.n_action_steps, rollout, rollout_s)
+        if solving:
+            importlib.import_module("mink")
+        return ArmModel(robot), []
+    except ImportError:
+        return None, [
+            Problem(path, "cartesian commands need mink: pip install 'vram-arbiter[runner]'")
+        ]
+    except ConfigError as error:
+        return None, [Problem(path, error.message)]
 
 
 class SidecarPolicy(SkillBase):
@@ -177,9 +278,10 @@ class SidecarPolicy(SkillBase):
     `wait_s` > 0 lets a simulated world wait for chunks.
 
     `speeds_rad_s`, by joint, limits a step to what one period allows. The safety gate would rightly
-    withhold larger leaps; they are intended only where the manifest says so (`targets_lead`). None
-    sends the policy's targets as they are. Steps begin at the motors' last targets (`sent`, rad by
-    joint): a command may be dropped for being late, or shortened by the gate.
+    withhold larger leaps; of absolute targets they are intended only where the manifest says so
+    (`targets_lead`). None sends the policy's targets as they are. Steps begin at the motors' last
+    targets (`sent`, rad by joint): a command may be dropped for being late, or shortened by the
+    gate.
     """
 
     holds_gpu = True
@@ -198,13 +300,19 @@ class SidecarPolicy(SkillBase):
         sent: Callable[[], Mapping[str, float]] | None = None,
     ) -> None:
         super().__init__(manifest, revision=revision)
-        self._longest = (
-            tuple(STEP_SHARE * speeds_rad_s[name] * period_s for name in wiring.joints)
-            if speeds_rad_s is not None
-            else None
+        longest = {name: STEP_SHARE * v * period_s for name, v in (speeds_rad_s or {}).items()}
+        self._longest = tuple(longest[name] for name in wiring.joints) if longest else None
+        self._read = wiring.robot.joint_names
+        self._stepper = (
+            None
+            if wiring.actions.direct
+            else Stepper(
+                wiring.actions, wiring.robot, wiring.model, period_s=period_s, longest=longest
+            )
         )
         self._sent = sent
         self._commanded: Row | None = None
+        self._last: Mapping[str, float] = {}  # what was commanded last, by joint
         self.cameras = tuple(wiring.cameras)
         self._wiring = wiring
         self._client = client
@@ -324,10 +432,10 @@ class SidecarPolicy(SkillBase):
             raise BadState(f"{self.key} was stepped without a goal")
         if self._use is not None and self._use.lost is not None:
             raise self._use.lost
-        measured = joint_positions(world, self._wiring.joints)
+        measured = joint_positions(world, self._read)
         if not self._running:
             if not self._at_start(measured):
-                return Act(self._action(tuple(self._target.values()), world))
+                return Act(_joint_action(self._target, None, world))
             self._running = True
             return Hold("at the start pose")
         if player.played >= self._steps or self._stands_still(player):
@@ -336,16 +444,54 @@ class SidecarPolicy(SkillBase):
         played = player.next_row(observation)
         if played is None:
             return Hold("the policy thinks")
-        self._recent.append(played.row)
         self.fraction = player.played / self._steps
-        action = self._action(self._step_towards(played.row, measured), world)
+        if self._stepper is not None:
+            return self._stepped(self._stepper, played, measured, world)
+        self._recent.append(played.row)
+        row = self._step_towards(played.row, measured)
+        action = Action(
+            control_mode=ControlMode.JOINT_POSITION,
+            joint_targets=(row,),
+            joint_names=self._wiring.joints,
+            stamp_ns=world.stamp_ns,
+        )
         return Act(action, chunk_index=played.chunk, prefetched=played.prefetched)
+
+    def _stepped(
+        self, stepper: Stepper, played: Played, measured: Mapping[str, float], world: WorldState
+    ) -> StepOutcome:
+        """Return what a row that is not just joint targets comes to from here."""
+        player = self._player
+        start = dict(measured)
+        if self._commanded is not None:
+            start.update(self._sent() if self._sent is not None else self._last)
+        step = stepper.step(played.row, start)
+        if step.terminated:
+            played_so_far = {"steps": player.played, "chunks": player.chunks} if player else {}
+            return Done({**played_so_far, "terminated": True})
+        if step.withheld:
+            return Hold(step.problem, withheld=True)
+        targets = {name: step.targets.get(name, start[name]) for name in self._wiring.joints}
+        self._commanded = tuple(targets.values())
+        self._last = targets
+        driving = step.twist is not None and any(abs(v) > STILL_RAD for v in step.twist)
+        if driving:
+            self._recent.clear()
+        else:
+            self._recent.append(self._commanded)
+        return Act(
+            _joint_action(targets, step.twist, world),
+            chunk_index=played.chunk,
+            prefetched=played.prefetched,
+            problem=step.problem,
+        )
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
         """Return whether the arm is at the start pose; set the next target when not."""
-        if self._wiring.start_pose is None:
+        if not self._wiring.start_pose:
             return True
-        goal = {name: self._wiring.start_pose[name] for name in self._wiring.joints}
+        start = self._wiring.start_pose
+        goal = {name: start[name] for name in self._read if name in start}
         if self._ramp is None:
             if is_at(measured, goal):
                 return True
@@ -381,9 +527,7 @@ class SidecarPolicy(SkillBase):
     def _observation(self, world: WorldState, measured: Mapping[str, float]) -> Message:
         import numpy as np
 
-        values = [measured[name] for name in self._wiring.joints]
-        if self._wiring.degrees:
-            values = [math.degrees(value) for value in values]
+        values = self._wiring.state.vector(world, measured, self._wiring.model)
         observation: Message = {
             STATE_KEY: np.asarray(values, dtype=np.float32),
             TASK_KEY: self._task,
@@ -406,7 +550,7 @@ class SidecarPolicy(SkillBase):
         return asyncio.run_coroutine_threadsafe(self._fetch(observation, token), self._loop)
 
     def _rows(self, answer: JsonMap) -> list[Row]:
-        """Return rows of joint targets in rad.
+        """Return rows in m and rad.
 
         Raises ModelError for a wrong shape or infinite numbers.
         """
@@ -418,27 +562,23 @@ class SidecarPolicy(SkillBase):
             actions = np.asarray(answer[ACTION_KEY], dtype=float)
         except (TypeError, ValueError) as error:
             raise ModelError(f"the policy's actions are no numbers: {error}") from error
-        if actions.ndim == 3 and actions.shape[0] == 1:
-            actions = actions[0]
-        if actions.ndim != 2 or actions.shape[1] != len(self._wiring.joints):
-            raise ModelError(
-                f"actions of shape {actions.shape}; (steps, {len(self._wiring.joints)}) is expected"
-            )
-        if not np.isfinite(actions).all():
-            raise ModelError(
-                "the policy commands numbers that are not finite", hint="its weights are broken"
-            )
-        if self._wiring.degrees:
-            actions = np.radians(actions)
-        return [tuple(map(float, row)) for row in actions[: self._wiring.steps_per_chunk]]
+        return self._wiring.actions.rows(actions, self._wiring.steps_per_chunk)
 
-    def _action(self, row: Row, world: WorldState) -> Action:
+
+def _joint_action(targets: Mapping[str, float], twist: Twist | None, world: WorldState) -> Action:
+    """Return an action of joint targets (rad), with a base's velocity, or of that alone."""
+    driving = None if twist is None else (twist,)
+    if not targets and driving is not None:
         return Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(row,),
-            joint_names=self._wiring.joints,
-            stamp_ns=world.stamp_ns,
+            control_mode=ControlMode.BODY_TWIST, body_twist=driving, stamp_ns=world.stamp_ns
         )
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION,
+        joint_targets=(tuple(targets.values()),),
+        joint_names=tuple(targets),
+        body_twist=driving,
+        stamp_ns=world.stamp_ns,
+    )
 
 
 def _picture(frame: SensorFrame, view: View | None) -> Any:

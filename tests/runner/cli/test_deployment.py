@@ -124,6 +124,41 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
     assert any("max_force_n (this robot does not tell efforts)" in line for line in said)
 
 
+def test_each_misfit_of_the_tasks_skill_is_a_line_of_its_own(
+    dry_run: DryRun, tmp_path: Path
+) -> None:
+    """What the robot cannot do is known before anything is opened, for `--check` as well."""
+    slots = (
+        "action_contract:\n  dim: 6\n  slots:\n"
+        "    - {range: [0, 2], control_mode: body_twist, frame: map}\n"
+        "    - {range: [3, 5], control_mode: joint_torque}"
+    )
+    manifest = GRAB.read_text(encoding="utf-8").replace("action_contract:\n  dim: 6", slots)
+    folder = tmp_path / "skills" / "odd"
+    folder.mkdir(parents=True)
+    (folder / "rskill.yaml").write_text(manifest, encoding="utf-8")
+    sensors = (
+        "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, "
+        "backend_params: {device: 1}}]\n"
+    )
+    code, out, err = dry_run(TWIN + sensors + GRAB_TASK, "--check", skills=folder)
+    assert (code, out) == (2, "")
+    said = [line for line in err.splitlines() if "action_contract" in line]
+    assert len(said) == 2, err
+    assert "slots[0].control_mode: so101 has no base to drive" in said[0]
+    assert "slots[1].range: covers 3 values for 6 joints" in said[1]
+
+
+def test_a_policys_vectors_are_told_where_it_fits(dry_run: DryRun) -> None:
+    sensors = (
+        "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, "
+        "backend_params: {device: 1}}]\n"
+    )
+    code, out, err = dry_run(TWIN + sensors, skills=GRAB)
+    assert (code, err) == (0, "")
+    assert "contract  vram-arbiter/so101-grab: 6 actions from a state of 6" in out
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -514,6 +514,35 @@ def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
     scenario(run_async, made, play)
 
 
+def test_steps_of_joints_begin_at_the_motors_targets_and_a_policy_may_end_its_goal(
+    manifest: RSkillManifest, tmp_path: Path, run_async: Run
+) -> None:
+    """Regression: deltas were played as absolute targets."""
+    text = MANIFEST.replace("mode: absolute", "mode: delta").replace(
+        "action_contract: {dim: 2}",
+        "action_contract: {dim: 3, slots: [{range: [0, 1], control_mode: joint_position},"
+        " {range: [2, 2], terminate: true}]}",
+    )
+
+    async def play(b: Bench) -> None:
+        import numpy as np
+
+        b.sidecar.action = np.array([[0.1, 0.0, 0.0], [0.0, -0.2, 0.4]], dtype=np.float32)
+        await b.skill.start(GOAL)
+        rows = [(await b.step()) for _ in range(4)]
+        assert isinstance(rows[0], Hold), "at the start pose"
+        assert [row.action.rows[0] for row in rows[1:] if isinstance(row, Act)] == [
+            pytest.approx((0.1, 0.5)),
+            pytest.approx((0.1, 0.3)),
+            pytest.approx((0.2, 0.3)),
+        ]
+        b.sidecar.action = np.array([[0.5, 0.5, 1.0]], dtype=np.float32)
+        await b.step()
+        assert await b.step() == Done({"steps": 5, "chunks": 3, "terminated": True})
+
+    scenario(run_async, Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", Arbiter()), play)
+
+
 def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
     policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
