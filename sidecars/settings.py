@@ -18,7 +18,7 @@ from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.schemas.yamltext import read_yaml
-from vram_arbiter.sidecars.weights import Weights, resolve
+from vram_arbiter.sidecars.weights import Weights, resolve, with_processors
 
 NICE_VARIABLE = "VRAM_ARBITER_SIDECAR_NICE"
 """Tells the server of imports its nice value (`preload`)."""
@@ -136,7 +136,8 @@ def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
             f"{rskill}: {manifest.name} has no weights",
             hint="sidecars serve detector, vlm, vla and reward skills",
         )
-    return manifest, resolve(manifest.weights_uri, configs)
+    weights = resolve(manifest.weights_uri, configs)
+    return manifest, with_processors(weights, manifest, configs)
 
 
 def read_footprints(path: Path) -> dict[str, FootprintEntry]:

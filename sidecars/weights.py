@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,15 +19,32 @@ from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.sidecars.quantization import check_checkpoint, nf4_of, torch_type
 
 CONFIG_FILE: Final = "config.json"
+POLICY_FILES: Final = ["*.json", "*.safetensors", "*.model", "*.txt"]
+"""What a policy's repository holds of use: weights, processors, tokenizers."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessorFiles:
+    """A policy's pre- and postprocessor: two file names in `source`, at `revision` of a hub
+    repository."""
+
+    source: str
+    revision: str | None
+    preprocessor: str
+    postprocessor: str
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Source of weights; `source` is what `from_pretrained` takes: a folder or `owner/repo`."""
+    """Source of weights; `source` is what `from_pretrained` takes: a folder or `owner/repo`.
+
+    `processors` are the manifest's; None: the ones beside the weights, under lerobot's names.
+    """
 
     source: str
     revision: str | None = None
     local: bool = False
+    processors: ProcessorFiles | None = None
 
 
 def resolve(uri: str, configs: Path) -> Weights:
@@ -53,6 +70,43 @@ def resolve(uri: str, configs: Path) -> Weights:
     return Weights(str(folder), local=True)
 
 
+def with_processors(weights: Weights, manifest: RSkillManifest, configs: Path) -> Weights:
+    """Return `weights` with the processors that the manifest names, if it names any.
+
+    Raises: ConfigError if a file is not there, or if the two lie in different places: lerobot
+    makes both from one checkpoint, because they share state.
+    """
+    if manifest.processors is None:
+        return weights
+    before, name_before = _file(manifest.processors.preprocessor_uri, configs)
+    after, name_after = _file(manifest.processors.postprocessor_uri, configs)
+    if before != after:
+        raise ConfigError(
+            f"{manifest.name}: preprocessor_uri and postprocessor_uri lead to {before.source} and "
+            f"{after.source}",
+            hint="name two files of one checkpoint",
+        )
+    revision = before.revision
+    if before.source == weights.source and revision is None:
+        revision = weights.revision  # processors of other weights would be in other units
+    return replace(
+        weights, processors=ProcessorFiles(before.source, revision, name_before, name_after)
+    )
+
+
+def _file(uri: str, configs: Path) -> tuple[Weights, str]:
+    """Parse the URI of a file. Raises ConfigError."""
+    scheme, _, rest = uri.partition("://")
+    if scheme == "hf":
+        owner, repository, name = rest.split("/", 2)
+        return resolve(f"hf://{owner}/{repository}", configs), name
+    folder, _, name = rest.rpartition("/")
+    place = resolve(f"{scheme}://{folder}", configs)
+    if not (Path(place.source) / name).is_file():
+        raise ConfigError(f"no file {Path(place.source) / name}", hint=f"{uri} names it")
+    return place, name
+
+
 def model_type(weights: Weights, key: str) -> str:
     """Return a text of a local checkpoint's `config.json`, such as `model_type`; "" if it has none
     that a module could be named by."""
@@ -70,6 +124,35 @@ def transformers_modules(weights: Weights) -> tuple[str, ...]:
     return ("torch", "transformers", "PIL.Image", f"transformers.models.{kind}.modeling_{kind}")
 
 
+def fetched(weights: Weights) -> Weights:
+    """Return the local folder of weights, after downloading what the hub's cache lacks.
+
+    Some of lerobot's loaders drop the revision and read the newest one. Raises ModelError.
+    """
+    from huggingface_hub import snapshot_download
+
+    if weights.local:
+        return weights
+    try:
+        folder = snapshot_download(
+            weights.source, revision=weights.revision, allow_patterns=POLICY_FILES
+        )
+    except Exception as error:
+        raise ModelError(
+            f"{weights.source} cannot be fetched: {type(error).__name__}: {error}",
+            hint="check its name, its revision and the network, or fetch it with `hf download`",
+        ) from error
+    return _in_folder(weights, folder)
+
+
+def _in_folder(weights: Weights, folder: str) -> Weights:
+    """Return hub weights that lie in a local folder, with their processors if these lie there."""
+    files = weights.processors
+    if files and (files.source, files.revision) == (weights.source, weights.revision):
+        files = replace(files, source=folder, revision=None)
+    return Weights(folder, local=True, processors=files)
+
+
 def cached(weights: Weights) -> Weights | None:
     """Return the local folder of a hub repository in the hub's cache; None if never fetched."""
     from huggingface_hub import snapshot_download
@@ -81,7 +164,7 @@ def cached(weights: Weights) -> Weights | None:
         )
     except LocalEntryNotFoundError:
         return None
-    return Weights(str(folder), local=True) if any(folder.glob("*.safetensors")) else None
+    return _in_folder(weights, str(folder)) if any(folder.glob("*.safetensors")) else None
 
 
 def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
