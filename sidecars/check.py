@@ -18,6 +18,7 @@ from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.sidecars.adapters import policy_families
 from vram_arbiter.sidecars.adapters.base import ModelAdapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
 from vram_arbiter.sidecars.device.capacity import capacities
@@ -115,6 +116,7 @@ def need_packages(manifest: RSkillManifest) -> None:
         lerobot = manifest.kind in (Kind.VLA, Kind.REWARD)
         library = "lerobot" if lerobot else "transformers"
         need(f"a model of kind {manifest.kind}", "torch", library, extra="sidecars")
+        policy_families.need_packages(manifest)
 
 
 def _packages(manifest: RSkillManifest) -> Finding:

@@ -2,38 +2,63 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
-from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
-from vram_arbiter.sidecars.checkpoints import load_lerobot, need_statistics
-from vram_arbiter.sidecars.images import decode
-from vram_arbiter.sidecars.weights import Weights, model_type, read_config
+from vram_arbiter.sidecars.adapters.policy_families import (
+    computing_type,
+    family_of,
+    need_packages,
+    need_type,
+)
+from vram_arbiter.sidecars.adapters.policy_observations import Batch, Observations
+from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
+from vram_arbiter.sidecars.quantization import TORCH_NAMES, nf4_of, quantize_linear, torch_type
+from vram_arbiter.sidecars.weights import (
+    ProcessorFiles,
+    Weights,
+    fetched,
+    model_type,
+    read_config,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-IMAGE_PREFIX = "observation.images."
 _OWN_POLICIES = (
     "vram_arbiter.sidecars.models.compact_act",
 )  # own policy types, by lerobot's naming convention
-
-
-type Batch = dict[str, "Tensor | str"]
-"""One observation as lerobot's processors take it: tensors, and the task in words."""
+_NO_DOWNLOADS: Final = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
+_ACTION: Final = "action"
 
 
 class PolicyAdapter:
     """The endpoints `get_action` and `reset`.
 
-    A checkpoint brings its own pre- and postprocessor, so units are the checkpoint's. Observation:
-    `observation.state` (D,), `observation.images.CAMERA` uint8 (H, W, 3) RGB or PNG/JPEG bytes,
-    `task` text; a leading dimension of 1 is accepted. Camera names go through the manifest's
-    `image_preprocessing.aliases`. Answer: `action` float32 (T, D).
+    A checkpoint brings its own pre- and postprocessor, so units are the checkpoint's; the manifest
+    may name others (`processors`). Observation: `observation.state` (D,),
+    `observation.images.CAMERA` uint8 (H, W, 3) RGB or PNG/JPEG bytes, `task` text. Camera names go
+    through the manifest's `image_preprocessing.aliases`. Answer: `action` float32 (T, D).
+
+    Policies without memory (ACT, SmolVLA, pi0 …) answer their whole chunk, as lerobot's inference
+    server does; the caller plays as much of it as the manifest's `n_action_steps` says. Policies
+    with `Family.queues` answer what lerobot's `select_action` plays before it predicts again: T is
+    the checkpoint's `n_action_steps` (TDMPC: `n_action_repeats`). A gaussian actor and an ACT with
+    temporal ensembling give one action an observation, so T is 1 and they have to be asked at
+    every control step.
+
+    The history of such a policy is lerobot's own queue: it begins empty at `reset`, the first
+    observation fills it by repetition, and each further one pushes out the oldest. It was trained
+    on consecutive control steps, but a caller that sends one observation a chunk leaves T steps
+    between two entries. An observation may therefore have a leading dimension, the last 1 to
+    `n_obs_steps` control steps with the oldest first; the actions are then those of a robot that
+    calls `select_action` at every step. lerobot's inference server cannot be followed here: it
+    gives one observation to `predict_action_chunk`, on which these policies fail.
     """
 
     kind: Literal["vla"] = "vla"
@@ -42,11 +67,15 @@ class PolicyAdapter:
     def __init__(self, manifest: RSkillManifest, weights: Weights) -> None:
         self._manifest = manifest
         self._weights = weights
+        self._family = family_of(manifest)
+        self._dtype = computing_type(manifest, self._family)
         self._config: Any = None
         self._policy_class: Any = None
         self._policy: Any = None
         self._before: Any = None
         self._after: Any = None
+        self._observations: Observations | None = None
+        self._device = "cpu"
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -55,45 +84,80 @@ class PolicyAdapter:
         return ("torch", "lerobot.policies.factory", own, *_OWN_POLICIES)
 
     def prepare(self) -> None:
+        need_packages(self._manifest)
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class
 
         for package in _OWN_POLICIES:
             importlib.import_module(package)  # registers itself
+        self._weights = fetched(self._weights)
         self._config = read_config(PreTrainedConfig, self._weights)
+        need_type(self._manifest, self._family, self._config, self._weights.source)
         self._policy_class = get_policy_class(self._config.type)
+        for field, value in _NO_DOWNLOADS.items():
+            if hasattr(self._config, field):  # the checkpoint holds these weights, as `load` sees
+                setattr(self._config, field, value)
+        if self._has_own_dtype:
+            self._config.dtype = TORCH_NAMES[self._dtype]
+
+    @property
+    def _has_own_dtype(self) -> bool:
+        """Return whether the policy's own code casts: some of its layers then stay float32."""
+        return hasattr(self._config, "dtype")
 
     def load(self, device: str) -> None:
         self._config.device = device
         self._config.pretrained_path = self._weights.source
-        self._policy = load_lerobot(self._policy_class, self._weights, self._config)
+        policy = load_lerobot(self._policy_class, self._weights, self._config)
+        self._policy = policy if self._has_own_dtype else policy.to(torch_type(self._dtype))
+        self._quantize(device)
         self._make_processors("cpu")
         need_statistics(self._before, self._config.input_features, self._weights.source)
         need_statistics(self._after, self._config.output_features, self._weights.source)
+        self._observations = Observations(
+            self._config.input_features,
+            self._manifest.image_preprocessing,
+            self._config.n_obs_steps if self._family.queues else 1,
+        )
+
+    def _quantize(self, device: str) -> None:
+        """Quantize the linear layers to NF4 where the manifest says int4; on `meta`, choose them."""
+        nf4 = nf4_of(self._manifest)
+        if nf4 is not None and device == META:
+            nf4.chosen(self._policy)
+        elif nf4 is not None:
+            quantize_linear(self._policy, self._manifest)
 
     @property
     def networks(self) -> Sequence[Any]:
         return (self._policy,)
 
     def place(self, device: str) -> None:
-        self._config.device = device
+        self._config.device = self._device = device
         self._policy.to(device)
         self._make_processors(device)
 
     def _make_processors(self, device: str) -> None:
         from lerobot.policies.factory import make_pre_post_processors
 
+        files = self._weights.processors or ProcessorFiles(
+            self._weights.source,
+            self._weights.revision,
+            "policy_preprocessor.json",
+            "policy_postprocessor.json",
+        )
         try:
             self._before, self._after = make_pre_post_processors(
                 self._config,
-                pretrained_path=self._weights.source,
-                pretrained_revision=self._weights.revision,
+                pretrained_path=files.source,
+                pretrained_revision=files.revision,
+                preprocessor_config_filename=files.preprocessor,
+                postprocessor_config_filename=files.postprocessor,
                 preprocessor_overrides={"device_processor": {"device": device}},
             )
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
-                f"{self._weights.source}: its processors cannot be read: {type(error).__name__}: "
-                f"{error}",
+                f"{files.source}: its processors cannot be read: {type(error).__name__}: {error}",
                 hint="check that the checkpoint is complete",
             ) from error
 
@@ -108,111 +172,72 @@ class PolicyAdapter:
                 "get_action needs data.observation, a map",
                 hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
             )
-        return {"action": self._act(self._batch(observation))}
+        assert self._observations is not None
+        return {"action": self._act(self._observations.read(observation))}
 
-    def _act(self, batch: Batch) -> "NDArray[Any]":
+    def _act(self, steps: list[Batch]) -> "NDArray[Any]":
         import torch
 
-        with torch.inference_mode():
-            chunk = self._policy.predict_action_chunk(self._before(batch))
-            steps = [
-                self._after(chunk[:, step]) for step in range(chunk.shape[1])
+        dtype = torch_type(self._dtype)
+        casts = dtype != torch.float32 and not self._has_own_dtype
+        with (
+            torch.inference_mode(),
+            # operations that the policy's code does in float32 meet weights of another type
+            torch.autocast(torch.device(self._device).type, dtype, enabled=casts),
+        ):
+            chunk = self._predict([_inputs(self._before(step), dtype, casts) for step in steps])
+            rows = [
+                self._after(chunk[:, step].to(torch.float32)) for step in range(chunk.shape[1])
             ]  # postprocessors take (B, D), as lerobot's own server does
-        actions = torch.stack([step[0] for step in steps]).to(torch.float32).cpu()
+        actions = torch.stack([row[0] for row in rows]).to(torch.float32).cpu()
         if not bool(torch.isfinite(actions).all()):
             raise ModelError(
                 "the policy's actions are not finite numbers", hint="nothing was sent to the robot"
             )
-        rows: NDArray[Any] = actions.numpy()
-        return rows
+        numbers: NDArray[Any] = actions.numpy()
+        return numbers
 
-    def _batch(self, observation: JsonMap) -> Batch:
-        """Return the observation as lerobot's preprocessor takes it.
+    def _predict(self, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
+        """Return the actions (B, T, D) after the last of `steps`, which are oldest first."""
+        if not self._selects:
+            chunk: Tensor = self._policy.predict_action_chunk(dict(steps[-1]))
+            return chunk
+        return _select(self._policy, steps)
 
-        Raises BadRequest naming what is missing or has the wrong shape.
-        """
-        batch: Batch = {"task": _task(observation.get("task"))}
-        given = {self._feature_name(name): (name, value) for name, value in observation.items()}
-        for feature, spec in self._config.input_features.items():
-            if feature not in given:
-                raise BadRequest(
-                    f"the observation lacks {feature}", hint=f"it has {sorted(observation)}"
-                )
-            name, value = given[feature]
-            visual = spec.type.value == "VISUAL"
-            batch[feature] = (
-                self._image(name, value) if visual else _vector(name, value, spec.shape)
-            )
-        return batch
-
-    def _feature_name(self, name: str) -> str:
-        """Return the checkpoint's name of an input: the manifest maps the robot's camera names."""
-        rules = self._manifest.image_preprocessing
-        if rules is None or not name.startswith(IMAGE_PREFIX):
-            return name
-        camera = name.removeprefix(IMAGE_PREFIX)
-        return rules.input_template.format(cam=rules.aliases.get(camera, camera))
-
-    def _image(self, name: str, value: Any) -> Any:
-        """Convert uint8 HWC to float (3, H, W) in 0..1, turned and resized as in training."""
-        import numpy as np
-        import torch
-
-        pixels = np.asarray(decode(value)) if isinstance(value, bytes) else value
-        if isinstance(pixels, np.ndarray) and pixels.ndim == 4 and len(pixels) == 1:
-            pixels = pixels[0]
-        if (
-            not isinstance(pixels, np.ndarray)
-            or pixels.dtype != np.uint8
-            or pixels.ndim != 3
-            or pixels.shape[2] != 3
-        ):
-            raise BadRequest(f"{name} must be uint8 (H, W, 3) or PNG bytes, not {_shape(pixels)}")
-        rules = self._manifest.image_preprocessing
-        if rules is not None and rules.flip_180:
-            pixels = pixels[::-1, ::-1]
-        if rules is not None and rules.flip_vertical:
-            pixels = pixels[::-1]
-        image = torch.tensor(np.ascontiguousarray(pixels)).permute(2, 0, 1).to(torch.float32) / 255
-        if rules is not None and rules.resize_width and rules.resize_height:
-            size = (rules.resize_height, rules.resize_width)
-            image = torch.nn.functional.interpolate(
-                image[None], size=size, mode="bilinear", antialias=True
-            )[0]
-        return image
+    @property
+    def _selects(self) -> bool:
+        ensembles = getattr(self._config, "temporal_ensemble_coeff", None) is not None
+        return self._family.queues or ensembles
 
 
-def _vector(name: str, value: Any, shape: tuple[int, ...]) -> Any:
-    import numpy as np
+def _select(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
+    """Return the actions (B, T, D) that `select_action` plays until it would predict again.
+
+    While an action is queued, `select_action` only records the observation: that is how all steps
+    but the last reach the history.
+    """
     import torch
 
-    try:
-        numbers = np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError):
-        raise BadRequest(
-            f"{name} must be numbers of shape {tuple(shape)}, not {_shape(value)}"
-        ) from None
-    if numbers.ndim == len(shape) + 1 and len(numbers) == 1:
-        numbers = numbers[0]
-    if numbers.shape != tuple(shape):
-        raise BadRequest(f"{name} must have shape {tuple(shape)}, not {numbers.shape}")
-    if not np.isfinite(numbers).all():
-        raise BadRequest(
-            f"{name} has numbers that are not finite",
-            hint="a stale or missing sensor must stop the goal",
-        )
-    return torch.from_numpy(np.ascontiguousarray(numbers))
+    queue: Any = getattr(policy, "_queues", {}).get(_ACTION)
+    for step in steps[:-1]:
+        queue.append(torch.empty(0))
+        policy.select_action(dict(step))
+    rows = [policy.select_action(dict(steps[-1]))]
+    if queue is not None:
+        rows += queue
+        queue.clear()
+    return torch.stack(rows, dim=1)
 
 
-def _task(value: Any) -> str:
-    if isinstance(value, list | tuple) and len(value) == 1:
-        value = value[0]
-    if value is None:
-        return ""
-    if not isinstance(value, str):
-        raise BadRequest("task must be a text", hint=f"not {type(value).__name__}")
-    return value
+def _inputs(batch: Mapping[str, Any], dtype: Any, casts: bool) -> Mapping[str, Any]:
+    """Return a preprocessed batch with its numbers in the model's type."""
+    import torch
 
-
-def _shape(value: Any) -> str:
-    return f"{value.dtype} {value.shape}" if hasattr(value, "dtype") else type(value).__name__
+    if not casts:
+        return batch
+    return {
+        name: value.to(dtype)
+        if isinstance(value, torch.Tensor) and value.is_floating_point()
+        else value
+        for name, value in batch.items()
+    }

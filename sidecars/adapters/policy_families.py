@@ -1,0 +1,128 @@
+"""Policy families that a sidecar serves: checkpoint types, packages, precisions, observation queues.
+
+A family is listed here once its actions were compared with lerobot's own, one by one
+(`tests/sidecars/adapters/test_policy_families.py`). Must not import torch or lerobot: `--check`
+reads this table where neither is installed.
+"""
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from vram_arbiter.schemas.errors import ConfigError, ModelError, UnsupportedQuantization
+from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import Dtype
+from vram_arbiter.schemas.runtime.extras import not_installed
+from vram_arbiter.sidecars.quantization import nf4_of
+
+_FLOATS: Final = frozenset({Dtype.FP32, Dtype.BF16, Dtype.FP16})
+_OWN_FLOATS: Final = frozenset({Dtype.FP32, Dtype.BF16})
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """What serving a family takes.
+
+    `types` are the `type` values of its checkpoints, `packages` the modules that its code imports
+    beyond torch, transformers and lerobot. `queues` marks a policy that keeps observations between
+    calls or gives one action a call: it answers through `select_action`, never through
+    `predict_action_chunk`. `precisions` are the number formats that its code runs in. `camera` is
+    the only name of an image that its code finds. `remote_code`: its code runs Python files of a
+    hub repository.
+    """
+
+    types: tuple[str, ...]
+    packages: tuple[str, ...] = ()
+    queues: bool = False
+    precisions: frozenset[Dtype] = _FLOATS
+    camera: str | None = None
+    remote_code: bool = False
+
+
+FAMILIES: Final[Mapping[ModelFamily, Family]] = {
+    ModelFamily.ACT: Family(("act", "compact_act")),
+    ModelFamily.DIFFUSION: Family(("diffusion",), ("diffusers",), queues=True),
+    ModelFamily.VQBET: Family(("vqbet",), queues=True),
+    ModelFamily.TDMPC: Family(("tdmpc",), queues=True, camera="observation.image"),
+    ModelFamily.MULTI_TASK_DIT: Family(("multi_task_dit",), ("diffusers",), queues=True),
+    ModelFamily.GAUSSIAN_ACTOR: Family(("gaussian_actor",), queues=True),
+    ModelFamily.SMOLVLA: Family(("smolvla",), ("num2words",)),
+    ModelFamily.PI0: Family(("pi0",), precisions=_OWN_FLOATS),
+    ModelFamily.PI05: Family(("pi05",), precisions=_OWN_FLOATS),
+    ModelFamily.PI0_FAST: Family(
+        ("pi0_fast",), ("scipy",), precisions=_OWN_FLOATS, remote_code=True
+    ),
+    ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS),
+}
+
+
+def family_of(manifest: RSkillManifest) -> Family:
+    """Return the manifest's family.
+
+    Raises: ConfigError for a family that is not served, or that runs code of the hub without the
+    manifest's consent.
+    """
+    name = manifest.model_family
+    family = FAMILIES.get(name) if name is not None else None
+    if name is None or family is None:
+        raise ConfigError(
+            f"{manifest.name}: model_family {name.value if name else None!r} is not served",
+            hint=f"sidecars serve {', '.join(sorted(FAMILIES))}",
+        )
+    if family.remote_code and manifest.quantization.extra.get("trust_remote_code") is not True:
+        raise ConfigError(
+            f"{manifest.name}: the action tokenizer of model_family {name} is Python code of the "
+            "hub",
+            hint="read that code, then write trust_remote_code: true in quantization.extra",
+        )
+    return family
+
+
+def need_packages(manifest: RSkillManifest) -> None:
+    """Raise ConfigError that names every package of the manifest's family that is not installed."""
+    family = FAMILIES.get(manifest.model_family) if manifest.model_family else None
+    missing = [
+        name
+        for name in (family.packages if family else ())
+        if importlib.util.find_spec(name) is None
+    ]
+    if missing:
+        raise not_installed(f"a policy of family {manifest.model_family}", missing, "sidecars")
+
+
+def computing_type(manifest: RSkillManifest, family: Family) -> Dtype:
+    """Return the number format that the policy computes in.
+
+    Raises: UnsupportedQuantization if the family's code does not run in it.
+    """
+    nf4 = nf4_of(manifest)
+    dtype = manifest.quantization.dtype if nf4 is None else nf4.compute_dtype
+    if dtype not in family.precisions:
+        raise UnsupportedQuantization(
+            f"{manifest.name}: a policy of family {manifest.model_family} does not compute in "
+            f"{dtype}",
+            hint=f"use {' or '.join(sorted(family.precisions))}",
+            details={"dtype": dtype.value, "supported": sorted(family.precisions)},
+        )
+    return dtype
+
+
+def need_type(manifest: RSkillManifest, family: Family, config: Any, source: str) -> None:
+    """Raise ModelError if a checkpoint's configuration is not one that the family's code can run.
+
+    `config` is lerobot's `PreTrainedConfig`.
+    """
+    if config.type not in family.types:
+        raise ModelError(
+            f"{source} is a policy of type {config.type!r}, but {manifest.name} names model_family "
+            f"{manifest.model_family}, whose checkpoints are of type {' or '.join(family.types)}",
+            hint="correct model_family or weights_uri in the manifest",
+        )
+    cameras = sorted(config.image_features)
+    if family.camera and cameras and cameras != [family.camera]:
+        raise ModelError(
+            f"{source} names its cameras {', '.join(cameras)}; lerobot's {config.type} finds only "
+            f"{family.camera}",
+            hint="rename the input in the checkpoint's config.json and processors",
+        )

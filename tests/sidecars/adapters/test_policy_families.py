@@ -1,0 +1,390 @@
+"""Every policy family that is served, loaded as in production, against lerobot itself.
+
+A tiny checkpoint of each family is saved by lerobot (`policies.py`). The reference is the robot's
+own loop in lerobot: preprocess, `select_action`, postprocess, at every control step.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.sidecars.adapters import policies
+from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, SIDE_PX, STATE, TASK, WRIST
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    ConfigError,
+    ModelError,
+    UnsupportedQuantization,
+)
+from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest, parse_manifest
+from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES
+from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
+from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
+from vram_arbiter.sidecars.settings import read_model
+from vram_arbiter.sidecars.weights import Weights, read_config
+
+pytestmark = pytest.mark.heavy
+
+NAMES = tuple(policies.SAVERS)
+ROWS = {  # actions in one answer
+    "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
+    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5,
+}  # fmt: skip
+CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
+SEED = 2  # most policies draw their actions
+NOT_SERVED = ("openvla", "rldx", "gr00t", "wall_x")
+
+
+def family_of(name: str) -> ModelFamily:
+    return ModelFamily(name.split()[0])
+
+
+def manifest_text(family: str, dtype: str = "fp32", more: str = "", extra: str = "") -> str:
+    files = "{preprocessor_uri: local://x/a.json, postprocessor_uri: local://x/b.json}"
+    processors = f"processors: {files}\n" if family in PROCESSOR_FAMILIES else ""
+    return (
+        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 5\n"
+        "weights_uri: local://models/x\ndescription: a tiny model\nactions: [grasp]\n"
+        f"latency_budget: {{per_chunk_ms: 100}}\nmodel_family: {family}\n"
+        f"quantization: {{dtype: {dtype}, extra: {{trust_remote_code: true{extra}}}}}\n"
+        "actuators_required:\n"
+        "  - {kind: joint_position, control_mode_semantics: {mode: absolute}}\n"
+        + (more or processors)
+    )
+
+
+def manifest_of(name: str, dtype: str = "fp32") -> RSkillManifest:
+    return parse_manifest(manifest_text(family_of(name), dtype))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_networks() -> Iterator[None]:
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with policies.small_networks():
+        yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Weights]:
+    """Return a checkpoint of a family, or skip the test where a package is missing."""
+    folder = tmp_path_factory.mktemp("policies")
+
+    def checkpoint(name: str) -> Weights:
+        for package in FAMILIES[family_of(name)].packages:
+            pytest.importorskip(package)
+        place = folder / f"clip {name}"  # multi_task_dit wants `clip` in its encoders' names
+        if not place.exists():
+            place.mkdir()
+            policies.SAVERS[name](place)
+        return Weights(str(place), local=True)
+
+    return checkpoint
+
+
+def loaded(name: str, weights: Weights, dtype: str = "fp32") -> PolicyAdapter:
+    adapter = make_adapter(manifest_of(name, dtype), weights)
+    assert isinstance(adapter, PolicyAdapter)
+    adapter.prepare()
+    adapter.load("cpu")
+    adapter.place("cpu")
+    return adapter
+
+
+def observations(count: int) -> list[dict[str, Any]]:
+    import numpy as np
+
+    random = np.random.default_rng(1)
+
+    def picture() -> Any:
+        return random.integers(0, 255, (SIDE_PX, SIDE_PX, 3), np.uint8)
+
+    return [
+        {
+            STATE: random.normal(size=DIM).astype(np.float32),
+            **{name: picture() for name in (FRONT, WRIST, ONLY_CAMERA)},
+            "task": TASK,
+        }
+        for _ in range(count)
+    ]
+
+
+def ask(adapter: PolicyAdapter, observation: dict[str, Any]) -> Any:
+    call = EndpointCall(endpoint="get_action", data={"observation": observation})
+    return adapter.run(call)["action"]
+
+
+def stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return consecutive observations as one with a leading dimension."""
+    import numpy as np
+
+    together = {
+        name: np.stack([step[name] for step in steps]) for name in steps[0] if name != "task"
+    }
+    return together | {"task": TASK}
+
+
+def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
+    """Return the actions of lerobot's loop, one a control step."""
+    import numpy as np
+    import torch
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.utils.constants import OBS_IMAGES
+
+    config = read_config(PreTrainedConfig, weights)
+    config.device = "cpu"
+    if hasattr(config, "pretrained_backbone_weights"):
+        config.pretrained_backbone_weights = None  # no network here
+    policy = get_policy_class(config.type).from_pretrained(weights.source, config=config)
+    policy.eval()
+    before, after = make_pre_post_processors(config, pretrained_path=weights.source)
+    policy.reset()
+    torch.manual_seed(SEED)
+    rows = []
+    for step in steps:
+        batch: dict[str, Any] = {STATE: torch.from_numpy(step[STATE]), "task": TASK}
+        for name in config.input_features:
+            if name.startswith((OBS_IMAGES, ONLY_CAMERA)) and name in step:
+                batch[name] = torch.from_numpy(step[name]).permute(2, 0, 1).float() / 255
+        with torch.inference_mode():
+            rows.append(after(policy.select_action(before(batch)))[0].numpy())
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: str) -> None:
+    """Regression: policies with an observation history loaded, passed `--check`, and failed at the
+    first `get_action`."""
+    import numpy as np
+    import torch
+
+    weights = checkpoint(name)
+    adapter = loaded(name, weights)
+    queues = FAMILIES[family_of(name)].queues
+    rows = ROWS[name]
+    played = rows if queues else min(rows, CHUNK_ROWS_PLAYED)
+    steps = observations(2 * played + 1)
+
+    expected = lerobots_own(weights, steps)
+    actions = []
+    for goal in range(2):
+        torch.manual_seed(SEED)
+        actions = []
+        for start in range(0, len(steps), played):
+            first = max(0, start + 1 - adapter._config.n_obs_steps) if queues else start
+            answer = ask(adapter, stacked(steps[first : start + 1]))
+            assert answer.shape == (rows, DIM)
+            assert answer.dtype == np.float32
+            actions += list(answer[:played])
+        np.testing.assert_array_equal(np.stack(actions[: len(steps)]), expected, f"goal {goal}")
+        adapter.run(EndpointCall(endpoint="reset"))
+
+
+def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weights]) -> None:
+    """One observation a chunk: the oldest of three leaves with the fourth, as in lerobot's queue."""
+    import numpy as np
+    import torch
+
+    adapter = loaded("vqbet", checkpoint("vqbet"))
+    first, second, third, fourth = observations(4)
+
+    def after(*asked: dict[str, Any]) -> Any:
+        adapter.run(EndpointCall(endpoint="reset"))
+        for observation in asked[:-1]:
+            ask(adapter, observation)
+        torch.manual_seed(SEED)
+        return ask(adapter, asked[-1])
+
+    np.testing.assert_array_equal(
+        after(first, second, third, fourth), after(stacked([second, third, fourth]))
+    )
+    np.testing.assert_array_equal(after(first, second), after(stacked([first, first, second])))
+    assert not np.array_equal(after(first, second), after(second))
+    with pytest.raises(BadRequest, match="takes up to 3"):
+        ask(adapter, stacked([first, second, third, fourth]))
+    with pytest.raises(BadRequest, match="of all inputs alike"):
+        ask(adapter, stacked([first, second]) | {STATE: first[STATE]})
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "act ensembling"])
+def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name: str) -> None:
+    """The manifest's number format is the one that the weights have after loading."""
+    import torch
+
+    weights = checkpoint(name)
+    supported = FAMILIES[family_of(name)].precisions
+    (observation,) = observations(1)
+    for dtype in sorted({"bf16", "fp16"} & supported):
+        adapter = loaded(name, weights, dtype)
+        wanted = {"bf16": torch.bfloat16, "fp16": torch.float16}[dtype]
+        kinds = {tensor.dtype for tensor in adapter.networks[0].parameters()}
+        assert wanted in kinds
+        assert kinds == {wanted} or adapter._has_own_dtype
+        assert ask(adapter, observation).shape == (ROWS[name], DIM)
+    for dtype in sorted({"fp16", "int8", "fp8", "fp4_nvfp4"} - supported):
+        with pytest.raises(UnsupportedQuantization, match=dtype):
+            make_adapter(manifest_of(name, dtype), weights)
+
+
+@pytest.mark.parametrize("name", ["act", "tdmpc", "smolvla", "pi05"])
+def test_linear_layers_in_nf4(checkpoint: Callable[[str], Weights], name: str) -> None:
+    """int4 is NF4 as for every other model: chosen by the manifest, or refused, never bf16."""
+    pytest.importorskip("bitsandbytes")
+    from vram_arbiter.sidecars.quantization import nf4_layers
+
+    weights = checkpoint(name)
+    last = {"act": "action_head", "tdmpc": "_reward"}.get(name, "action_out_proj")
+    extra = f", min_params_to_quantize: 64, skip_modules: [{last}]"
+    adapter = make_adapter(
+        parse_manifest(manifest_text(family_of(name), "int4", extra=extra)), weights
+    )
+    assert isinstance(adapter, PolicyAdapter)
+    adapter.prepare()
+    adapter.load("meta")
+    adapter.load("cpu")
+    adapter.place("cpu")
+    layers = nf4_layers(adapter.networks[0])
+    assert layers
+    assert not any(last in layer for layer in layers)
+    assert ask(adapter, observations(1)[0]).shape == (ROWS[name], DIM)
+    adapter = make_adapter(manifest_of(name, "int4"), weights)  # 4,000,000 weights and more
+    adapter.prepare()
+    for device in ("meta", "cpu"):
+        with pytest.raises(UnsupportedQuantization, match="no linear layer to quantize"):
+            adapter.load(device)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("act")])
+def test_an_incomplete_policy_is_refused(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
+) -> None:
+    """lerobot's loaders differ: some fill gaps with random numbers, some swallow a missing file."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(checkpoint(name).source, tmp_path / "clip")
+    file = tmp_path / "clip" / "model.safetensors"
+    tensors = load_file(file)
+    adapter = make_adapter(manifest_of(name), Weights(str(file.parent), local=True))
+    adapter.prepare()
+    adapter.load("meta")
+    dropped = sorted(tensors)[0]
+    for device in ("cpu", "meta"):
+        save_file({key: tensors[key] for key in tensors if key != dropped}, file)
+        with pytest.raises(ModelError, match="missing from it"):
+            adapter.load(device)
+        save_file(tensors | {"another.models.weight": torch.zeros(3)}, file)
+        with pytest.raises(ModelError, match=r"unknown to the model \(.*another.models"):
+            adapter.load(device)
+        file.unlink()
+        with pytest.raises(ModelError):
+            adapter.load(device)
+
+
+def test_every_type_of_lerobot_is_named() -> None:
+    """A new type in lerobot has to be looked at before a manifest can name it."""
+    import lerobot.policies  # noqa: F401  registers the types
+    from lerobot.configs.policies import PreTrainedConfig
+
+    served = {kind for family in FAMILIES.values() for kind in family.types}
+    field = {family.value for family in ModelFamily} | {"groot"}  # the field writes gr00t
+    assert set(PreTrainedConfig.get_known_choices()) <= served | field
+    assert served <= set(PreTrainedConfig.get_known_choices())
+
+
+def test_the_manifests_family_decides(
+    checkpoint: Callable[[str], Weights], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = checkpoint("tdmpc")
+    adapter = make_adapter(manifest_of("vqbet"), weights)
+    with pytest.raises(ModelError, match="'tdmpc', but test/model names model_family vqbet"):
+        adapter.prepare()
+    for family in NOT_SERVED:
+        with pytest.raises(ConfigError, match=f"'{family}' is not served"):
+            make_adapter(manifest_of(family), weights)
+    with pytest.raises(ConfigError, match="Python code of the hub"):
+        make_adapter(
+            parse_manifest(manifest_text("pi0_fast").replace("_code: true", "_code: false")),
+            weights,
+        )
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="of family diffusion needs diffusers, which"):
+        make_adapter(manifest_of("diffusion"), weights).prepare()
+
+
+def test_a_camera_that_tdmpc_does_not_find_is_refused(
+    checkpoint: Callable[[str], Weights], tmp_path: Path
+) -> None:
+    """Regression: such a checkpoint loaded and failed at the first `get_action`."""
+    shutil.copytree(checkpoint("tdmpc").source, tmp_path / "tdmpc")
+    config = tmp_path / "tdmpc" / "config.json"
+    config.write_text(config.read_text().replace(ONLY_CAMERA, FRONT))
+    adapter = make_adapter(manifest_of("tdmpc"), Weights(str(config.parent), local=True))
+    with pytest.raises(ModelError, match=r"front; lerobot's tdmpc finds only observation\.image"):
+        adapter.prepare()
+
+
+def test_the_manifests_processors_are_used(
+    checkpoint: Callable[[str], Weights], tmp_path: Path
+) -> None:
+    """Regression: the files beside the weights were read, whatever `processors` named."""
+    from safetensors.torch import load_file, save_file
+
+    models = tmp_path / "models"
+    shutil.copytree(checkpoint("tdmpc").source, models / "x")
+    models.joinpath("other").mkdir()
+    for file in (models / "x").glob("policy_*"):
+        shutil.move(file, models / "other" / file.name.replace(".json", "_v2.json"))
+    numbers = models / "other" / "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
+    changed = {
+        key: value + 100 if key.startswith("action.m") else value
+        for key, value in load_file(numbers).items()
+    }
+    save_file(changed, numbers)
+    rskill = tmp_path / "rskill.yaml"
+
+    def write(before: str, after: str) -> None:
+        files = f"{{preprocessor_uri: local://{before}, postprocessor_uri: local://{after}}}"
+        rskill.write_text(manifest_text("tdmpc", more=f"processors: {files}\n"))
+
+    before, after = "models/other/policy_preprocessor_v2.json", "policy_postprocessor_v2.json"
+    write(before, f"models/other/{after}")
+    manifest, weights = read_model(rskill, tmp_path)
+    adapter = make_adapter(manifest, weights)
+    adapter.prepare()
+    adapter.load("cpu")
+    adapter.place("cpu")
+    assert ask(adapter, observations(1)[0]).mean() > 90
+    write(before, f"models/other/{after}.bak.json")
+    with pytest.raises(ConfigError, match=r"no file .*\.bak\.json"):
+        read_model(rskill, tmp_path)
+    shutil.copy(models / "other" / after, models / "x" / after)
+    write(before, f"models/x/{after}")
+    with pytest.raises(ConfigError, match=r"lead to .*other and .*x"):
+        read_model(rskill, tmp_path)
+
+
+def test_a_pinned_revision_is_what_is_loaded(
+    checkpoint: Callable[[str], Weights], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: pi0's loader drops the revision, and read the newest weights of the hub."""
+    folder = checkpoint("pi05").source
+    asked: list[tuple[str, str]] = []
+
+    def snapshot_download(source: str, *, revision: str, **_: Any) -> str:
+        asked.append((source, revision))
+        return folder
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
+    adapter = loaded("pi05", Weights("field/pi05", "0f1e2d"))
+    assert asked == [("field/pi05", "0f1e2d")]
+    assert ask(adapter, observations(1)[0]).shape == (ROWS["pi05"], DIM)
