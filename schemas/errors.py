@@ -221,6 +221,15 @@ class CalibrationFailed(OperatorError):
     code = "calibration_failed"
 
 
+# -- programs that know nothing of the arbiter
+class ActionFailed(TransientError):
+    code = "action_failed"  # a program did not free or restore its memory; details.url, status
+
+
+class CheckpointUnsupported(OperatorError):
+    code = "checkpoint_unsupported"  # driver, architecture, package or privileges
+
+
 # -- runner and reasoner
 class RunnerUnreachable(TransientError):
     code = "runner_unreachable"  # it does not answer: not running, or hanging

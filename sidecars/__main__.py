@@ -30,7 +30,7 @@ from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_card
-from vram_arbiter.sidecars.check import Wanted, check, need_packages, report
+from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
 from vram_arbiter.sidecars.device.capacity import FAKE, simulated
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ENVIRONMENT
@@ -75,6 +75,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
         adapter_for(manifest, settings.weights)  # refused before anything is served
         if adapter_for is make_adapter:
             need_packages(manifest)
+            need_precision(manifest, settings.device)
         from vram_arbiter.sidecars.host import SidecarHost
 
         with (

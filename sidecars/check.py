@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vram_arbiter.schemas.defaults import RESERVE_BYTES
-from vram_arbiter.schemas.errors import ConfigError, NoGpu, VramError
+from vram_arbiter.schemas.errors import ConfigError, NoGpu, UnsupportedQuantization, VramError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable
@@ -24,7 +24,7 @@ from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_
 from vram_arbiter.sidecars.device.capacity import capacities
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.quantization import check_precision
-from vram_arbiter.sidecars.settings import FootprintEntry, lease_footprint, read_model
+from vram_arbiter.sidecars.settings import DECLARED, FootprintEntry, lease_footprint, read_model
 from vram_arbiter.sidecars.weights import Weights, cached
 
 NOT_COMPARED = "not compared with the model"
@@ -65,14 +65,19 @@ def check(wanted: Wanted) -> list[Finding]:
     except ConfigError as error:
         findings.append(_bad("weights", error))
     adapter: ModelAdapter | None = None
+    family, refused = Finding("family", True, f"served as {_family(manifest)}"), None
     try:
         adapter = wanted.adapter_for(manifest, weights or Weights(manifest.weights_uri or ""))
-        findings.append(Finding("family", True, f"served as {_family(manifest)}"))
+    except UnsupportedQuantization as error:
+        refused = error
     except VramError as error:
-        findings.append(_bad("family", error))
+        family = _bad("family", error)
+    findings.append(family)
     findings.append(packages := _packages(manifest))
     precision = Finding("precision", None, "not checked: packages are missing")
-    if packages.ok:
+    if refused is not None:
+        precision = _bad("precision", refused)
+    elif packages.ok:
         precision = _precision(manifest, wanted.device)
     findings.append(precision)
     comparable = adapter is not None and packages.ok and precision.ok
@@ -127,9 +132,15 @@ def _packages(manifest: RSkillManifest) -> Finding:
     return Finding("packages", True, "installed")
 
 
+def need_precision(manifest: RSkillManifest, device: str) -> None:
+    """Raise UnsupportedQuantization where the model cannot be run in its number format."""
+    if not is_passthrough(manifest):
+        check_precision(manifest, device)
+
+
 def _precision(manifest: RSkillManifest, device: str) -> Finding:
     try:
-        check_precision(manifest, device)
+        need_precision(manifest, device)
     except VramError as error:
         return _bad("precision", error)
     return Finding("precision", True, str(manifest.quantization.dtype))
@@ -153,8 +164,7 @@ def _weights(
             Finding(
                 "weights",
                 False,
-                f"weights are not here: {manifest.weights_uri} is not in the hub's cache "
-                f"(hf download {weights.source}{at})",
+                f"weights are not here: `hf download {weights.source}{at}` fetches them",
             )
         ]
     if adapter_for is None:
@@ -168,8 +178,11 @@ def _weights(
     except ImportError as error:
         hint = "pip install 'vram-arbiter[sidecars]'"
         return [Finding("packages", False, f"{error} ({hint})")]
+    except UnsupportedQuantization as error:
+        return [_bad("precision", error)]
     except VramError as error:
-        return [_bad("weights", error)]
+        lacks = isinstance(error.__cause__, ImportError)
+        return [_bad("packages" if lacks else "weights", error)]
     # any failure of a model's code is a finding
     except Exception as error:  # noqa: BLE001
         return [Finding("weights", False, f"{type(error).__name__}: {error}")]
@@ -201,7 +214,7 @@ def _bytes(manifest: RSkillManifest, wanted: Wanted) -> list[Finding]:
                 "footprint",
                 True,
                 f"load peak {format_bytes(needed)}, charged {format_bytes(lease.steady_bytes)} "
-                f"while resident ({entry.source or 'as given'})",
+                f"while resident{', as ' + DECLARED if entry.source == DECLARED else ''}",
             )
         )
     except ConfigError as error:

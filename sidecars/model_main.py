@@ -32,6 +32,7 @@ from vram_arbiter.sidecars import host_weights
 from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
 from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
 from vram_arbiter.sidecars.device.open import open_memory
+from vram_arbiter.sidecars.quantization import check_precision
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.weights import Weights
 from vram_arbiter.sidecars.wires import parse
@@ -189,6 +190,8 @@ class _Model:
         if gpu:
             memory.bind(gpu)
         memory.touch()
+        if self._adapter.networks:  # a passthrough computes in whatever it likes
+            check_precision(settings.manifest, memory.torch_device)
         if memory.torch_device == "cpu":  # simulated, or none: a copy all the same
             host_weights.own(self._adapter.networks)
         self._adapter.place(memory.torch_device)

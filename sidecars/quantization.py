@@ -8,7 +8,9 @@ import importlib.util
 import json
 import logging
 import math
+import os
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -20,6 +22,7 @@ from vram_arbiter.schemas.errors import ConfigError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype, QuantizationBackend
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.sidecars.device.capacity import visible
 
 if TYPE_CHECKING:
     import torch
@@ -379,22 +382,16 @@ def _capability_without_cuda() -> Iterator[None]:
 
 
 def capabilities(device: str) -> list[tuple[int, int]]:
-    """Return the compute capability of `cuda:N`, or of every GPU for `cuda`, without initializing
-    CUDA; none where NVML does not tell."""
+    """Return the compute capabilities of the GPUs that `cuda` or `cuda:N` may mean, without
+    initializing CUDA; none where NVML does not tell."""
     import pynvml
 
-    index = device.partition(":")[2]
     try:
         pynvml.nvmlInit()
         try:
-            numbers = [int(index)] if index else range(pynvml.nvmlDeviceGetCount())
             return [
-                tuple(
-                    pynvml.nvmlDeviceGetCudaComputeCapability(
-                        pynvml.nvmlDeviceGetHandleByIndex(number)
-                    )
-                )
-                for number in numbers
+                tuple(pynvml.nvmlDeviceGetCudaComputeCapability(handle))
+                for handle in visible(device, os.environ, pynvml)
             ]
         finally:
             pynvml.nvmlShutdown()
@@ -412,8 +409,8 @@ def check_precision(manifest: RSkillManifest, device: str) -> None:
     nf4 = nf4_of(manifest)
     if device.partition(":")[0] != "cuda":
         return
-    torch = _torch()
-    if torch.cuda.is_initialized():
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_initialized():
         found = [torch.cuda.get_device_capability(device)]
     else:
         found = capabilities(device)

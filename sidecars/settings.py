@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -27,6 +27,8 @@ WAIT_TIMEOUT_S = 120.0  # wait for the lease of a request without a time limit o
 # limit of work in the model; the field's clients wait as long for an answer
 REQUEST_TIMEOUT_S = 180.0
 GB = 10**9  # manifests count in 1000s
+DECLARED: Final = "min_vram_gb says"
+"""Source of a footprint that nobody measured: the manifest's own word."""
 _KEY = re.compile(rf"[^/\s]+/[^/\s]+(/({'|'.join(Dtype)}))?")
 """Key of a footprint: a model, or a model in one number format."""
 
@@ -208,7 +210,7 @@ def footprint_for(
         load_peak=declared,
         steady=declared,
         residue=min(declared, d.RESIDUE_BYTES),
-        source="min_vram_gb",
+        source=DECLARED,
     )
 
 

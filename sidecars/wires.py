@@ -4,8 +4,8 @@ Shapes are in `schemas.sidecar`; the host performs them. Every bad message gets 
 ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decides.
 
 A request without `id` comes from a client of the field, which knows its family's shapes only: a
-policy's answer is `[actions, info]`, and an error of the endpoint family is a map of one key, which
-such a client tells by its size from a map of actions.
+policy's answer is `[actions, info]`, every judged picture has a probability of success, and an error
+of the endpoint family is a map of one key, which such a client tells by its size from actions.
 """
 
 import functools
@@ -84,8 +84,8 @@ class Wire:
         try:
             call = parse(message, self._host.model_ops)
             reply = await self._answer(call, message)
-            if of_field and name_of(call) == "get_action":
-                reply = [reply, {}]
+            if of_field:
+                reply = _in_field_shape(name_of(call), reply)
         except VramError as error:
             reply = error_reply(error, family, of_field=of_field)
         except Exception as error:  # noqa: BLE001  the outermost loop of a server
@@ -194,6 +194,15 @@ def error_reply(error: VramError, family: Family, *, of_field: bool) -> Message:
     if of_field:
         return {"error": f"{text} ({error.hint})" if error.hint else text}
     return {**error.to_wire(), "error": text}
+
+
+def _in_field_shape(name: str, reply: Message) -> Reply:
+    """Return the answer to a request without id as the field's own servers give it."""
+    if name == "get_action":
+        return [reply, {}]
+    if name == "score" and not reply["success"]:  # its clients read the last one
+        return {**reply, "success": [0.0] * len(reply["progress"])}
+    return reply
 
 
 def unread_reply(model_ops: frozenset[str]) -> Callable[[VramError], Message]:

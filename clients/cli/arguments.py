@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
+from vram_arbiter.schemas.sizes import parse_bytes
 
 
 def add_endpoint(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +41,14 @@ def one_line(most: int, *, required: bool) -> Callable[[str], str]:
 name = one_line(NAME_MAX_CHARS, required=True)
 reason = one_line(REASON_MAX_CHARS, required=True)
 remark = one_line(REASON_MAX_CHARS, required=False)
+
+
+def size(written: str) -> int:
+    """Argparse type: a byte size such as 5GiB."""
+    try:
+        return parse_bytes(written)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def at_least(low: float, high: float | None = None) -> Callable[[str], float]:

@@ -5,48 +5,54 @@ The lease belongs to `vramctl`, the bytes to its child: a consumer is a process 
 arbiter charges a child's bytes to its nearest ancestor with a lease. A program that leaves the tree
 (it daemonizes) or leases for itself is not covered.
 
-A program cannot unload, it can only end. So it counts as one long use, and what a revoke does is
-decided here (`ON_REVOKE`).
+What happens on an eviction is `clients.foreign`'s; it is written down in docs/foreign-programs.md.
 """
 
 import argparse
 import asyncio
-import contextlib
-import logging
+import json
 import os
 import shutil
-import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from collections.abc import Sequence
+from typing import Final
 
 from pydantic import ValidationError
 
-from vram_arbiter.clients import cuda
-from vram_arbiter.clients._protocol import traces
-from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.clients.foreign.actions import Action
+from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
+from vram_arbiter.clients.foreign.http import METHODS, HttpAction, Request, checked_url
+from vram_arbiter.clients.foreign.program import adopt_orphans
+from vram_arbiter.clients.foreign.servers import SERVERS
+from vram_arbiter.clients.foreign.supervisor import (
+    OnRevoke,
+    RunSpec,
+    Supervisor,
+    lease_spec,
+    say,
+)
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
-from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.runtime.printable import printable
-from vram_arbiter.schemas.sizes import format_bytes, parse_bytes
+from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import checked_spec
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.views import GpuView
 
-log = logging.getLogger(__name__)
-
-PRIORITY = 40
+PRIORITY: Final = 40
 """Below that of other leases: programs make room for a robot's models, and queue among
 themselves."""
-OnRevoke = Literal["priority", "term", "pin"]
-ON_REVOKE: tuple[OnRevoke, ...] = ("priority", "term", "pin")
-"""priority: end the program for a request of a higher priority, or for an operator; others wait
-until it ends. term: end it for any request, and when the arbiter stays away. pin: never."""
+ON_REVOKE: Final[tuple[OnRevoke, ...]] = ("priority", "term", "pin")
+"""priority: make room for a request of a higher priority, or for an operator; others wait until the
+program ends. term: make room for any request, and when the arbiter stays away. pin: never."""
+CHECKPOINT: Final = "cuda-checkpoint"
+ON_EVICT: Final = ("end", "stop", "http", *SERVERS, CHECKPOINT)
+OPTIONS: Final = (
+    "url", "restore_url", "method", "body", "restore_body", "allow_remote", "timeout", "park",
+)  # fmt: skip
+TIMEOUT_S: Final = 60.0
+NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
 
 DESCRIPTIONS = {
     "run": "Run a program that knows nothing of the arbiter under a lease: vramctl run --vram 5GiB "
@@ -56,34 +62,12 @@ DESCRIPTIONS = {
     "program's code (128+n if signal n ended it), 1 if no lease was granted, 3 without an arbiter, "
     "126 or 127 if the program cannot be started."
 }
-PATIENCE_S = 1.0
-FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
-NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
-
-
-@dataclass(frozen=True, slots=True)
-class RunSpec:
-    """What to run and what it needs. `grace_s`: from SIGTERM to SIGKILL; None waits for as long as
-    the program takes."""
-
-    command: list[str]
-    name: str | None
-    vram_bytes: int
-    gpu: str
-    priority: int
-    wait_timeout_s: float | None
-    exclusive: bool
-    on_revoke: OnRevoke
-    grace_s: float | None
-
-    @property
-    def consumer(self) -> str:
-        """`--name`, or the program's, which may hold any byte and be of any length."""
-        return self.name or printable(Path(self.command[0]).name)[:NAME_MAX_CHARS] or "program"
 
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
-    parser.add_argument("--vram", required=True, type=_bytes, help="bytes it needs, e.g. 5GiB")
+    parser.add_argument(
+        "--vram", required=True, type=arguments.size, help="bytes it needs, e.g. 5GiB"
+    )
     parser.add_argument("--name", help="consumer's name (default: the program's)")
     parser.add_argument("--gpu", default="any", help="uuid, index or any (default: any)")
     parser.add_argument(
@@ -104,19 +88,57 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "--on-revoke",
         choices=ON_REVOKE,
-        default="priority",
-        help="priority: end the program for a request of a higher priority or an operator, others "
-        "wait; term: end it for any request; pin: as --pin (default: %(default)s)",
+        help="priority: make room for a request of a higher priority or an operator, others wait; "
+        "term: for any request; pin: as --pin (default: priority where the program is ended, else "
+        "term)",
     )
     parser.add_argument(
         "--grace",
         type=arguments.at_least(0.0),
         metavar="SECONDS",
-        help="from SIGTERM to SIGKILL (default: as long as the program takes)",
+        help="from SIGTERM to SIGKILL, or for requests in progress (default: as long as it takes)",
     )
+    _add_eviction(parser)
     arguments.add_endpoint(parser)
     parser.add_argument(
         "command", nargs=argparse.REMAINDER, metavar="COMMAND", help="the program, after `--`"
+    )
+
+
+def _add_eviction(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("making room (docs/foreign-programs.md)")
+    group.add_argument(
+        "--on-evict",
+        choices=ON_EVICT,
+        default="end",
+        metavar="ACTION",
+        help="end: end the program for good; stop: end it, and start it again when there is room; "
+        "http: call --url to free and --restore-url to restore; vllm, ollama, llama.cpp, comfyui: "
+        "call that server's own API at --url; cuda-checkpoint: suspend its CUDA processes, and "
+        "resume them (default: %(default)s)",
+    )
+    group.add_argument("--url", help="http: the URL that frees; a server: its address")
+    group.add_argument("--restore-url", metavar="URL", help="http: the URL that restores")
+    group.add_argument(
+        "--method", choices=METHODS, help="http: method of both requests (default: POST)"
+    )
+    group.add_argument("--body", metavar="JSON", help="http: what is sent to --url")
+    group.add_argument("--restore-body", metavar="JSON", help="http: what is sent to --restore-url")
+    group.add_argument(
+        "--allow-remote", action="store_true", help="allow URLs of hosts other than this one"
+    )
+    group.add_argument(
+        "--timeout",
+        type=arguments.at_least(0.1),
+        metavar="SECONDS",
+        help=f"for freeing, and for restoring (default: {TIMEOUT_S:g})",
+    )
+    group.add_argument(
+        "--park",
+        type=arguments.size,
+        metavar="SIZE",
+        help="host RAM that the program keeps while it is away (default: as --vram for vllm and "
+        "cuda-checkpoint, else 0)",
     )
 
 
@@ -126,6 +148,11 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error("expected a program to run: vramctl run --vram 5GiB -- COMMAND")
     if args.pin and args.on_revoke == "term":
         args.parser.error("--pin and --on-revoke term exclude each other")
+    on_revoke: OnRevoke = "pin" if args.pin else args.on_revoke
+    if on_revoke == "pin" and args.on_evict != "end":
+        args.parser.error(f"a pinned program is not evicted: leave out --on-evict {args.on_evict}")
+    action = _action(args)
+    parks = action is not None and action.parks
     spec = RunSpec(
         command,
         args.name,
@@ -134,8 +161,11 @@ def run(args: argparse.Namespace) -> int:
         args.priority,
         args.wait,
         args.exclusive,
-        "pin" if args.pin else args.on_revoke,
+        on_revoke or ("priority" if action is None else "term"),
         args.grace,
+        restarts=args.on_evict == "stop",
+        action=action,
+        park_bytes=(args.vram if parks else 0) if args.park is None else args.park,
     )
     try:
         checked_spec(to_map(lease_spec(spec)))
@@ -146,200 +176,90 @@ def run(args: argparse.Namespace) -> int:
     return asyncio.run(run_leased(spec, args.endpoint))
 
 
-def _bytes(written: str) -> int:
-    """Argparse type: a byte size such as 5GiB."""
+def _action(args: argparse.Namespace) -> Action | None:
+    """Return what frees a running program; None where it is ended. Exits with 2 for options that
+    the action has no use for."""
+    chosen, server = args.on_evict, SERVERS.get(args.on_evict)
+    takes = {"end": (), "stop": (), CHECKPOINT: ("timeout", "park"), "http": OPTIONS}
+    for option in OPTIONS:
+        given = getattr(args, option) not in (None, False)
+        if given and option not in takes.get(chosen, ("url", "allow_remote", "timeout", "park")):
+            flag = option.replace("_", "-")
+            args.parser.error(f"--{flag} has no meaning for --on-evict {chosen}")
+    timeout_s = TIMEOUT_S if args.timeout is None else args.timeout
+    if server is not None:
+        return server(_url(args, "url", server.default_url), timeout_s)
+    if chosen == CHECKPOINT:
+        return CheckpointAction(CudaDriver(), timeout_s)
+    if chosen != "http":
+        return None
+    if args.url is None:
+        args.parser.error("--on-evict http needs --url, the URL that frees")
+    if args.restore_body is not None and args.restore_url is None:
+        args.parser.error("--restore-body needs --restore-url")
+    method = args.method or "POST"
+    restoring = None
+    if args.restore_url is not None:
+        restoring = Request(_url(args, "restore_url"), method, _json(args, "restore_body"))
+    freeing = Request(_url(args, "url"), method, _json(args, "body"))
+    return HttpAction(freeing, restoring, timeout_s)
+
+
+def _url(args: argparse.Namespace, option: str, default: str = "") -> str:
     try:
-        return parse_bytes(written)
+        return checked_url(getattr(args, option) or default, remote=args.allow_remote)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+        parser: argparse.ArgumentParser = args.parser
+        parser.error(f"--{option.replace('_', '-')}: {error}")
 
 
-def lease_spec(spec: RunSpec) -> LeaseSpec:
-    """The program's whole need for its whole life: nothing is known of phases inside it. It leaves
-    no residue: it exits."""
-    return LeaseSpec(
-        consumer=spec.consumer,
-        model_id=spec.consumer,
-        gpu=spec.gpu,
-        mode="exclusive" if spec.exclusive else "shared",
-        footprint=Footprint(
-            load_peak_bytes=spec.vram_bytes, steady_bytes=spec.vram_bytes, residue_bytes=0
-        ),
-        priority=spec.priority,
-        evictable=spec.on_revoke != "pin",
-    )
+def _json(args: argparse.Namespace, option: str) -> str:
+    text: str = getattr(args, option) or ""
+    try:
+        json.loads(text or "null")
+    except ValueError as error:
+        args.parser.error(f"--{option.replace('_', '-')}: expected JSON, got {text!r} ({error})")
+    return text
 
 
 async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
-    """The program's exit code. Raises the typed error of a lease that was not granted,
-    ArbiterUnreachable."""
+    """Return the program's exit code. Raises the typed error of a lease that was not granted,
+    ArbiterUnreachable, CheckpointUnsupported, ConfigError."""
     program = shutil.which(spec.command[0])
     if program is None:
         code, problem = _why_not(spec.command[0])
-        _say(f"{spec.command[0]}: {problem}")
+        say(f"{spec.command[0]}: {problem}")
         return code
+    if spec.action is not None:
+        spec.action.check()
+    if spec.comes_back:
+        adopt_orphans()
     async with AsyncClient(
         f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS], endpoint=endpoint
     ) as client:
-        run = _Run(spec, client)
-        acquiring = client.acquire(
-            lease_spec(spec),
-            spec.wait_timeout_s,
-            unload={"pin": None, "term": run.end, "priority": run.ended}[spec.on_revoke],
-            on_revoke=run.revoke_asked,
-            on_lost=run.lost,
-        )
-        lease = await _tell_why(client, asyncio.ensure_future(acquiring), spec.consumer)
-        with Forwarding() as signals:
+        if spec.action is not None:
+            status = await client.ask("status")
+            assert isinstance(status, StatusReply)
+            check_gpus(spec.gpu, status.gpus)
+        supervisor = Supervisor(spec, client, program)
+        await supervisor.acquire()
+        with Forwarding(supervisor.asked_to_end) as signals:
             try:
-                child = await asyncio.create_subprocess_exec(
-                    program, *spec.command[1:], env=_environ(lease)
-                )
+                await supervisor.start(signals)
             except OSError as error:
-                _say(f"{program}: {error.strerror}")
-                await lease.release()
+                say(f"{program}: {error.strerror}")
                 return NOT_STARTED
-            signals.to(child)
-            code = await run.until_ended(child, lease)
-            await lease.release(exiting=True)
+            code = await supervisor.until_ended()
     return code if code >= 0 else 128 - code
 
 
-class _Run:
-    """One program under one lease, from its start to its end."""
-
-    def __init__(self, spec: RunSpec, client: AsyncClient) -> None:
-        self._spec = spec
-        self._client = client
-        self._child: asyncio.subprocess.Process | None = None
-        self.peak_bytes = 0
-        self._wake = asyncio.Event()
-        self._ending = False
-        self._last: asyncio.Task[None] | None = None  # ends the program
-        self._reason = "its lease is over"  # said when the program is made to end
-        self._told: set[str] = set()  # waiters that were named to the user
-
-    async def until_ended(self, child: asyncio.subprocess.Process, lease: AsyncLease) -> int:
-        self._child = child
-        background = [
-            asyncio.create_task(self._hold(lease)),
-            asyncio.create_task(self._watch(lease)),
-        ]
-        code = await child.wait()
-        for task in background:
-            task.cancel()
-        for outcome in await asyncio.gather(*background, return_exceptions=True):
-            if isinstance(outcome, VramError):
-                log.warning("%s: %s", lease.lease_id, outcome)
-        if self.peak_bytes:
-            asked = self._spec.vram_bytes
-            more = ", more than was asked for" if self.peak_bytes > asked else ""
-            _say(
-                f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} "
-                f"asked{more}"
-            )
-        else:
-            _say("peak not measured: no reading showed bytes of the program")
-        return code
-
-    async def _hold(self, lease: AsyncLease) -> None:
-        """The program is one long use, unless any request may end it."""
-        await lease.ready()
-        if self._spec.on_revoke != "term":
-            async with lease.use(self._spec.consumer):
-                await asyncio.Event().wait()  # until canceled
-
-    async def _watch(self, lease: AsyncLease) -> None:
-        """Measure the peak, and see which requests the program keeps waiting."""
-        pause_s = FIRST_LOOK_S
-        while True:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), pause_s)
-            self._wake.clear()
-            self._decide(lease, None)
-            with contextlib.suppress(VramError):
-                status = await self._client.ask("status")  # its first page has all queues' heads
-                assert isinstance(status, StatusReply)
-                self._measure(lease, status)
-                self._decide(lease, status)
-            pause_s = LOOK_S
-
-    def _measure(self, lease: AsyncLease, status: StatusReply) -> None:
-        used = sum(
-            process.used_bytes or 0
-            for gpu in status.gpus
-            for process in gpu.processes
-            if lease.lease_id in process.lease_ids
+def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
+    """Raises ConfigError where a program that lives on could be granted another GPU later."""
+    if wanted == "any" and len(gpus) > 1:
+        raise ConfigError(
+            f"there are {len(gpus)} GPUs, and the program must return to the one it was started on",
+            hint="name it by --gpu",
         )
-        self.peak_bytes = max(self.peak_bytes, used)
-
-    # -- revoke
-    async def revoke_asked(self, lease: AsyncLease, eviction: Eviction) -> None:
-        self._reason = eviction.reason
-        self._wake.set()
-
-    async def lost(self, lease: AsyncLease, error: VramError) -> None:
-        _say(f"{lease.lease_id} was lost: {error}")
-
-    def _decide(self, lease: AsyncLease, status: StatusReply | None) -> None:
-        """End the program where a revoke is for a higher priority. A request that came after the
-        revoke is seen in `status`."""
-        eviction = lease.evicted
-        if eviction is None or self._ending or self._spec.on_revoke != "priority":
-            return
-        waiting = [
-            (view.consumer, view.priority)
-            for view in (() if status is None else status.leases)
-            if view.state == "queued" and view.gpu in (None, lease.gpu)
-        ]
-        asked_by = self._spec.priority + 1 if eviction.priority is None else eviction.priority
-        waiting.append((eviction.by, asked_by))
-        consumer, priority = max(waiting, key=lambda one: one[1])
-        if priority > self._spec.priority:
-            self._reason = (
-                eviction.reason if consumer == eviction.by else f"{consumer} needs the room"
-            )
-            self._last = asyncio.create_task(self.end())
-        elif consumer not in self._told:
-            self._told.add(consumer)
-            _say(
-                f"{consumer} waits for its room (priority {priority}): it gets it when the program "
-                "ends"
-            )
-
-    async def ended(self) -> None:
-        if self._child is not None:
-            await self._child.wait()
-
-    async def end(self) -> None:
-        """SIGTERM, and SIGKILL after the grace. Returns when the program has ended."""
-        child = self._child
-        if child is None or child.returncode is not None or self._ending:
-            return
-        self._ending = True
-        _say(f"{self._reason}; sending SIGTERM")
-        child.terminate()
-        try:
-            await asyncio.wait_for(child.wait(), self._spec.grace_s)
-        except TimeoutError:
-            _say(f"still running after {self._spec.grace_s:g} s; sending SIGKILL")
-            child.kill()
-            await child.wait()
-
-
-async def _tell_why(
-    client: AsyncClient, acquiring: asyncio.Future[AsyncLease], consumer: str
-) -> AsyncLease:
-    """Return the lease. Say once, on stderr, what a long wait is for."""
-    try:
-        done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
-        if not done:
-            for entry in (await client.why(consumer)).leases:
-                if entry.state == "queued":
-                    _say(f"waiting: {entry.text}")
-        return await acquiring
-    finally:
-        acquiring.cancel()
 
 
 def _why_not(command: str) -> tuple[int, str]:
@@ -353,18 +273,3 @@ def _why_not(command: str) -> tuple[int, str]:
     if not found:
         return NOT_FOUND, "not found"
     return NOT_STARTED, "is a directory" if os.path.isdir(found[0]) else "permission denied"
-
-
-def _environ(lease: AsyncLease) -> dict[str, str]:
-    return {
-        **os.environ,
-        **traces.environ(),
-        **cuda.visible(lease.gpu, os.environ),
-        "VRAM_LEASE_ID": lease.lease_id,
-        "VRAM_LEASE_TOKEN": f"{lease.token[0]}.{lease.token[1]}",
-        "VRAM_LEASE_GPU": lease.gpu,
-    }
-
-
-def _say(text: str) -> None:
-    print(f"vramctl run: {printable(text)}", file=sys.stderr)

@@ -4,6 +4,7 @@
 import asyncio
 import signal
 import threading
+from collections.abc import Callable
 from typing import Self
 
 FORWARDED = (
@@ -17,13 +18,20 @@ FORWARDED = (
 TYPED = frozenset({signal.SIGINT, signal.SIGQUIT})
 r"""A terminal sends these to the program as well (Ctrl-C, Ctrl-\): they are passed on only when a
 process sent them."""
+ENDING = TYPED | {signal.SIGTERM, signal.SIGHUP}
+"""Signals that ask the program to end."""
 SI_KERNEL = 128
 
 
 class Forwarding:
-    """`with Forwarding() as signals`, start a program, then `signals.to(it)`."""
+    """`with Forwarding(...) as signals`, start a program, then `signals.to(it)`; again for its
+    successor.
 
-    def __init__(self) -> None:
+    `asked_to_end` is called with each signal of ENDING, whether a program runs or not.
+    """
+
+    def __init__(self, asked_to_end: Callable[[signal.Signals], None]) -> None:
+        self._asked_to_end = asked_to_end
         self._child: asyncio.subprocess.Process | None = None
         self._early: list[signal.Signals] = []
         self._over = False
@@ -34,15 +42,17 @@ class Forwarding:
 
     def __enter__(self) -> Self:
         for number in (*FORWARDED, *TYPED):
-            self._loop.add_signal_handler(number, self._forward, number)
+            self._loop.add_signal_handler(number, self._heard, number)
         return self
 
     def to(self, child: asyncio.subprocess.Process) -> None:
-        """It has started. Not before, because it inherits which signals are blocked."""
+        """It has started. Signals of its terminal are blocked here from now on."""
         self._child = child
-        signal.pthread_sigmask(signal.SIG_BLOCK, TYPED)
-        self._listener.start()
-        for number in self._early:
+        if self._listener.ident is None:
+            signal.pthread_sigmask(signal.SIG_BLOCK, TYPED)
+            self._listener.start()
+        early, self._early = self._early, []
+        for number in early:
             self._forward(number)
 
     def __exit__(self, *_: object) -> None:
@@ -59,8 +69,14 @@ class Forwarding:
             found = signal.sigwaitinfo(TYPED)
             if self._over:
                 return
-            if found.si_code != SI_KERNEL:
-                self._loop.call_soon_threadsafe(self._forward, signal.Signals(found.si_signo))
+            number = signal.Signals(found.si_signo)
+            typed = found.si_code == SI_KERNEL
+            self._loop.call_soon_threadsafe(self._asked_to_end if typed else self._heard, number)
+
+    def _heard(self, number: signal.Signals) -> None:
+        if number in ENDING:
+            self._asked_to_end(number)
+        self._forward(number)
 
     def _forward(self, number: signal.Signals) -> None:
         if self._child is None:

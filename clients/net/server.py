@@ -222,10 +222,11 @@ class RouterServer:
             connection.admit()
         waiting.count += 1
         waiting.size_bytes += size
-        peer = client.peer
-        if connection.envelope:
-            peer = replace(peer, envelope=connection.envelope)
-        task = asyncio.Task(self._run(peer, message, waiting, size), loop=loop, eager_start=True)
+        if connection.envelope != client.peer.envelope:  # requests under way keep theirs
+            client.peer = replace(client.peer, envelope=connection.envelope)
+        task = asyncio.Task(
+            self._run(client.peer, message, waiting, size), loop=loop, eager_start=True
+        )
         if not task.done():
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)

@@ -44,7 +44,7 @@ def request(family: Family, op: str, fields: JsonMap) -> tuple[str, Message]:
 
     Raises: UnknownOp for what it has not; BadRequest for what it cannot be asked.
     """
-    given = {key: value for key, value in fields.items() if value is not None}
+    given = {key: value for key, value in fields.items() if value is not None and value != []}
     given.pop("traceparent", None)
     if family == "endpoint":
         return _policy_request(op, given)
@@ -52,6 +52,8 @@ def request(family: Family, op: str, fields: JsonMap) -> tuple[str, Message]:
         return op, {}
     if op not in FIELDS:
         raise _unknown(op)
+    if op == "query" and "image" not in given and len(given.get("images", [])) == 1:
+        given["image"] = given.pop("images")[0]
     unsaid = sorted(given.keys() - FIELDS[op] - WITHOUT_EFFECT)
     if unsaid:
         raise BadRequest(
@@ -60,6 +62,8 @@ def request(family: Family, op: str, fields: JsonMap) -> tuple[str, Message]:
             details={"fields": unsaid},
         )
     sent = {key: value for key, value in given.items() if key in FIELDS[op]}
+    if op == "query" and "image" not in sent:
+        raise BadRequest("query needs an image", details={"fields": ["image"]})
     if op == "detect":
         _size_of(sent.get("image"))
         if isinstance(sent.get("query"), list):

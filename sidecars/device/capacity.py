@@ -42,12 +42,9 @@ def capacities(
     try:
         nvml.nvmlInit()
         try:
-            handles = _visible(nvml, environ)
-            number = device.partition(":")[2]
-            if number:
-                handles = handles[int(number) : int(number) + 1]
             found = {
-                str(nvml.nvmlDeviceGetUUID(handle)): _bytes(nvml, handle) for handle in handles
+                str(nvml.nvmlDeviceGetUUID(handle)): _bytes(nvml, handle)
+                for handle in visible(device, environ, nvml)
             }
         finally:
             nvml.nvmlShutdown()
@@ -61,6 +58,12 @@ def capacities(
             f"the NVIDIA driver lists no GPU for --device {device}", hint="see nvidia-smi -L"
         )
     return found
+
+
+def visible(device: str, environ: Mapping[str, str], nvml: Any) -> list[Any]:
+    """Return the handles of the GPUs that `cuda` or `cuda:N` may mean, of an initialized `nvml`."""
+    found, number = _visible(nvml, environ), device.partition(":")[2]
+    return found[int(number) : int(number) + 1] if number else found
 
 
 def _visible(nvml: Any, environ: Mapping[str, str]) -> list[Any]:

@@ -96,9 +96,10 @@ def wait_told(
     return event
 
 
-@pytest.mark.parametrize(
-    "through", [[], ["sh", "-c", '"$@"; exit $?', "sh"]], ids=["child", "grandchild"]
-)
+THROUGH_SHELL = ["sh", "-c", '"$@"; exit $?', "sh"]
+
+
+@pytest.mark.parametrize("through", [[], THROUGH_SHELL], ids=["child", "grandchild"])
 def test_the_bytes_of_a_child_are_those_of_the_lease(
     quick_reader: ArbiterProcess, observer: WireClient, through: list[str]
 ) -> None:
@@ -130,8 +131,9 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
 def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
     quick_reader: ArbiterProcess, observer: WireClient
 ) -> None:
+    """The program itself dies with `vramctl`, here a shell; what it started does not."""
     assert observer.ask("subscribe")["ok"]
-    with job(quick_reader, 4 * GIB) as (vramctl, child):
+    with job(quick_reader, 4 * GIB, *THROUGH_SHELL) as (vramctl, child):
         seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
         vramctl.send_signal(signal.SIGKILL)
         stowaway = wait_told(observer, "stowaway", lambda event: event["pid"] == child)

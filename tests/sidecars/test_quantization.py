@@ -1,5 +1,8 @@
 """Number formats: what a manifest may ask for, and NF4 in host RAM."""
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,8 +12,16 @@ from vram_arbiter.schemas.errors import CODES, ConfigError, UnsupportedQuantizat
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.contracts import Quantization
 from vram_arbiter.schemas.manifest.load import load_manifest
-from vram_arbiter.sidecars import quantization
-from vram_arbiter.sidecars.quantization import Nf4, check_precision, nf4_of, quantize_linear
+from vram_arbiter.sidecars import host_weights, quantization
+from vram_arbiter.sidecars.checkpoints import load_transformers
+from vram_arbiter.sidecars.quantization import (
+    Nf4,
+    check_precision,
+    nf4_layers,
+    nf4_of,
+    quantize_linear,
+)
+from vram_arbiter.sidecars.weights import Weights, model_options
 
 FIELD = {
     "scheme": "nf4",
@@ -112,6 +123,8 @@ class TestQuantizedLinear:
             wanted = model(tokens)
             quantize_linear(model, int4(compute_dtype="float32"))
             found = model(tokens)
+            host_weights.share([model], "test")
+            assert model(tokens).equal(found)
         quantized = {name for name, part in model.named_modules() if isinstance(part, Linear4bit)}
         assert quantized == {"layers.0", "layers.1", "narrow"}
         assert model.head_of_embed.weight is model.embed.weight
@@ -139,3 +152,164 @@ class TestQuantizedLinear:
             quantize_linear(model, manifest("int4"))
         quantize_linear(model, manifest("fp32"))
         assert type(model.layers[0]).__name__ == "Linear"
+
+
+@pytest.mark.parametrize(
+    ("dtype", "extra", "needs"),
+    [
+        ("bf16", {}, (8, 0)),
+        ("fp16", {}, (5, 3)),
+        ("int4", {}, (8, 0)),
+        ("int4", {"compute_dtype": "float16"}, (6, 0)),
+    ],
+)
+def test_a_gpu_that_cannot_compute_in_the_number_format_is_refused(
+    monkeypatch: pytest.MonkeyPatch, dtype: str, extra: dict[str, Any], needs: tuple[int, int]
+) -> None:
+    """Regression: torch emulates bf16 on such a GPU, many times slower."""
+    asked = manifest(dtype, extra=extra)
+    has = [(5, 2)]
+    monkeypatch.setattr(quantization, "capabilities", lambda device: has)
+    for device in ("cuda", "cuda:1"):
+        with pytest.raises(UnsupportedQuantization, match=f"capability {needs[0]}.{needs[1]}"):
+            check_precision(asked, device)
+    check_precision(asked, "cpu")
+    check_precision(manifest("fp32"), "cuda")
+    has.append(needs)
+    check_precision(asked, "cuda")
+
+
+CUDA_ASKED = """
+import torch
+
+torch.cuda.is_available, torch.cuda.device_count = (lambda: True), (lambda: 1)
+asked = []
+torch.cuda.get_device_capability = lambda device=None: asked.append(device) or (8, 0)
+from vram_arbiter.sidecars.quantization import load_bitsandbytes
+bnb = load_bitsandbytes()
+assert not asked, "its import would initialize CUDA"
+assert torch.cuda.get_device_capability() == (8, 0)
+assert type(bnb.cextension.lib).__name__ == "CudaBNBNativeLibrary"
+assert bnb.cuda_ops
+"""
+
+
+@pytest.mark.heavy
+def test_bitsandbytes_is_imported_without_initializing_cuda() -> None:
+    """Its import asks torch for the GPUs' capabilities, which initializes CUDA: no process forked
+    from this one could use a GPU."""
+    torch = pytest.importorskip("torch")
+    if torch.version.cuda is None:
+        pytest.skip("this build of torch has no CUDA libraries")
+    subprocess.run([sys.executable, "-c", CUDA_ASKED], check=True, timeout=120)
+
+
+def small_vlm(name: str) -> Any:
+    import torch
+    import transformers
+
+    torch.manual_seed(0)
+    text = {
+        "vocab_size": 64, "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 2,
+        "num_attention_heads": 2, "num_key_value_heads": 1, "head_dim": 32,
+        "rope_scaling": {"rope_type": "default", "mrope_section": [6, 5, 5]},
+    }  # fmt: skip
+    vision = {"depth": 1, "hidden_size": 64, "intermediate_size": 128, "num_heads": 2,
+              "patch_size": 8, "out_hidden_size": 64}  # fmt: skip
+    config = getattr(transformers, f"{name}Config")(text_config=text, vision_config=vision)
+    return getattr(transformers, f"{name}ForConditionalGeneration")(config)
+
+
+@pytest.fixture(scope="module", params=["Qwen3VL", "Qwen2_5_VL"])
+def folder(request: pytest.FixtureRequest, tmp_path_factory: Any) -> Path:
+    place: Path = tmp_path_factory.mktemp(request.param)
+    small_vlm(request.param).save_pretrained(place)
+    return place
+
+
+@pytest.mark.heavy
+def test_transformers_skips_all_but_the_chosen_layers() -> None:
+    """transformers takes `layers.1` as the beginning of `layers.10`, too."""
+    quantizers = pytest.importorskip("transformers.quantizers.quantizers_utils")
+    names = ["", "layers", "layers.1.fc", "layers.10.fc", "layers.1.fcs", "model.layers.1.fc", "fc"]
+    patterns = quantization.all_but(["layers.1.fc", "fc"])
+    assert [name for name in names if quantizers.should_convert_module(name, patterns)] == [
+        "layers.1.fc",
+        "fc",
+    ]
+
+
+@pytest.mark.heavy
+class TestTransformers:
+    def load(self, folder: Path, device: str = "cpu", **extra: Any) -> Any:
+        from transformers import AutoModelForImageTextToText
+
+        weights = Weights(str(folder), local=True)
+        options = model_options(int4(**extra), weights, device)
+        return load_transformers(AutoModelForImageTextToText, weights, **options)
+
+    def logits(self, model: Any) -> Any:
+        import torch
+
+        with torch.inference_mode():
+            return model(input_ids=torch.arange(12)[None]).logits
+
+    def test_the_skip_list_names_transformers_modules(self, folder: Path) -> None:
+        """Regression: `model.visual…` was quantized although `visual` was in the skip list."""
+        text = "model.language_model.layers."
+        quantized = nf4_layers(self.load(folder))
+        assert len(quantized) == 2 * 7
+        assert all(name.startswith(text) for name in quantized)
+        quantized = nf4_layers(self.load(folder, skip_modules=["lm_head", "visual", "layers.1"]))
+        assert len(quantized) == 7
+        assert all(name.startswith(f"{text}0.") for name in quantized)
+        everything = nf4_layers(self.load(folder, skip_modules=[]))
+        assert any(name.startswith("model.visual") for name in everything)
+        assert "lm_head" in everything
+        quantized = nf4_layers(self.load(folder, min_params_to_quantize=64 * 128))
+        assert {name.rpartition(".")[2] for name in quantized} == {
+            "gate_proj",
+            "up_proj",
+            "down_proj",
+        }
+        with pytest.raises(ConfigError, match="no such module"):
+            self.load(folder, "meta", skip_modules=["vision_tower"])
+
+    def test_the_manifests_compute_dtype_is_that_of_the_whole_model(self, folder: Path) -> None:
+        import torch
+
+        for name in ("float16", "bfloat16"):
+            model = self.load(folder, compute_dtype=name)
+            wanted = getattr(torch, name)
+            assert {layer.compute_dtype for layer in nf4_layers(model).values()} == {wanted}
+            kept = {tensor.dtype for tensor in model.parameters() if tensor.is_floating_point()}
+            assert kept == {wanted}
+
+    def test_a_quantized_checkpoint_is_loaded_as_it_is(self, folder: Path, tmp_path: Path) -> None:
+        """What transformers 4 saved with the skip list `visual` holds a vision tower that
+        transformers 5 takes as quantized, and casts to uint8."""
+        model = self.load(folder)
+        model.config.quantization_config.llm_int8_skip_modules = ["visual", "lm_head"]
+        model.save_pretrained(tmp_path)
+        again = self.load(tmp_path, min_params_to_quantize=10**9)
+        assert nf4_layers(again).keys() == nf4_layers(model).keys()
+        for name, layer in nf4_layers(again).items():
+            assert layer.weight.equal(nf4_layers(model)[name].weight)
+        assert self.logits(again).equal(self.logits(model))
+        checked = self.load(tmp_path, "meta")
+        assert {tensor.device.type for tensor in checked.parameters()} == {"meta"}
+
+    def test_answers_are_the_same_after_the_weights_were_moved(self, folder: Path) -> None:
+        """The keeper moves weights into shared memory, a residency copies and places them."""
+        model = self.load(folder)
+        wanted = self.logits(model)
+        layer = next(iter(nf4_layers(model).values()))
+        before = layer.weight.data_ptr()
+        size = host_weights.share([model], "test")
+        assert size >= sum(tensor.nbytes for tensor in model.parameters())
+        shared = layer.weight.data_ptr()
+        assert shared != before, "the first answer must not have repacked it either"
+        assert self.logits(model).equal(wanted)
+        assert layer.weight.data_ptr() == shared, "an answer leaves the weights shared"
+        host_weights.own([model])
+        assert self.logits(model.to("cpu")).equal(wanted)

@@ -10,6 +10,7 @@ from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.sidecars.__main__ import _parser, main, settings_from
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.settings import (
+    DECLARED,
     FootprintEntry,
     footprint_for,
     parse_footprint,
@@ -106,7 +107,7 @@ def test_a_footprint_is_found_by_model_and_number_format():
     for number in range(1, len(keys) + 1):
         assert footprint_for(manifest, found).steady == number
         del found[keys[number - 1]]
-    assert footprint_for(manifest, found).source == "min_vram_gb"
+    assert footprint_for(manifest, found).source == DECLARED
 
 
 def test_the_lease_covers_the_inference_peak(rskill):

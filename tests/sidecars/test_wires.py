@@ -15,7 +15,7 @@ from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.wires import PENDING_MAX, Wire, parse, unread_reply
 
 PNG = b"\x89PNG\r\n\x1a\n"
-OPS = frozenset({"detect", "get_action", "reset"})
+OPS = frozenset({"detect", "get_action", "reset", "score"})
 PEER = Peer(1, 0, 0)
 
 
@@ -138,6 +138,7 @@ def test_the_known_ops_are_told():
         "load",
         "ping",
         "reset",
+        "score",
         "shutdown",
         "unload",
     ]
@@ -224,7 +225,7 @@ def test_too_many_waiting_requests_are_refused_and_ping_still_answers():
 
 def test_clients_of_the_field_get_their_familys_shapes():
     """The field's policy clients read a map of two keys as actions, and unpack a pair; both ended
-    in a KeyError far from its cause."""
+    in a KeyError far from its cause. Its reward client reads the last of no values."""
     act = {"endpoint": "get_action", "data": {"observation": {}, "options": None}}
     replies, _ = talk(act, {**act, "id": 5}, answer={"action": [1.0]})
     assert replies == [[{"action": [1.0]}, {}], {"action": [1.0], "re": 5}]
@@ -236,7 +237,11 @@ def test_clients_of_the_field_get_their_familys_shapes():
     assert list(unknown) == ["error"]
     assert (ours["error"], ours["code"], ours["re"]) == ("ModelError: no", "model_error", 5)
     assert (detector["ok"], detector["error"]) == (False, "ModelError: no")
-    assert unread_reply(OPS - {"detect"})(error) == policy
+    replies, _ = talk(
+        RAW, {**RAW, "id": 6}, answer={"ok": True, "progress": [0.5, 0.6], "success": []}
+    )
+    assert [reply["success"] for reply in replies] == [[0.0, 0.0], []]
+    assert unread_reply(frozenset({"get_action", "reset"}))(error) == policy
     assert unread_reply(OPS)(error) == detector
 
 
@@ -356,7 +361,7 @@ def test_pictures_to_judge_come_as_the_field_sends_them_or_as_pngs():
     assert parse(RAW, ops) == ScoreOp(**RAW)
     assert parse({"op": "score", "images": [PNG, PNG]}, ops).images == [PNG, PNG]
     with pytest.raises(UnknownOp):
-        parse(RAW, OPS)
+        parse(RAW, OPS - ops)
 
 
 @pytest.mark.parametrize(

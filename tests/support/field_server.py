@@ -1,9 +1,9 @@
 """Servers of the field for tests: one REP socket and one thread, which answers one request after
 the other in the field's own shapes. Written after their wire, not copied. Not a test module.
 
-What a test asks decides what happens: the text `hang` is answered once `release` is set, `garbage`
-with bytes that are no msgpack, `list` with a list, `fail` with the family's error, `die` by closing
-the socket. Else `answer` is the model's text, and `action` maps names to arrays.
+What a test asks decides what happens: the text `hang` is answered once `release` is set, `fail` with
+the family's error, a key of `RAW` with those bytes, `list` with a list, `die` by closing the socket.
+Else `answer` is the model's text, and `action` maps names to arrays.
 """
 
 import io
@@ -15,6 +15,11 @@ from typing import Any, Self
 import msgpack
 import zmq
 
+RAW: dict[str, Callable[[], bytes]] = {
+    "garbage": lambda: b"ERROR",
+    "huge": lambda: b"\xc6" + bytes(64 << 20),
+    "many": lambda: b"\xdd" + (70_000).to_bytes(4) + b"\xc0" * 70_000,
+}
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 200, 100)
 
 
@@ -76,8 +81,8 @@ class FieldServer:
                 break
             if "hang" in asked:
                 self.release.wait()
-            if "garbage" in asked:
-                self._socket.send(b"ERROR")
+            if asked in RAW:
+                self._socket.send(RAW[asked]())
                 continue
             answer: Callable[..., Any] = self._endpoint if "endpoint" in request else self._op
             try:

@@ -18,9 +18,8 @@ import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
-from vram_arbiter.clients.cli.run import RunSpec, _Run, lease_spec
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.clients.foreign.supervisor import RunSpec, Supervisor
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
@@ -320,27 +319,28 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     """The bytes of the program's process, charged to the lease of its parent; they are gone when
     the peak is said."""
     holder = (
-        "import sys; from pathlib import Path; from vram_arbiter.sidecars.device.fake import "
-        "FakeMemory\n"
-        "memory = FakeMemory(Path(sys.argv[1]), 'job', 0); memory.allocate('x', 2 << 30); "
-        "sys.stdin.read()"
+        "import signal, sys; from pathlib import Path; "
+        "from vram_arbiter.sidecars.device.fake import FakeMemory\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))\n"
+        "FakeMemory(Path(sys.argv[1]), 'job', 0).allocate('x', 2 << 30); signal.pause()"
     )
-    spec = RunSpec(["job"], None, 1 << 30, "any", 40, None, False, "priority", None)
+    command = [sys.executable, "-c", holder, str(arbiter_daemon.card)]
+    spec = RunSpec(command, "job", 1 << 30, "any", 40, None, False, "priority", None)
+
+    class Signals:
+        def to(self, child: asyncio.subprocess.Process) -> None:
+            self.child = child
+
     async with (
         asyncio.timeout(PATIENCE_S),
         AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
     ):
-        run = _Run(spec, client)
-        lease: AsyncLease = await client.acquire(lease_spec(spec))
-        child = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", holder, str(arbiter_daemon.card),
-            env=arbiter_daemon.environ, stdin=subprocess.PIPE,
-        )  # fmt: skip
-        ended = asyncio.create_task(run.until_ended(child, lease))
+        run, signals = Supervisor(spec, client, sys.executable), Signals()
+        await run.acquire()
+        await run.start(signals)
+        ended = asyncio.create_task(run.until_ended())
         while not run.peak_bytes:
             await asyncio.sleep(0.05)
-        assert child.stdin is not None
-        child.stdin.close()
+        signals.child.terminate()
         assert await ended == 0
-        await lease.release(exiting=True)
     assert "peak 2 GiB measured of 1 GiB asked, more than was asked for" in capfd.readouterr().err

@@ -7,74 +7,21 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 
-from tests.support import protocol_wire
-from vram_arbiter.clients.net.server import Peer, RouterServer
-from vram_arbiter.schemas.defaults import WIRE_VERSION
-from vram_arbiter.schemas.errors import LeaseLost, VramError
-from vram_arbiter.schemas.plain import Message
+from tests.support.grants_at_once import GrantsAtOnce
+from vram_arbiter.schemas.errors import LeaseLost
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 WAIT_S = 60.0
-WELCOME = {
-    "version": WIRE_VERSION,
-    "boot_id": "b",
-    "server": "s",
-    "role": "client",
-    "heartbeat_s": 60.0,
-    "grace_s": 60.0,
-}
-VIEW = protocol_wire.view(token=[1, 2])
 PROGRAM = (
     "import os, signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print(os.getpid(), "
     "flush=True); signal.pause()"
 )
-
-
-class GrantsAtOnce:
-    """Grants every lease, and leaves `ready` to the test; anything else is fine with it."""
-
-    def __init__(self, ready: VramError | None) -> None:
-        self.ready = ready  # None: no answer
-        self.heard: list[str] = []
-        self.refused = asyncio.Event()
-
-    @asynccontextmanager
-    async def serving(self) -> AsyncIterator[str]:
-        with tempfile.TemporaryDirectory(prefix="va") as folder:
-            server = RouterServer(
-                f"ipc://{folder}/a.sock", lambda error: {"error": error.to_wire()}
-            )
-
-            async def handle(peer: Peer, message: Message) -> None:
-                reply = self.reply(message)
-                if reply is not None:
-                    await server.send(peer, {"re": message["id"], "epoch": 1, **reply})
-                if message["op"] == "ready" and self.ready is not None:
-                    self.refused.set()
-
-            async with server:
-                task = asyncio.create_task(server.serve(handle))
-                yield server.endpoint
-                task.cancel()
-
-    def reply(self, message: Message) -> dict[str, Any] | None:
-        self.heard.append(message["op"])
-        match message["op"]:
-            case "hello":
-                return {"ok": True, **WELCOME}
-            case "acquire":
-                return {"ok": True, "state": "loading", "lease": VIEW}
-            case "ready":
-                return None if self.ready is None else {"ok": False, "error": self.ready.to_wire()}
-        return {"ok": True, **protocol_wire.PLAIN.get(message["op"], {})}
 
 
 @asynccontextmanager

@@ -5,7 +5,9 @@ import asyncio
 import os
 from pathlib import Path
 
+import msgpack
 import pytest
+import zmq
 
 from tests.support.wire import WireClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, check_free
@@ -42,6 +44,38 @@ def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_p
         request = client.send("ask")
         asyncio.run(answer_and_end())
         assert client.reply(request)["data"] == ANSWER
+
+
+def test_a_late_answer_is_in_the_envelope_of_its_own_request(tmp_path: Path) -> None:
+    """A REQ that asked again took the answer to its first request for that to its second: every
+    answer stood in the envelope of the last message."""
+    endpoint = f"ipc://{tmp_path}/s.sock"
+
+    async def asked_twice() -> object:
+        waiting: list[tuple[Peer, Message]] = []
+        async with RouterServer(endpoint, refused) as server:
+
+            async def handle(peer: Peer, message: Message) -> None:
+                waiting.append((peer, message))
+                if len(waiting) == 2:
+                    for asker, request in waiting:
+                        await server.send(asker, {"answer": request["n"]})
+
+            serving = asyncio.create_task(server.serve(handle))
+            with zmq.Context.instance().socket(zmq.REQ) as socket:
+                for option in (zmq.REQ_CORRELATE, zmq.REQ_RELAXED):
+                    socket.setsockopt(option, 1)
+                socket.setsockopt(zmq.LINGER, 0)
+                socket.setsockopt(zmq.RCVTIMEO, 60_000)
+                socket.connect(endpoint)
+                for n in (1, 2):
+                    socket.send(msgpack.packb({"n": n}))
+                answer = await asyncio.to_thread(socket.recv)
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+        return msgpack.unpackb(answer)
+
+    assert asyncio.run(asked_twice()) == {"answer": 2}
 
 
 def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -> None:

@@ -119,6 +119,8 @@ async def test_every_operation_of_the_endpoint_family(server: FieldServer) -> No
     [
         ("fail", ModelError, "ValueError: as asked"),
         ("garbage", ModelError, "not a msgpack value"),
+        ("many", ModelError, "more than 65536 values"),
+        ("huge", SidecarUnavailable, "hung up"),
         ("list", ModelError, "answered with list"),
         ("die", SidecarUnavailable, "no answer to detect|hung up"),
     ],
@@ -181,12 +183,16 @@ async def test_what_it_would_answer_wrongly_is_refused(folder: Path) -> None:
             with pytest.raises(BadRequest, match="not a PNG"):
                 await client.detect(b"\xff\xd8\xff" + bytes(64), "x")
             with pytest.raises(BadRequest, match="query with images, video"):
-                await client.call("query", {"images": [PNG], "video": b"", "question": "?"})
+                await client.call("query", {"images": [PNG] * 2, "video": [PNG], "question": "?"})
+            with pytest.raises(BadRequest, match="needs an image"):
+                await client.call("query", {"images": [], "question": "?"})
+            one = {"images": [PNG], "video": [], "question": "?"}
+            assert (await client.call("query", one))["answer"] == f"? {len(PNG)}"
             with pytest.raises(UnknownOp, match="no dance"):
                 await client.call("dance")
             with pytest.raises(MessageTooLarge, match="limit is 67108864"):
                 await client.detect(PNG + bytes(2**26), "x")
-        assert len(server.heard) == 2
+        assert [request["op"] for request in server.heard] == ["ping", "detect", "query"]
         async with PolicyClient(server.endpoint) as policy:
             with pytest.raises(UnknownOp, match="no get_actions"):
                 await policy.call("get_actions")

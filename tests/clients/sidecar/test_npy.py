@@ -109,6 +109,28 @@ def test_only_arrays_of_numbers_whose_bytes_are_there() -> None:
 
 
 @pytest.mark.heavy
+def test_arrays_of_msgpack_numpy_are_read_and_its_pickles_are_not() -> None:
+    import numpy
+
+    array = {b"nd": True, b"type": "<f4", b"kind": b"", b"shape": [2, 1], b"data": bytes(8)}
+    found = npy.unpack({"a": array, "b": {key.decode(): array[key] for key in array}})
+    for one in found.values():
+        assert (one.dtype, one.shape, one.flags.writeable) == (numpy.float32, (2, 1), True)
+    assert npy.unpack({b"nd": False, b"type": "<i2", b"data": b"\x07\x00"}) == 7
+    assert npy.unpack({"nd": "a name"}) == {"nd": "a name"}
+    for changes in (
+        {b"kind": b"O"}, {b"kind": b"V", b"type": [["a", "<f4"]]}, {b"type": "|O"}, {b"type": "<c8"},
+        {b"type": "no type"}, {b"type": "(2,)<f4"}, {b"type": "<f4" * 9}, {b"shape": [3, 1]},
+        {b"shape": [-2, -1]}, {b"shape": [2.0, 1]}, {b"shape": 2}, {b"shape": [1] * 9 + [2]},
+        {b"data": "text"}, {b"data": bytes(7)}, {b"nd": False},
+    ):  # fmt: skip
+        with pytest.raises(BadRequest):
+            npy.unpack({"a": {**array, **changes}})
+    with pytest.raises(BadRequest, match="more than 256 arrays"):
+        npy.unpack([array] * (npy.ARRAYS_MAX + 1))
+
+
+@pytest.mark.heavy
 def test_a_message_has_a_bounded_number_of_arrays() -> None:
     import numpy
 

@@ -17,6 +17,7 @@ from vram_arbiter.schemas.runtime.trust import (
     check_server,
     check_uid,
     frame_uid,
+    port_uids,
     trusts,
 )
 
@@ -54,6 +55,32 @@ def test_the_kernel_names_the_user_who_listens(tmp_path: Path) -> None:
     again = from_wire(raised.value.to_wire())
     assert isinstance(again, UntrustedServer)
     assert again.details["uid"] == nobody
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "0.0.0.0", "::"])
+def test_the_kernel_names_the_user_behind_a_port(address: str) -> None:
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    if ":" in address and not socket.has_dualstack_ipv6():
+        pytest.skip("no IPv6 here")
+    with (
+        socket.create_server((address, 0), family=family, dualstack_ipv6=":" in address) as server,
+        socket.create_connection(("127.0.0.1", server.getsockname()[1])) as client,
+    ):
+        assert port_uids(client) == {os.geteuid()}, "nobody has accepted it: who listens"
+        accepted, _ = server.accept()
+        server.close()
+        assert port_uids(client) == {os.geteuid()}, "the owner of the other end"
+        accepted.close()
+        assert port_uids(client) == set(), "there is none any more"
+
+
+@as_root
+def test_every_user_who_listens_on_the_port_counts() -> None:
+    """The kernel names no owner of a connection that waits to be accepted: it read as root's."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        os.fchown(server.fileno(), FOREIGN, -1)
+        with socket.create_connection(server.getsockname()) as client:
+            assert port_uids(client) == {FOREIGN}
 
 
 def test_users_can_be_named() -> None:

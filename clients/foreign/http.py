@@ -1,0 +1,140 @@
+"""Freeing and restoring through HTTP: one request each.
+
+`http.client` of the standard library: a few short requests to loopback need no HTTP package in the
+base install, and unlike `urllib.request` it follows neither redirects nor proxies of the
+environment, so that a request goes to the named host and nowhere else.
+"""
+
+import http.client
+import ipaddress
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlsplit
+
+from vram_arbiter.clients.foreign.actions import Deadline
+from vram_arbiter.schemas.errors import ActionFailed
+from vram_arbiter.schemas.runtime.printable import printable
+
+METHODS: Final = ("GET", "POST", "PUT", "PATCH", "DELETE")
+ANSWER_MAX_BYTES: Final = 4 << 20
+SHOWN_MAX_CHARS: Final = 200
+"""Of an answer that is quoted in an error."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One request. `body`: JSON as text; "" for none."""
+
+    url: str
+    method: str = "POST"
+    body: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.method} {self.url}"
+
+
+def checked_url(url: str, *, remote: bool) -> str:
+    """Return a URL that may be called, without a slash at its end. Raises ValueError.
+
+    `remote`: hosts other than this one are allowed.
+    """
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise ValueError(f"expected a URL such as http://127.0.0.1:8000, got {url!r}")
+    if parts.username is not None or parts.fragment or not url.isascii() or not url.isprintable():
+        raise ValueError(f"expected a URL without user, fragment and special characters: {url!r}")
+    if " " in url or parts.port == 0:  # `port` raises ValueError where it is no port
+        raise ValueError(f"expected a URL without spaces and with a port from 1 on, got {url!r}")
+    if not remote and not _is_here(parts.hostname):
+        raise ValueError(
+            f"{parts.hostname} is not a loopback host: the program runs on this machine; "
+            "--allow-remote calls it all the same"
+        )
+    return url.rstrip("/")
+
+
+def _is_here(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def answer(request: Request, deadline: Deadline) -> tuple[int, bytes]:
+    """Return the status and the body. Raises ActionFailed where there is no answer in time."""
+    parts = urlsplit(request.url)
+    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+    target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+    headers = {"Content-Type": "application/json"} if request.body else {}
+    assert parts.hostname is not None, f"{request.url} was not checked"
+    connection = kind(parts.hostname, parts.port, timeout=deadline.left_s(str(request)))
+    try:
+        connection.request(request.method, target, request.body or None, headers)
+        reply = connection.getresponse()
+        body = b""
+        while chunk := reply.read1(1 << 16):
+            body += chunk
+            deadline.left_s(str(request))
+            if len(body) > ANSWER_MAX_BYTES:
+                raise ActionFailed(f"{request}: an answer of more than {ANSWER_MAX_BYTES} bytes")
+    except TimeoutError as error:
+        raise ActionFailed(
+            f"{request}: no answer within {deadline.limit_s:g} s", hint="allow more by --timeout"
+        ) from error
+    except (OSError, http.client.HTTPException) as error:
+        raise ActionFailed(
+            f"{request}: {str(error) or type(error).__name__}",
+            hint="is this the program's address?",
+        ) from error
+    finally:
+        connection.close()
+    return reply.status, body
+
+
+def call(request: Request, deadline: Deadline) -> bytes:
+    """Return the body of a success. Raises ActionFailed for any other status than 2xx."""
+    status, body = answer(request, deadline)
+    if not 200 <= status < 300:
+        told = printable(body.decode(errors="replace"))[:SHOWN_MAX_CHARS]
+        raise ActionFailed(
+            f"{request}: answered {status}" + (f": {told}" if told else ""),
+            details={"status": status, "url": request.url},
+        )
+    return body
+
+
+def call_json(request: Request, deadline: Deadline) -> object:
+    """Return the JSON of a success. Raises ActionFailed."""
+    body = call(request, deadline)
+    try:
+        return json.loads(body)
+    except ValueError as error:
+        raise ActionFailed(f"{request}: expected JSON, got {body[:40]!r}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class HttpAction:
+    """A request that frees, and one that restores, if any. `parks`: the weights stay in host
+    RAM."""
+
+    freeing: Request
+    restoring: Request | None
+    timeout_s: float
+    parks: bool = False
+    name: str = "http"
+    keeps_context: bool = True
+
+    def check(self) -> None:
+        """It needs nothing of this machine."""
+
+    def busy(self) -> int | None:
+        return None
+
+    def free(self, pids: Sequence[int]) -> None:
+        call(self.freeing, Deadline(self.timeout_s))
+
+    def restore(self, pids: Sequence[int]) -> None:
+        if self.restoring is not None:
+            call(self.restoring, Deadline(self.timeout_s))

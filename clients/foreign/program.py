@@ -1,0 +1,147 @@
+"""A started program and its process tree.
+
+The program dies with `vramctl` (parent-death signal): without it nothing answers for its GPU
+memory, and a suspended program would never be resumed. It stays in the process group of `vramctl`,
+so that the terminal's signals and input reach it.
+"""
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import signal
+from collections.abc import Mapping, Sequence
+from typing import Final, Self
+
+from vram_arbiter.schemas.runtime import procfs
+
+ORPHAN_GRACE_S: Final = 5.0
+"""From SIGTERM to SIGKILL for processes that outlive the program itself."""
+ORPHAN_POLL_S: Final = 0.05
+_PR_SET_PDEATHSIG: Final = 1
+_PR_SET_CHILD_SUBREAPER: Final = 36
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of processes whose parent ends, so that none leaves the tree (prctl(2))."""
+    if _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+class Program:
+    """One run of a program. `stopping`: it is ended to make room, and is to be started again."""
+
+    def __init__(self, child: asyncio.subprocess.Process, others: frozenset[int]) -> None:
+        self.child = child
+        self.stopping = False
+        self._others = others  # children of this process that are not the program's
+
+    @classmethod
+    async def start(cls, path: str, arguments: Sequence[str], environ: Mapping[str, str]) -> Self:
+        """Start it. Raises OSError where it cannot be executed."""
+        others = frozenset(_children().get(os.getpid(), ()))
+        parent = os.getpid()
+
+        def prepare() -> None:  # in the child, before it executes the program
+            _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGQUIT})
+            if os.getppid() != parent:  # it ended before the call above
+                os._exit(128 + signal.SIGKILL)
+
+        child = await asyncio.create_subprocess_exec(
+            path, *arguments, env=environ, preexec_fn=prepare
+        )
+        return cls(child, others)
+
+    @property
+    def running(self) -> bool:
+        return self.child.returncode is None
+
+    async def wait(self) -> int:
+        """Return the exit code of the program itself, -n after signal n."""
+        return await self.child.wait()
+
+    async def end(self, grace_s: float | None) -> bool:
+        """Send SIGTERM, and SIGKILL after the grace. Return whether it needed SIGKILL."""
+        if not self.running:
+            return False
+        self.child.terminate()
+        try:
+            await asyncio.wait_for(self.child.wait(), grace_s)
+        except TimeoutError:
+            self.child.kill()
+            await self.child.wait()
+            return True
+        return False
+
+    async def end_orphans(self) -> int:
+        """End the processes of the tree that outlived the program, through their pidfds: SIGTERM,
+        then SIGKILL. Return how many there were. Needs `adopt_orphans`."""
+        ended: set[int] = set()
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            signaled: set[int] = set()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(ORPHAN_GRACE_S):
+                    while orphans := self._orphans():
+                        for pid in orphans - signaled:
+                            _send(pid, number)
+                        signaled |= orphans
+                        await asyncio.sleep(ORPHAN_POLL_S)
+            ended |= signaled
+        return len(ended)
+
+    def tree(self) -> list[int]:
+        """Return the pids of the program's living processes, parents first."""
+        children = _children()
+        found = [pid for pid in children.get(os.getpid(), ()) if pid not in self._others]
+        for pid in found:
+            found += children.get(pid, ())
+        return found
+
+    def reap(self) -> None:
+        """Take the exit status of adopted processes that ended. Needs `adopt_orphans`."""
+        with contextlib.suppress(ChildProcessError):
+            options = os.WEXITED | os.WNOHANG | os.WNOWAIT
+            while ended := os.waitid(os.P_ALL, 0, options):
+                if ended.si_pid in self._others or ended.si_pid == self.child.pid:
+                    return  # asyncio's; the next call goes on
+                os.waitpid(ended.si_pid, os.WNOHANG)
+
+    def _orphans(self) -> set[int]:
+        self.reap()
+        return set(self.tree()) - {self.child.pid}
+
+
+def _children() -> dict[int, list[int]]:
+    """Return the living processes by their parents."""
+    found: dict[int, list[int]] = {}
+    for entry in procfs.PROC.iterdir():
+        if entry.name.isdecimal():
+            stat = procfs.read_stat(int(entry.name))
+            if stat is not None and stat.alive:
+                found.setdefault(stat.parent_pid, []).append(int(entry.name))
+    return found
+
+
+def _send(pid: int, number: signal.Signals) -> None:
+    """Signal a process unless it has ended; a process that took its pid is not of the tree."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    try:
+        if _is_below(pid, os.getpid()):  # asked after the pidfd names the process
+            signal.pidfd_send_signal(pidfd, number)
+    except ProcessLookupError:
+        pass
+    finally:
+        os.close(pidfd)
+
+
+def _is_below(pid: int, ancestor: int) -> bool:
+    while pid > 1 and pid != ancestor:
+        stat = procfs.read_stat(pid)
+        pid = 0 if stat is None else stat.parent_pid
+    return pid == ancestor

@@ -1,0 +1,198 @@
+"""Model servers whose API is known: which requests free their memory, and how they say that they
+work."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+from urllib.parse import quote
+
+from vram_arbiter.clients.foreign.actions import Deadline
+from vram_arbiter.clients.foreign.http import Request, answer, call, call_json
+from vram_arbiter.schemas.errors import ActionFailed
+
+LOOK_TIMEOUT_S: Final = 5.0
+"""How long a server may take to say whether it works."""
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A model server at `url`. A subclass says how it frees.
+
+    Most load again with the next request, so there is nothing to restore.
+    """
+
+    url: str
+    timeout_s: float
+    name: ClassVar[str]
+    default_url: ClassVar[str]
+    parks: ClassVar[bool] = False
+    keeps_context: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """It needs nothing of this machine."""
+
+    def busy(self) -> int | None:
+        try:
+            return self.requests(Deadline(min(LOOK_TIMEOUT_S, self.timeout_s)))
+        except ActionFailed:
+            return None  # it is down, or does not tell; freeing finds out which
+
+    def requests(self, deadline: Deadline) -> int | None:
+        """Return the number of requests in progress. Raises ActionFailed."""
+        return None
+
+    def free(self, pids: Sequence[int]) -> None:
+        raise NotImplementedError
+
+    def restore(self, pids: Sequence[int]) -> None:
+        """The next request loads the model."""
+
+    def _get(self, path: str) -> Request:
+        return Request(self.url + path, "GET")
+
+    def _post(self, path: str, body: Mapping[str, object] | None = None) -> Request:
+        return Request(self.url + path, "POST", "" if body is None else json.dumps(body))
+
+    def _until_none(
+        self, names: Callable[[Deadline], Sequence[str]], deadline: Deadline, what: str
+    ) -> None:
+        """Wait until the server lists no loaded model. Raises ActionFailed."""
+        while left := names(deadline):
+            deadline.pause(f"{what} {', '.join(left)}")
+
+
+class Vllm(Server):
+    """vLLM's sleep mode, level 1: the weights go to host RAM, the KV cache is dropped.
+
+    Needs `vllm serve --enable-sleep-mode` with VLLM_SERVER_DEV_MODE=1
+    (https://docs.vllm.ai/en/latest/features/sleep_mode/). `/sleep` aborts requests in progress,
+    which `/metrics` counts.
+    """
+
+    name = "vllm"
+    default_url = "http://127.0.0.1:8000"
+    parks = True
+    WORK: ClassVar = ("vllm:num_requests_running", "vllm:num_requests_waiting")
+
+    def requests(self, deadline: Deadline) -> int | None:
+        text = call(self._get("/metrics"), deadline).decode(errors="replace")
+        counts: list[float] = []
+        for line in text.splitlines():
+            metric, _, value = line.rpartition(" ")
+            if metric.partition("{")[0] in self.WORK:
+                try:
+                    counts.append(float(value))
+                except ValueError as error:
+                    raise ActionFailed(f"{self.url}/metrics: not a count: {line!r}") from error
+        return int(sum(counts)) if counts else None
+
+    def free(self, pids: Sequence[int]) -> None:
+        call(self._post("/sleep?level=1"), Deadline(self.timeout_s))
+
+    def restore(self, pids: Sequence[int]) -> None:
+        call(self._post("/wake_up"), Deadline(self.timeout_s))
+
+
+class Ollama(Server):
+    """Ollama: `keep_alive` 0 for each model that `/api/ps` lists
+    (https://github.com/ollama/ollama/blob/main/docs/api.md, "Unload a model").
+
+    A model that answers a request is unloaded after it; so freeing waits until `/api/ps` lists
+    none.
+    """
+
+    name = "ollama"
+    default_url = "http://127.0.0.1:11434"
+
+    def free(self, pids: Sequence[int]) -> None:
+        deadline = Deadline(self.timeout_s)
+        for model in self._loaded(deadline):
+            call(self._post("/api/generate", {"model": model, "keep_alive": 0}), deadline)
+        self._until_none(self._loaded, deadline, "POST /api/generate: still loaded:")
+
+    def _loaded(self, deadline: Deadline) -> Sequence[str]:
+        request = self._get("/api/ps")
+        models = _entries(call_json(request, deadline), "models", request)
+        return [str(model.get("model") or model.get("name")) for model in models]
+
+
+class LlamaCpp(Server):
+    """llama.cpp's `llama-server` as a router (started without a model): `/models/unload` for each
+    model that is not unloaded (https://github.com/ggml-org/llama.cpp/blob/master/tools/server,
+    "Using multiple models"). Each model is a process of its own, which ends.
+
+    Unloading aborts requests in progress, which `/slots` shows unless it is switched off.
+    """
+
+    name = "llama.cpp"
+    default_url = "http://127.0.0.1:8080"
+    keeps_context = False
+    AWAY: ClassVar = ("unloaded", "failed")
+
+    def requests(self, deadline: Deadline) -> int | None:
+        busy = 0
+        for model in self._models(deadline, lambda status: status == "loaded"):
+            request = self._get(f"/slots?model={quote(model, safe='')}")
+            status, body = answer(request, deadline)
+            if status != 200:
+                return None  # --no-slots
+            try:
+                slots = json.loads(body)
+            except ValueError as error:
+                raise ActionFailed(f"{request}: expected JSON, got {body[:40]!r}") from error
+            busy += sum(bool(slot.get("is_processing")) for slot in slots)
+        return busy
+
+    def free(self, pids: Sequence[int]) -> None:
+        deadline = Deadline(self.timeout_s)
+        for model in self._loaded(deadline):
+            call(self._post("/models/unload", {"model": model}), deadline)
+        self._until_none(self._loaded, deadline, "POST /models/unload: still loaded:")
+
+    def _loaded(self, deadline: Deadline) -> Sequence[str]:
+        return self._models(deadline, lambda status: status not in self.AWAY)
+
+    def _models(self, deadline: Deadline, wanted: Callable[[object], bool]) -> Sequence[str]:
+        request = self._get("/models")
+        models = _entries(call_json(request, deadline), "data", request)
+        if not all(isinstance(model.get("status"), dict) for model in models):
+            raise ActionFailed(
+                f"{request}: models without a status",
+                hint="start llama-server without a model: only its router can unload",
+            )
+        return [str(model.get("id")) for model in models if wanted(model["status"].get("value"))]
+
+
+class ComfyUi(Server):
+    """ComfyUI: `POST /free` (routes of https://github.com/comfyanonymous/ComfyUI, `server.py`).
+
+    It answers before it frees: its worker does so when no prompt runs. `/queue` lists prompts.
+    """
+
+    name = "comfyui"
+    default_url = "http://127.0.0.1:8188"
+
+    def requests(self, deadline: Deadline) -> int | None:
+        request = self._get("/queue")
+        queue = call_json(request, deadline)
+        if not isinstance(queue, dict):
+            raise ActionFailed(f"{request}: expected a map")
+        return sum(len(queue.get(name) or ()) for name in ("queue_running", "queue_pending"))
+
+    def free(self, pids: Sequence[int]) -> None:
+        wanted = {"unload_models": True, "free_memory": True}
+        call(self._post("/free", wanted), Deadline(self.timeout_s))
+
+
+SERVERS: Final[Mapping[str, type[Server]]] = {
+    server.name: server for server in (Vllm, Ollama, LlamaCpp, ComfyUi)
+}
+
+
+def _entries(found: object, key: str, request: Request) -> Sequence[Mapping[str, Any]]:
+    """Return the list of maps at `key`. Raises ActionFailed."""
+    entries = found.get(key) if isinstance(found, dict) else None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ActionFailed(f"{request}: expected a list of {key}")
+    return entries

@@ -1,0 +1,440 @@
+"""One program under one lease after another, from its start to its end.
+
+A program cannot unload, it can only end or be made to free. So it counts as one long use, unless
+any request may have its room, and what a revoke does is decided here: `RunSpec.on_revoke` says for
+which requests the program makes room, `RunSpec.on_evict` how.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final, Literal, Protocol
+
+import anyio
+import anyio.to_thread
+
+from vram_arbiter.clients import cuda
+from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients._protocol.records import Eviction
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.foreign.actions import Action
+from vram_arbiter.clients.foreign.program import Program
+from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, RESIDUE_BYTES
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+
+log = logging.getLogger(__name__)
+
+type OnRevoke = Literal["priority", "term", "pin"]
+PATIENCE_S: Final = 1.0
+FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
+BUSY_POLL_S: Final = 0.5
+NO_LEASE: Final = "its lease is over"
+
+
+@dataclass(frozen=True, slots=True)
+class RunSpec:
+    """What to run and what it needs.
+
+    `grace_s`: from SIGTERM to SIGKILL, or for requests in progress; None waits for as long as it
+    takes. `restarts`: the program is ended to make room, and started again. `action`: it is made
+    to free instead, and keeps `park_bytes` of host RAM meanwhile. With neither, its end is the end.
+    """
+
+    command: list[str]
+    name: str | None
+    vram_bytes: int
+    gpu: str
+    priority: int
+    wait_timeout_s: float | None
+    exclusive: bool
+    on_revoke: OnRevoke
+    grace_s: float | None
+    restarts: bool = False
+    action: Action | None = None
+    park_bytes: int = 0
+
+    @property
+    def consumer(self) -> str:
+        """`--name`, or the program's, which may hold any byte and be of any length."""
+        return self.name or printable(Path(self.command[0]).name)[:NAME_MAX_CHARS] or "program"
+
+    @property
+    def comes_back(self) -> bool:
+        return self.restarts or self.action is not None
+
+
+def lease_spec(spec: RunSpec) -> LeaseSpec:
+    """Return the program's whole need for its whole life: nothing is known of phases inside it."""
+    keeps_context = spec.action is not None and spec.action.keeps_context
+    return LeaseSpec(
+        consumer=spec.consumer,
+        model_id=spec.consumer,
+        gpu=spec.gpu,
+        mode="exclusive" if spec.exclusive else "shared",
+        footprint=Footprint(
+            load_peak_bytes=spec.vram_bytes,
+            steady_bytes=spec.vram_bytes,
+            residue_bytes=min(RESIDUE_BYTES, spec.vram_bytes) if keeps_context else 0,
+        ),
+        priority=spec.priority,
+        evictable=spec.on_revoke != "pin",
+        standby=spec.comes_back,
+        park_bytes=spec.park_bytes,
+    )
+
+
+class Forwards(Protocol):
+    """Passes signals on (`clients.cli.signals.Forwarding`)."""
+
+    def to(self, child: asyncio.subprocess.Process) -> None: ...
+
+
+class Supervisor:
+    """Holds the lease, starts the program, and makes room when the arbiter asks."""
+
+    def __init__(self, spec: RunSpec, client: AsyncClient, path: str) -> None:
+        self._spec = spec
+        self._client = client
+        self._path = path
+        self._program: Program | None = None
+        self._lease: AsyncLease | None = None
+        self.peak_bytes = 0
+        self._signals: Forwards | None = None
+        self._over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._wake = asyncio.Event()
+        self._leave = asyncio.Event()  # the program is to make room, and comes back
+        self._ending = False  # it is made to end for good
+        self._reason = NO_LEASE  # said when the program is made to leave
+        self._told: set[str] = set()  # waiters that were named to the user
+
+    async def acquire(self) -> None:
+        """Wait for the first lease. Raises the typed error of one that was not granted."""
+        self._lease = await self._acquire(self._spec.wait_timeout_s)
+
+    async def start(self, signals: Forwards) -> None:
+        """Start the program. Raises OSError, with the lease released."""
+        self._signals = signals
+        try:
+            await self._start()
+        except OSError:
+            await self.lease.release()
+            raise
+
+    async def until_ended(self) -> int:
+        """Keep the program and its lease together. Return the program's exit code."""
+        self._spawn(self._follow())
+        self._spawn(self._watch())
+        code = await self._over
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._program is not None:
+            await self._program.end(self._spec.grace_s)  # where it has not ended itself
+            if self._spec.comes_back:
+                await self._program.end_orphans()
+        self._say_peak()
+        await self.lease.release(exiting=True)
+        return code
+
+    def asked_to_end(self, number: signal.Signals) -> None:
+        """Take a signal that asks the program to end: it is not started again."""
+        if self._program is not None and self._program.stopping:
+            self._finish(-number)
+
+    @property
+    def lease(self) -> AsyncLease:
+        assert self._lease is not None, "not acquired yet"
+        return self._lease
+
+    # -- the program
+    async def _start(self) -> None:
+        self._program = await Program.start(
+            self._path, self._spec.command[1:], _environ(self.lease)
+        )
+        assert self._signals is not None
+        self._signals.to(self._program.child)
+        self._spawn(self._until_exit(self._program))
+
+    async def _until_exit(self, program: Program) -> None:
+        code = await program.wait()
+        if not program.stopping:
+            self._finish(code)
+
+    async def _end(self) -> None:
+        """End the program, for good or until there is room again."""
+        program = self._program
+        if program is None or not program.running or program.stopping:
+            return
+        program.stopping = self._spec.comes_back
+        say(f"{self._reason}; sending SIGTERM")
+        if await program.end(self._spec.grace_s):
+            say(f"it did not end within {self._spec.grace_s:g} s and was killed")
+        if program.stopping and (count := await program.end_orphans()):
+            say(f"ended {count} of its processes that outlived it")
+
+    def _finish(self, code: int) -> None:
+        if not self._over.done():
+            self._over.set_result(code)
+
+    def _spawn(self, work: Coroutine[None, None, None]) -> None:
+        self._tasks.add(asyncio.create_task(work))
+
+    # -- its lease
+    async def _acquire(self, wait_timeout_s: float | None) -> AsyncLease:
+        unload: dict[str, Callable[[], object] | None] = {
+            "pin": None,
+            "term": self._unload,
+            "priority": self._unload if self._spec.comes_back else self._ended,
+        }
+        acquiring = self._client.acquire(
+            lease_spec(self._spec),
+            wait_timeout_s,
+            unload=unload[self._spec.on_revoke],
+            park=self._free if self._spec.park_bytes else None,
+            on_revoke=self._revoke_asked,
+            on_lost=self._lost,
+        )
+        return await _tell_why(self._client, asyncio.ensure_future(acquiring), self._spec.consumer)
+
+    async def _follow(self) -> None:
+        """Hold the lease while the program is resident; get it back where it was evicted."""
+        await self._resident()
+        if not self._spec.comes_back:
+            return
+        try:
+            while True:
+                await self._regain()
+                self._reason = NO_LEASE
+                self._leave.clear()
+                self._told.clear()
+                if not await self._restore():
+                    return
+                await self._resident()
+        except (VramError, OSError) as error:  # the program is away, and cannot return
+            say(f"{self._spec.consumer} cannot return: {error}")
+            self._finish(1)
+
+    async def _resident(self) -> None:
+        """Return when the program's bytes are freed: it is away, or its lease is over."""
+        lease = self.lease
+        holding = asyncio.create_task(self._hold(lease))
+        try:
+            if not self._spec.comes_back:
+                await holding
+            state = lease.state
+            while state not in ("standby", "parked", "gone"):
+                state = await lease.wait_change(state)
+        finally:
+            holding.cancel()
+        if state == "gone":
+            await lease.wait_gone()
+
+    async def _hold(self, lease: AsyncLease) -> None:
+        """Count the program as one long use until it is to make room, unless any request may have
+        that."""
+        try:
+            await lease.ready()
+            if self._spec.on_revoke != "term":
+                async with lease.use(self._spec.consumer):
+                    await self._leave.wait()
+        except VramError as error:
+            log.warning("%s: %s", lease.lease_id, error)
+
+    async def _regain(self) -> None:
+        """Wait until the program may return: by itself from standby, else as a new waiter."""
+        lease, evicted = self.lease, self.lease.evicted
+        if lease.state == "parked" and evicted is not None and evicted.cause == "operator":
+            await lease.reacquire()  # it would not return by itself
+            return
+        if lease.state != "gone":
+            with contextlib.suppress(VramError):  # lost meanwhile
+                await lease.wait_returned()
+                return
+        self._lease = await self._acquire(None)
+
+    async def _restore(self) -> bool:
+        """Bring the program back under its lease. Return whether it holds one."""
+        if self._program is None or self._program.stopping:
+            say("there is room again: starting it")
+            await self._start()
+            return True
+        assert self._spec.action is not None
+        try:
+            await _in_thread(self._spec.action.restore, self._program.tree())
+        except VramError as error:
+            say(f"{error}; its lease is released, and the program goes on without one")
+            await self.lease.release()
+            return False
+        say("there is room again: restored")
+        return True
+
+    # -- revoke
+    async def _revoke_asked(self, lease: AsyncLease, eviction: Eviction) -> None:
+        self._reason = eviction.reason
+        self._wake.set()
+
+    async def _lost(self, lease: AsyncLease, error: VramError) -> None:
+        say(f"{lease.lease_id} was lost: {error}")
+
+    async def _ended(self) -> None:
+        if self._program is not None:
+            await self._program.wait()
+
+    async def _unload(self) -> None:
+        """Make room without host RAM: it has none for this program, or the lease was lost."""
+        evicted = self._lease is not None and self._lease.state != "gone"
+        if self._spec.action is None:
+            await self._end()
+        elif self._spec.park_bytes and evicted:
+            wanted = format_bytes(self._spec.park_bytes)
+            self._reason += f"; the arbiter has no {wanted} of host RAM for its weights"
+            await self._end()
+        else:
+            await self._free()
+
+    async def _free(self) -> None:
+        """Let the program free its memory, after its requests in progress."""
+        program, action = self._program, self._spec.action
+        assert action is not None
+        if program is None or not program.running:
+            return
+        await self._quiesce(action)
+        say(f"{self._reason}; freeing by {action.name}")
+        try:
+            await _in_thread(action.free, program.tree())
+        except VramError as error:
+            say(f"{error}; the arbiter measures what the program keeps: vramctl status")
+
+    async def _quiesce(self, action: Action) -> None:
+        """Wait until no request is in progress, where the program says so, or the grace is over."""
+        told = False
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._spec.grace_s):
+                while count := await _in_thread(action.busy):
+                    if not told:
+                        say(f"{self._reason}; waiting for {count} requests in progress")
+                    told = True
+                    await asyncio.sleep(BUSY_POLL_S)
+                return
+        say(f"requests are in progress after {self._spec.grace_s:g} s all the same")
+
+    # -- what the arbiter sees
+    async def _watch(self) -> None:
+        """Measure the peak, and see which requests the program keeps waiting."""
+        pause_s = FIRST_LOOK_S
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), pause_s)
+            self._wake.clear()
+            self._decide(None)
+            with contextlib.suppress(VramError):
+                status = await self._client.ask("status")  # its first page has all queues' heads
+                assert isinstance(status, StatusReply)
+                self._measure(status)
+                self._decide(status)
+            if self._program is not None and self._spec.comes_back:
+                self._program.reap()
+            pause_s = LOOK_S
+
+    def _measure(self, status: StatusReply) -> None:
+        used = sum(
+            process.used_bytes or 0
+            for gpu in status.gpus
+            for process in gpu.processes
+            if self.lease.lease_id in process.lease_ids
+        )
+        self.peak_bytes = max(self.peak_bytes, used)
+
+    def _decide(self, status: StatusReply | None) -> None:
+        """Leave where a revoke is for a higher priority. A request that came after the revoke is
+        seen in `status`."""
+        lease, spec = self.lease, self._spec
+        eviction = lease.evicted
+        if eviction is None or self._ending or self._leave.is_set() or spec.on_revoke != "priority":
+            return
+        waiting = [
+            (view.consumer, view.priority)
+            for view in (() if status is None else status.leases)
+            if view.state == "queued" and view.gpu in (None, lease.gpu)
+        ]
+        asked_by = spec.priority + 1 if eviction.priority is None else eviction.priority
+        waiting.append((eviction.by, asked_by))
+        consumer, priority = max(waiting, key=lambda one: one[1])
+        if priority > spec.priority:
+            self._reason = (
+                eviction.reason if consumer == eviction.by else f"{consumer} needs the room"
+            )
+            if spec.comes_back:
+                self._leave.set()
+            elif not self._ending:  # it stays in use until it has ended
+                self._ending = True
+                self._spawn(self._end())
+        elif consumer not in self._told:
+            self._told.add(consumer)
+            say(
+                f"{consumer} waits for its room (priority {priority}): it gets it when the program "
+                "ends"
+            )
+
+    def _say_peak(self) -> None:
+        asked = self._spec.vram_bytes
+        if self.peak_bytes:
+            more = ", more than was asked for" if self.peak_bytes > asked else ""
+            say(
+                f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} "
+                f"asked{more}"
+            )
+        else:
+            say("peak not measured: no reading showed bytes of the program")
+
+
+async def _in_thread[T](work: Callable[..., T], *arguments: object) -> T:
+    """Run what blocks; canceled, it is left to itself."""
+    own_thread = anyio.CapacityLimiter(1)
+    return await anyio.to_thread.run_sync(
+        partial(work, *arguments), abandon_on_cancel=True, limiter=own_thread
+    )
+
+
+async def _tell_why(
+    client: AsyncClient, acquiring: asyncio.Future[AsyncLease], consumer: str
+) -> AsyncLease:
+    """Return the lease. Say once, on stderr, what a long wait is for."""
+    try:
+        done, _ = await asyncio.wait({acquiring}, timeout=PATIENCE_S)
+        if not done:
+            for entry in (await client.why(consumer)).leases:
+                if entry.state == "queued":
+                    say(f"waiting: {entry.text}")
+        return await acquiring
+    finally:
+        acquiring.cancel()
+
+
+def _environ(lease: AsyncLease) -> dict[str, str]:
+    return {
+        **os.environ,
+        **traces.environ(),
+        **cuda.visible(lease.gpu, os.environ),
+        "VRAM_LEASE_ID": lease.lease_id,
+        "VRAM_LEASE_TOKEN": f"{lease.token[0]}.{lease.token[1]}",
+        "VRAM_LEASE_GPU": lease.gpu,
+    }
+
+
+def say(text: str) -> None:
+    """Tell the user of `vramctl run`."""
+    print(f"vramctl run: {printable(text)}", file=sys.stderr)

@@ -1,0 +1,138 @@
+"""Requests that free and restore, against a stand-in server on loopback."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.model_server import ModelServer
+from vram_arbiter.clients.foreign.actions import Deadline
+from vram_arbiter.clients.foreign.http import HttpAction, Request, call, checked_url
+from vram_arbiter.clients.foreign.servers import SERVERS, Server
+from vram_arbiter.schemas.errors import ActionFailed
+
+LIMIT_S = 30.0
+FREEING = {
+    "vllm": [("POST /sleep?level=1", None)],
+    "ollama": [
+        ("GET /api/ps", None),
+        ("POST /api/generate", {"model": "a", "keep_alive": 0}),
+        ("POST /api/generate", {"model": "b", "keep_alive": 0}),
+        ("GET /api/ps", None),
+        ("GET /api/ps", None),
+    ],
+    "llama.cpp": [
+        ("GET /models", None),
+        ("POST /models/unload", {"model": "a"}),
+        ("POST /models/unload", {"model": "b"}),
+        ("GET /models", None),
+        ("GET /models", None),
+    ],
+    "comfyui": [("POST /free", {"unload_models": True, "free_memory": True})],
+}
+
+
+@pytest.fixture
+def model_server() -> Iterator[ModelServer]:
+    with ModelServer() as server:
+        yield server
+
+
+@pytest.mark.parametrize("name", SERVERS)
+def test_a_server_is_freed_by_its_own_api(name: str, model_server: ModelServer) -> None:
+    """Where the API lists models, freeing is over when it lists none: Ollama and llama.cpp answer
+    before a model is gone."""
+    server: Server = SERVERS[name](model_server.url, LIMIT_S)
+    model_server.lingering = 1
+    server.free([])
+    assert model_server.heard == FREEING[name]
+    assert model_server.loaded == []
+    model_server.heard.clear()
+    server.restore([])
+    assert model_server.heard == ([("POST /wake_up", None)] if name == "vllm" else [])
+
+
+def test_requests_in_progress_are_counted_where_the_server_tells(
+    model_server: ModelServer,
+) -> None:
+    for name, counts in {"vllm": [3], "llama.cpp": [1, 0], "comfyui": [2]}.items():
+        server = SERVERS[name](model_server.url, LIMIT_S)
+        model_server.busy = list(counts)
+        assert (server.busy(), server.busy()) == (sum(counts), 0)
+    assert SERVERS["ollama"](model_server.url, LIMIT_S).busy() is None
+    model_server.broken = {"/metrics": 404, "/slots": 501}
+    assert SERVERS["vllm"](model_server.url, LIMIT_S).busy() is None
+    assert SERVERS["llama.cpp"](model_server.url, LIMIT_S).busy() is None
+
+
+def test_what_a_failing_server_says_is_told(model_server: ModelServer) -> None:
+    vllm = SERVERS["vllm"](model_server.url, LIMIT_S)
+    model_server.broken = {"/sleep": 500}
+    with pytest.raises(ActionFailed, match=r"/sleep\?level=1: answered 500: broken") as raised:
+        vllm.free([])
+    assert "\x1b" not in str(raised.value)
+    model_server.broken = {}
+    model_server.lingering = 10**6
+    with pytest.raises(ActionFailed, match=r"still loaded: a, b: not done within 0\.3 s"):
+        SERVERS["ollama"](model_server.url, 0.3).free([])
+    with pytest.raises(ActionFailed, match="expected a list of models"):
+        SERVERS["ollama"](f"{model_server.url}/other", LIMIT_S).free([])
+
+
+def test_a_llama_server_that_is_no_router_is_refused(model_server: ModelServer) -> None:
+    """With one model given, `/models` has no status, and nothing can be unloaded."""
+    model_server.answer = lambda path, body: {"data": [{"id": "a"}]}  # type: ignore[method-assign]
+    with pytest.raises(ActionFailed, match="start llama-server without a model"):
+        SERVERS["llama.cpp"](model_server.url, LIMIT_S).free([])
+
+
+def test_a_server_that_is_down_silent_or_speaks_no_http() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(ActionFailed, match=r"no answer within 0\.2 s"):
+            SERVERS["vllm"](url, 0.2).free([])
+    vllm = SERVERS["vllm"](url, LIMIT_S)
+    assert vllm.busy() is None
+    with pytest.raises(ActionFailed, match="refused"):
+        vllm.free([])
+
+
+def test_any_request_may_free_and_restore(model_server: ModelServer) -> None:
+    freeing = Request(f"{model_server.url}/free?x=1", "PUT", '{"a": 1}')
+    action = HttpAction(freeing, Request(f"{model_server.url}/restore", "PUT"), LIMIT_S)
+    action.free([])
+    action.restore([])
+    assert model_server.heard == [("PUT /free?x=1", {"a": 1}), ("PUT /restore", None)]
+    HttpAction(freeing, None, LIMIT_S).restore([])  # nothing to call
+    assert len(model_server.heard) == 2
+
+
+def test_a_redirect_is_not_followed(model_server: ModelServer) -> None:
+    """It could lead off this machine."""
+    model_server.broken = {"/free": 307}
+    with pytest.raises(ActionFailed, match="answered 307"):
+        call(Request(f"{model_server.url}/free"), Deadline(LIMIT_S))
+
+
+@pytest.mark.parametrize(
+    ("url", "problem"),
+    [
+        ("127.0.0.1:8000", "such as http"),
+        ("ftp://localhost/free", "such as http"),
+        ("http://user:secret@localhost/", "without user"),
+        ("http://localhost:0/", "port"),
+        ("http://localhost:x/", "Port"),
+        ("http://localhost/a b", "spaces"),
+        ("http://192.0.2.1:8000/", "not a loopback host"),
+        ("http://localhost.example.org/", "not a loopback host"),
+    ],
+)
+def test_urls_that_are_refused(url: str, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        checked_url(url, remote=False)
+
+
+def test_urls_that_are_called() -> None:
+    for url in ("http://localhost:8000", "http://127.0.0.2/x", "https://[::1]:8/?a=1"):
+        assert checked_url(url + "/" if url.endswith("00") else url, remote=False) == url
+    assert checked_url("http://192.0.2.1:8000/", remote=True) == "http://192.0.2.1:8000"

@@ -1,0 +1,136 @@
+"""A program and its leases, with an action that only takes notes."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
+
+import pytest
+
+from tests.support.grants_at_once import GrantsAtOnce
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.foreign.supervisor import OnRevoke, RunSpec, Supervisor
+from vram_arbiter.schemas.wire.spec import LeaseSpec
+
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+PATIENCE_S = 60.0
+Spec = Callable[..., LeaseSpec]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+
+
+class Notes:
+    """An action that does nothing to the program. `work`: answers of the next looks at its
+    requests, then 0."""
+
+    name = "notes"
+    keeps_context = parks = False
+
+    def __init__(self) -> None:
+        self.did: list[str] = []
+        self.work: list[int] = []
+
+    def check(self) -> None: ...
+
+    def busy(self) -> int:
+        self.did.append("look")
+        return self.work.pop(0) if self.work else 0
+
+    def free(self, pids: Sequence[int]) -> None:
+        self.did.append(f"free {len(pids)}")
+
+    def restore(self, pids: Sequence[int]) -> None:
+        self.did.append(f"restore {len(pids)}")
+
+
+class Signals:
+    """Signals that nobody sends."""
+
+    child: asyncio.subprocess.Process
+
+    def to(self, child: asyncio.subprocess.Process) -> None:
+        self.child = child
+
+
+@asynccontextmanager
+async def supervised(
+    client: AsyncClient, action: Notes, on_revoke: OnRevoke = "term", grace_s: float | None = None
+) -> AsyncIterator[Supervisor]:
+    """A program of 5 GiB until the block ends."""
+    command = ["sleep", "1000"]
+    spec = RunSpec(
+        command, "job", 5 << 30, "any", 40, None, False, on_revoke, grace_s, action=action
+    )
+    supervisor, signals = Supervisor(spec, client, "/bin/sleep"), Signals()
+    await supervisor.acquire()
+    await supervisor.start(signals)
+    ended = asyncio.create_task(supervisor.until_ended())
+    try:
+        yield supervisor
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            signals.child.kill()
+        assert await ended == -9
+
+
+async def test_requests_in_progress_are_waited_for(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, capfd: pytest.CaptureFixture[str]
+) -> None:
+    action = Notes()
+    action.work = [2, 1]
+    async with (
+        asyncio.timeout(PATIENCE_S),
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
+        supervised(client, action) as run,
+    ):
+        await until(lambda: run.lease.state == "held")
+        other = await client.acquire(spec("b", 5), PATIENCE_S)
+        assert action.did == ["look", "look", "look", "free 1"]
+        assert run.lease.state == "standby"
+        await other.release()
+        await until(lambda: run.lease.state == "held")
+        assert action.did[-1] == "restore 1"
+    assert "waiting for 2 requests in progress" in capfd.readouterr().err
+
+
+async def test_requests_that_never_end_are_waited_for_during_the_grace(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Under a steady load there is no moment without requests: its room would never be free. And
+    with `priority`, only a higher one makes it leave."""
+    action = Notes()
+    action.work = [1] * 1000
+    async with (
+        asyncio.timeout(PATIENCE_S),
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
+        supervised(client, action, "priority", 0.1) as run,
+    ):
+        await until(lambda: run.lease.state == "held")
+        equal = asyncio.create_task(client.acquire(spec("a", 5, priority=40), PATIENCE_S))
+        await until(lambda: run.lease.state == "revoking")
+        assert (action.did, run.lease.uses) == ([], 1)
+        higher = await client.acquire(spec("b", 5), PATIENCE_S)
+        assert action.did[-1] == "free 1"
+        await higher.release()
+        await (await equal).release()
+    told = capfd.readouterr().err
+    assert "a waits for its room (priority 40)" in told
+    assert "requests are in progress after 0.1 s all the same" in told
+
+
+async def test_a_lease_that_was_lost_is_replaced(until: Until) -> None:
+    """The memory is freed, as for every lease that is lost, and the program is not left without
+    for ever."""
+    action = Notes()
+    arbiter = GrantsAtOnce(ready="ok")
+    async with (
+        asyncio.timeout(PATIENCE_S),
+        arbiter.serving() as endpoint,
+        AsyncClient("t", endpoint=endpoint) as client,
+        supervised(client, action) as run,
+    ):
+        await until(lambda: run.lease.state == "held")
+        await arbiter.lose()
+        await until(lambda: arbiter.grants == 2 and run.lease.state == "held")
+        assert action.did == ["look", "free 1", "restore 1"]
+        assert run.lease.lease_id == "L1-2"

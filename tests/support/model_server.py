@@ -1,0 +1,146 @@
+"""Stand-in for a model server: answers as vLLM, Ollama, llama.cpp's router and ComfyUI do.
+
+`python -m tests.support.model_server FOLDER BYTES HOST PORT [BROKEN…]` holds bytes on the simulated
+GPU in FOLDER until it is told to free them, prints its pid, and serves until SIGTERM.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import FrameType
+from typing import Any
+from urllib.parse import urlsplit
+
+
+class ModelServer:
+    """A server with two models loaded.
+
+    `heard`: what was called, in order. `busy`: answers of the next looks at its work, then 0.
+    `broken`: paths that answer with this status.
+    """
+
+    def __init__(
+        self,
+        free: Callable[[], None] = lambda: None,
+        load: Callable[[], None] = lambda: None,
+        address: tuple[str, int] = ("127.0.0.1", 0),
+    ) -> None:
+        self.loaded = ["a", "b"]
+        self.heard: list[tuple[str, Any]] = []
+        self.busy: list[int] = []
+        self.broken: dict[str, int] = {}
+        self.lingering = 0  # looks at the list of models that still show those being unloaded
+        self._leaving: list[str] = []
+        self._free, self._load = free, load
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def log_message(self, *_: object) -> None:
+                pass
+
+            def do_GET(self) -> None:
+                outer.serve(self)
+
+            do_POST = do_PUT = do_GET
+
+        self._server = ThreadingHTTPServer(address, Handler)
+        self._server.daemon_threads = True
+        self.url = f"http://{address[0]}:{self._server.server_address[1]}"
+
+    def __enter__(self) -> "ModelServer":
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.01,))
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def serve(self, request: BaseHTTPRequestHandler) -> None:
+        path = urlsplit(request.path).path
+        sent = request.rfile.read(int(request.headers.get("Content-Length", 0)))
+        body = json.loads(sent) if sent else None
+        self.heard.append((f"{request.command} {request.path}", body))
+        status = self.broken.get(path, 200)
+        answer = self.answer(path, body) if status == 200 else "broken <&>\x1b"
+        data = (answer if isinstance(answer, str) else json.dumps(answer)).encode()
+        request.send_response(status)
+        request.send_header("Content-Length", str(len(data)))
+        request.end_headers()
+        request.wfile.write(data)
+
+    def answer(self, path: str, body: Any) -> object:
+        match path:
+            case "/sleep" | "/free":
+                self.unload(*self.loaded)
+            case "/wake_up" | "/restore":
+                self._load()
+            case "/api/generate" if body["keep_alive"] == 0:
+                self.unload(body["model"])
+                return {"done": True, "done_reason": "unload"}
+            case "/models/unload":
+                self.unload(body["model"])
+                return {"success": True}
+            case "/api/ps":
+                return {"models": [{"model": name, "size_vram": 1} for name in self.listed()]}
+            case "/models":
+                shown = dict.fromkeys("abc", "unloaded")
+                shown |= dict.fromkeys(self.listed(), "loaded")
+                return {"data": [{"id": n, "status": {"value": v}} for n, v in shown.items()]}
+            case "/metrics":
+                count = self.busy.pop(0) if self.busy else 0
+                return f'# HELP x\nvllm:num_requests_running{{m="a b"}} {count}.0\nother 7\n'
+            case "/slots":
+                return [{"id": 0, "is_processing": bool(self.busy and self.busy.pop(0))}]
+            case "/queue":
+                count = self.busy.pop(0) if self.busy else 0
+                return {"queue_running": [[1]] * count, "queue_pending": []}
+        return {}
+
+    def unload(self, *names: str) -> None:
+        for name in names:
+            self.loaded.remove(name)
+            self._leaving.append(name)
+        if not self.loaded:
+            self._free()
+
+    def listed(self) -> list[str]:
+        """Models that a list shows: those being unloaded too, for a while."""
+        if self.lingering and self._leaving:
+            self.lingering -= 1
+            return self.loaded + self._leaving
+        return self.loaded
+
+
+def main(folder: str, size: str, host: str, port: str, *broken: str) -> None:
+    from vram_arbiter.sidecars.device.fake import FakeMemory
+
+    memory = FakeMemory(Path(folder), "server")
+    blocks = [memory.allocate("weights", int(size))]
+
+    def free() -> None:
+        memory.free(blocks.pop())
+        memory.empty_cache()
+
+    def load() -> None:
+        blocks.append(memory.allocate("weights", int(size)))
+
+    def end(number: int, frame: FrameType | None) -> None:
+        memory.close()
+        sys.exit(0)
+
+    signal.signal(signal.SIGTERM, end)
+    with ModelServer(free, load, (host, int(port))) as server:
+        server.broken = dict.fromkeys(broken, 500)
+        print(os.getpid(), flush=True)
+        signal.pause()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
