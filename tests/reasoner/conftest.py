@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.field_server import PNG
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
 from vram_arbiter.schemas.goals import (
@@ -114,7 +115,7 @@ class Runner:
                 return {
                     "camera": request.camera or "front",
                     "encoding": "png",
-                    "data": b"\x89PNG\r\n\x1a\n",
+                    "data": PNG,
                     "width": 4,
                     "height": 4,
                     "stamp_monotonic_ns": 1,

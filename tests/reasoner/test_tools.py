@@ -5,10 +5,12 @@ clients.
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
+from tests.support.field_server import FieldServer
 from tests.support.waiting import play
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
@@ -400,6 +402,43 @@ def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: 
     outcome, asked = play(story)
     assert (outcome.status, outcome.code) == ("refused", "not_permitted")
     assert asked == ["ping"]
+
+
+def test_servers_of_the_field_are_looked_through(a_runner: Any, tmp_path: Path) -> None:
+    """They have no lease, so that nothing is loaded or unloaded; one that is gone saw nothing."""
+
+    async def story() -> list[Outcome]:
+        async with (
+            a_runner() as runner,
+            RunnerClient(runner.endpoint) as client,
+            DetectorClient(f"ipc://{tmp_path}/field", connect_timeout_s=60.0) as detector,
+            SceneVlmClient(f"ipc://{tmp_path}/field") as vlm,
+        ):
+            tools = Tools(client, detector, vlm, components={"detector": detector})
+            with FieldServer(detector.endpoint, "<box><400><400><600><600></box>") as server:
+                found = [await tools(LOOK), await tools(ASK)]
+                server.answer = "None."
+                found.append(await tools(LOOK))
+                for transition in ("configure", "activate", "deactivate"):
+                    call = {"node": "detector", "transition": transition}
+                    found.append(await tools(LifecycleTransition.model_validate(call)))
+            while detector._rpc.proven:  # it has not noticed yet
+                await asyncio.sleep(0)
+            detector._connect_timeout_s = 0.05
+            return [*found, await tools(LOOK)]
+
+    outcomes = play(story)
+    assert [(one.status, one.code) for one in outcomes] == [
+        ("error", "frame_stale"),  # seen, but the camera does not say where it stands
+        ("answered", ""),
+        ("not_seen", ""),
+        ("done", ""),
+        ("done", ""),
+        ("error", "unknown_op"),
+        ("error", "sidecar_unavailable"),
+    ]
+    assert outcomes[0].data["box"] == [80.0, 40.0, 120.0, 60.0]
+    assert outcomes[3].text == "detector serves field/model, resident"
 
 
 def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_sidecar: Any) -> None:
