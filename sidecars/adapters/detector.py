@@ -3,7 +3,6 @@
 These are OWL-ViT, OWLv2, Grounding DINO and OmDet-Turbo.
 """
 
-import inspect
 import math
 import re
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.inputs import to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.weights import (
@@ -24,7 +24,12 @@ from vram_arbiter.sidecars.weights import (
 )
 
 NORM = 1000  # the field's grounding answers give boxes in thousandths of the image
+ZERO_SHOT_LOADER = "transformers.AutoModelForZeroShotObjectDetection"
+_ANSWERS = {"logits", "pred_boxes", "decoder_class_logits", "decoder_coord_logits"}
 _SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # the field joins its labels by </c>
+
+type _Found = tuple[list[float], list[str], list[list[float]]]
+"""Scores, texts and boxes (x0, y0, x1, y1 in pixels), as long as each other."""
 
 
 class DetectorAdapter:
@@ -95,28 +100,98 @@ class DetectorAdapter:
     ) -> list[DetectionResult]:
         import torch
 
-        inputs = self._processor(
-            images=picture, text=[labels], truncation=True, return_tensors="pt"
-        ).to(self._model.device)
-        with torch.inference_mode():
-            outputs = self._model(**inputs)
-        post_process = self._processor.post_process_grounded_object_detection
-        known = inspect.signature(post_process).parameters
-        options = {
-            "text_labels": [labels],
-            "input_ids": inputs.get("input_ids"),
-            "target_sizes": [size],
-            "threshold": threshold,
-        }
-        (result,) = post_process(
-            outputs, **{name: value for name, value in options.items() if name in known}
+        self._refuse_long(labels)
+        model = self._model
+        inputs = to_model(
+            self._processor(images=picture, text=[labels], truncation=True, return_tensors="pt"),
+            model,
         )
-        names = result.get("text_labels") or [labels[int(index)] for index in result["labels"]]
+        # Grounding DINO scores tokens, the others score texts.
+        spans = (
+            self._spans(inputs["input_ids"][0].tolist(), labels)
+            if hasattr(model.config, "max_text_len")
+            else None
+        )
+        # Grounding DINO makes float32 of its own between layers of 16 bits: autocast joins them.
+        half = model.dtype in (torch.float16, torch.bfloat16)
+        with (
+            torch.inference_mode(),
+            torch.autocast(model.device.type, model.dtype, enabled=half),
+        ):
+            outputs = model(**inputs)
+        for name in _ANSWERS & outputs.keys():
+            if outputs[name].isnan().any():  # no score of it is above a threshold
+                raise ModelError(
+                    "the detector's answer is not a number",
+                    hint="check its weights, or run it in a wider number format, e.g. bf16",
+                )
+            outputs[name] = outputs[name].float()
+        scores, names, boxes = (
+            self._classified(outputs, labels, threshold, size)
+            if spans is None
+            else _grounded(outputs, spans, labels, size)
+        )
         found = [
-            _detection(str(name), float(score), box.tolist(), size)
-            for name, score, box in zip(names, result["scores"], result["boxes"], strict=True)
+            clip(name, score, box, size)
+            for score, name, box in zip(scores, names, boxes, strict=True)
+            if score > threshold
         ]
         return sorted((one for one in found if one is not None), key=lambda one: -one["score"])
+
+    def _refuse_long(self, labels: list[str]) -> None:
+        """Raise BadRequest for a text that the model would read only in part."""
+        tokenizer = self._processor.tokenizer
+        for label, tokens in zip(labels, tokenizer(labels)["input_ids"], strict=True):
+            if len(tokens) > tokenizer.model_max_length:
+                raise BadRequest(
+                    f"{label[:40]!r} has {len(tokens)} tokens; this model reads "
+                    f"{tokenizer.model_max_length}",
+                    hint="describe the object in fewer words",
+                )
+
+    def _classified(
+        self, outputs: Any, labels: list[str], threshold: float, size: tuple[int, int]
+    ) -> _Found:
+        """Read the answer of a model that scores each box for each text (OWL, OmDet-Turbo)."""
+        (result,) = self._processor.post_process_grounded_object_detection(
+            outputs, text_labels=[labels], target_sizes=[size], threshold=threshold
+        )
+        return result["scores"].tolist(), result["text_labels"], result["boxes"].tolist()
+
+    def _spans(self, tokens: list[int], labels: list[str]) -> list[slice]:
+        """Return where each text lies among the tokens. Raises BadRequest for too much text."""
+        spans, at = [], 0
+        for label in labels:
+            own = self._processor.tokenizer(label.lower(), add_special_tokens=False)["input_ids"]
+            while at < len(tokens) and tokens[at : at + len(own)] != own:
+                at += 1
+            spans.append(slice(at, at + len(own)))
+            at += len(own)
+        if max(at, len(tokens)) > (limit := self._model.config.max_text_len):
+            raise BadRequest(
+                f"{len(labels)} objects have {max(at, len(tokens))} tokens; this model reads "
+                f"{limit}",
+                hint="ask for fewer objects in one request",
+            )
+        return spans
+
+
+def _grounded(outputs: Any, spans: list[slice], labels: list[str], size: tuple[int, int]) -> _Found:
+    """Read the answer of a model that scores each box for each token (Grounding DINO).
+
+    A box gets the text with the best token. The processor's own reading joins all tokens over a
+    threshold, which may be half a text, or none.
+    """
+    import torch
+
+    probabilities = outputs.logits[0].sigmoid()
+    scores, best = torch.stack([probabilities[:, span].amax(dim=-1) for span in spans], dim=-1).max(
+        dim=-1
+    )
+    x, y, width, height = outputs.pred_boxes[0].unbind(-1)
+    corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+    boxes = torch.stack(corners, dim=-1) * torch.tensor([size[1], size[0]] * 2).to(x)
+    return scores.tolist(), [labels[index] for index in best.tolist()], boxes.tolist()
 
 
 def split_query(query: str | Sequence[str]) -> list[str]:
@@ -149,7 +224,7 @@ def grounding_answer(found: list[DetectionResult], width: int, height: int) -> s
     return "".join(parts)
 
 
-def _detection(
+def clip(
     label: str, score: float, box: list[float], size: tuple[int, int]
 ) -> DetectionResult | None:
     """Clip a box to the picture; None if nothing is left of it.
