@@ -35,7 +35,7 @@ ImageBytes = Annotated[bytes, Field(min_length=8, max_length=16 * 1024 * 1024)]
 Question = Annotated[str, Field(min_length=1, max_length=2000)]
 Side = Annotated[int, Field(ge=1, le=4096)]
 
-PICTURES_MAX = 32  # of one `score`
+PICTURES_MAX = 32  # of one `query` or `score`
 QUERIES_MAX = 64  # of one `detect`
 
 
@@ -82,17 +82,35 @@ class DetectOp(_Look):
     image: ImageBytes
     query: Question | Annotated[list[Question], Field(min_length=1, max_length=QUERIES_MAX)]
     max_side: Annotated[int, Field(ge=32, le=4096)] = 1024
-    mode: str = "hybrid"  # of the field's wire; a zero-shot detector has one mode
+    # how LocateAnything decodes; other detectors have one way
+    mode: Literal["fast", "slow", "hybrid"] = "hybrid"
     max_new_tokens: Annotated[int, Field(ge=1, le=8192)] = 1024
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
 
 
 class QueryOp(_Look):
+    """Ask `question` about pictures, in this order: `image` (the field's one), `images`, `video`.
+
+    `video` is frames of one camera, oldest first, `fps` of them a second.
+    """
+
     op: Literal["query"]
-    image: ImageBytes
     question: Question
+    image: ImageBytes | None = None
+    images: Annotated[list[ImageBytes], Field(max_length=PICTURES_MAX)] = []
+    video: Annotated[list[ImageBytes], Field(max_length=PICTURES_MAX)] = []
+    fps: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = None
     max_side: Annotated[int, Field(ge=32, le=4096)] = 1024
     max_new_tokens: Annotated[int, Field(ge=1, le=8192)] = 256
+
+    @model_validator(mode="after")
+    def _some_pictures(self) -> Self:
+        count = (self.image is not None) + len(self.images) + len(self.video)
+        if not 1 <= count <= PICTURES_MAX:
+            raise ValueError(f"give 1 to {PICTURES_MAX} pictures in image, images and video")
+        if bool(self.video) != (self.fps is not None):
+            raise ValueError("video and fps go together")
+        return self
 
 
 class ScoreOp(_Look):

@@ -159,6 +159,14 @@ def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
     return decoded
 
 
+def of_one_size(pictures: "Sequence[Image.Image]") -> "Sequence[Image.Image]":
+    """Return the pictures. Raises BadRequest unless all have the size of the first."""
+    if len({picture.size for picture in pictures}) > 1:
+        sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in pictures}))
+        raise BadRequest(f"pictures of different sizes: {sizes}", hint="send one camera's pictures")
+    return pictures
+
+
 def within(picture: "Image.Image", max_side: int) -> "Image.Image":
     """Return the picture with its longest side at most `max_side` pixels."""
     from PIL import Image

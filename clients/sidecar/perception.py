@@ -60,22 +60,33 @@ class DetectorClient(SidecarClient):
 
 
 class SceneVlmClient(SidecarClient):
-    """`await vlm.query(png, "Is the red cube held?")`."""
+    """`await vlm.query(png, "Is the red cube held?")`, or
+    `await vlm.query(images=[before, after], question="Has the cube moved?")`."""
 
     async def query(
         self,
-        image_png: bytes,
-        question: str,
+        image_png: bytes | None = None,
+        question: str = "",
         *,
+        images: Sequence[bytes] = (),
+        video: Sequence[bytes] = (),
+        fps: float | None = None,
         max_side: int = MAX_SIDE,
         max_new_tokens: int = 256,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
         fresh_s: float | None = None,
     ) -> str:
-        """The model's answer, as it wrote it. Raises as `DetectorClient.detect`."""
-        fields = {
-            "image": image_png,
+        """Ask about a picture, further `images`, and a `video`: frames of one camera, oldest first,
+        `fps` of them a second.
+
+        Returns: the model's answer, as it wrote it, without its thoughts.
+
+        Raises: as `DetectorClient.detect`; LimitExceeded for too many tokens, and where the model
+        thought for all of `max_new_tokens`.
+        """
+        given = {"image": image_png, "images": list(images), "video": list(video), "fps": fps}
+        fields = {name: value for name, value in given.items() if value} | {
             "question": question,
             "max_side": max_side,
             "max_new_tokens": max_new_tokens,

@@ -14,7 +14,7 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import ScoreOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.checkpoints import load_lerobot
-from vram_arbiter.sidecars.images import decode_all
+from vram_arbiter.sidecars.images import decode_all, of_one_size
 from vram_arbiter.sidecars.weights import Weights, read_config
 
 _OWN_MODELS = (
@@ -140,12 +140,7 @@ def _pictures(call: ScoreOp) -> Any:
         shape = (-1, call.height, call.width, BYTES_A_PIXEL)
         stack = np.frombuffer(call.frames, np.uint8).reshape(shape)[..., ::-1]
     else:
-        taken = decode_all(call.images)
-        if len({picture.size for picture in taken}) > 1:
-            sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in taken}))
-            raise BadRequest(
-                f"pictures of different sizes: {sizes}", hint="send one camera's pictures"
-            )
+        taken = of_one_size(decode_all(call.images))
         stack = np.stack([np.asarray(picture) for picture in taken])
     return (
         torch.from_numpy(np.ascontiguousarray(stack)).permute(0, 3, 1, 2).to(torch.float32)[None]

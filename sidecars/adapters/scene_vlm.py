@@ -1,17 +1,19 @@
-"""Questions about a picture through transformers' image-text-to-text classes.
+"""Questions about pictures and short videos through transformers' image-text-to-text classes.
 
-These are Qwen3.5 and others.
+These are Qwen2.5-VL, Qwen3-VL, Qwen3.5, LLaVA-OneVision, SmolVLM and others.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
+from vram_arbiter.schemas.errors import BadRequest, LimitExceeded, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QueryOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.inputs import to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
-from vram_arbiter.sidecars.images import decode, within
+from vram_arbiter.sidecars.images import decode_all, of_one_size, within
 from vram_arbiter.sidecars.weights import (
     Weights,
     from_pretrained,
@@ -19,13 +21,14 @@ from vram_arbiter.sidecars.weights import (
     transformers_modules,
 )
 
-ANSWER_MAX_S = (
-    120.0  # limit of one answer, as by max_new_tokens: below the time that counts as stuck
-)
+# limit of one answer, as by max_new_tokens: below the time that counts as stuck
+ANSWER_MAX_S: Final = 120.0
+# limit of a question with its pictures: the bytes of the cache grow with it, beside the footprint
+PROMPT_MAX_TOKENS: Final = 16_384
 
 
 class SceneVlmAdapter:
-    """The op `query`: a picture and a question in, the answer out.
+    """The op `query`: pictures, a video and a question in, the answer out.
 
     Greedy, so the same question gets the same answer.
     """
@@ -51,6 +54,14 @@ class SceneVlmAdapter:
         MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING.get(
             type(config), None
         )  # imports the model's code, which saves seconds under the lease
+        try:
+            self._prompt([{"type": "text", "text": "?"}])
+        except Exception as error:
+            raise ModelError(
+                f"{self._weights.source}: its chat template cannot be used: {error}",
+                hint="take a checkpoint that was trained on questions (instruct), with its "
+                "chat_template",
+            ) from error
 
     def load(self, device: str) -> None:
         from transformers import AutoModelForImageTextToText
@@ -67,31 +78,125 @@ class SceneVlmAdapter:
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, QueryOp)
-        picture = within(decode(call.image), call.max_side)
-        return {"ok": True, "answer": self._answer(picture, call.question, call.max_new_tokens)}
+        single = [] if call.image is None else [call.image]
+        pictures = [
+            within(picture, call.max_side)
+            for picture in decode_all([*single, *call.images, *call.video])
+        ]
+        count = len(pictures) - len(call.video)
+        inputs, thinks = self._inputs(
+            pictures[:count], of_one_size(pictures[count:]), call.fps, call.question
+        )
+        text = self._generate(inputs, call.max_new_tokens)
+        # a template may have opened the thought at the end of the prompt
+        return {"ok": True, "answer": after_thinking(f"<think>{text}" if thinks else text)}
 
-    def _answer(self, picture: Any, question: str, max_new_tokens: int) -> str:
+    def _inputs(
+        self, images: Sequence[Any], video: Sequence[Any], fps: float | None, question: str
+    ) -> tuple[Any, bool]:
+        """Return the model's inputs, and whether the prompt ends in the middle of a thought."""
+        processor = self._processor
+        self._refuse_unreadable(images, video, question)
+        content = [{"type": "image"} for _ in images]
+        content += [{"type": "video"}] if video else []
+        prompt = self._prompt([*content, {"type": "text", "text": question}])
+        given: dict[str, Any] = {"images": [list(images)]} if images else {}  # of one prompt
+        if video:
+            given |= _video(video, fps)
+        inputs = processor(text=[prompt], return_tensors="pt", **given)
+        return to_model(inputs, self._model), "<think>" in prompt.rpartition("</think>")[2]
+
+    def _prompt(self, content: Sequence[Message]) -> str:
+        """Return the user's turn and the begin of the answer, as the checkpoint's template says."""
+        template = self._processor.chat_template
+        # thinking would use up the tokens of the answer
+        known = {"enable_thinking": False} if "enable_thinking" in str(template) else {}
+        return str(
+            self._processor.apply_chat_template(
+                [{"role": "user", "content": list(content)}],
+                add_generation_prompt=True,
+                tokenize=False,
+                **known,
+            )
+        )
+
+    def _refuse_unreadable(
+        self, images: Sequence[Any], video: Sequence[Any], question: str
+    ) -> None:
+        """Raise BadRequest for what this model's processor cannot read, or would read wrongly."""
+        processor = self._processor
+        for name in ("image_token", "video_token"):
+            if (token := getattr(processor, name, None)) and token in question:
+                raise BadRequest(
+                    f"the question has {token}, which stands for a picture in the prompt",
+                    hint="ask in plain words; pictures are put before the question",
+                )
+        if not video:
+            return
+        if getattr(processor, "video_processor", None) is None:
+            raise BadRequest(
+                f"{type(processor).__name__} reads no video",
+                hint="send the frames as `images`",
+            )
+        if images and self._model.config.model_type == "smolvlm":  # it would drop the video
+            raise BadRequest(
+                "SmolVLM reads pictures or a video, not both",
+                hint="send all of them as `images`",
+            )
+
+    def _generate(self, inputs: Any, max_new_tokens: int) -> str:
         import torch
 
-        content = [{"type": "image"}, {"type": "text", "text": question}]
-        prompt = self._processor.apply_chat_template(
-            [{"role": "user", "content": content}],
-            add_generation_prompt=True,
-            tokenize=False,
-            # for templates that know it; thinking would use up the tokens of the answer
-            enable_thinking=False,
-        )
-        inputs = self._processor(text=[prompt], images=[picture], return_tensors="pt").to(
-            self._model.device
-        )
+        asked = inputs["input_ids"].shape[1]
+        context = getattr(self._model.config.get_text_config(), "max_position_embeddings", None)
+        limit = min(PROMPT_MAX_TOKENS, (context or PROMPT_MAX_TOKENS) - max_new_tokens)
+        if asked > limit:
+            raise LimitExceeded(
+                f"the question and its pictures have {asked} tokens; with an answer of "
+                f"{max_new_tokens} this model reads {limit}",
+                hint="send fewer pictures, or lower max_side",
+                details={"limit": "tokens", "tokens": asked, "tokens_max": limit},
+            )
         with torch.inference_mode():
             output = self._model.generate(
                 **inputs, max_new_tokens=max_new_tokens, do_sample=False, max_time=ANSWER_MAX_S
             )
-        answer = output[0, inputs["input_ids"].shape[1] :]
-        return after_thinking(self._processor.decode(answer, skip_special_tokens=True))
+        return str(self._processor.decode(output[0, asked:], skip_special_tokens=True))
+
+
+def _video(frames: Sequence[Any], fps: float | None) -> dict[str, Any]:
+    """Return a processor's arguments for a video all of whose frames are looked at."""
+    import numpy as np
+    from transformers.video_utils import VideoMetadata
+
+    assert fps is not None, "the message's own check"
+    count = len(frames)
+    metadata = VideoMetadata(
+        total_num_frames=count,
+        fps=fps,
+        width=frames[0].width,
+        height=frames[0].height,
+        duration=count / fps,
+        frames_indices=list(range(count)),
+    )
+    return {
+        "videos": [[np.stack([np.asarray(frame) for frame in frames])]],
+        "do_sample_frames": False,
+        "video_metadata": [metadata],
+    }
 
 
 def after_thinking(text: str) -> str:
-    """Return the answer proper: the text after the last `</think>`, if there is one."""
-    return text.rpartition("</think>")[2].strip()
+    """Return the answer proper: the text after the last thought.
+
+    Raises: LimitExceeded if the tokens ended in the middle of a thought. There is no answer then,
+    and an empty one would be taken for one.
+    """
+    answer = text.rpartition("</think>")[2]
+    if "<think>" in answer:
+        raise LimitExceeded(
+            "the model has used all tokens for thinking",
+            hint="raise max_new_tokens, or use a checkpoint that does not think",
+            details={"limit": "max_new_tokens"},
+        )
+    return answer.strip()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.schemas.errors import BadRequest, LimitExceeded
 from vram_arbiter.schemas.sidecar import QueryOp
 from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter, after_thinking
 
@@ -10,6 +10,9 @@ from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter, after_thin
 def test_only_what_follows_the_last_thought_is_the_answer():
     assert after_thinking("hm</think> no, wait</think>\n\nyes ") == "yes"
     assert after_thinking("yes") == "yes"
+    for unclosed in ("<think>hm", "<think>hm</think> well <think>"):
+        with pytest.raises(LimitExceeded, match="raise max_new_tokens"):
+            after_thinking(unclosed)
 
 
 @pytest.mark.heavy
