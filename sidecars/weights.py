@@ -45,6 +45,7 @@ class Weights:
     revision: str | None = None
     local: bool = False
     processors: ProcessorFiles | None = None
+    own_code: bool = False  # the checkpoint's own Python files may be run
 
 
 def resolve(uri: str, configs: Path) -> Weights:
@@ -176,6 +177,8 @@ def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:
         options["local_files_only"] = True
     elif weights.revision:
         options["revision"] = weights.revision
+    if cls.__module__.startswith("transformers."):
+        options["trust_remote_code"] = weights.own_code  # unsaid, it asks at the terminal
     with fitting(cls, weights):
         return cls.from_pretrained(weights.source, **options)
 

@@ -4,8 +4,9 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import DetectorEngine, Runtime
 from vram_arbiter.sidecars.adapters.base import ModelAdapter
-from vram_arbiter.sidecars.adapters.detector import DetectorAdapter
+from vram_arbiter.sidecars.adapters.detector import ZERO_SHOT_LOADER, DetectorAdapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter, is_passthrough
+from vram_arbiter.sidecars.adapters.locate_anything import LOADER, LocateAnythingAdapter
 from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.reward import RewardAdapter
 from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter
@@ -28,6 +29,14 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
             raise ConfigError(
                 f"{manifest.name}: detector engine {engine} is not served",
                 hint="use engine zeroshot_hf",
+            )
+        loader = manifest.quantization.extra.get("loader")
+        if loader == LOADER:
+            return LocateAnythingAdapter(manifest, weights)
+        if loader not in (None, ZERO_SHOT_LOADER):
+            raise ConfigError(
+                f"{manifest.name}: quantization.extra.loader {loader!r} is not served",
+                hint=f"write {ZERO_SHOT_LOADER}, or {LOADER} for LocateAnything",
             )
         return DetectorAdapter(manifest, weights)
     if manifest.kind is Kind.VLM:
