@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable
 from typing import Self
 
+from vram_arbiter.clients.foreign.program import Program
+
 FORWARDED = (
     signal.SIGTERM,
     signal.SIGHUP,
@@ -32,7 +34,7 @@ class Forwarding:
 
     def __init__(self, asked_to_end: Callable[[signal.Signals], None]) -> None:
         self._asked_to_end = asked_to_end
-        self._child: asyncio.subprocess.Process | None = None
+        self._program: Program | None = None
         self._early: list[signal.Signals] = []
         self._over = False
         self._loop = asyncio.get_running_loop()
@@ -45,9 +47,9 @@ class Forwarding:
             self._loop.add_signal_handler(number, self._heard, number)
         return self
 
-    def to(self, child: asyncio.subprocess.Process) -> None:
+    def to(self, program: Program) -> None:
         """It has started. Signals of its terminal are blocked here from now on."""
-        self._child = child
+        self._program = program
         if self._listener.ident is None:
             signal.pthread_sigmask(signal.SIG_BLOCK, TYPED)
             self._listener.start()
@@ -79,7 +81,7 @@ class Forwarding:
         self._forward(number)
 
     def _forward(self, number: signal.Signals) -> None:
-        if self._child is None:
+        if self._program is None:
             self._early.append(number)
-        elif self._child.returncode is None:
-            self._child.send_signal(number)
+        else:
+            self._program.send_signal(number)

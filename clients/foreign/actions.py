@@ -30,6 +30,11 @@ class Action(Protocol):
         """Whether the weights stay in host RAM while it is away."""
         ...
 
+    @property
+    def suspends(self) -> bool:
+        """Whether the program stands still while it is away, and may not react to signals."""
+        ...
+
     def check(self) -> None:
         """Look for what the action needs of this machine. Raises CheckpointUnsupported."""
         ...

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 from vram_arbiter.clients.foreign.actions import Deadline
 from vram_arbiter.schemas.errors import ActionFailed, CheckpointUnsupported
@@ -63,9 +63,10 @@ class CheckpointAction:
     timeout_s: float
     machine: str = platform.machine()
     proc: Path = procfs.PROC
-    name: str = "cuda-checkpoint"
-    keeps_context: bool = False
-    parks: bool = True
+    name: ClassVar = "cuda-checkpoint"
+    keeps_context: ClassVar = False
+    parks: ClassVar = True
+    suspends: ClassVar = True
 
     def check(self) -> None:
         if self.machine != MACHINE:

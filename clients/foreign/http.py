@@ -10,7 +10,7 @@ import ipaddress
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
 from vram_arbiter.clients.foreign.actions import Deadline
@@ -116,15 +116,15 @@ def call_json(request: Request, deadline: Deadline) -> object:
 
 @dataclass(frozen=True, slots=True)
 class HttpAction:
-    """A request that frees, and one that restores, if any. `parks`: the weights stay in host
-    RAM."""
+    """A request that frees, and one that restores, if any."""
 
     freeing: Request
     restoring: Request | None
     timeout_s: float
-    parks: bool = False
-    name: str = "http"
-    keeps_context: bool = True
+    name: ClassVar = "http"
+    keeps_context: ClassVar = True
+    parks: ClassVar = False
+    suspends: ClassVar = False
 
     def check(self) -> None:
         """It needs nothing of this machine."""

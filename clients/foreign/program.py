@@ -34,8 +34,13 @@ class Program:
     """One run of a program. `stopping`: it is ended to make room, and is to be started again."""
 
     def __init__(self, child: asyncio.subprocess.Process, others: frozenset[int]) -> None:
-        self.child = child
+        self.pid = child.pid
+        self._child = child
         self.stopping = False
+        try:
+            self._pidfd: int | None = os.pidfd_open(child.pid)
+        except ProcessLookupError:
+            self._pidfd = None  # it has ended, and asyncio knows
         self._others = others  # children of this process that are not the program's
 
     @classmethod
@@ -57,22 +62,36 @@ class Program:
 
     @property
     def running(self) -> bool:
-        return self.child.returncode is None
+        return self._child.returncode is None
 
     async def wait(self) -> int:
         """Return the exit code of the program itself, -n after signal n."""
-        return await self.child.wait()
+        code = await self._child.wait()
+        if self._pidfd is not None:
+            os.close(self._pidfd)
+            self._pidfd = None
+        return code
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Signal the program unless it has ended.
+
+        Through its pidfd: asyncio's own `send_signal`, in Python 3.12.1 at least, takes the exit
+        status of a program that has just ended, and 255 is reported.
+        """
+        if self._pidfd is not None:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pidfd, number)
 
     async def end(self, grace_s: float | None) -> bool:
         """Send SIGTERM, and SIGKILL after the grace. Return whether it needed SIGKILL."""
         if not self.running:
             return False
-        self.child.terminate()
+        self.send_signal(signal.SIGTERM)
         try:
-            await asyncio.wait_for(self.child.wait(), grace_s)
+            await asyncio.wait_for(self.wait(), grace_s)
         except TimeoutError:
-            self.child.kill()
-            await self.child.wait()
+            self.send_signal(signal.SIGKILL)
+            await self.wait()
             return True
         return False
 
@@ -105,13 +124,13 @@ class Program:
         with contextlib.suppress(ChildProcessError):
             options = os.WEXITED | os.WNOHANG | os.WNOWAIT
             while ended := os.waitid(os.P_ALL, 0, options):
-                if ended.si_pid in self._others or ended.si_pid == self.child.pid:
+                if ended.si_pid in self._others or ended.si_pid == self.pid:
                     return  # asyncio's; the next call goes on
                 os.waitpid(ended.si_pid, os.WNOHANG)
 
     def _orphans(self) -> set[int]:
         self.reap()
-        return set(self.tree()) - {self.child.pid}
+        return set(self.tree()) - {self.pid}
 
 
 def _children() -> dict[int, list[int]]:

@@ -28,6 +28,7 @@ class Server:
     default_url: ClassVar[str]
     parks: ClassVar[bool] = False
     keeps_context: ClassVar[bool] = True
+    suspends: ClassVar[bool] = False
 
     def check(self) -> None:
         """It needs nothing of this machine."""

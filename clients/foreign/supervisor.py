@@ -40,6 +40,7 @@ type OnRevoke = Literal["priority", "term", "pin"]
 PATIENCE_S: Final = 1.0
 FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
 BUSY_POLL_S: Final = 0.5
+SUSPENDED_GRACE_S: Final = 5.0
 NO_LEASE: Final = "its lease is over"
 
 
@@ -98,7 +99,7 @@ def lease_spec(spec: RunSpec) -> LeaseSpec:
 class Forwards(Protocol):
     """Passes signals on (`clients.cli.signals.Forwarding`)."""
 
-    def to(self, child: asyncio.subprocess.Process) -> None: ...
+    def to(self, program: Program) -> None: ...
 
 
 class Supervisor:
@@ -116,6 +117,7 @@ class Supervisor:
         self._tasks: set[asyncio.Task[None]] = set()
         self._wake = asyncio.Event()
         self._leave = asyncio.Event()  # the program is to make room, and comes back
+        self._away = False  # its action has freed its memory
         self._ending = False  # it is made to end for good
         self._reason = NO_LEASE  # said when the program is made to leave
         self._told: set[str] = set()  # waiters that were named to the user
@@ -150,9 +152,12 @@ class Supervisor:
         return code
 
     def asked_to_end(self, number: signal.Signals) -> None:
-        """Take a signal that asks the program to end: it is not started again."""
-        if self._program is not None and self._program.stopping:
+        """Take a signal that asks the program to end: it is not started again, and not resumed."""
+        program, action = self._program, self._spec.action
+        if program is not None and program.stopping:
             self._finish(-number)
+        elif program is not None and action is not None and action.suspends and self._away:
+            self._spawn(self._end_suspended(program))
 
     @property
     def lease(self) -> AsyncLease:
@@ -165,7 +170,7 @@ class Supervisor:
             self._path, self._spec.command[1:], _environ(self.lease)
         )
         assert self._signals is not None
-        self._signals.to(self._program.child)
+        self._signals.to(self._program)
         self._spawn(self._until_exit(self._program))
 
     async def _until_exit(self, program: Program) -> None:
@@ -184,6 +189,12 @@ class Supervisor:
             say(f"it did not end within {self._spec.grace_s:g} s and was killed")
         if program.stopping and (count := await program.end_orphans()):
             say(f"ended {count} of its processes that outlived it")
+
+    async def _end_suspended(self, program: Program) -> None:
+        """End a program that waits in CUDA calls, where its own handlers may not run."""
+        grace_s = SUSPENDED_GRACE_S if self._spec.grace_s is None else self._spec.grace_s
+        if await program.end(grace_s):
+            say(f"it is suspended, did not end within {grace_s:g} s, and was killed")
 
     def _finish(self, code: int) -> None:
         if not self._over.done():
@@ -278,6 +289,7 @@ class Supervisor:
             say(f"{error}; its lease is released, and the program goes on without one")
             await self.lease.release()
             return False
+        self._away = False
         say("there is room again: restored")
         return True
 
@@ -314,8 +326,10 @@ class Supervisor:
         await self._quiesce(action)
         say(f"{self._reason}; freeing by {action.name}")
         try:
+            self._away = True
             await _in_thread(action.free, program.tree())
         except VramError as error:
+            self._away = False
             say(f"{error}; the arbiter measures what the program keeps: vramctl status")
 
     async def _quiesce(self, action: Action) -> None:
@@ -345,8 +359,8 @@ class Supervisor:
                 assert isinstance(status, StatusReply)
                 self._measure(status)
                 self._decide(status)
-            if self._program is not None and self._spec.comes_back:
-                self._program.reap()
+            if self._program is not None and self._program.running and self._spec.comes_back:
+                self._program.reap()  # not while its successor is started, whose status it could take
             pause_s = LOOK_S
 
     def _measure(self, status: StatusReply) -> None:

@@ -72,7 +72,6 @@ class GrantsAtOnce:
         """End the newest lease, as after its TTL."""
         assert self._server is not None
         assert self._peer is not None
-        number = self.grants
-        error = LeaseLost(f"L1-{number} expired").to_wire()
-        lease = {"lease_id": f"L1-{number}", "token": [1, 1 + number]}
+        lease = {"lease_id": f"L1-{self.grants}", "token": [1, 1 + self.grants]}
+        error = LeaseLost(f"L1-{self.grants} expired").to_wire()
         await self._server.send(self._peer, {"push": "lost", "epoch": 1, **lease, "error": error})

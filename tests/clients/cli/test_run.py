@@ -19,6 +19,7 @@ import pytest
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.foreign.program import Program
 from vram_arbiter.clients.foreign.supervisor import RunSpec, Supervisor
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -328,8 +329,8 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     spec = RunSpec(command, "job", 1 << 30, "any", 40, None, False, "priority", None)
 
     class Signals:
-        def to(self, child: asyncio.subprocess.Process) -> None:
-            self.child = child
+        def to(self, program: Program) -> None:
+            self.program = program
 
     async with (
         asyncio.timeout(PATIENCE_S),
@@ -341,6 +342,6 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
         ended = asyncio.create_task(run.until_ended())
         while not run.peak_bytes:
             await asyncio.sleep(0.05)
-        signals.child.terminate()
+        signals.program.send_signal(signal.SIGTERM)
         assert await ended == 0
     assert "peak 2 GiB measured of 1 GiB asked, more than was asked for" in capfd.readouterr().err

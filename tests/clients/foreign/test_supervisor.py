@@ -1,7 +1,7 @@
 """A program and its leases, with an action that only takes notes."""
 
 import asyncio
-import contextlib
+import signal
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 
@@ -10,6 +10,7 @@ import pytest
 from tests.support.grants_at_once import GrantsAtOnce
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.foreign.program import Program
 from vram_arbiter.clients.foreign.supervisor import OnRevoke, RunSpec, Supervisor
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -26,7 +27,8 @@ class Notes:
     name = "notes"
     keeps_context = parks = False
 
-    def __init__(self) -> None:
+    def __init__(self, suspends: bool = False) -> None:
+        self.suspends = suspends
         self.did: list[str] = []
         self.work: list[int] = []
 
@@ -46,31 +48,30 @@ class Notes:
 class Signals:
     """Signals that nobody sends."""
 
-    child: asyncio.subprocess.Process
+    program: Program
 
-    def to(self, child: asyncio.subprocess.Process) -> None:
-        self.child = child
+    def to(self, program: Program) -> None:
+        self.program = program
 
 
 @asynccontextmanager
 async def supervised(
     client: AsyncClient, action: Notes, on_revoke: OnRevoke = "term", grace_s: float | None = None
 ) -> AsyncIterator[Supervisor]:
-    """A program of 5 GiB until the block ends."""
-    command = ["sleep", "1000"]
+    """A program of 5 GiB, deaf to SIGTERM, until the block ends."""
+    command = ["sh", "-c", "trap '' TERM; exec sleep 1000"]
     spec = RunSpec(
         command, "job", 5 << 30, "any", 40, None, False, on_revoke, grace_s, action=action
     )
-    supervisor, signals = Supervisor(spec, client, "/bin/sleep"), Signals()
+    supervisor, signals = Supervisor(spec, client, "/bin/sh"), Signals()
     await supervisor.acquire()
     await supervisor.start(signals)
     ended = asyncio.create_task(supervisor.until_ended())
     try:
         yield supervisor
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            signals.child.kill()
-        assert await ended == -9
+        signals.program.send_signal(signal.SIGKILL)
+        assert await ended == -signal.SIGKILL
 
 
 async def test_requests_in_progress_are_waited_for(
@@ -134,3 +135,21 @@ async def test_a_lease_that_was_lost_is_replaced(until: Until) -> None:
         await until(lambda: arbiter.grants == 2 and run.lease.state == "held")
         assert action.did == ["look", "free 1", "restore 1"]
         assert run.lease.lease_id == "L1-2"
+
+
+async def test_a_suspended_program_that_does_not_react_is_ended(
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It waits in a CUDA call, and Ctrl-C would have to wait for room on the GPU."""
+    action = Notes(suspends=True)
+    async with (
+        asyncio.timeout(PATIENCE_S),
+        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
+        supervised(client, action, grace_s=0.1) as run,
+    ):
+        await until(lambda: run.lease.state == "held")
+        run.asked_to_end(signal.SIGTERM)  # the program hears that itself
+        await client.acquire(spec("b", 5), PATIENCE_S)
+        run.asked_to_end(signal.SIGTERM)
+        await until(lambda: run.lease.state == "gone")
+    assert "it is suspended, did not end within 0.1 s" in capfd.readouterr().err
