@@ -74,10 +74,11 @@ def check(wanted: Wanted) -> list[Finding]:
         family = _bad("family", error)
     findings.append(family)
     findings.append(packages := _packages(manifest))
-    precision = Finding("precision", None, "not checked: packages are missing")
     if refused is not None:
         precision = _bad("precision", refused)
-    elif packages.ok:
+    elif importlib.util.find_spec("torch") is None:
+        precision = Finding("precision", None, "not checked: torch is not installed")
+    else:
         precision = _precision(manifest, wanted.device)
     findings.append(precision)
     comparable = adapter is not None and packages.ok and precision.ok

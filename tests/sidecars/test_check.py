@@ -1,5 +1,6 @@
 """`vram-sidecar --check`: every reason why a model cannot be served, before anything is loaded."""
 
+import importlib.util
 import json
 import shutil
 from collections.abc import Callable
@@ -14,10 +15,12 @@ from vram_arbiter.schemas.errors import ModelError, NoGpu, UnsupportedQuantizati
 from vram_arbiter.schemas.manifest import Kind, load_manifest
 from vram_arbiter.sidecars.__main__ import main
 from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
 from vram_arbiter.sidecars.device.capacity import capacities
 
 GIB = 2**30
 CONFIGS = Path(__file__).parents[2] / "configs"
+PAGE = (CONFIGS.parent / "docs/models.md").read_text(encoding="utf-8")
 SHIPPED = sorted(CONFIGS.glob("rskills/*/rskill.yaml"))
 HEAD = (
     "version: 0.1.0\nembodiment_tags: [any]\nchunk_size: 1\ndescription: d\n"
@@ -66,7 +69,7 @@ FIELD = {  # what decides in the field's files, and the findings that must be ba
     "rldx1-ft-rc365-nf4": (
         of_hub(RLDX) + processors(RLDX) + INT4 + ARM + "license: rlwrld_non_commercial\nkind: vla\n"
         "model_family: rldx\nactions: [pick]\nmin_vram_gb: {int4: 7.0}\n",
-        {"license", "weights"},
+        {"license", "family", "weights"},
     ),
     "rskill-nav2-navigate-to-pose": (
         "name: OpenRAL/rskill-nav2-navigate-to-pose\nlicense: apache-2.0\nkind: ros_action\n"
@@ -164,9 +167,24 @@ def test_a_shipped_manifest_lacks_at_most_its_weights(check: Check, path: Path) 
     if manifest.weights_uri is None:
         assert manifest.kind in (Kind.ROS_ACTION, Kind.ROS_SERVICE)
         return
-    assert bad(findings) == (set() if here else {"weights"})
-    assert code == (0 if here else 2)
+    lacking = set() if here else {"weights"}
+    family = FAMILIES.get(manifest.model_family)
+    if family and not all(map(importlib.util.find_spec, family.packages)):
+        lacking.add("packages")
+    assert bad(findings) == lacking
+    assert code == (2 if lacking else 0)
+    if not here:
+        row = next(line for line in PAGE.splitlines() if f"`{path.parent.name}`" in line)
+        assert f"| {manifest.quantization.dtype} |" in row
     assert "min_vram_gb" not in findings["footprint"]["says"], "on file, not only declared"
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_page_names_every_policy_family(name: str) -> None:
+    family = FAMILIES[name]
+    row = next(line for line in PAGE.splitlines() if line.startswith(f"| `{name}` |"))
+    for word in (*family.types, *family.packages, *family.precisions):
+        assert word in row
 
 
 DETECTOR = (
