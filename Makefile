@@ -26,8 +26,8 @@ WORKERS ?= 2
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-gpu test-core nightly mutation lint format chaos sim bench \
-	schemas install-units clean
+.PHONY: help setup setup-core demo test test-core test-gpu nightly mutation lint format chaos sim \
+	bench bench-switch schemas install-units clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -76,6 +76,9 @@ sim: setup ## the daemon under simulated faults: SEED=n one run, SEEDS=1000 many
 
 bench: setup ## latencies beside bare ZeroMQ and Redis locks: QUICK=1 is shorter
 	$(TOOL) tests/bench/run.py $(if $(QUICK),--quick) $(ARGS)
+
+bench-switch: setup ## how fast a model of 500 MB is loaded, restored and evicted: QUICK=1 is shorter
+	$(TOOL) tests/bench/bench_switch.py $(if $(QUICK),--quick) $(ARGS)
 
 schemas: setup ## write the JSON Schemas after a model changed
 	$(BIN)/python -m vram_arbiter.schemas export schemas/json

@@ -24,7 +24,8 @@ def bytes_alphabet():
     return sorted(ByteLevel.alphabet())
 
 
-def save_owlvit(folder: Path) -> None:
+def save_owlvit(folder: Path, **vision: int) -> None:
+    """`vision`: of its vision tower, where the model is to be larger."""
     import torch
     from transformers import (
         CLIPTokenizer,
@@ -57,7 +58,7 @@ def save_owlvit(folder: Path) -> None:
         text_config=small | {"vocab_size": len(tokens), "max_position_embeddings": 16,
         "pad_token_id": 0,
                              "bos_token_id": len(tokens) - 2, "eos_token_id": len(tokens) - 1},
-        vision_config=small | {"image_size": 64, "patch_size": 16},
+        vision_config=small | {"image_size": 64, "patch_size": 16} | vision,
         projection_dim=32,
     )  # fmt: skip
     model = OwlViTForObjectDetection(config)
@@ -66,7 +67,8 @@ def save_owlvit(folder: Path) -> None:
     model.save_pretrained(folder)
 
 
-def save_qwen(folder: Path) -> None:
+def save_qwen(folder: Path, **text: object) -> None:
+    """`text`: of its language model, where the model is to be larger."""
     import torch
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers
     from transformers import (
@@ -118,10 +120,10 @@ def save_qwen(folder: Path) -> None:
                      "layer_types": ["linear_attention", "full_attention"],
                      "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0,
                      "mrope_section": [2, 1, 1],
-                                         "mrope_interleaved": True, "partial_rotary_factor": 0.5}},
+                                         "mrope_interleaved": True, "partial_rotary_factor": 0.5}} | text,
         vision_config={"depth": 1, "hidden_size": 32, "intermediate_size": 64, "num_heads": 2,
         "patch_size": 8,
-                       "out_hidden_size": 32, "num_position_embeddings": 64},
+                       "out_hidden_size": text.get("hidden_size", 32), "num_position_embeddings": 64},
         image_token_id=ids("<|image_pad|>"), video_token_id=ids("<|video_pad|>"),
         vision_start_token_id=ids("<|vision_start|>"), vision_end_token_id=ids("<|vision_end|>"),
     )  # fmt: skip
@@ -131,7 +133,7 @@ def save_qwen(folder: Path) -> None:
     model.save_pretrained(folder)
 
 
-def save_act(folder: Path) -> None:
+def save_act(folder: Path, **larger: int) -> None:
     import torch
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -145,9 +147,9 @@ def save_act(folder: Path) -> None:
             "observation.state": PolicyFeature(FeatureType.STATE, (6,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (6,))},
-        pretrained_backbone_weights=None, dim_model=32, n_heads=2, dim_feedforward=32,
-        n_encoder_layers=1,
-        n_vae_encoder_layers=1, chunk_size=5, n_action_steps=5, device="cpu",
+        pretrained_backbone_weights=None, n_vae_encoder_layers=1, chunk_size=5, n_action_steps=5,
+        device="cpu",
+        **{"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1} | larger,
     )  # fmt: skip
     ones = torch.ones(6)
     stats = {
