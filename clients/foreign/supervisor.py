@@ -144,7 +144,7 @@ class Supervisor:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._program is not None:
-            await self._program.end(self._spec.grace_s)  # where it has not ended itself
+            await self._program.end(self._grace_s)  # where it has not ended itself
             if self._spec.comes_back:
                 await self._program.end_orphans()
         self._say_peak()
@@ -153,16 +153,26 @@ class Supervisor:
 
     def asked_to_end(self, number: signal.Signals) -> None:
         """Take a signal that asks the program to end: it is not started again, and not resumed."""
-        program, action = self._program, self._spec.action
+        program = self._program
         if program is not None and program.stopping:
             self._finish(-number)
-        elif program is not None and action is not None and action.suspends and self._away:
+        elif program is not None and self._suspended:
             self._spawn(self._end_suspended(program))
 
     @property
     def lease(self) -> AsyncLease:
         assert self._lease is not None, "not acquired yet"
         return self._lease
+
+    @property
+    def _suspended(self) -> bool:
+        """Whether the program waits in CUDA calls, where its own signal handlers may not run."""
+        return self._spec.action is not None and self._spec.action.suspends and self._away
+
+    @property
+    def _grace_s(self) -> float | None:
+        given = self._spec.grace_s
+        return SUSPENDED_GRACE_S if given is None and self._suspended else given
 
     # -- the program
     async def _start(self) -> None:
@@ -191,8 +201,7 @@ class Supervisor:
             say(f"ended {count} of its processes that outlived it")
 
     async def _end_suspended(self, program: Program) -> None:
-        """End a program that waits in CUDA calls, where its own handlers may not run."""
-        grace_s = SUSPENDED_GRACE_S if self._spec.grace_s is None else self._spec.grace_s
+        grace_s = self._grace_s
         if await program.end(grace_s):
             say(f"it is suspended, did not end within {grace_s:g} s, and was killed")
 

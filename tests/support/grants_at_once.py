@@ -9,7 +9,7 @@ from typing import Any, Literal
 from tests.support import protocol_wire
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.defaults import WIRE_VERSION
-from vram_arbiter.schemas.errors import LeaseLost, VramError
+from vram_arbiter.schemas.errors import LeaseLost, VramError, VramInsufficient
 from vram_arbiter.schemas.plain import Message
 
 WELCOME = {
@@ -30,6 +30,7 @@ class GrantsAtOnce:
         self.heard: list[str] = []
         self.refused = asyncio.Event()
         self.grants = 0
+        self.grants_max: int | None = None  # further requests are denied
         self._server: RouterServer | None = None
         self._peer: Peer | None = None
 
@@ -60,6 +61,8 @@ class GrantsAtOnce:
         match message["op"]:
             case "hello":
                 return {"ok": True, **WELCOME}
+            case "acquire" if self.grants == self.grants_max:
+                return {"ok": False, "error": VramInsufficient("too large").to_wire()}
             case "acquire":
                 self.grants += 1
                 view = protocol_wire.view(f"L1-{self.grants}", [1, 1 + self.grants])

@@ -56,7 +56,11 @@ class Signals:
 
 @asynccontextmanager
 async def supervised(
-    client: AsyncClient, action: Notes, on_revoke: OnRevoke = "term", grace_s: float | None = None
+    client: AsyncClient,
+    action: Notes,
+    on_revoke: OnRevoke = "term",
+    grace_s: float | None = None,
+    code: int = -signal.SIGKILL,
 ) -> AsyncIterator[Supervisor]:
     """A program of 5 GiB, deaf to SIGTERM, until the block ends."""
     command = ["sh", "-c", "trap '' TERM; exec sleep 1000"]
@@ -70,8 +74,10 @@ async def supervised(
     try:
         yield supervisor
     finally:
-        signals.program.send_signal(signal.SIGKILL)
-        assert await ended == -signal.SIGKILL
+        if code < 0:
+            signals.program.send_signal(signal.SIGKILL)
+        assert await ended == code
+        assert not signals.program.running
 
 
 async def test_requests_in_progress_are_waited_for(
@@ -153,3 +159,17 @@ async def test_a_suspended_program_that_does_not_react_is_ended(
         run.asked_to_end(signal.SIGTERM)
         await until(lambda: run.lease.state == "gone")
     assert "it is suspended, did not end within 0.1 s" in capfd.readouterr().err
+
+
+async def test_a_program_that_can_never_return_is_ended(capfd: pytest.CaptureFixture[str]) -> None:
+    """Suspended, it would stay for ever: its lease was lost, and a new one is denied."""
+    arbiter = GrantsAtOnce(ready="ok")
+    arbiter.grants_max = 1
+    async with (
+        asyncio.timeout(PATIENCE_S),
+        arbiter.serving() as endpoint,
+        AsyncClient("t", endpoint=endpoint) as client,
+        supervised(client, Notes(suspends=True), grace_s=0.1, code=1),
+    ):
+        await arbiter.lose()
+    assert "job cannot return: too large" in capfd.readouterr().err
