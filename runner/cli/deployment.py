@@ -178,7 +178,9 @@ def offered(
         elif why := manifest.license_refusal(allow_noncommercial=allow_noncommercial):
             refused[manifest.name] = why
         elif found and wanted != manifest.name:
-            refused[manifest.name] = "; ".join(problem for _, problem in found)
+            refused[manifest.name] = "; ".join(
+                problem.removeprefix(f"{manifest.name}: ") for _, problem in found
+            )
         else:
             kept.append(manifest)
     body = body_of(file.robot, parts.hal.description)

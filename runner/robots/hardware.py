@@ -286,9 +286,8 @@ class HardwareRobot:
 
 
 def with_base(world: WorldState, base: MobileBase) -> WorldState:
-    """Return the world state with pose and velocity of a base whose joints are in its joint state.
-
-    Unchanged where they are not: a base that is not measured has no pose.
+    """Return the world state with pose and velocity of a base instead of the base's joints, if its
+    joint state has them; a base that is not measured has no pose.
     """
     state = world.joint_state
     place = {name: index for index, name in enumerate(state.name)}
@@ -305,7 +304,19 @@ def with_base(world: WorldState, base: MobileBase) -> WorldState:
         quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
         frame_id=base.world_frame,
     )
-    return world.model_copy(update={"base_pose": pose, "base_twist": twist})
+    arm = [index for name, index in place.items() if name not in base.joints]
+    rows = {
+        field: tuple(values[index] for index in arm)
+        for field in ("name", "position", "velocity", "effort")
+        if (values := getattr(state, field))
+    }
+    return world.model_copy(
+        update={
+            "base_pose": pose,
+            "base_twist": twist,
+            "joint_state": state.model_copy(update=rows),
+        }
+    )
 
 
 HardwareRunner = ControlLoop[HardwareRobot]

@@ -76,13 +76,13 @@ class Command:
 class ActionPlan:
     """A contract resolved for one robot.
 
-    `joints` are those that it commands; `bounds` are the ends to which the policy's own numbers are
-    clipped (None: none has any). `notes` are parts of the contract that change nothing on this
+    `joints` are those that it commands. `scales` turn the policy's numbers into m and rad, `bounds`
+    are the ends to which they are clipped before (None: none has any). `notes` are parts of the contract that change nothing on this
     robot.
     """
 
     dim: int
-    scales: tuple[Scale, ...]
+    scales: tuple[Scale, ...] | None
     commands: tuple[Command, ...]
     joints: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...] | None = None
@@ -114,7 +114,7 @@ class ActionPlan:
         actions = actions[:most]
         if self.bounds is not None:
             actions = np.clip(actions, *np.array(self.bounds).T)
-        if any(scale != SAME for scale in self.scales):
+        if self.scales is not None:
             actions = actions * [s.scale for s in self.scales] + [s.offset for s in self.scales]
         return [tuple(map(float, row)) for row in actions]
 
@@ -563,7 +563,7 @@ def plan_actions(
     )
     plan = ActionPlan(
         len(resolver.scales),
-        tuple(resolver.scales),
+        None if set(resolver.scales) <= {SAME} else tuple(resolver.scales),
         tuple(resolver.commands),
         tuple(commanded),
         tuple(resolver.bounds.get(index, _ALL) for index in range(len(resolver.scales)))

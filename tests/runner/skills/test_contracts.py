@@ -2,20 +2,22 @@
 says of it, and a finding for whatever the robot cannot do.
 """
 
+import asyncio
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
 from tests.runner.manual_clock import ManualClock
+from tests.runner.small_robots import FedCamera
 from tests.support.paths import ROOT
-from vram_arbiter.runner.protocols import MobileBase, RobotDescription
+from vram_arbiter.runner.protocols import Goal, MobileBase, RobotDescription, SkillEnded
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.factory import make_hal
-from vram_arbiter.runner.robots.hardware import with_base
+from vram_arbiter.runner.robots.hardware import hardware_runner, with_base
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
 from vram_arbiter.runner.safety.gate import RobotGate
@@ -23,7 +25,7 @@ from vram_arbiter.runner.skills.actions import Stepper
 from vram_arbiter.runner.skills.kinematics import ArmModel, Pose3
 from vram_arbiter.runner.skills.motion import joint_positions
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers, turn
-from vram_arbiter.runner.skills.sidecar_policy import Wiring, wire_up
+from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, Wiring, wire_up
 from vram_arbiter.schemas.config.robot import load_robot
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ModelError, StateStale
@@ -38,6 +40,7 @@ from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
 from vram_arbiter.schemas.manifest.vocabulary import Rotation
 from vram_arbiter.schemas.world import Action, WorldState
 
+np: Any = pytest.importorskip("numpy")  # the base install has none
 pytest.importorskip("mink", reason="needs the solver of the extra `runner`")
 pytestmark = pytest.mark.heavy  # MuJoCo, mink
 
@@ -195,6 +198,9 @@ def test_the_fields_vector_drives_arm_gripper_and_base_at_once(panda: Bench) -> 
     assert panda.tool().xyz - before.xyz == pytest.approx([0, 0, 30 * 0.06 * 0.05], abs=3e-3)
     assert panda.measured()["panda_gripper"] == pytest.approx(0.0, abs=2e-3)
     world = panda.world()
+    assert (
+        world.joint_state.name == panda.robot.joint_names
+    )  # a recording's columns: each has a target
     assert world.base_pose is not None
     assert world.base_twist is not None
     turned = 0.5 * (1.0 + 0.2)
@@ -316,6 +322,79 @@ def test_raw_numbers_are_clipped_to_the_slots_bounds(panda: Bench) -> None:
         np.array([[3.0, -3.0, 0.5, 0, 0, 2.0, 0, 0, 0, 0, 0, 5.0]]), None
     )
     assert row[:6] == pytest.approx((0.05, -0.05, 0.025, 0.0, 0.0, 0.5))
+
+
+class Answers:
+    """Stands for a policy's sidecar: the same chunk to every observation."""
+
+    def __init__(self, row: list[float]) -> None:
+        self.row = row
+        self.states: list[Any] = []
+
+    async def load(self, **_: Any) -> dict[str, Any]:
+        return {"lease_id": None, "token": None}
+
+    async def reset(self, *_: Any, **__: Any) -> None: ...
+
+    async def get_action(self, observation: Any, **_: Any) -> dict[str, Any]:
+        self.states.append(observation["observation.state"])
+        return {"action": np.array([self.row] * 5)}
+
+    async def unload(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+def test_a_goal_of_the_fields_policy_runs_on_the_robot(
+    panda: Bench, run_async: Callable[[Any], Any]
+) -> None:
+    """Loop, skill, gate and twin as `vram-runner deploy` composes them."""
+    client: Any = Answers([0.1, 0, 0, 0, 0, 0, 1.0, 0.2, 0, 0, 0, 1.0])
+    text = FIELD_SLOTS.replace("LAYOUT", "human300_16d") + "policy_extras: {rollout_steps: 20}\n"
+    wiring = wire_up(skill(text), panda.robot, panda.robot.rest_pose_rad)
+    assert wiring.stepwise
+    policy = SidecarPolicy(
+        skill(text),
+        wiring,
+        client,
+        None,
+        period_s=1 / HZ,
+        wait_s=30.0,
+        speeds_rad_s=panda.gate.limits.speeds_rad_s,
+        sent=panda.hal.sent,
+    )
+    runner = hardware_runner(
+        panda.hal,
+        [(FedCamera("front", panda.clock), 100.0)],
+        lambda stepped: panda.gate.for_skill(stepped.manifest, stepped.cameras),
+        rate_hz=HZ,
+        clock=panda.clock,
+    )
+    ended: list[SkillEnded] = []
+    before = panda.tool().xyz[0]
+
+    async def play() -> None:
+        runner.activate()
+        goal = Goal("g", "test/contract", prompt="go")
+        await policy.start(goal)
+        runner.begin_skill(policy, goal, ended.append)
+        for _ in range(60):
+            await asyncio.to_thread(runner.tick)
+            panda.clock.advance(1 / HZ)
+        await policy.finish()
+        runner.deactivate()
+
+    run_async(play())
+    assert [(end.error, end.data["steps"], end.data["withheld"]) for end in ended] == [
+        (None, 20, 0)
+    ]
+    assert [state.shape for state in client.states] == [(16,)] * 4
+    panda.hal.connect()
+    assert panda.tool().xyz[0] - before == pytest.approx(20 * 0.1 * 0.05, abs=5e-3)
+    world = panda.world()
+    assert world.base_pose is not None
+    assert world.base_pose.xyz[0] == pytest.approx(0.2 * (20 / HZ + 0.2), abs=0.03)
+    assert client.states[-1][7] > 0.05, "the state tells where the base is"
 
 
 # -- limits
