@@ -109,9 +109,11 @@ class PolicyAdapter:
         self._config.device = device
         self._config.pretrained_path = self._weights.source
         policy = load_lerobot(self._policy_class, self._weights, self._config)
+        if device != META:
+            _need_trained(policy, self._weights.source)
         self._policy = policy if self._has_own_dtype else policy.to(torch_type(self._dtype))
         self._quantize(device)
-        self._make_processors("cpu")
+        self._make_processors()
         need_statistics(self._before, self._config.input_features, self._weights.source)
         need_statistics(self._after, self._config.output_features, self._weights.source)
         self._observations = Observations(
@@ -135,9 +137,15 @@ class PolicyAdapter:
     def place(self, device: str) -> None:
         self._config.device = self._device = device
         self._policy.to(device)
-        self._make_processors(device)
+        from lerobot.processor import DeviceProcessorStep
 
-    def _make_processors(self, device: str) -> None:
+        for step in self._before.steps:  # not read again: a tokenizer takes up to a second
+            if isinstance(step, DeviceProcessorStep):
+                step.device = device
+                step.__post_init__()
+
+    def _make_processors(self) -> None:
+        """Read the processors, for the CPU. Raises ModelError."""
         from lerobot.policies.factory import make_pre_post_processors
 
         files = self._weights.processors or ProcessorFiles(
@@ -153,7 +161,7 @@ class PolicyAdapter:
                 pretrained_revision=files.revision,
                 preprocessor_config_filename=files.preprocessor,
                 postprocessor_config_filename=files.postprocessor,
-                preprocessor_overrides={"device_processor": {"device": device}},
+                preprocessor_overrides={"device_processor": {"device": "cpu"}},
             )
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
@@ -208,6 +216,16 @@ class PolicyAdapter:
     def _selects(self) -> bool:
         ensembles = getattr(self._config, "temporal_ensemble_coeff", None) is not None
         return self._family.queues or ensembles
+
+
+def _need_trained(policy: Any, source: str) -> None:
+    """Raise ModelError for a VQ-BeT whose codes were never trained; lerobot only warns."""
+    vqbet = getattr(policy, "vqbet", None)
+    if vqbet is not None and not vqbet.action_head.vqvae_model.discretized.item():
+        raise ModelError(
+            f"{source}: the quantizer of its actions is not trained: `discretized` is false",
+            hint="train past n_vqvae_training_steps",
+        )
 
 
 def _select(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":

@@ -53,6 +53,7 @@ FAMILIES: Final[Mapping[ModelFamily, Family]] = {
     ModelFamily.PI0_FAST: Family(
         ("pi0_fast",), ("scipy",), precisions=_OWN_FLOATS, remote_code=True
     ),
+    ModelFamily.EO1: Family(("eo1",), precisions=_OWN_FLOATS),
     ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS),
 }
 
@@ -118,6 +119,11 @@ def need_type(manifest: RSkillManifest, family: Family, config: Any, source: str
             f"{source} is a policy of type {config.type!r}, but {manifest.name} names model_family "
             f"{manifest.model_family}, whose checkpoints are of type {' or '.join(family.types)}",
             hint="correct model_family or weights_uri in the manifest",
+        )
+    if config.use_peft:
+        raise ModelError(
+            f"{source} is a PEFT adapter, not a whole policy",
+            hint="merge it into its base policy and save that",
         )
     cameras = sorted(config.image_features)
     if family.camera and cameras and cameras != [family.camera]:

@@ -55,13 +55,14 @@ def save(folder: Path, config: Any, *cameras: str, change: Callable[[Any], None]
         pipeline.save_pretrained(folder)
 
 
-def save_tokenizer(folder: Path) -> str:
+def save_tokenizer(folder: Path, image_token: str = "<image_token>") -> str:
     """Save a tokenizer of a few words. Returns its folder."""
     from tokenizers import Tokenizer, models, pre_tokenizers
     from transformers import PreTrainedTokenizerFast
 
-    names = ("fake_image_token", "image_token", "global_image_token", "end_of_utterance_token")
-    special = ["<pad>", "<unknown>", "<bos>", "<eos>", *(f"<{name}>" for name in names)]
+    names = ("fake_image_token", "global_image_token", "end_of_utterance_token")
+    tokens = {name: f"<{name}>" for name in names} | {"image_token": image_token}
+    special = ["<pad>", "<unknown>", "<bos>", "<eos>", *tokens.values()]
     words = [*special, "Action", ":", "|", *TASK.split()]
     words += [f"word{place}" for place in range(len(words), WORDS)]
     raw = Tokenizer(
@@ -70,7 +71,7 @@ def save_tokenizer(folder: Path) -> str:
     raw.pre_tokenizer = pre_tokenizers.Whitespace()
     PreTrainedTokenizerFast(
         tokenizer_object=raw, pad_token="<pad>", bos_token="<bos>", eos_token="<eos>",
-        unk_token="<unknown>", extra_special_tokens={name: f"<{name}>" for name in names},
+        unk_token="<unknown>", extra_special_tokens=tokens,
     ).save_pretrained(folder)  # fmt: skip
     return str(folder)
 
@@ -196,6 +197,60 @@ def save_smolvla(folder: Path) -> None:
         chunk_size=5, n_action_steps=3, max_state_dim=8, max_action_dim=8, num_steps=2,
         resize_imgs_with_padding=(32, 32), empty_cameras=1,
     )  # fmt: skip
+    save(folder, config, FRONT)
+
+
+def save_eo1(folder: Path) -> None:
+    """Its VLM's config and processor lie beside it."""
+    from lerobot.policies.eo1.configuration_eo1 import EO1Config
+    from transformers import (
+        AutoTokenizer,
+        Qwen2_5_VLConfig,
+        Qwen2_5_VLProcessor,
+        Qwen2VLImageProcessor,
+        Qwen2VLVideoProcessor,
+    )
+
+    vlm = folder / "vlm"
+    tokenizer = AutoTokenizer.from_pretrained(save_tokenizer(vlm, "<|image_pad|>"))
+    tokenizer.add_tokens(
+        ["<|video_pad|>", "<|vision_start|>", "<|vision_end|>"],
+        special_tokens=True,
+    )
+    template = (
+        "{% for message in messages %}{% for part in message.content %}"
+        "{% if part.type == 'image' %}<|vision_start|><|image_pad|><|vision_end|>"
+        "{% else %}{{ part.text }}{% endif %}{% endfor %}{% endfor %}"
+    )
+    Qwen2_5_VLProcessor(
+        image_processor=Qwen2VLImageProcessor(patch_size=8),
+        tokenizer=tokenizer,
+        video_processor=Qwen2VLVideoProcessor(patch_size=8),
+        chat_template=template,
+    ).save_pretrained(vlm)
+    ids = tokenizer.convert_tokens_to_ids
+    text = {
+        "vocab_size": 2 * WORDS, "hidden_size": 16, "intermediate_size": 16,
+        "num_hidden_layers": 1, "num_attention_heads": 2, "num_key_value_heads": 1,
+        "rope_parameters": {
+            "rope_type": "default", "rope_theta": 10000.0, "mrope_section": [2, 1, 1]
+        },
+    }  # fmt: skip
+    vision = {
+        "depth": 1, "hidden_size": 16, "intermediate_size": 16, "num_heads": 2, "patch_size": 8,
+        "out_hidden_size": 16, "window_size": 32, "fullatt_block_indexes": [0],
+    }  # fmt: skip
+    vlm_config = Qwen2_5_VLConfig(
+        text_config=text, vision_config=vision, image_token_id=ids("<|image_pad|>"),
+        video_token_id=ids("<|video_pad|>"), vision_start_token_id=ids("<|vision_start|>"),
+        vision_end_token_id=ids("<|vision_end|>"),
+    )  # fmt: skip
+    config = EO1Config(
+        **features(FRONT), vlm_base=str(vlm), vlm_config=vlm_config.to_dict(), chunk_size=5,
+        n_action_steps=3, max_state_dim=8, max_action_dim=8, num_denoise_steps=2,
+        image_min_pixels=32 * 32, image_max_pixels=SIDE_PX * SIDE_PX, dtype="float32",
+    )  # fmt: skip
+    config.pretrained_path = folder  # its VLM is made from the config
     save(folder, config, FRONT)
 
 
@@ -365,4 +420,5 @@ SAVERS: dict[str, Callable[[Path], None]] = {
     "pi05": save_pi05,
     "pi0_fast": save_pi0_fast,
     "xvla": save_xvla,
+    "eo1": save_eo1,
 }

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.heavy
 NAMES = tuple(policies.SAVERS)
 ROWS = {  # actions in one answer
     "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
-    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5,
+    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5,
 }  # fmt: skip
 CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
 SEED = 2  # most policies draw their actions
@@ -321,6 +321,24 @@ def test_the_manifests_family_decides(
         make_adapter(manifest_of("diffusion"), weights).prepare()
 
 
+def test_what_cannot_act_is_refused(checkpoint: Callable[[str], Weights], tmp_path: Path) -> None:
+    """lerobot only warns of a VQ-BeT in its first stage of training, and its actions are noise."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(checkpoint("vqbet").source, tmp_path / "vqbet")
+    file = tmp_path / "vqbet" / "model.safetensors"
+    flag = "vqbet.action_head.vqvae_model.discretized"
+    save_file(load_file(file) | {flag: torch.tensor(False)}, file)
+    weights = Weights(str(file.parent), local=True)
+    with pytest.raises(ModelError, match="the quantizer of its actions is not trained"):
+        loaded("vqbet", weights)
+    config = file.parent / "config.json"
+    config.write_text(config.read_text().replace('"use_peft": false', '"use_peft": true'))
+    with pytest.raises(ModelError, match="is a PEFT adapter"):
+        loaded("vqbet", weights)
+
+
 def test_a_camera_that_tdmpc_does_not_find_is_refused(
     checkpoint: Callable[[str], Weights], tmp_path: Path
 ) -> None:
@@ -362,7 +380,9 @@ def test_the_manifests_processors_are_used(
     adapter = make_adapter(manifest, weights)
     adapter.prepare()
     adapter.load("cpu")
+    shutil.move(models / "other", models / "away")  # a residency reads no file
     adapter.place("cpu")
+    shutil.move(models / "away", models / "other")
     assert ask(adapter, observations(1)[0]).mean() > 90
     write(before, f"models/other/{after}.bak.json")
     with pytest.raises(ConfigError, match=r"no file .*\.bak\.json"):
