@@ -134,6 +134,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         idle_release_s=flags.idle_release_s,
         standby=flags.standby,
         nice=flags.nice,
+        port=flags.port,
     )
 
 
@@ -227,6 +228,13 @@ def _parser() -> argparse.ArgumentParser:
         help=f"default: fake:${FOLDER_VARIABLE} if set, else cuda",
     )
     add("--endpoint", metavar="EP", help="endpoint to serve; default: <runtime folder>/<name>.sock")
+    add(
+        "--port",
+        type=_number(int, 1, 65_535),
+        metavar="N",
+        help="serve the endpoint on 127.0.0.1:N, too, for the field's clients; to users who may"
+        " open the socket's file",
+    )
     add("--arbiter", metavar="EP", help="default: the arbiter's usual endpoint")
     add("--no-arbiter", action="store_true", help="load at once and stay resident, without a lease")
     add("--configs", type=Path, metavar="DIR", help="folder that local:// weights are looked up in")

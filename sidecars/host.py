@@ -12,7 +12,7 @@ import signal
 from collections.abc import Callable
 
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.net.server import RouterServer
+from vram_arbiter.clients.net.server import RouterServer, path_of
 from vram_arbiter.schemas.errors import NoGpu, VramError
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime import procfs
@@ -20,6 +20,7 @@ from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ModelProcesses
+from vram_arbiter.sidecars.port import on_port
 from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.wires import Wire, unread_reply
@@ -76,6 +77,8 @@ class SidecarHost:
                     settings.endpoint, unread_reply(self._adapter.ops), work_share=WORK_SHARE
                 )
             )
+            if settings.port is not None:
+                await stack.enter_async_context(on_port(settings.port, path_of(settings.endpoint)))
             self._processes.preload(self._adapter.modules)
             residency = self._residency = Residency(settings, self._processes, client)
             background = [

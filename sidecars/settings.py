@@ -88,6 +88,7 @@ class Settings:
     nice: int = NICE
     idle_release_s: float | None = None  # None: resident until another request needs the room
     standby: bool = False  # once evicted, it returns when there is room
+    port: int | None = None  # of 127.0.0.1, in front of the endpoint
 
     @property
     def revision(self) -> str:

@@ -3,6 +3,7 @@ may send."""
 
 import asyncio
 import io
+import socketserver
 
 import msgpack
 import pytest
@@ -316,17 +317,26 @@ def test_a_real_sidecar_survives_what_strangers_send(lone_box):
 
 @pytest.mark.e2e
 def test_req_clients_of_the_field_are_answered(lone_box):
-    """Strict ones, and those that number their requests, which waited for ever."""
-    lone_box.start("detector", "--no-arbiter", device="none")
+    """Strict ones, and those that number their requests, which waited for ever; on a port, which is
+    all that the field's clients can be told."""
+    with socketserver.TCPServer(("127.0.0.1", 0), None) as free:
+        port = free.server_address[1]
+    lone_box.start("detector", "--no-arbiter", "--port", str(port), device="none")
+    file, on_port = f"ipc://{lone_box.runtime}/detector.sock", f"tcp://127.0.0.1:{port}"
     detect = {"image": PNG, "query": "cube", "max_side": 512, "mode": "hybrid"}
     observation = {"video.image": npy(picture_array()), "annotation.task": ["grab"]}
-    for options in ((), (zmq.REQ_CORRELATE,), (zmq.REQ_CORRELATE, zmq.REQ_RELAXED)):
+    for endpoint, *options in (
+        (on_port,),
+        (file,),
+        (file, zmq.REQ_CORRELATE),
+        (on_port, zmq.REQ_CORRELATE, zmq.REQ_RELAXED),
+    ):
         with zmq.Context.instance().socket(zmq.REQ) as socket:
             socket.setsockopt(zmq.LINGER, 0)
             socket.setsockopt(zmq.RCVTIMEO, 60_000)
             for option in options:
                 socket.setsockopt(option, 1)
-            socket.connect(f"ipc://{lone_box.runtime}/detector.sock")
+            socket.connect(endpoint)
 
             def ask(socket=socket, **message):
                 socket.send(msgpack.packb(message))

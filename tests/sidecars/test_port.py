@@ -1,0 +1,88 @@
+"""The port in front of a sidecar's socket: what passes, and who is refused."""
+
+import asyncio
+import os
+import pwd
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.sidecars.port import CONNECTIONS_MAX, on_port
+
+BYTES = bytes(range(256)) * 4096  # more than one read
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+async def echo(reader, writer):
+    while data := await reader.read(1 << 16):
+        writer.write(data)
+        await writer.drain()
+    writer.close()
+
+
+def test_bytes_pass_both_ways_and_a_hang_up_too(tmp_path):
+    async def story():
+        served = await asyncio.start_unix_server(echo, tmp_path / "s")
+        port = free_port()
+        async with served, on_port(port, tmp_path / "s"):
+            with pytest.raises(ConfigError, match=f"port {port} of 127.0.0.1 cannot be served"):
+                await on_port(port, tmp_path / "s").__aenter__()
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(BYTES)
+            assert await reader.readexactly(len(BYTES)) == BYTES
+            (tmp_path / "s").rename(tmp_path / "away")
+            other, other_writer = await asyncio.open_connection("127.0.0.1", port)
+            assert await other.read() == b"", "nothing serves the socket"
+            (tmp_path / "away").rename(tmp_path / "s")
+            crowd = [
+                await asyncio.open_connection("127.0.0.1", port) for _ in range(CONNECTIONS_MAX)
+            ]
+            assert await crowd[-1][0].read() == b"", "one too many"
+            for _, one in [*crowd, (other, other_writer)]:
+                one.close()
+        assert await reader.read() == b"", "the port has ended"
+        writer.close()
+
+    asyncio.run(asyncio.wait_for(story(), 60))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can connect as another user")
+def test_only_users_who_may_open_the_socket_are_let_in(tmp_path):
+    """On loopback any user of the machine could command the robot."""
+    nobody = pwd.getpwnam("nobody")
+    code = """
+import encodings.idna, os, socket, sys
+os.setgroups([]); os.setgid(int(sys.argv[2])); os.setuid(int(sys.argv[1]))
+connection = socket.create_connection(("127.0.0.1", int(sys.argv[3])))
+try:
+    connection.sendall(b"hello")
+    print(connection.recv(5))
+except ConnectionError:
+    print(b"")
+"""
+
+    async def heard(port):
+        argv = (str(nobody.pw_uid), str(nobody.pw_gid), str(port))
+        child = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", code, *argv, stdout=subprocess.PIPE
+        )
+        out, _ = await child.communicate()
+        return out.strip()
+
+    async def story(path: Path):
+        served = await asyncio.start_unix_server(echo, path)
+        port = free_port()
+        async with served, on_port(port, path):
+            assert await heard(port) == b"b''"
+            os.chown(path, -1, nobody.pw_gid)
+            assert await heard(port) == b"b'hello'"
+
+    asyncio.run(asyncio.wait_for(story(tmp_path / "s"), 60))
