@@ -57,6 +57,7 @@ class DetectorAdapter:
             AutoProcessor,
         )
 
+        _name_backbones_offline()
         self._processor = from_pretrained(AutoProcessor, self._weights)
         config = from_pretrained(AutoConfig, self._weights)
         MODEL_FOR_ZERO_SHOT_OBJECT_DETECTION_MAPPING.get(
@@ -192,6 +193,23 @@ def _grounded(outputs: Any, spans: list[slice], labels: list[str], size: tuple[i
     corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
     boxes = torch.stack(corners, dim=-1) * torch.tensor([size[1], size[0]] * 2).to(x)
     return scores.tolist(), [labels[index] for index in best.tolist()], boxes.tolist()
+
+
+def _name_backbones_offline() -> None:
+    """Keep transformers from asking the hub whether the name of a backbone is a repository.
+
+    It asks that of timm's names too, such as OmDet-Turbo's, at every load: without a network the
+    model could not be loaded from the cache.
+    """
+    from transformers import backbone_utils
+
+    backbone_utils.repo_exists = _is_repository
+
+
+def _is_repository(name: str) -> bool:
+    from huggingface_hub import repo_exists
+
+    return "/" in name and repo_exists(name)
 
 
 def split_query(query: str | Sequence[str]) -> list[str]:

@@ -1,6 +1,7 @@
 """Detectors of every family, saved by the family's own code and loaded as in production, in each
 precision."""
 
+import json
 import math
 
 import pytest
@@ -13,7 +14,7 @@ from vram_arbiter.sidecars.weights import Weights
 
 pytestmark = pytest.mark.heavy
 
-BLOCK = "actions: [detect]\ndetector: {{labels: [cube], score_threshold: 0.0}}\n"
+BLOCK = "actions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0}\n"
 LABELS = ["red cube", "ball"]
 WIDTH, HEIGHT = 80, 60
 
@@ -28,7 +29,7 @@ def loaded(tmp_path_factory):
         if not folder.exists():
             folder.mkdir()
             (save or tiny_vision.DETECTORS[family])(folder)
-        described = manifest("detector", BLOCK.format() + f"quantization: {{dtype: {dtype}}}\n")
+        described = manifest("detector", BLOCK + f"quantization: {{dtype: {dtype}}}\n")
         adapter = DetectorAdapter(described, Weights(str(folder), local=True))
         adapter.prepare()
         adapter.load("cpu")
@@ -67,6 +68,26 @@ def test_omdet_turbo_with_a_backbone_of_timm(loaded, manifest, png):
     pytest.importorskip("timm", reason="OmDet-Turbo's published backbone comes from timm")
     adapter = loaded("omdet_timm", manifest, "fp16", tiny_vision.save_omdet_turbo_timm)
     assert detect(adapter, png(WIDTH, HEIGHT))
+
+
+def test_the_name_of_a_backbone_is_not_looked_up_on_the_hub(manifest, monkeypatch, tmp_path):
+    """OmDet-Turbo's published config names timm's backbone in the old form. transformers asks the
+    hub about the name at every load: a cached model could not be loaded without a network."""
+    import huggingface_hub
+    from transformers import backbone_utils
+
+    tiny_vision.save_omdet_turbo(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text()) | {
+        "backbone": "swin_tiny_patch4_window7_224",
+        "backbone_config": None,
+        "backbone_kwargs": {"out_indices": [1, 2, 3], "img_size": 640},
+        "use_timm_backbone": True,
+    }
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    monkeypatch.setattr(backbone_utils, "repo_exists", huggingface_hub.repo_exists)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    adapter = DetectorAdapter(manifest("detector", BLOCK), Weights(str(tmp_path), local=True))
+    adapter.prepare()
 
 
 @pytest.mark.parametrize("family", ["owlvit", "grounding_dino"])
