@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, Literal
 
+from vram_arbiter.clients.sidecar.field import NORM
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
@@ -23,7 +24,6 @@ from vram_arbiter.sidecars.weights import (
     transformers_modules,
 )
 
-NORM = 1000  # the field's grounding answers give boxes in thousandths of the image
 ZERO_SHOT_LOADER = "transformers.AutoModelForZeroShotObjectDetection"
 _ANSWERS = {"logits", "pred_boxes", "decoder_class_logits", "decoder_coord_logits"}
 _SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # the field joins its labels by </c>
@@ -133,7 +133,7 @@ class DetectorAdapter:
             else _grounded(outputs, spans, labels, size)
         )
         found = [
-            clip(name, score, box, size)
+            _detection(name, score, box, size)
             for score, name, box in zip(scores, names, boxes, strict=True)
             if score > threshold
         ]
@@ -242,7 +242,7 @@ def grounding_answer(found: list[DetectionResult], width: int, height: int) -> s
     return "".join(parts)
 
 
-def clip(
+def _detection(
     label: str, score: float, box: list[float], size: tuple[int, int]
 ) -> DetectionResult | None:
     """Clip a box to the picture; None if nothing is left of it.

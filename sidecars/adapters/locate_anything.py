@@ -11,12 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from vram_arbiter.clients.sidecar.field import NORM, grounded
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.sidecar import DetectionResult, DetectOp
+from vram_arbiter.schemas.sidecar import DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
-from vram_arbiter.sidecars.adapters.detector import NORM, clip, split_query
+from vram_arbiter.sidecars.adapters.detector import split_query
 from vram_arbiter.sidecars.adapters.inputs import to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
@@ -26,7 +27,6 @@ LOADER: Final = "transformers.AutoModel"
 """`quantization.extra.loader` of a manifest whose model this adapter runs."""
 CONSENT: Final = "trust_remote_code"
 """Key of `quantization.extra` that lets the checkpoint's code run."""
-SCORE: Final = 1.0  # the model gives none
 REPETITION_PENALTY: Final = 1.1  # the field's; without it a greedy answer repeats its last box
 # files whose `auto_map` names code
 _MAPS: Final = (
@@ -36,7 +36,6 @@ _MAPS: Final = (
     "tokenizer_config.json",
 )
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_PART = re.compile(r"<ref>(.*?)</ref>|<box><(\d+)><(\d+)><(\d+)><(\d+)></box>", re.DOTALL)
 
 
 class LocateAnythingAdapter:
@@ -101,7 +100,7 @@ class LocateAnythingAdapter:
             "ok": True,
             "answer": answer,
             "norm": NORM,
-            "detections": parse_grounding(answer, width, height),
+            "detections": grounded(answer, NORM, (width, height), ", ".join(labels)),
         }
 
     def _answer(self, picture: Any, labels: list[str], mode: str, max_new_tokens: int) -> str:
@@ -186,23 +185,3 @@ def _texts(value: object) -> list[str]:
     if isinstance(value, dict):
         value = list(value.values())
     return [text for part in value for text in _texts(part)] if isinstance(value, list) else []
-
-
-def parse_grounding(answer: str, width: int, height: int) -> list[DetectionResult]:
-    """Return the boxes of `<ref>label</ref><box><x0><y0><x1><y1></box>…`, in the picture's pixels.
-
-    A box belongs to the last label before it. Boxes without area, of points (two numbers) and of
-    absent objects (`<box>None</box>`), and doubles are left out.
-    """
-    label, found = "", []
-    for part in _PART.finditer(answer):
-        if part[1] is not None:
-            label = part[1].strip()
-            continue
-        x0, y0, x1, y1 = (int(number) / NORM for number in part.groups()[1:])
-        (x0, x1), (y0, y1) = sorted((x0, x1)), sorted((y0, y1))
-        box = [x0 * width, y0 * height, x1 * width, y1 * height]
-        one = clip(label, SCORE, box, (height, width))
-        if one is not None and one not in found:
-            found.append(one)
-    return found
