@@ -14,8 +14,9 @@ Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "g
 `detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the card, a
 load, another request) are not looked at. Every request may carry "id" (echoed as "re": a DEALER may
 have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
-unless it is the sidecar's current one) and "traceparent". Images are PNG bytes of RGB. Arrays are
-`{"__ndarray_class__": true, "as_npy": bytes}` (numpy's .npy format, pickle never allowed).
+unless it is the sidecar's current one) and "traceparent". Images are PNG or JPEG bytes of RGB,
+and a video is a list of them. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}` (numpy's
+.npy format, pickle never allowed).
 
 `load` makes the model resident (acquiring the lease) and answers with the lease id and token, so
 that a caller can mark a use of its own on it at the arbiter: a goal that spans many `get_action`

@@ -26,6 +26,8 @@ from vram_arbiter.schemas.errors import (
     OutOfMemory,
     SidecarUnavailable,
 )
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.sidecar import QueryOp
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
@@ -283,6 +285,27 @@ async def test_the_token_travels_with_the_call(endpoint: str) -> None:
         assert await client.query(PNG, "held?", token=(3, 7)) == "held? [3, 7]"
         loaded = await client.load(timeout_s=60.0)
         assert (loaded["lease_id"], loaded["token"]) == ("L1-1", [1, 2])
+
+
+async def test_pictures_and_a_video_travel_in_one_query(
+    monkeypatch: pytest.MonkeyPatch, endpoint: str
+) -> None:
+    asked: list[QueryOp] = []
+
+    async def call(self: SidecarClient, op: str, fields: JsonMap, **_: object) -> JsonMap:
+        asked.append(QueryOp.model_validate({"op": op, **fields}))
+        return {"ok": True, "answer": "yes"}
+
+    monkeypatch.setattr(SidecarClient, "call", call)
+    client = SceneVlmClient(endpoint)
+    assert await client.query(PNG, "held?") == "yes"
+    assert await client.query(images=[PNG, PNG], question="moved?") == "yes"
+    assert await client.query(PNG, "fell?", video=[PNG, PNG], fps=4.0) == "yes"
+    assert [(one.image is not None, len(one.images), len(one.video), one.fps) for one in asked] == [
+        (True, 0, 0, None),
+        (False, 2, 0, None),
+        (True, 0, 2, 4.0),
+    ]
 
 
 @pytest.mark.heavy
