@@ -73,6 +73,8 @@ def check(wanted: Wanted) -> list[Finding]:
     except VramError as error:
         family = _bad("family", error)
     findings.append(family)
+    if manifest.weights_uri is None:
+        return findings  # nothing to load: no bytes
     findings.append(packages := _packages(manifest))
     if refused is not None:
         precision = _bad("precision", refused)

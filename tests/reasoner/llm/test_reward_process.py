@@ -106,7 +106,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             async with program({**environ, **llm}, *think) as reasoner:
                 assert await reasoner.wait() == 1, "the planner said that it was no success"
 
-            # resident under a lease of its own, at the weight that it stands for
+            # resident under a lease of its own, at the inference peak of what it stands for
             identity = await reward.ping(timeout_s=60.0)
             assert (identity["state"], identity["kind"], identity["pid"]) == (
                 "resident",
@@ -119,7 +119,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                 assert (lease["consumer"], lease["pid"], lease["charge_bytes"]) == (
                     "reward",
                     sidecar.pid,
-                    3.33 * GB,
+                    3.56 * GB,
                 )
                 token = identity["token"]  # of the sidecar: `status` shows tokens to holders only
                 assert (await reward.score([picture], "grab the red cube", token=token)).progress[
@@ -133,7 +133,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                 )
                 assert granted["ok"], granted
                 push = await asyncio.to_thread(arbiter.push, "granted", 60.0)
-                assert (await reward.ping(timeout_s=60.0))["state"] == "unloaded"
+                assert (await reward.ping(timeout_s=60.0))["state"] == "parked"
                 with pytest.raises(Evicted):
                     await reward.score([picture], "grab the red cube", token=token)
                 assert arbiter.ask(
