@@ -285,13 +285,22 @@ async def measure_program(
     return Measured(figures, basis, sampler.series.rate_hz, 0)
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a model is asked. `pictures`: a folder of them (None: noise); `prompt`: in words (None:
+    the manifest's)."""
+
+    requests: int
+    pictures: Path | None = None
+    prompt: str | None = None
+
+
 async def measure_model(
     gpu: Gpu,
     pace: Pace,
     manifest: RSkillManifest,
     arguments: Sequence[str],
-    requests: int,
-    pictures: Path | None,
+    asked: Asked,
     say: Callable[[str], None],
     sidecar: Sequence[str] = SIDECAR,
 ) -> Measured:
@@ -308,7 +317,7 @@ async def measure_model(
         ]  # fmt: skip
         spawn = SpawnSpec(argv, dict(gpu.environ), Path(folder) / "log")
         client = client_for(endpoint, spawn=spawn, timeout_s=LOAD_S)
-        ask = asking(client, manifest, pictures)
+        ask = asking(client, manifest, asked.pictures, asked.prompt)
         basis = await find_basis(gpu, pace)
         say(f"an empty context has {format_bytes(basis.context_bytes)}; loading {manifest.name}")
         with Sampler(OwnBytes(gpu, basis), pace.period_s) as sampler:
@@ -319,8 +328,8 @@ async def measure_model(
                     raise _no_bytes(gpu, manifest.name, "")
                 asked_s = sampler.clock()
                 load_peak = sampler.series.peak(0.0, asked_s)
-                say(f"resident with {format_bytes(steady)}; asking {requests} times")
-                for _ in range(requests):
+                say(f"resident with {format_bytes(steady)}; asking {asked.requests} times")
+                for _ in range(asked.requests):
                     await ask()
                     sampler.check()
                 await asyncio.sleep(2 * pace.period_s)  # a reading after the last answer
@@ -337,11 +346,11 @@ async def measure_model(
         context=basis.context_bytes,
         load_peak=load_peak,
         steady=steady,
-        inference_peak=inference_peak if requests else None,
+        inference_peak=inference_peak if asked.requests else None,
         retained=retained,
         after_exit=after,
     )
-    return Measured(figures, basis, sampler.series.rate_hz, requests)
+    return Measured(figures, basis, sampler.series.rate_hz, asked.requests)
 
 
 async def _settled(sampler: Sampler, pace: Pace, *, gone: bool = False) -> int:

@@ -43,9 +43,12 @@ def client_type(manifest: RSkillManifest) -> type[SidecarClient]:
     return _CLIENTS[manifest.kind]
 
 
-def asking(client: SidecarClient, manifest: RSkillManifest, pictures: Path | None) -> Ask:
-    """Return what makes one request at each call. Raises ConfigError."""
-    task = manifest.default_prompt or manifest.description
+def asking(
+    client: SidecarClient, manifest: RSkillManifest, pictures: Path | None, prompt: str | None
+) -> Ask:
+    """Return what makes one request at each call. `prompt`: the task, the question or what is to be
+    found, else the manifest's. Raises ConfigError."""
+    task = prompt or manifest.default_prompt or manifest.description
     if isinstance(client, PolicyClient):
         if pictures is not None:
             raise ConfigError(
@@ -59,12 +62,13 @@ def asking(client: SidecarClient, manifest: RSkillManifest, pictures: Path | Non
     match client:
         case DetectorClient() as detector:
             labels = manifest.detector.labels if manifest.detector else ()
-            query = ", ".join(labels) or "object"
+            query = prompt or ", ".join(labels) or "object"
             return lambda: detector.detect(next(shown), query)
         case RewardClient() as reward:
             return lambda: reward.score(_several(shown), task)
         case SceneVlmClient() as vlm:
-            return lambda: vlm.query(next(shown), "Describe everything in the picture.")
+            question = prompt or "Describe everything in the picture."
+            return lambda: vlm.query(next(shown), question)
     raise AssertionError(f"no request is known for {type(client).__name__}")
 
 

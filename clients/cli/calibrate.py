@@ -23,7 +23,13 @@ from typing import Any
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.calibration import entry as entries
 from vram_arbiter.clients.calibration.gpu import Gpu, open_gpu
-from vram_arbiter.clients.calibration.measure import Measured, Pace, measure_model, measure_program
+from vram_arbiter.clients.calibration.measure import (
+    Asked,
+    Measured,
+    Pace,
+    measure_model,
+    measure_program,
+)
 from vram_arbiter.clients.cli import arguments, text
 from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.client import AsyncClient
@@ -86,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         metavar="DIR",
         help="PNG and JPEG files for the requests (default: noise)",
     )
+    add("--prompt", help="task, question or objects of the requests (default: the manifest's)")
     add(
         "--seconds",
         type=arguments.at_least(1.0),
@@ -157,9 +164,8 @@ def run(args: argparse.Namespace) -> int:
             words.append("--allow-noncommercial")
         if not gpu.device.startswith("fake:"):
             words += ["--footprint", "0B,0B,0B"]  # its own bytes, without ballast
-        return await measure_model(
-            gpu, pace, target.manifest, words, args.requests, args.pictures, _say
-        )
+        asked = Asked(args.requests, args.pictures, args.prompt)
+        return await measure_model(gpu, pace, target.manifest, words, asked, _say)
 
     try:
         measured = asyncio.run(_in_peace(args, gpu, target.key, work))

@@ -21,6 +21,7 @@ from vram_arbiter.arbiter.host.gpu.fake import make_card
 from vram_arbiter.clients.calibration import entry as entries
 from vram_arbiter.clients.calibration.gpu import FakeGpu, NvmlGpu, Reading, open_gpu
 from vram_arbiter.clients.calibration.measure import (
+    Asked,
     Basis,
     OwnBytes,
     Pace,
@@ -452,8 +453,7 @@ async def test_a_model_in_a_sidecar_of_its_own(gpu: Watched) -> None:
         replace(QUICK, rate_hz=50.0, rest_s=0.6),
         load_manifest(gpu.seen / "rskill.yaml"),
         ("--rskill", str(gpu.seen / "rskill.yaml"), "--footprint", "1200MiB,1GiB,300MiB"),
-        3,
-        None,
+        Asked(3),
         print,
         (sys.executable, str(echo_sidecar.__file__), str(gpu.seen)),
     )
