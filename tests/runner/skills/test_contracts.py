@@ -25,7 +25,8 @@ from vram_arbiter.runner.skills.actions import Stepper
 from vram_arbiter.runner.skills.kinematics import ArmModel, Pose3
 from vram_arbiter.runner.skills.motion import joint_positions
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers, turn
-from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy, Wiring, wire_up
+from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
+from vram_arbiter.runner.skills.wiring import Wiring, wire_up
 from vram_arbiter.schemas.config.robot import load_robot
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ModelError, StateStale

@@ -16,7 +16,8 @@ from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from vram_arbiter.runner.skills.sidecar_policy import STEP_SHARE, SidecarPolicy, Wiring, wire_up
+from vram_arbiter.runner.skills.sidecar_policy import STEP_SHARE, SidecarPolicy
+from vram_arbiter.runner.skills.wiring import Wiring, wire_up
 from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,

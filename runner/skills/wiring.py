@@ -1,0 +1,191 @@
+"""What a policy's manifest needs of this robot, found out before anything moves.
+
+`wire_up` reads cameras, joints, vectors and the rollout, with a finding for each part that does not
+fit.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vram_arbiter.runner.protocols import Joint, RobotDescription
+from vram_arbiter.runner.skills.action_contract import needs_frames as actions_need_frames
+from vram_arbiter.runner.skills.action_contract import plan_actions
+from vram_arbiter.runner.skills.actions import ActionPlan
+from vram_arbiter.runner.skills.kinematics import ArmModel
+from vram_arbiter.runner.skills.states import StatePlan, plan_state
+from vram_arbiter.runner.skills.states import needs_frames as state_needs_frames
+from vram_arbiter.schemas.control import JOINT_MODES
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import ManifestError, RSkillManifest
+from vram_arbiter.schemas.manifest.problems import Problem
+
+ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
+IMAGES_PREFIX = "observation.images."
+
+
+class View(BaseModel):
+    """Crop in fractions of the picture (x0, y0, x1, y1) and the size it is averaged down to."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    size_px: tuple[int, int] | None = None
+
+
+class Rollout(BaseModel):
+    """Part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    rollout_steps: int | None = Field(
+        default=None, ge=1, le=100_000
+    )  # None: latency_budget.max_execution_s
+    stop_when_still: bool = True
+    views: dict[str, View] = Field(default_factory=dict)
+    prefetch_at: int = Field(default=0, ge=0, le=1000)
+    targets_lead: bool = (
+        False  # its targets are set points far ahead of the arm: a robot goes there step by step
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """Map from a manifest's features to this robot: cameras, joints, start pose (rad), and what
+    its vectors mean. `model` where a contract speaks of frames.
+    """
+
+    cameras: Mapping[str, str]
+    robot: RobotDescription
+    start_pose: Mapping[str, float] | None  # None: it begins where the robot stands
+    actions: ActionPlan
+    state: StatePlan
+    model: ArmModel | None
+    steps_per_chunk: int | None
+    rollout: Rollout
+    rollout_s: float
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Return the joints that are commanded, in the order of their targets."""
+        return self.actions.joints
+
+    @property
+    def stepwise(self) -> bool:
+        """Return whether rows are approached, or are steps themselves."""
+        return self.rollout.targets_lead or not self.actions.direct
+
+
+def wire_up(
+    manifest: RSkillManifest,
+    robot: RobotDescription | tuple[str, ...],
+    rest: Mapping[str, float] | None,
+) -> Wiring:
+    """Read the manifest. `robot` may be its joints' names alone.
+
+    Raises ManifestError with a finding for each part that this robot cannot do or tell.
+    """
+    if isinstance(robot, tuple):
+        robot = RobotDescription(
+            "this world", tuple(Joint(name, -math.inf, math.inf, math.inf) for name in robot), {}
+        )
+    problems: list[Problem] = []
+    cameras = _cameras(manifest)
+    if not cameras:
+        problems.append(
+            Problem(
+                ("sensors_required",),
+                f"names no camera: give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
+            )
+        )
+    order, found = _joint_order(manifest, robot)
+    model, lost = _model(manifest, robot)
+    problems += found
+    problems += lost
+    actions, found = plan_actions(manifest, robot, order, model)
+    state, others = plan_state(manifest, robot, order, model)
+    if not lost:  # else all of them say the same
+        problems += [*found, *others]
+    start = rest
+    if manifest.starting_pose is not None:
+        if len(manifest.starting_pose) != len(order):
+            problems.append(Problem(("starting_pose",), f"must give {len(order)} joints"))
+        else:
+            start = dict(zip(order, manifest.starting_pose, strict=True))
+    rollout = Rollout()
+    try:
+        rollout = Rollout.model_validate(manifest.policy_extras)
+    except ValidationError as error:
+        problems.append(Problem(("policy_extras",), error.errors()[0]["msg"]))
+    if problems:
+        raise ManifestError(manifest.name, problems)
+    rollout_s = manifest.latency_budget.max_execution_s or ROLLOUT_S
+    return Wiring(
+        cameras,
+        robot,
+        start,
+        actions,
+        state,
+        model,
+        manifest.n_action_steps,
+        rollout,
+        rollout_s,
+    )
+
+
+def _cameras(manifest: RSkillManifest) -> dict[str, str]:
+    """Return the key of each of the robot's cameras: the sidecar renames it to what the checkpoint
+    calls it.
+    """
+    aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
+    robot_name = {model: robot for robot, model in aliases.items()}
+    cameras = {}
+    for sensor in manifest.sensors_required:
+        if sensor.modality == "rgb" and sensor.vla_feature_key:
+            name = sensor.vla_feature_key.rpartition(".")[2]
+            camera = robot_name.get(name, name)
+            cameras[camera] = IMAGES_PREFIX + camera
+    return cameras
+
+
+def _joint_order(
+    manifest: RSkillManifest, robot: RobotDescription
+) -> tuple[tuple[str, ...], list[Problem]]:
+    """Return the joints in the policy's order, the robot's where the manifest gives none."""
+    for index, actuator in enumerate(manifest.actuators_required):
+        order = actuator.control_mode_semantics.joint_order
+        if order is None or actuator.kind not in JOINT_MODES:
+            continue
+        path = ("actuators_required", index, "control_mode_semantics", "joint_order")
+        if set(order) <= set(robot.joint_names) and len(set(order)) == len(order):
+            return order, []
+        return robot.joint_names, [
+            Problem(
+                path,
+                f"moves {', '.join(order)}; the robot has {', '.join(robot.joint_names)}",
+            )
+        ]
+    return robot.joint_names, []
+
+
+def _model(
+    manifest: RSkillManifest, robot: RobotDescription
+) -> tuple[ArmModel | None, list[Problem]]:
+    """Return the robot's model if a contract speaks of frames and there is one."""
+    solving = actions_need_frames(manifest)
+    if not robot.model or not (solving or state_needs_frames(manifest.state_contract)):
+        return None, []
+    path = ("action_contract",) if solving else ("state_contract",)
+    try:
+        if solving:
+            importlib.import_module("mink")
+        return ArmModel(robot), []
+    except ImportError:
+        return None, [
+            Problem(path, "cartesian commands need mink: pip install 'vram-arbiter[runner]'")
+        ]
+    except ConfigError as error:
+        return None, [Problem(path, error.message)]
