@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from tests.sidecars import echo_sidecar
+from tests.support.paths import CONFIGS
 from tests.support.process import ArbiterProcess
 from vram_arbiter.arbiter.host.gpu.fake import make_card
 from vram_arbiter.clients.calibration import entry as entries
@@ -29,10 +30,12 @@ from vram_arbiter.clients.calibration.measure import (
     measure_model,
     measure_program,
 )
-from vram_arbiter.clients.calibration.requests import noise_png
+from vram_arbiter.clients.calibration.requests import asking, noise_png, observation_of
 from vram_arbiter.clients.calibration.series import Figures, Series, of_life
 from vram_arbiter.clients.cli.calibrate import source_of
 from vram_arbiter.clients.cli.main import run_main
+from vram_arbiter.clients.sidecar.perception import DetectorClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES, VERIFY_TOLERANCE_BYTES
@@ -307,6 +310,35 @@ def test_noise_is_a_picture() -> None:
     assert header(noise_png(64)).width == 64
 
 
+@pytest.mark.heavy
+def test_an_observation_as_the_manifest_describes_it() -> None:
+    import numpy as np
+
+    grab = load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml")
+    observation = observation_of(grab, "grab it")
+    shapes = {key: value.shape for key, value in observation.items() if key != "task"}
+    assert shapes == {
+        "observation.state": (6,),
+        "observation.images.front": (360, 480, 3),
+        "observation.images.wrist": (240, 320, 3),
+    }
+    assert list(observation["observation.state"]) == pytest.approx(list(grab.starting_pose or ()))
+    assert observation["observation.images.front"].dtype == np.uint8
+
+
+def test_pictures_of_a_folder(tmp_path: Path) -> None:
+    detector = load_manifest(CONFIGS / "rskills/so101-detector/rskill.yaml")
+    client = DetectorClient("ipc:///nowhere")
+    with pytest.raises(ConfigError, match="holds no picture"):
+        asking(client, detector, tmp_path, None)
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        asking(client, detector, tmp_path / "x", None)
+    with pytest.raises(ConfigError, match="a policy is asked with noise"):
+        asking(PolicyClient("ipc:///nowhere"), detector, tmp_path, None)
+    (tmp_path / "a.png").write_bytes(noise_png(8))
+    asking(client, detector, tmp_path, None)
+
+
 # -- programs
 PROGRAM = """
 import os, sys, time
@@ -545,6 +577,8 @@ def test_a_robot_goes_first(
 REQUEST = """
 import sys, time
 from pathlib import Path
+from vram_arbiter.clients.sidecar.perception import DetectorClient
+from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.clients.sync import Client
 
 while not Path(sys.argv[2], "up").exists():
