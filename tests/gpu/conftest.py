@@ -67,14 +67,24 @@ class Model:
     client: WireClient
     log: Path
 
-    def ask(self, op: str, **fields: Any) -> dict[str, Any]:
-        answer = self.client.reply(self.client.send(op, **fields), PATIENCE_S)
+    def send(self, op: str, **fields: Any) -> int:
+        return self.client.send(op, **fields)
+
+    def result(self, request: int) -> dict[str, Any]:
+        answer = self.client.reply(request, PATIENCE_S)
         assert answer["ok"], (answer, self.log.read_text())
         return answer
 
+    def send_detect(self, query: str = "cube") -> int:
+        return self.send("detect", image=b"\x89PNG\r\n\x1a\n", query=query)
+
     def detect(self, query: str = "cube") -> str:
-        answer: str = self.ask("detect", image=b"\x89PNG\r\n\x1a\n", query=query)["answer"]
+        answer: str = self.result(self.send_detect(query))["answer"]
         return answer
+
+    def state(self) -> str:
+        found: str = self.result(self.send("ping"))["state"]
+        return found
 
     @property
     def forks(self) -> tuple[int, int]:
@@ -117,7 +127,7 @@ class Machine:
             process = subprocess.Popen(argv, env=self.environ, stdout=log, stderr=log)
         client = WireClient(f"ipc://{self.arbiter.runtime}/{name}.sock")
         self.models.append(Model(process, client, folder / "log"))
-        assert self.models[-1].ask("ping")["state"] == "unloaded"
+        assert self.models[-1].state() == "unloaded"
         return self.models[-1]
 
     def used(self) -> int:
@@ -141,14 +151,18 @@ class Machine:
                 continue
         return UVM in opened or self.bytes_of(pid) > 0
 
+    def status(self) -> dict[str, Any]:
+        with WireClient(self.arbiter.endpoint) as client:
+            return client.hello().ask("status")
+
+    def lease_state(self, consumer: str) -> str | None:
+        """Return the state of a consumer's lease; None: it has none."""
+        leases = self.status()["leases"]
+        return next((one["state"] for one in leases if one["consumer"] == consumer), None)
+
     def budget(self) -> int:
         """Return the bytes that the arbiter leases on the GPU."""
-        with WireClient(self.arbiter.endpoint) as client:
-            (view,) = [
-                view
-                for view in client.hello().ask("status")["gpus"]
-                if view["gpu"] == self.gpu.uuid
-            ]
+        (view,) = [view for view in self.status()["gpus"] if view["gpu"] == self.gpu.uuid]
         return int(view["capacity_bytes"] - view["reserve_bytes"] - view["stowaway_bytes"])
 
     def close(self) -> None:

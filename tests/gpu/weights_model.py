@@ -2,15 +2,17 @@
 
 The op `detect` answers with a figure that depends on every weight, computed on the device; for the
 query `reference` with that of the same weights on the CPU, for `copies` with the seconds that
-copying the weights took.
+copying the weights took, for `hold PATH` once that file exists (`PATH.held` says that it waits).
 """
 
 import functools
 import json
 import statistics
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -65,11 +67,19 @@ class WeightsModel:
         match call.query:
             case "copies":
                 answer = json.dumps(self._copies())
+            case str(query) if query.startswith("hold "):
+                answer = self._held(Path(query.removeprefix("hold ")))
             case "reference":
                 answer = f"{self._reference():.9e}"
             case _:
                 answer = f"{self._figure():.9e}"
         return {"ok": True, "answer": answer, "norm": 1000, "detections": []}
+
+    def _held(self, go: Path) -> str:
+        go.with_suffix(".held").touch()
+        while not go.exists():
+            threading.Event().wait(0.005)
+        return f"{self._figure():.9e}"
 
     def _reference(self) -> float:
         other = WeightsModel(self._blocks * LAYER_BYTES, self._manifest)
