@@ -33,7 +33,15 @@ if TYPE_CHECKING:
 _OWN_POLICIES = (
     "vram_arbiter.sidecars.models.compact_act",
 )  # own policy types, by lerobot's naming convention
-_NO_DOWNLOADS: Final = {"pretrained_backbone_weights": None, "load_vlm_weights": False}
+_OURS: Final = {
+    "pretrained_backbone_weights": None,  # the checkpoint holds these weights, as `load` sees
+    "load_vlm_weights": False,
+    "vlm_dtype": "float32",  # the whole policy is cast after it was read
+    "use_amp": False,
+    "use_flash_attn": False,  # it does not compute in float32
+    "enable_gradient_checkpointing": False,
+}
+"""Fields of configurations that the sidecar decides."""
 _ACTION: Final = "action"
 
 
@@ -94,8 +102,8 @@ class PolicyAdapter:
         self._config = read_config(PreTrainedConfig, self._weights)
         need_type(self._manifest, self._family, self._config, self._weights.source)
         self._policy_class = get_policy_class(self._config.type)
-        for field, value in _NO_DOWNLOADS.items():
-            if hasattr(self._config, field):  # the checkpoint holds these weights, as `load` sees
+        for field, value in _OURS.items():
+            if hasattr(self._config, field):
                 setattr(self._config, field, value)
         if self._has_own_dtype:
             self._config.dtype = TORCH_NAMES[self._dtype]

@@ -54,6 +54,7 @@ FAMILIES: Final[Mapping[ModelFamily, Family]] = {
         ("pi0_fast",), ("scipy",), precisions=_OWN_FLOATS, remote_code=True
     ),
     ModelFamily.EO1: Family(("eo1",), precisions=_OWN_FLOATS),
+    ModelFamily.EVO1: Family(("evo1",)),
     ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS),
 }
 

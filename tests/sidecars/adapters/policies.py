@@ -254,6 +254,39 @@ def save_eo1(folder: Path) -> None:
     save(folder, config, FRONT)
 
 
+def save_evo1(folder: Path) -> None:
+    """Its VLM lies beside it, with weights that the checkpoint replaces."""
+    from lerobot.policies.evo1.configuration_evo1 import Evo1Config
+    from transformers import AutoTokenizer, InternVLConfig, InternVLModel
+
+    vlm = folder / "vlm"
+    image_token = "<IMG_CONTEXT>"
+    tokenizer = AutoTokenizer.from_pretrained(save_tokenizer(vlm, image_token))
+    tokenizer.add_tokens(["<img>", "</img>"], special_tokens=True)
+    tokenizer.save_pretrained(vlm)
+    small = {
+        "hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+    }  # fmt: skip
+    vision = small | {"image_size": [SIDE_PX, SIDE_PX], "patch_size": [16, 16]}
+    text = small | {
+        "model_type": "qwen2", "vocab_size": 2 * WORDS, "num_key_value_heads": 1,
+    }  # fmt: skip
+    InternVLModel(
+        InternVLConfig(
+            vision_config=vision, text_config=text, image_seq_length=4,
+            image_token_id=tokenizer.convert_tokens_to_ids(image_token),
+        )
+    ).save_pretrained(vlm)  # fmt: skip
+    config = Evo1Config(
+        **features(FRONT), vlm_model_name=str(vlm), vlm_num_layers=1, vlm_dtype="float32",
+        image_resolution=(SIDE_PX, SIDE_PX), max_views=2, embed_dim=16, hidden_dim=16,
+        state_hidden_dim=16, num_heads=2, num_layers=1, num_inference_timesteps=2, chunk_size=5,
+        n_action_steps=3, max_state_dim=8, max_action_dim=8, use_flash_attn=False,
+    )  # fmt: skip
+    save(folder, config, FRONT)
+
+
 def save_xvla(folder: Path) -> None:
     from lerobot.policies.xvla.configuration_xvla import XVLAConfig
 
@@ -421,4 +454,5 @@ SAVERS: dict[str, Callable[[Path], None]] = {
     "pi0_fast": save_pi0_fast,
     "xvla": save_xvla,
     "eo1": save_eo1,
+    "evo1": save_evo1,
 }
