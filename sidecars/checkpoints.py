@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import ModelError
-from vram_arbiter.sidecars.quantization import Nf4, load_bitsandbytes, read_packed, settle
+from vram_arbiter.sidecars.packed_weights import PackedHeader, install, packed_in, read_packed
+from vram_arbiter.sidecars.quantization import Nf4, load_bitsandbytes, settle
 from vram_arbiter.sidecars.weights import (
     Weights,
     fitting,
@@ -172,8 +173,10 @@ def _differences(account: Mapping[str, Any]) -> Differences:
     )
 
 
-def load_lerobot(cls: Any, weights: Weights, config: Any) -> Any:
+def load_lerobot(cls: Any, weights: Weights, config: Any, nf4: Nf4 | None = None) -> Any:
     """Call `cls.from_pretrained` of lerobot onto `config.device`.
+
+    With `nf4`, a checkpoint may hold quantized weights: they stay as they are.
 
     lerobot's loaders differ from policy to policy: they rename, drop, and some swallow what they
     could not read. All of them end in the policy's own `load_state_dict`, so that is where the
@@ -181,7 +184,7 @@ def load_lerobot(cls: Any, weights: Weights, config: Any) -> Any:
 
     Raises: ModelError if the checkpoint does not fit the class or does not hold the whole model.
     """
-    record = _Record(weights.source)
+    record = _Record(weights.source, nf4)
     try:
         return _load_recorded(cls, weights, config, record)
     except ModelError:
@@ -189,7 +192,7 @@ def load_lerobot(cls: Any, weights: Weights, config: Any) -> Any:
             raise
     config.device = "cpu"  # not every class can be built without bytes
     try:
-        return _load_recorded(cls, weights, config, _Record(weights.source))
+        return _load_recorded(cls, weights, config, _Record(weights.source, nf4))
     finally:
         config.device = META
 
@@ -239,7 +242,8 @@ def need_statistics(pipeline: Any, features: "Mapping[str, PolicyFeature]", sour
 class _Record:
     """Record of what `load_state_dict` was given while one model was loaded."""
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, nf4: Nf4 | None) -> None:
+        self.nf4 = nf4
         self._source = source
         self._found = Differences()
         self._loaded: set[str] = set()
@@ -252,13 +256,14 @@ class _Record:
         """Note a failed load, which concerns the checkpoint and not only building without bytes."""
         return self.built and (not self._compared or self._found != Differences())
 
-    def compare(self, own: "Mapping[str, Tensor]", given: "Mapping[str, Tensor]") -> None:
+    def compare(self, own: "Mapping[str, Tensor]", header: PackedHeader) -> None:
         """Compare a state dict before it is copied.
 
         Raises ModelError for defects that no further part of the checkpoint can repair.
         """
         self._compared = True
-        for name, tensor in given.items():
+        self._found.misshapen |= header.misshapen
+        for name, tensor in header.tensors.items():
             if name not in own:
                 self._found.foreign.add(name)
             elif tensor.shape != own[name].shape:
@@ -268,7 +273,7 @@ class _Record:
         tied = {_identity(own[name]) for name in self._loaded}
         self._found.missing = {
             name for name, tensor in own.items() if _identity(tensor) not in tied
-        }
+        } | header.missing
         if self._found.foreign or self._found.misshapen:
             self.refuse_differences()
 
@@ -302,7 +307,11 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
         def load_state_dict(
             self, state_dict: "Mapping[str, Tensor]", *arguments: Any, **options: Any
         ) -> Any:
-            record.compare(self.state_dict(keep_vars=True), state_dict)
+            nf4 = record.nf4
+            header = PackedHeader(dict(state_dict)) if nf4 is None else packed_in(state_dict)
+            record.compare(self.state_dict(keep_vars=True), header)
+            if nf4 is not None:
+                state_dict = install(self, state_dict, header, nf4)
             with _silence():
                 result = super().load_state_dict(state_dict, *arguments, **options)
             record.copied()

@@ -5,17 +5,14 @@ quantized in host RAM, then copied. What cannot be done is refused. Must not kno
 """
 
 import importlib.util
-import json
 import logging
-import math
 import os
 import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.schemas.errors import ConfigError, UnsupportedQuantization
@@ -26,7 +23,6 @@ from vram_arbiter.sidecars.device.capacity import visible
 
 if TYPE_CHECKING:
     import torch
-    from torch import Tensor
     from torch.nn import Module
 
 _log = logging.getLogger(__name__)
@@ -226,43 +222,80 @@ def quantize_linear(module: "Module", manifest: RSkillManifest) -> None:
     """Quantize the linear layers of a model in host RAM to NF4, in place, one after the other.
 
     For models that transformers does not load. Cast the rest of the model before: what is quantized
-    must never be cast. Each weight keeps the `dtype` that its model's code may ask it for.
+    must never be cast. Each weight keeps the `dtype` that its model's code may ask it for. A model
+    of a quantized checkpoint (`packed_weights`) keeps its layers as they are.
 
     Raises: ConfigError, UnsupportedQuantization.
     """
     nf4 = nf4_of(manifest)
     if nf4 is None:
         return
-    bnb = load_bitsandbytes()
-    chosen = nf4.chosen(module)
-    for name in chosen:
-        linear = module.get_submodule(name)
-        assert isinstance(linear, _torch().nn.Linear)
-        storage = linear.weight.dtype
-        quantized = bnb.nn.Linear4bit(
-            linear.in_features,
-            linear.out_features,
-            bias=False,
-            compute_dtype=nf4.compute_type,
-            compress_statistics=False,
-            quant_type="nf4",
-            quant_storage=storage,
-            device="meta",
-        )
-        quantized.weight = bnb.nn.Params4bit(
-            linear.weight.data,
-            compress_statistics=False,
-            quant_type="nf4",
-            quant_storage=storage,
-            module=quantized,
-        ).to("cpu")
-        quantized.bias = linear.bias
-        if linear.bias is not None:
-            quantized.bias.data = linear.bias.data.to(nf4.compute_type)
-        module.set_submodule(name, quantized.train(linear.training))
-        del linear  # its weight is freed before the next one is quantized
+    if layers := nf4_layers(module):
+        for layer in layers.values():
+            _store_as(layer, nf4.compute_type)
+    else:
+        kind = load_bitsandbytes().nn.Params4bit
+        chosen = nf4.chosen(module)
+        for name in chosen:
+            linear = module.get_submodule(name)
+            storage = linear.weight.dtype
+            weight = kind(
+                linear.weight.data,
+                compress_statistics=False,
+                quant_type="nf4",
+                quant_storage=storage,
+            ).to("cpu")
+            module.set_submodule(name, linear4bit(linear, weight, nf4))
+            del linear  # its weight is freed before the next one is quantized
     settle(module)
-    _log.info("quantized %d linear layers to NF4", len(chosen))
+    _log.info("%d linear layers are NF4", len(layers) or len(chosen))
+
+
+def linear4bit(linear: Any, weight: Any, nf4: Nf4) -> Any:
+    """Return a layer like `linear` with the quantized `weight`."""
+    layer = load_bitsandbytes().nn.Linear4bit(
+        linear.in_features,
+        linear.out_features,
+        bias=False,
+        compute_dtype=nf4.compute_type,
+        compress_statistics=weight.compress_statistics,
+        quant_type="nf4",
+        quant_storage=weight.quant_storage,
+        device="meta",
+    )
+    weight.module, layer.weight, layer.quant_state = layer, weight, weight.quant_state
+    layer.bias = linear.bias
+    if linear.bias is not None:
+        layer.bias.data = linear.bias.data.to(nf4.compute_type)
+    return layer.train(linear.training)
+
+
+def _store_as(layer: Any, dtype: "torch.dtype") -> None:
+    """Show the bytes of a quantized weight as numbers of `dtype`, which its model's code reads."""
+    weight = layer.weight
+    weight.data = weight.data.reshape(-1).view(dtype).unsqueeze(1)
+    weight.quant_storage = layer.quant_storage = dtype
+
+
+def check_weights(model: "Module", manifest: RSkillManifest) -> None:
+    """Refuse a model whose own code loads most of its weights in another number format than its
+    manifest's. Raises: UnsupportedQuantization."""
+    dtype = manifest.quantization.dtype
+    if dtype not in TORCH_NAMES:
+        return
+    sizes: Counter[torch.dtype] = Counter()
+    for parameter in model.parameters():
+        if parameter.is_floating_point():
+            sizes[parameter.dtype] += parameter.numel()
+    ((found, _),) = sizes.most_common(1) or [(torch_type(dtype), 0)]
+    if found != torch_type(dtype):
+        names = {torch_type(one): one.value for one in TORCH_NAMES}
+        raise UnsupportedQuantization(
+            f"{manifest.name}: quantization.dtype is {dtype.value!r}, and "
+            f"{type(model).__name__} loads its weights in {names.get(found, found)}",
+            hint=f"write dtype: {names.get(found, 'fp32')}",
+            details={"dtype": dtype.value, "supported": [names.get(found, str(found))]},
+        )
 
 
 def settle(model: "Module") -> None:
@@ -279,79 +312,6 @@ def nf4_layers(model: "Module") -> dict[str, Any]:
     """Return the quantized linear layers of a model by name."""
     kind = load_bitsandbytes().nn.Linear4bit
     return {name: layer for name, layer in model.named_modules() if isinstance(layer, kind)}
-
-
-@dataclass(slots=True)
-class PackedHeader:
-    """Names and shapes of a checkpoint with NF4 weights, as if it were not quantized.
-
-    `tensors` are on `meta`; `quantized` are the names among them that the checkpoint holds packed.
-    """
-
-    tensors: "dict[str, Tensor]" = field(default_factory=dict)
-    quantized: list[str] = field(default_factory=list)
-    missing: set[str] = field(default_factory=set)
-    misshapen: dict[str, str] = field(default_factory=dict)
-
-
-_BLOB: Final = ".quant_state.bitsandbytes__nf4"  # JSON: shape, block size
-_NESTED: Final = ("nested_absmax", "nested_quant_map")  # statistics of the statistics
-_STATISTICS: Final = ("absmax", "quant_map", *_NESTED)
-_BYTES: Final = {"U8": 1, "F16": 2, "BF16": 2, "F32": 4}  # of an element, as safetensors names it
-_CODES: Final = 16
-_NESTED_CODES: Final = 256
-
-
-def read_packed(files: Iterable[Path]) -> PackedHeader:
-    """Read the headers of safetensors files, and of each packed weight the bytes that tell its
-    shape. Raises what safetensors and JSON raise for a file that is not whole."""
-    import torch
-    from safetensors import safe_open
-
-    shapes: dict[str, list[int]] = {}
-    types: dict[str, str] = {}
-    states: dict[str, JsonMap] = {}
-    for path in files:
-        with safe_open(path, "pt") as file:
-            for name in file.keys():  # noqa: SIM118  not a mapping
-                part = file.get_slice(name)
-                shapes[name], types[name] = part.get_shape(), part.get_dtype()
-                if name.endswith(_BLOB):
-                    blob = bytes(file.get_tensor(name).tolist())
-                    states[name.removesuffix(_BLOB)] = json.loads(blob)
-    found = PackedHeader()
-    for name, shape in shapes.items():
-        weight, _, last = name.rpartition(".")
-        if last in _STATISTICS and (weight in shapes or weight in states):
-            if weight not in states:
-                found.missing.add(weight + _BLOB)
-        elif not name.endswith(_BLOB) and name not in states:
-            found.tensors[name] = torch.empty(shape, device="meta")
-    for weight, state in states.items():
-        expected = _sizes_of(weight, state)
-        found.missing |= expected.keys() - shapes.keys() - {weight}
-        for name in expected.keys() & shapes.keys():
-            size = math.prod(shapes[name]) * _BYTES.get(types[name], 0)
-            if size != expected[name]:
-                found.misshapen[name] = f"{size} bytes, not {expected[name]}"
-        if weight in shapes:
-            found.tensors[weight] = torch.empty(state["shape"], device="meta")
-            found.quantized.append(weight)
-    return found
-
-
-def _sizes_of(weight: str, state: JsonMap) -> dict[str, int]:
-    """Return the bytes of a packed weight and of its statistics, by name."""
-    count = math.prod(state["shape"])
-    blocks = -(-count // state["blocksize"])
-    sizes = {weight: -(-count // 2), f"{weight}.quant_map": 4 * _CODES}
-    if "nested_blocksize" not in state:
-        return sizes | {f"{weight}.absmax": 4 * blocks}
-    return sizes | {
-        f"{weight}.absmax": blocks,
-        f"{weight}.nested_absmax": 4 * -(-blocks // state["nested_blocksize"]),
-        f"{weight}.nested_quant_map": 4 * _NESTED_CODES,
-    }
 
 
 def load_bitsandbytes() -> Any:

@@ -116,7 +116,9 @@ class PolicyAdapter:
     def load(self, device: str) -> None:
         self._config.device = device
         self._config.pretrained_path = self._weights.source
-        policy = load_lerobot(self._policy_class, self._weights, self._config)
+        policy = load_lerobot(
+            self._policy_class, self._weights, self._config, nf4_of(self._manifest)
+        )
         if device != META:
             _need_trained(policy, self._weights.source)
         self._policy = policy if self._has_own_dtype else policy.to(torch_type(self._dtype))

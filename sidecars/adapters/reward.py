@@ -13,8 +13,9 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import ScoreOp
 from vram_arbiter.sidecars.adapters.base import ModelCall
-from vram_arbiter.sidecars.checkpoints import load_lerobot
+from vram_arbiter.sidecars.checkpoints import META, load_lerobot
 from vram_arbiter.sidecars.images import decode_all, of_one_size
+from vram_arbiter.sidecars.quantization import check_weights, nf4_of, quantize_linear
 from vram_arbiter.sidecars.weights import Weights, read_config
 
 _OWN_MODELS = (
@@ -37,6 +38,7 @@ class RewardAdapter:
 
     def __init__(self, manifest: RSkillManifest, weights: Weights) -> None:
         assert manifest.reward is not None, "the kind requires the block"
+        self._manifest = manifest
         self._contract = manifest.reward
         self._weights = weights
         self._config: Any = None
@@ -60,7 +62,13 @@ class RewardAdapter:
     def load(self, device: str) -> None:
         self._config.device = device
         self._config.pretrained_path = self._weights.source
-        self._model = load_lerobot(self._model_class, self._weights, self._config)
+        nf4 = nf4_of(self._manifest)
+        self._model = load_lerobot(self._model_class, self._weights, self._config, nf4)
+        check_weights(self._model, self._manifest)
+        if nf4 is not None and device == META:
+            nf4.chosen(self._model)
+        else:
+            quantize_linear(self._model, self._manifest)
         self._make_processor()
 
     @property

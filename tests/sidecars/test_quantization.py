@@ -17,6 +17,7 @@ from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.quantization import (
     Nf4,
     check_precision,
+    check_weights,
     nf4_layers,
     nf4_of,
     quantize_linear,
@@ -135,6 +136,17 @@ class TestQuantizedLinear:
         state = layer.weight.quant_state
         size = layer.weight.nbytes + state.absmax.nbytes
         assert 0.25 <= size / (256 * 128 * 2) < 0.29
+
+    def test_a_model_that_loads_itself_in_another_number_format_is_refused(
+        self, model: Any
+    ) -> None:
+        """Regression: a reward model ran in its code's number format, whatever its manifest."""
+        check_weights(model, manifest("fp32"))
+        with pytest.raises(UnsupportedQuantization, match=r"weights in fp32 \(write dtype: fp32"):
+            check_weights(model, manifest("bf16"))
+        model.layers.bfloat16()
+        model.attention.bfloat16()
+        check_weights(model, manifest("bf16"))
 
     def test_skipped_modules_and_small_layers_stay(self, model: Any) -> None:
         from bitsandbytes.nn import Linear4bit

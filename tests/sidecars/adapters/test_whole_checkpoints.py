@@ -14,8 +14,11 @@ from typing import Any
 import pytest
 
 from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.manifest.contracts import Quantization
+from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.sidecars.checkpoints import load_lerobot, load_transformers
-from vram_arbiter.sidecars.quantization import Nf4
+from vram_arbiter.sidecars.quantization import Nf4, nf4_layers, quantize_linear
 from vram_arbiter.sidecars.weights import Weights, read_config
 
 pytestmark = pytest.mark.heavy
@@ -345,6 +348,74 @@ def test_a_quantized_checkpoint_is_compared_with_its_statistics(
     refusal_of(load_detector_nf4, tmp_path, device)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_quantized_policy_is_loaded_as_it_is(
+    saved: Callable[[str], Path], tmp_path: Path, device: str
+) -> None:
+    """The field ships policies whose state dict bitsandbytes wrote."""
+    import torch
+    from bitsandbytes.functional import dequantize_4bit, quantize_4bit
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class
+    from safetensors.torch import load_file, save_file
+
+    nf4 = Nf4(min_params=0)
+    shutil.copytree(saved("act"), tmp_path, dirs_exist_ok=True)
+    weights = Weights(str(tmp_path), local=True)
+    config = read_config(PreTrainedConfig, weights)
+    config.device = device
+    cls = get_policy_class(config.type)
+
+    def load(nf4: Nf4 | None = nf4) -> Any:
+        return load_lerobot(cls, weights, config, nf4)
+
+    names = [f"{name}.weight" for name in nf4.chosen(load())]
+    tensors = load_file(tmp_path / WHOLE)
+    packed, values = dict(tensors), {}
+    for name in names:
+        packed[name], state = quantize_4bit(
+            tensors[name], quant_type="nf4", compress_statistics=True
+        )
+        values[name] = dequantize_4bit(packed[name], state)
+        packed |= {f"{name}.{key}": part for key, part in state.as_dict(packed=True).items()}
+    file = tmp_path / WHOLE
+    save_file(packed, file)
+    assert "absmax" in refused(load, None).message, "the manifest has to say int4"
+    model = load()
+    assert {tensor.device.type for tensor in model.parameters()} == {device}
+    if device == "cpu":
+        model = model.to(torch.bfloat16)  # as an adapter does: packed bytes are no numbers
+        skill = load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml")
+        int4 = {"quantization": Quantization(dtype=Dtype.INT4)}
+        quantize_linear(model, skill.model_copy(update=int4))
+        layers = nf4_layers(model)
+        assert {f"{name}.weight" for name in layers} == set(names)
+        for name, layer in layers.items():
+            assert layer.weight.dtype == layer.compute_dtype == torch.bfloat16
+            found = dequantize_4bit(layer.weight.data, layer.weight.quant_state)
+            assert found.equal(values[f"{name}.weight"])
+        x = torch.randn(1, layer.in_features, dtype=torch.bfloat16)
+        with torch.inference_mode():
+            assert layer(x).isfinite().all()
+
+    def damaged(content: dict[str, Any]) -> ModelError:
+        save_file(content, file)
+        return refused(load, nf4)
+
+    name = names[0]
+    error = damaged({key: part for key, part in packed.items() if key != f"{name}.absmax"})
+    assert (error.details["missing"], error.details["misshapen"]) == (1, 0)
+    error = damaged({key: part for key, part in packed.items() if not key.startswith(name)})
+    assert f"1 missing from it ({name})" in error.message
+    assert damaged(packed | {name: packed[name][1:]}).details["misshapen"] == 1
+
+
+def refused(load: Callable[[Nf4 | None], Any], nf4: Nf4 | None) -> ModelError:
+    with pytest.raises(ModelError) as caught:
+        load(nf4)
+    return caught.value
+
+
 def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Path) -> None:
     """lerobot's pi0.5: without weights, or with those of another model, it prints a line and
     returns random numbers. Three billion, so without bytes."""
@@ -369,7 +440,6 @@ def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, d
     network's units, not in the robot's."""
     from safetensors.torch import load_file, save_file
 
-    from vram_arbiter.schemas.manifest import load_manifest
     from vram_arbiter.sidecars.adapters.choose import make_adapter
 
     shipped_copy("so101-grab")(tmp_path)
