@@ -108,16 +108,13 @@ class DetectorAdapter:
             model,
         )
         # Grounding DINO scores tokens, the others score texts.
-        spans = (
-            self._spans(inputs["input_ids"][0].tolist(), labels)
-            if hasattr(model.config, "max_text_len")
-            else None
-        )
-        # Grounding DINO makes float32 of its own between layers of 16 bits: autocast joins them.
-        half = model.dtype in (torch.float16, torch.bfloat16)
+        tokens = inputs["input_ids"][0].tolist() if hasattr(model.config, "max_text_len") else None
+        spans = None if tokens is None else self._spans(tokens, labels)
+        # It also makes float32 of its own between layers of 16 bits; autocast joins them.
+        mixed = spans is not None and model.dtype in (torch.float16, torch.bfloat16)
         with (
             torch.inference_mode(),
-            torch.autocast(model.device.type, model.dtype, enabled=half),
+            torch.autocast(model.device.type, model.dtype, enabled=mixed),
         ):
             outputs = model(**inputs)
         for name in _ANSWERS & outputs.keys():
