@@ -76,12 +76,9 @@ def check(wanted: Wanted) -> list[Finding]:
     if manifest.weights_uri is None:
         return findings  # nothing to load: no bytes
     findings.append(packages := _packages(manifest))
-    if refused is not None:
-        precision = _bad("precision", refused)
-    elif importlib.util.find_spec("torch") is None:
-        precision = Finding("precision", None, "not checked: torch is not installed")
-    else:
-        precision = _precision(manifest, wanted.device)
+    precision = (
+        _precision(manifest, wanted.device) if refused is None else _bad("precision", refused)
+    )
     findings.append(precision)
     comparable = adapter is not None and packages.ok and precision.ok
     findings += _weights(manifest, weights, wanted.adapter_for if comparable else None)
