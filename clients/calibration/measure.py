@@ -306,7 +306,8 @@ async def measure_model(
 ) -> Measured:
     """Load a model in a sidecar of its own, ask it, unload it and end it.
 
-    `sidecar` is its command, and `arguments` name the model for `vram-sidecar`. Raises the sidecar's typed errors.
+    `sidecar` is its command, and `arguments` name the model for it. Raises the sidecar's typed
+    errors, CalibrationFailed and ProbeFailed.
     """
     client_for = client_type(manifest)
     with tempfile.TemporaryDirectory(prefix="vc") as folder:
@@ -368,7 +369,7 @@ async def _settled(sampler: Sampler, pace: Pace, *, gone: bool = False) -> int:
         await asyncio.sleep(pace.period_s)
     raise CalibrationFailed(
         f"the program's bytes did not come to rest within {deadline_s - since_s:.0f} s",
-        hint="does it work in the background? measure it as a program: vramctl calibrate -- COMMAND",
+        hint="does it work in the background? measure it with: vramctl calibrate -- COMMAND",
     )
 
 

@@ -1,4 +1,4 @@
-"""Residencies on a GPU: two sidecars take turns on a budget, each from host RAM, and leave nothing."""
+"""Residencies on a GPU: sidecars take turns on a budget, come from host RAM and leave nothing."""
 
 import json
 import os
