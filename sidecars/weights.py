@@ -126,24 +126,29 @@ def transformers_modules(weights: Weights) -> tuple[str, ...]:
 
 
 def fetched(weights: Weights) -> Weights:
-    """Return the local folder of weights, after downloading what the hub's cache lacks.
+    """Return the local folder of weights and processors, after downloading what is not here.
 
     Some of lerobot's loaders drop the revision and read the newest one. Raises ModelError.
     """
+    if not weights.local:
+        weights = _in_folder(weights, _download(weights.source, weights.revision))
+    files = weights.processors
+    if files and not Path(files.source).is_dir():
+        folder = _download(files.source, files.revision)
+        weights = replace(weights, processors=replace(files, source=folder, revision=None))
+    return weights
+
+
+def _download(source: str, revision: str | None) -> str:
     from huggingface_hub import snapshot_download
 
-    if weights.local:
-        return weights
     try:
-        folder = snapshot_download(
-            weights.source, revision=weights.revision, allow_patterns=POLICY_FILES
-        )
+        return str(snapshot_download(source, revision=revision, allow_patterns=POLICY_FILES))
     except Exception as error:
         raise ModelError(
-            f"{weights.source} cannot be fetched: {type(error).__name__}: {error}",
+            f"{source} cannot be fetched: {type(error).__name__}: {error}",
             hint="check its name, its revision and the network, or fetch it with `hf download`",
         ) from error
-    return _in_folder(weights, folder)
 
 
 def _in_folder(weights: Weights, folder: str) -> Weights:

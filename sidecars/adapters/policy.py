@@ -12,6 +12,7 @@ from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
     family_of,
+    need_own_steps,
     need_packages,
     need_type,
 )
@@ -164,6 +165,7 @@ class PolicyAdapter:
             "policy_preprocessor.json",
             "policy_postprocessor.json",
         )
+        need_own_steps(self._manifest, files)
         try:
             self._before, self._after = make_pre_post_processors(
                 self._config,
@@ -219,6 +221,11 @@ class PolicyAdapter:
         """Return the actions (B, T, D) after the last of `steps`, which are oldest first."""
         if not self._selects:
             chunk: Tensor = self._policy.predict_action_chunk(dict(steps[-1]))
+            if self._config.type == "pi0_fast" and not chunk.any():
+                raise ModelError(  # lerobot logs the reason and answers zeros
+                    "the policy's tokens cannot be decoded into actions",
+                    hint="the sidecar's log has the tokens; nothing was sent to the robot",
+                )
             return chunk
         return _select(self._policy, steps)
 

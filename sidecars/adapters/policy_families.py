@@ -6,8 +6,10 @@ reads this table where neither is installed.
 """
 
 import importlib.util
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from vram_arbiter.schemas.errors import ConfigError, ModelError, UnsupportedQuantization
@@ -15,9 +17,12 @@ from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.runtime.extras import not_installed
 from vram_arbiter.sidecars.quantization import nf4_of
+from vram_arbiter.sidecars.weights import ProcessorFiles
 
 _FLOATS: Final = frozenset({Dtype.FP32, Dtype.BF16, Dtype.FP16})
 _OWN_FLOATS: Final = frozenset({Dtype.FP32, Dtype.BF16})
+_CONSENT_HINT: Final = "read that code, then write trust_remote_code: true in quantization.extra"
+_OWN_STEPS: Final = ("lerobot.", "vram_arbiter.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +77,17 @@ def family_of(manifest: RSkillManifest) -> Family:
             f"{manifest.name}: model_family {name.value if name else None!r} is not served",
             hint=f"sidecars serve {', '.join(sorted(FAMILIES))}",
         )
-    if family.remote_code and manifest.quantization.extra.get("trust_remote_code") is not True:
+    if family.remote_code and not _consents(manifest):
         raise ConfigError(
             f"{manifest.name}: the action tokenizer of model_family {name} is Python code of the "
             "hub",
-            hint="read that code, then write trust_remote_code: true in quantization.extra",
+            hint=_CONSENT_HINT,
         )
     return family
+
+
+def _consents(manifest: RSkillManifest) -> bool:
+    return manifest.quantization.extra.get("trust_remote_code") is True
 
 
 def need_packages(manifest: RSkillManifest) -> None:
@@ -126,6 +135,11 @@ def need_type(manifest: RSkillManifest, family: Family, config: Any, source: str
             f"{source} is a PEFT adapter, not a whole policy",
             hint="merge it into its base policy and save that",
         )
+    if config.type == "gaussian_actor" and config.vision_encoder_name and not _consents(manifest):
+        raise ModelError(
+            f"{source}: its image encoder {config.vision_encoder_name} is Python code of the hub",
+            hint=_CONSENT_HINT,
+        )
     cameras = sorted(config.image_features)
     if family.camera and cameras and cameras != [family.camera]:
         raise ModelError(
@@ -133,3 +147,30 @@ def need_type(manifest: RSkillManifest, family: Family, config: Any, source: str
             f"{family.camera}",
             hint="rename the input in the checkpoint's config.json and processors",
         )
+
+
+def need_own_steps(manifest: RSkillManifest, files: ProcessorFiles) -> None:
+    """Raise ModelError if a processor names code that is neither lerobot's nor ours.
+
+    lerobot imports and calls any class that a processor's file names, such as `subprocess.Popen`.
+    """
+    if _consents(manifest):
+        return
+    for name in (files.preprocessor, files.postprocessor):
+        path = Path(files.source) / name
+        try:
+            steps = [dict(step) for step in json.loads(path.read_text(encoding="utf-8"))["steps"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ModelError(
+                f"{path}: its processors cannot be read: {type(error).__name__}: {error}",
+                hint="check that the checkpoint is complete",
+            ) from error
+        for step in steps:
+            called = str(step.get("class", ""))
+            options = step.get("config") or {}
+            if (called and not called.startswith(_OWN_STEPS)) or options.get("trust_remote_code"):
+                raise ModelError(
+                    f"{path} runs other code than lerobot's: "
+                    f"{called or step.get('registry_name')} {options}",
+                    hint=_CONSENT_HINT,
+                )

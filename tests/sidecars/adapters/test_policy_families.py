@@ -339,6 +339,44 @@ def test_what_cannot_act_is_refused(checkpoint: Callable[[str], Weights], tmp_pa
         loaded("vqbet", weights)
 
 
+@pytest.mark.parametrize(
+    "step",
+    [
+        '"class": "subprocess.Popen", "config": {"args": ["touch", "TOUCHED"]}',
+        '"registry_name": "action_tokenizer_processor", "config": {"trust_remote_code": true}',
+    ],
+)
+def test_a_processor_runs_no_code_of_others(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, step: str
+) -> None:
+    """Regression: lerobot imports and calls whatever class a checkpoint's processor names."""
+    shutil.copytree(checkpoint("tdmpc").source, tmp_path / "tdmpc")
+    file = tmp_path / "tdmpc" / "policy_preprocessor.json"
+    touched = tmp_path / "touched"
+    text = file.read_text().replace(
+        '"steps": [', f'"steps": [{{{step.replace("TOUCHED", str(touched))}}},'
+    )
+    file.write_text(text)
+    manifest = parse_manifest(
+        manifest_text("tdmpc").replace("trust_remote_code: true", "trust_remote_code: false")
+    )
+    adapter = make_adapter(manifest, Weights(str(file.parent), local=True))
+    adapter.prepare()
+    with pytest.raises(ModelError, match="runs other code than lerobot's"):
+        adapter.load("cpu")
+    assert not touched.exists()
+
+
+def test_tokens_that_are_no_actions_never_leave(
+    checkpoint: Callable[[str], Weights], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: lerobot logs the failure and answers the middle of each joint's range."""
+    adapter = loaded("pi0_fast", checkpoint("pi0_fast"))
+    monkeypatch.setattr(policies.FastTokenizer, "decode", lambda self, tokens: None)
+    with pytest.raises(ModelError, match="cannot be decoded into actions"):
+        ask(adapter, observations(1)[0])
+
+
 def test_a_camera_that_tdmpc_does_not_find_is_refused(
     checkpoint: Callable[[str], Weights], tmp_path: Path
 ) -> None:
