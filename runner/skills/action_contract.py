@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 from vram_arbiter.runner.protocols import EndEffector, Joint, RobotDescription
 from vram_arbiter.runner.skills.actions import TWIST, ActionPlan, Command, Kind
@@ -16,6 +15,7 @@ from vram_arbiter.runner.skills.kinematics import ArmModel
 from vram_arbiter.runner.skills.units import SAME, Scale, of_joint, opening
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.contracts import ActuatorRequirement, ControlModeSemantics
 from vram_arbiter.schemas.manifest.io_contracts import ActionContract, ActionSlot
 from vram_arbiter.schemas.manifest.problems import Path, Problem
 from vram_arbiter.schemas.manifest.vocabulary import (
@@ -54,12 +54,14 @@ class _Resolver:
         self.findings.append(Problem(path, message))
 
     # -- what the manifest says elsewhere
-    def semantics(self, modes: frozenset[ControlMode]) -> Any:
+    def actuator(self, modes: frozenset[ControlMode]) -> ActuatorRequirement | None:
+        """Return the manifest's actuator of these modes, if it has one."""
+        return next((a for a in self.manifest.actuators_required if a.kind in modes), None)
+
+    def semantics(self, modes: frozenset[ControlMode]) -> ControlModeSemantics | None:
         """Return how the actuator of these modes is meant, if the manifest has one."""
-        for actuator in self.manifest.actuators_required:
-            if actuator.kind in modes:
-                return actuator.control_mode_semantics
-        return None
+        found = self.actuator(modes)
+        return found.control_mode_semantics if found is not None else None
 
     def gripper_convention(self, slot: ActionSlot | None) -> GripperConvention | None:
         if slot is not None and slot.gripper_convention is not None:
@@ -245,27 +247,24 @@ class _Resolver:
         kind: Kind = "joint_delta" if delta else "joint_position"
         if mode is ControlMode.JOINT_VELOCITY:
             kind = "joint_velocity"
-        if kind == "joint_position":
-            grippers: tuple[int, ...] = ()
-        else:  # a gripper among them is still told where to be, if its convention is stated
-            convention = stated_convention(self.manifest)
-            grippers = tuple(
-                i for i, name in enumerate(names) if known[name].gripper and convention is not None
-            )
         for index, name in enumerate(names):
             scale = self.joint_scale(path, known[name])
-            absolute = kind == "joint_position" or index in grippers
-            self.scales[at[index]] = scale if absolute else Scale(scale.scale)
-        rest = tuple(i for i in range(len(names)) if i not in grippers)
-        groups: tuple[tuple[tuple[int, ...], Kind], ...] = (
-            (rest, kind),
-            (grippers, "joint_position"),
-        )
-        for picked, how in groups:
-            if picked:
-                moved = tuple(names[i] for i in picked)
-                self.claim(path, moved)
-                self.commands.append(Command(how, tuple(at[i] for i in picked), moved))
+            self.scales[at[index]] = scale if kind == "joint_position" else Scale(scale.scale)
+        gripper = self.actuator(GRIPPER_MODES)
+        apart: tuple[int, ...] = ()  # grippers that do not go as the other joints do
+        if gripper is not None and not (
+            kind == "joint_position"
+            and gripper.kind is ControlMode.GRIPPER_POSITION
+            and gripper.control_mode_semantics.mode == "absolute"
+        ):
+            apart = tuple(i for i, name in enumerate(names) if known[name].gripper)
+            for i in apart:
+                convention = gripper.control_mode_semantics.gripper_convention
+                self.gripper_value(path, at[i], known[names[i]], gripper.kind, convention)
+        if rest := [i for i in range(len(names)) if i not in apart]:
+            moved = tuple(names[i] for i in rest)
+            self.claim(path, moved)
+            self.commands.append(Command(kind, tuple(at[i] for i in rest), moved))
 
     def joint_scale(self, path: Path, joint: Joint) -> Scale:
         contract = self.manifest.action_contract
@@ -373,6 +372,17 @@ class _Resolver:
         if joint is None:
             self.wrong((*path, "ee"), f"{ee} has no gripper that this robot moves")
             return
+        self.gripper_value(path, at, joint, mode, convention)
+
+    def gripper_value(
+        self,
+        path: Path,
+        at: int,
+        joint: Joint,
+        mode: ControlMode,
+        convention: GripperConvention | None,
+    ) -> None:
+        """Command one gripper by one value."""
         if convention is None:
             self.wrong(
                 path,

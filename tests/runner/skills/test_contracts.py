@@ -295,6 +295,47 @@ def test_joint_steps_and_speeds_start_at_the_last_target(
     assert step.terminated
 
 
+@pytest.mark.parametrize(
+    ("gripper", "value", "wanted"),
+    [
+        (
+            "gripper_position, control_mode_semantics: {mode: absolute, gripper_convention:"
+            " normalized_open_unit}",
+            0.75,
+            0.75,
+        ),
+        (
+            "gripper_position, control_mode_semantics: {mode: delta, gripper_convention:"
+            " normalized_open_unit}",
+            0.25,
+            0.75,
+        ),
+        (
+            "gripper_binary, control_mode_semantics: {mode: absolute, gripper_convention:"
+            " normalized_open_symmetric}",
+            0.1,
+            1.0,
+        ),
+    ],
+)
+def test_a_gripper_among_joint_steps_goes_as_its_own_actuator_says(
+    gripper: str, value: float, wanted: float
+) -> None:
+    """Six joints in one vector: five deltas, and a gripper that is told where to be, or switched."""
+    robot = so101(simulated=True)
+    manifest = skill(
+        "actuators_required:\n  - {kind: joint_position, control_mode_semantics: {mode: delta}}\n"
+        f"  - {{kind: {gripper}}}\naction_contract: {{dim: 6}}\n"
+    )
+    wiring = wire_up(manifest, robot, None)
+    lower, span = -0.17453, 1.74533 + 0.17453
+    start = {**dict.fromkeys(robot.joint_names, 0.0), "gripper": lower + 0.5 * span}
+    (row,) = wiring.actions.rows(np.array([[0.1, 0, 0, 0, 0, value]]), None)
+    step = Stepper(wiring.actions, robot, None, period_s=1 / HZ).step(row, start)
+    assert step.targets["shoulder_pan"] == pytest.approx(0.1)
+    assert step.targets["gripper"] == pytest.approx(lower + wanted * span)
+
+
 @pytest.mark.parametrize("rotation", [*Rotation, None])
 def test_a_cartesian_pose_is_where_the_tool_goes(panda: Bench, rotation: Rotation | None) -> None:
     width = 3 + (rotation.width if rotation is not None else 0)
