@@ -156,7 +156,7 @@ def _in_folder(weights: Weights, folder: str) -> Weights:
     files = weights.processors
     if files and (files.source, files.revision) == (weights.source, weights.revision):
         files = replace(files, source=folder, revision=None)
-    return Weights(folder, local=True, processors=files)
+    return replace(weights, source=folder, revision=None, local=True, processors=files)
 
 
 def cached(weights: Weights) -> Weights | None:
