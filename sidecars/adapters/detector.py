@@ -165,10 +165,10 @@ class DetectorAdapter:
                 at += 1
             spans.append(slice(at, at + len(own)))
             at += len(own)
-        if max(at, len(tokens)) > (limit := self._model.config.max_text_len):
+        limit = self._model.config.max_text_len
+        if at > len(tokens) or len(tokens) > limit:  # a text is cut off, or is there in part
             raise BadRequest(
-                f"{len(labels)} objects have {max(at, len(tokens))} tokens; this model reads "
-                f"{limit}",
+                f"{len(labels)} objects have {len(tokens)} tokens; this model reads {limit}",
                 hint="ask for fewer objects in one request",
             )
         return spans

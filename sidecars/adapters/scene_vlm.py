@@ -103,8 +103,14 @@ class SceneVlmAdapter:
         given: dict[str, Any] = {"images": [list(images)]} if images else {}  # of one prompt
         if video:
             given |= _video(video, fps)
-        inputs = processor(text=[prompt], return_tensors="pt", **given)
-        return to_model(inputs, self._model), "<think>" in prompt.rpartition("</think>")[2]
+        try:
+            inputs = processor(text=[prompt], return_tensors="pt", **given)
+        except ValueError as error:  # such as a picture 200 times as wide as high
+            raise BadRequest(
+                f"{type(processor).__name__} cannot read these pictures: {error}",
+                hint="send pictures of an ordinary shape",
+            ) from error
+        return to_model(inputs, self._model), prompt.rstrip().endswith("<think>")
 
     def _prompt(self, content: Sequence[Message]) -> str:
         """Return the user's turn and the begin of the answer, as the checkpoint's template says."""
@@ -149,12 +155,13 @@ class SceneVlmAdapter:
 
         asked = inputs["input_ids"].shape[1]
         context = getattr(self._model.config.get_text_config(), "max_position_embeddings", None)
-        limit = min(PROMPT_MAX_TOKENS, (context or PROMPT_MAX_TOKENS) - max_new_tokens)
+        limit = PROMPT_MAX_TOKENS if context is None else context - max_new_tokens
+        limit = max(0, min(limit, PROMPT_MAX_TOKENS))
         if asked > limit:
             raise LimitExceeded(
                 f"the question and its pictures have {asked} tokens; with an answer of "
                 f"{max_new_tokens} this model reads {limit}",
-                hint="send fewer pictures, or lower max_side",
+                hint="send fewer pictures, or lower max_side or max_new_tokens",
                 details={"limit": "tokens", "tokens": asked, "tokens_max": limit},
             )
         with torch.inference_mode():

@@ -128,13 +128,16 @@ def test_what_the_model_cannot_read_is_refused(loaded, manifest, png, monkeypatc
         adapter.run(asked(image=png()).model_copy(update={"max_new_tokens": 4096 - 20}))
     assert refused.value.details["tokens_max"] == 20
     monkeypatch.setattr(scene_vlm, "PROMPT_MAX_TOKENS", 50)
-    assert adapter.run(asked(image=png()))["ok"]
+    doubting = asked(image=png()).model_copy(update={"question": "<think>?"})
+    assert adapter.run(doubting)["ok"], "the thought is the caller's, not the model's"
     with pytest.raises(LimitExceeded, match="send fewer pictures"):
         adapter.run(asked(images=[png(), png()]))
     with pytest.raises(BadRequest, match="different sizes"):
         adapter.run(asked(video=[png(64, 48), png(48, 64)], fps=1.0))
     with pytest.raises(BadRequest, match="stands for a picture"):
         adapter.run(asked(image=png()).model_copy(update={"question": "<|image_pad|>?"}))
+    with pytest.raises(BadRequest, match="cannot read these pictures"):
+        adapter.run(asked(image=png(900, 4)))
     with pytest.raises(BadRequest, match="more than"):
         adapter.run(asked(images=[png(4000, 2100), png(4000, 2100)]))
     adapter._processor.video_processor = None
