@@ -319,6 +319,8 @@ def load_bitsandbytes() -> Any:
 
     Its import asks each GPU for its compute capability, and torch answers through CUDA.
     """
+    # it warns of a kernel for repacked weights, which are not used (`settle`)
+    logging.getLogger("bitsandbytes.backends.cpu.ops").setLevel(logging.ERROR)
     with _capability_without_cuda():
         import bitsandbytes
     return bitsandbytes

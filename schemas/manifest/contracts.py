@@ -118,7 +118,11 @@ class SafetyEnvelope(Block):
 
 # -- what it runs on
 class Quantization(Block):
-    """Number format of the weights and what makes it; `extra` belongs to the adapter."""
+    """Number format of the weights and what makes it.
+
+    `extra` of the field: `scheme`, `quantizer`, `compute_dtype`, `min_params_to_quantize`,
+    `skip_modules`, `loader`, `trust_remote_code`.
+    """
 
     dtype: Dtype = Dtype.FP32
     backend: QuantizationBackend = QuantizationBackend.PYTORCH

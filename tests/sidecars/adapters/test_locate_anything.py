@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import sys
 import textwrap
 
@@ -160,6 +161,26 @@ def test_it_runs_the_checkpoints_own_code(dtype, folder, described):
     assert (absent["ok"], absent["detections"]) == (True, [])
     with pytest.raises(BadRequest, match="own tokens"):
         adapter.run(call.model_copy(update={"query": "<image-1>"}))
+
+
+@pytest.mark.heavy
+def test_a_quantized_checkpoint_with_own_code_is_loaded_as_it_is(folder, described, tmp_path):
+    """The field ships this model in NF4."""
+    from vram_arbiter.sidecars.quantization import nf4_layers
+
+    def loaded(place, device="cpu"):
+        adapter = make_adapter(described(dtype="int4"), Weights(str(place), local=True))
+        adapter.prepare()
+        adapter.load(device)
+        return adapter.networks[0]
+
+    model, packed = loaded(folder), tmp_path / "packed"
+    shutil.copytree(folder, packed)
+    model.save_pretrained(packed)
+    assert loaded(packed, "meta").device.type == "meta"
+    again = nf4_layers(loaded(packed))
+    assert again.keys() == nf4_layers(model).keys()
+    assert all(again[name].weight.equal(nf4_layers(model)[name].weight) for name in again)
 
 
 @pytest.mark.heavy
