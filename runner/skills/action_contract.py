@@ -113,7 +113,7 @@ class _Resolver:
                 f"is {contract.dim}; {representation} has {width + with_gripper} values",
             )
             return
-        if len(self.robot.ends) != 1:
+        if len({end.frame for end in self.robot.ends}) != 1:
             self.wrong(
                 (*_PATH, "representation"),
                 f"{representation} moves the one end effector of a robot; {self.robot.name} has"

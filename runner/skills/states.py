@@ -285,7 +285,8 @@ def _resolve(
             if model is None:
                 wrong(f"the pose of {part.ee} needs a model of {robot.name}; there is none")
                 return part
-            end = next((end.frame for end in robot.ends if end.name == part.ee), part.ee)
+            ends = {end.name: end.frame for end in robot.ends}
+            end = part.ee if model.has(part.ee) else ends.get(part.ee, part.ee)
             if not model.has(end):
                 wrong(no_frame(end, model))
             if not (model.has(part.frame) or (base and part.frame == base.world_frame)):

@@ -42,7 +42,6 @@ from vram_arbiter.schemas.manifest.vocabulary import Rotation
 from vram_arbiter.schemas.world import Action, WorldState
 
 np: Any = pytest.importorskip("numpy")  # the base install has none
-pytest.importorskip("mink", reason="needs the solver of the extra `runner`")
 pytestmark = pytest.mark.heavy  # MuJoCo, mink
 
 HZ = 30.0
@@ -354,6 +353,26 @@ def test_a_cartesian_pose_is_where_the_tool_goes(panda: Bench, rotation: Rotatio
     assert there.xyz == pytest.approx(goal.xyz, abs=2e-3)
     wanted = goal if rotation is not None else here
     assert there.matrix == pytest.approx(wanted.matrix, abs=0.02)
+
+
+def test_a_representation_without_slots_moves_the_robots_one_tool(panda: Bench) -> None:
+    words = (
+        "actuators_required:\n"
+        "  - {kind: cartesian_delta, control_mode_semantics: {mode: delta, reference_frame: FRAME}}\n"
+        "  - {kind: gripper_position, control_mode_semantics: {mode: absolute,"
+        " gripper_convention: normalized_open_unit}}\n"
+        "action_contract: {dim: 7, representation: delta_ee_6d_plus_gripper,"
+        " cartesian_delta_scale: [0.1, 0.1, 0.1, 1, 1, 1]}\n"
+    )
+    wiring = wire_up(skill(words.replace("FRAME", "panda_link0")), panda.robot, None)
+    before = panda.tool().xyz
+    panda.play(wiring, [[0.0, 0.05, 0.0, 0.0, 0.0, 0.0, 0.5]] * 10)
+    panda.wait(0.5)
+    assert panda.tool().xyz - before == pytest.approx([0.0, 0.05, 0.0], abs=2e-3)
+    assert panda.measured()["panda_gripper"] == pytest.approx(0.02, abs=2e-3)
+    assert findings(skill(words.replace("FRAME", "map")), panda.robot)[0].startswith(
+        "action_contract.frame: no frame 'map'"
+    )
 
 
 def test_raw_numbers_are_clipped_to_the_slots_bounds(panda: Bench) -> None:
@@ -739,6 +758,19 @@ def test_cartesian_commands_without_the_solver_are_refused(
     assert findings(tool_skill("panda_link0"), panda.robot) == [
         "action_contract: cartesian commands need mink: pip install 'vram-arbiter[runner]'"
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "widths"),
+    [("libero-pi05-nf4", (7, 8)), ("so100-smolvla-base", (6, 6)), ("so101-grab", (6, 6))],
+)
+def test_shipped_policies_fit_a_shipped_robot(
+    panda: Bench, name: str, widths: tuple[int, int]
+) -> None:
+    manifest = load_manifest(ROOT / "configs/rskills" / name / "rskill.yaml")
+    robot = panda.robot if name.startswith("libero") else so101(simulated=True)
+    wiring = wire_up(manifest, robot, robot.rest_pose_rad)
+    assert (wiring.actions.dim, wiring.state.width) == widths
 
 
 @pytest.mark.skipif(not FIELD, reason="the field's own manifests do not lie beside this repository")
