@@ -61,9 +61,12 @@ class ChunkPlayer:
         self.chunks = 0
         self.played = 0
 
-    def wants_observation(self) -> bool:
-        """Return whether the next `next_row` will ask for a chunk and so needs an observation."""
-        return self._under_way is None and len(self._rows) <= self._prefetch_at
+    def wants_observation(self, ahead: int = 0) -> bool:
+        """Return whether the next `next_row` will ask for a chunk and so needs an observation.
+
+        With `ahead`, whether it or one of so many after it will, as far as the rows tell.
+        """
+        return self._under_way is None and len(self._rows) <= self._prefetch_at + ahead
 
     def next_row(self, observation: Any) -> Played | None:
         """Return what to play now, or None while the next chunk is pending.

@@ -160,6 +160,7 @@ class SidecarPolicy(SkillBase):
         self._running = False
         self._player: ChunkPlayer | None = None
         self._recent: deque[Row] = deque(maxlen=STILL_WINDOW)
+        self._seen: deque[Message] = deque(maxlen=wiring.rollout.n_obs_steps)
         self._target: dict[str, float] = {}
 
     # -- event loop
@@ -175,6 +176,7 @@ class SidecarPolicy(SkillBase):
         await self._client.reset({TASK_KEY: self._task}, token=self._token)
         self._ramp, self._running, self._commanded = None, False, None
         self._recent.clear()
+        self._seen.clear()
         # of this goal: a late request without a token would load the model anew
         token = self._token
         self._player = ChunkPlayer(
@@ -254,7 +256,11 @@ class SidecarPolicy(SkillBase):
 
     # -- control thread
     def wants_frames(self) -> bool:
-        return self._running and self._player is not None and self._player.wants_observation()
+        return (
+            self._running
+            and self._player is not None
+            and self._player.wants_observation(self._wiring.rollout.n_obs_steps - 1)
+        )
 
     def _step(self, world: WorldState) -> StepOutcome:
         player = self._player
@@ -270,8 +276,9 @@ class SidecarPolicy(SkillBase):
             return Hold("at the start pose")
         if player.played >= self._steps or self._stands_still(player):
             return Done({"steps": player.played, "chunks": player.chunks})
-        observation = self._observation(world, measured) if player.wants_observation() else None
-        played = player.next_row(observation)
+        if player.wants_observation(self._wiring.rollout.n_obs_steps - 1):
+            self._seen.append(self._observation(world, measured))
+        played = player.next_row(self._history() if player.wants_observation() else None)
         if played is None:
             return Hold("the policy thinks")
         self.fraction = player.played / self._steps
@@ -371,6 +378,23 @@ class SidecarPolicy(SkillBase):
                 )
             observation[key] = _picture(frame, self._wiring.rollout.views.get(camera))
         return observation
+
+    def _history(self) -> Message:
+        """Return the observations since the last chunk as one, and forget them.
+
+        With several, arrays have a leading dimension: control steps, oldest first. The sidecar
+        keeps what came with the chunks before.
+        """
+        import numpy as np
+
+        steps = list(self._seen)
+        self._seen.clear()
+        if len(steps) == 1:
+            return steps[0]
+        return {
+            name: value if name == TASK_KEY else np.stack([step[name] for step in steps])
+            for name, value in steps[-1].items()
+        }
 
     def _request(
         self, observation: Any, token: tuple[int, ...] | None

@@ -47,6 +47,7 @@ class Rollout(BaseModel):
     stop_when_still: bool = True
     views: dict[str, View] = Field(default_factory=dict)
     prefetch_at: int = Field(default=0, ge=0, le=1000)
+    n_obs_steps: int = Field(default=1, ge=1, le=16)  # consecutive observations that a chunk needs
     targets_lead: bool = (
         False  # its targets are set points far ahead of the arm: a robot goes there step by step
     )

@@ -300,6 +300,24 @@ def test_a_goal_is_one_use_and_its_chunks_play_in_order(
     scenario(run_async, policy_bench(Arbiter()), play)
 
 
+def test_a_policy_with_a_history_sees_consecutive_steps(tmp_path: Path, run_async: Run) -> None:
+    """Regression: it got one observation a chunk, and was trained on one a control step."""
+    manifest = parse_manifest(MANIFEST.replace("steps: 7,", "steps: 7, n_obs_steps: 2,"))
+
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        await b.play()
+        states = [seen["observation.state"] for seen in b.sidecar.observations]
+        assert states[0].tolist() == pytest.approx([0.0, 0.5]), "there is no step before the first"
+        assert states[1].shape == states[2].shape == (2, 2)
+        assert states[1].ravel().tolist() == pytest.approx([0.0, 0.01, 0.0, 0.02])
+        assert states[2].ravel().tolist() == pytest.approx([0.01, 0.01, 0.01, 0.02])
+        assert b.sidecar.observations[1]["observation.images.front"].shape == (2, 2, 4, 3)
+        assert b.sidecar.observations[1]["task"] == GOAL.prompt
+
+    scenario(run_async, Bench(manifest, f"ipc://{tmp_path}/grab.sock", None), play)
+
+
 def test_the_arm_goes_to_its_start_pose_before_the_policy_sees_anything(
     policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
