@@ -54,7 +54,8 @@ class Nf4:
 
         Left alone: modules that the manifest skips, by any part of their path; layers with fewer
         than `min_params` weights, or rows that do not fill whole bytes; weights that another module
-        shares; subclasses of `Linear`, whose owners read the weight themselves.
+        shares; subclasses of `Linear`, and layers of torch's own transformer: their owners read the
+        weight themselves.
 
         Raises: ConfigError if the manifest skips a module that the model does not have,
         UnsupportedQuantization if no layer is left.
@@ -73,6 +74,11 @@ class Nf4:
         uses = Counter(
             id(parameter) for _, parameter in model.named_parameters(remove_duplicate=False)
         )
+        readers = [
+            name
+            for name, module in model.named_modules()
+            if isinstance(module, torch.nn.TransformerEncoderLayer)
+        ]
         found = [
             name
             for name, module in model.named_modules()
@@ -80,7 +86,7 @@ class Nf4:
             and module.weight.numel() >= self.min_params
             and module.in_features % _WHOLE_BYTES == 0
             and uses[id(module.weight)] == 1
-            and not any(_within(name, skipped) for skipped in kept)
+            and not any(_within(name, part) for part in (*kept, *readers))
         ]
         if not found:
             raise UnsupportedQuantization(

@@ -101,6 +101,7 @@ class TestQuantizedLinear:
                 self.embed = nn.Embedding(64, 128)
                 self.visual = nn.ModuleDict({"proj": nn.Linear(128, 128)})
                 self.attention = nn.MultiheadAttention(128, 2)
+                self.block = nn.TransformerEncoderLayer(128, 2, 128, batch_first=True)
                 self.layers = nn.ModuleList([nn.Linear(128, 256), nn.Linear(256, 128)])
                 self.narrow = nn.Linear(128, 6)
                 self.lm_head = nn.Linear(128, 64, bias=False)
@@ -111,7 +112,7 @@ class TestQuantizedLinear:
                 # policies ask a layer for its type: packed bytes must not answer uint8
                 x = self.embed(tokens).to(self.layers[0].weight.dtype)
                 x = self.layers[1](self.layers[0](x).relu())
-                return self.narrow(x + self.attention(x, x, x)[0])
+                return self.narrow(self.block(x + self.attention(x, x, x)[0]))
 
         return Model().eval().requires_grad_(False)
 
@@ -144,8 +145,8 @@ class TestQuantizedLinear:
         check_weights(model, manifest("fp32"))
         with pytest.raises(UnsupportedQuantization, match=r"weights in fp32 \(write dtype: fp32"):
             check_weights(model, manifest("bf16"))
-        model.layers.bfloat16()
-        model.attention.bfloat16()
+        model.bfloat16()
+        model.embed.float()
         check_weights(model, manifest("bf16"))
 
     def test_skipped_modules_and_small_layers_stay(self, model: Any) -> None:
