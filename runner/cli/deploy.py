@@ -117,7 +117,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
                 PolicyClient(sidecar_endpoint(manifest.name, given, os.environ)),
                 arbiter,
                 period_s=1.0 / file.robot.rate_hz,
-                speeds_rad_s=speeds if wiring.stepwise else None,
+                speeds_rad_s=speeds,
                 sent=parts.hal.sent,
             )
 

@@ -147,7 +147,7 @@ def makers_of(
         wiring = wire_up(manifest, world.robot or world.joints, world.rest)
         client = PolicyClient(sidecar_endpoint(manifest.name, given, os.environ))
         speeds, sent = None, None
-        if world.environment is not None and wiring.stepwise:
+        if world.environment is not None:
             speeds, sent = (
                 world.environment.limits_for(manifest).speeds_rad_s,
                 world.environment.sent,

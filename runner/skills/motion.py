@@ -34,7 +34,8 @@ def bounded(here: float, there: float, reach: float) -> float:
 
 
 class JointRamp:
-    """Motion from the present pose to `goal` (rad, by name) at a bounded speed.
+    """Motion from the present pose to `goal` (rad, by name) at a bounded speed; `longest` are the
+    longest steps (rad) of joints that are slower.
 
     `done` when the joints arrived, or cannot go further.
     """
@@ -46,16 +47,18 @@ class JointRamp:
         *,
         period_s: float,
         speed_rad_s: float = SPEED_RAD_S,
+        longest: Mapping[str, float] | None = None,
     ) -> None:
         self._target = {name: start[name] for name in goal}
         self._goal = dict(goal)
-        self._stride = speed_rad_s * period_s
+        stride = speed_rad_s * period_s
+        self._strides = {name: min(stride, (longest or {}).get(name, stride)) for name in goal}
         self._settling = 0
 
     def next_target(self) -> dict[str, float]:
         """Return the next joint targets; the goal itself once they are there."""
         self._target = {
-            name: bounded(here, self._goal[name], self._stride)
+            name: bounded(here, self._goal[name], self._strides[name])
             for name, here in self._target.items()
         }
         return dict(self._target)

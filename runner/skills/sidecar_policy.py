@@ -102,9 +102,10 @@ class SidecarPolicy(SkillBase):
 
     `wait_s` > 0 lets a simulated world wait for chunks.
 
-    `speeds_rad_s`, by joint, limits a step to what one period allows. The safety gate would rightly
-    withhold larger leaps; of absolute targets they are intended only where the manifest says so
-    (`targets_lead`). None sends the policy's targets as they are. Steps begin at the motors' last
+    `speeds_rad_s`, by joint, limits the way to the start pose and a policy's steps to what one
+    period allows. The safety gate would rightly withhold larger leaps; absolute targets are
+    approached only where the manifest says that they lead (`targets_lead`), and else sent as they
+    are. Steps begin at the motors' last
     targets (`sent`, rad by joint): a command may be dropped for being late, or shortened by the
     gate.
     """
@@ -126,7 +127,9 @@ class SidecarPolicy(SkillBase):
     ) -> None:
         super().__init__(manifest, revision=revision)
         longest = {name: STEP_SHARE * v * period_s for name, v in (speeds_rad_s or {}).items()}
-        self._longest = tuple(longest[name] for name in wiring.joints) if longest else None
+        self._longest_steps = longest
+        leads = bool(longest) and wiring.actions.direct and wiring.rollout.targets_lead
+        self._longest = tuple(longest[name] for name in wiring.joints) if leads else None
         self._read = wiring.robot.joint_names
         self._stepper = (
             None
@@ -332,7 +335,9 @@ class SidecarPolicy(SkillBase):
         if self._ramp is None:
             if is_at(measured, goal):
                 return True
-            self._ramp = JointRamp(measured, goal, period_s=self._period_s)
+            self._ramp = JointRamp(
+                measured, goal, period_s=self._period_s, longest=self._longest_steps
+            )
         if self._ramp.done(measured):
             return True
         self._target = self._ramp.next_target()

@@ -74,11 +74,6 @@ class Wiring:
         """Return the joints that are commanded, in the order of their targets."""
         return self.actions.joints
 
-    @property
-    def stepwise(self) -> bool:
-        """Return whether rows are approached, or are steps themselves."""
-        return self.rollout.targets_lead or not self.actions.direct
-
 
 def wire_up(
     manifest: RSkillManifest,

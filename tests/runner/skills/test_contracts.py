@@ -406,22 +406,23 @@ class Answers:
     async def close(self) -> None: ...
 
 
-def test_a_goal_of_the_fields_policy_runs_on_the_robot(
-    panda: Bench, run_async: Callable[[Any], Any]
-) -> None:
+def run_goal(
+    panda: Bench,
+    run_async: Callable[[Any], Any],
+    client: Any,
+    manifest: RSkillManifest,
+    ticks: int,
+) -> list[SkillEnded]:
     """Loop, skill, gate and twin as `vram-runner deploy` composes them."""
-    client: Any = Answers([0.1, 0, 0, 0, 0, 0, 1.0, 0.2, 0, 0, 0, 1.0])
-    text = FIELD_SLOTS.replace("LAYOUT", "human300_16d") + "policy_extras: {rollout_steps: 20}\n"
-    wiring = wire_up(skill(text), panda.robot, panda.robot.rest_pose_rad)
-    assert wiring.stepwise
+    wiring = wire_up(manifest, panda.robot, panda.robot.rest_pose_rad)
     policy = SidecarPolicy(
-        skill(text),
+        manifest,
         wiring,
         client,
         None,
         period_s=1 / HZ,
         wait_s=30.0,
-        speeds_rad_s=panda.gate.limits.speeds_rad_s,
+        speeds_rad_s=panda.gate.for_skill(manifest, ()).limits.speeds_rad_s,
         sent=panda.hal.sent,
     )
     runner = hardware_runner(
@@ -432,25 +433,49 @@ def test_a_goal_of_the_fields_policy_runs_on_the_robot(
         clock=panda.clock,
     )
     ended: list[SkillEnded] = []
-    before = panda.tool().xyz[0]
 
     async def play() -> None:
         runner.activate()
         goal = Goal("g", "test/contract", prompt="go")
         await policy.start(goal)
         runner.begin_skill(policy, goal, ended.append)
-        for _ in range(60):
+        for _ in range(ticks):
             await asyncio.to_thread(runner.tick)
             panda.clock.advance(1 / HZ)
         await policy.finish()
+        panda.said += runner.slot.violations
         runner.deactivate()
 
     run_async(play())
+    panda.hal.connect()
+    return ended
+
+
+def test_a_slow_arm_comes_to_its_start_pose(panda: Bench, run_async: Callable[[Any], Any]) -> None:
+    """Regression: the way there was planned faster than the envelope allows, so that targets ran
+    ahead until the gate withheld them and the goal failed.
+    """
+    client: Any = Answers([0.0] * 6 + [-1.0] + [0.0] * 5)
+    far = "starting_pose: [-1.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785, 0.01]\n"
+    slow = "envelope: {max_joint_speed_factor: 0.2}\npolicy_extras: {rollout_steps: 5}\n"
+    manifest = skill(FIELD_SLOTS.replace("LAYOUT", "rc365") + far + slow)
+    ended = run_goal(panda, run_async, client, manifest, 150)
+    assert [(end.error, end.data["withheld"]) for end in ended] == [(None, 0)]
+    assert panda.said == []
+    assert panda.measured()["panda_joint1"] == pytest.approx(-1.0, abs=0.07)
+
+
+def test_a_goal_of_the_fields_policy_runs_on_the_robot(
+    panda: Bench, run_async: Callable[[Any], Any]
+) -> None:
+    client: Any = Answers([0.1, 0, 0, 0, 0, 0, 1.0, 0.2, 0, 0, 0, 1.0])
+    text = FIELD_SLOTS.replace("LAYOUT", "human300_16d") + "policy_extras: {rollout_steps: 20}\n"
+    before = panda.tool().xyz[0]
+    ended = run_goal(panda, run_async, client, skill(text), 60)
     assert [(end.error, end.data["steps"], end.data["withheld"]) for end in ended] == [
         (None, 20, 0)
     ]
     assert [state.shape for state in client.states] == [(16,)] * 4
-    panda.hal.connect()
     assert panda.tool().xyz[0] - before == pytest.approx(20 * 0.1 * 0.05, abs=5e-3)
     world = panda.world()
     assert world.base_pose is not None

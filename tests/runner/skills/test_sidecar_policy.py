@@ -230,7 +230,9 @@ class Bench:
 
 @pytest.fixture
 def policy_bench(manifest: RSkillManifest, tmp_path: Path) -> Callable[..., Bench]:
-    def make(arbiter: Arbiter | None = None, **options: Any) -> Bench:
+    def make(
+        arbiter: Arbiter | None = None, manifest: RSkillManifest = manifest, **options: Any
+    ) -> Bench:
         return Bench(manifest, f"ipc://{tmp_path}/grab.sock", arbiter, **options)
 
     return make
@@ -496,6 +498,17 @@ def test_views_are_cropped_and_averaged_as_trained(
     scenario(run_async, Bench(viewing, f"ipc://{tmp_path}/grab.sock", Arbiter()), play)
 
 
+def leading(policy_bench: Callable[..., Bench], **options: Any) -> Bench:
+    """A bench of a policy whose manifest says that its targets lead."""
+    return policy_bench(
+        Arbiter(),
+        manifest=parse_manifest(
+            MANIFEST.replace("rollout_steps: 7", "rollout_steps: 7, targets_lead: true")
+        ),
+        **options,
+    )
+
+
 def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
     policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
@@ -510,7 +523,7 @@ def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
             for n in range(1, 8)
         ]
 
-    scenario(run_async, policy_bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}), play)
+    scenario(run_async, leading(policy_bench, speeds_rad_s={"a": 3.0, "b": 1.5}), play)
 
 
 def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
@@ -529,7 +542,7 @@ def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
         rows, _ = await b.play()  # nothing of it reaches the motors
         assert rows == [pytest.approx((3.0 * STEP_SHARE / 30, 0.5 - 1.5 * STEP_SHARE / 30))] * 7
 
-    made = policy_bench(Arbiter(), speeds_rad_s={"a": 3.0, "b": 1.5}, sent=lambda: motors)
+    made = leading(policy_bench, speeds_rad_s={"a": 3.0, "b": 1.5}, sent=lambda: motors)
     scenario(run_async, made, play)
 
 
