@@ -168,6 +168,7 @@ def _refuse_code_of_others(weights: Weights) -> None:
             revision=weights.revision,
             local_files_only=weights.local,
             _raise_exceptions_for_missing_entries=False,
+            _raise_exceptions_for_connection_errors=False,  # what is cached is all that is loaded
         )
         named = {} if path is None else json.loads(Path(path).read_text(encoding="utf-8"))
         for reference in _texts(named.get("auto_map")):
