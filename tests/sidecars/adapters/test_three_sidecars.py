@@ -85,15 +85,15 @@ def test_the_budget_of_8_gib_is_shared_as_it_fits(sidecars, arbiter_daemon, png)
 
     ask(sidecars["detector"], detect)
     ask(sidecars["scene-vlm"], query)
-    assert states() == {"detector": "unloaded", "scene-vlm": "resident", "grab": "unloaded"}
+    assert states() == {"detector": "parked", "scene-vlm": "resident", "grab": "unloaded"}
     answer = npy.unpack(ask(sidecars["grab"], act))
     assert answer["action"].shape == (5, 6)
-    assert states() == {"detector": "unloaded", "scene-vlm": "resident", "grab": "resident"}, (
+    assert states() == {"detector": "parked", "scene-vlm": "resident", "grab": "resident"}, (
         "these two fit together"
     )
     ask(sidecars["scene-vlm"], query)
     ask(sidecars["detector"], detect)
-    assert states() == {"detector": "resident", "scene-vlm": "unloaded", "grab": "unloaded"}
+    assert states() == {"detector": "resident", "scene-vlm": "parked", "grab": "parked"}
     report = check_log((arbiter_daemon.card / "log.jsonl").read_text())
     assert (report.problems, report.oom_events) == ([], 0)
     assert report.peak_bytes <= report.capacity_bytes
