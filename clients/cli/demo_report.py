@@ -20,7 +20,7 @@ OTHER_COLOUR = "#8d8d8d"
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Bytes of one program on the card from `at_s` (monotonic) on."""
+    """Bytes of one program on the GPU from `at_s` (monotonic) on."""
 
     at_s: float
     name: str
@@ -29,7 +29,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class CardStory:
-    """What happened on the card: every change of every program, the peak, and how often an
+    """What happened on the GPU: every change of every program, the peak, and how often an
     allocation was refused."""
 
     points: tuple[Point, ...]
@@ -171,7 +171,7 @@ def draw_timeline(
         )
     axes.set(
         xlabel="seconds",
-        ylabel="GiB on the card",
+        ylabel="GiB on the GPU",
         ylim=(0, capacity_bytes / GIB * 1.25),
         title=title,
     )

@@ -10,6 +10,7 @@ on a simulated GPU, on which a load copies every byte. Writes `out/bench/switch.
   restore_ms      the same for a parked model: the weights are copied
   evict_ms        from the request that needs the room until the model's process is gone
   copy_floor_ms   copying the same bytes in one process, in turns with the restores
+  ping_ms         the slowest answer to a `ping` meanwhile, one every 5 ms
 
 Times are medians. The last row of each family loads the same folder by `from_pretrained` in a fresh
 process, as a script or a proxy that starts programs would.
@@ -23,6 +24,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,6 +42,8 @@ RESTORE_MAX = 2.0
 COLD_MIN = 10.0
 """Target: a cold start takes at least so many times a restore."""
 EVICT_MAX_MS = 100.0
+PING_MAX_MS = 50.0
+PING_EVERY_S = 0.005
 COMMON = (
     "version: 0.1.0\nlicense: mit\nembodiment_tags: [any]\nchunk_size: 5\n"
     "description: random weights\nlatency_budget: {per_chunk_ms: 100}\n"
@@ -68,6 +72,7 @@ class Row:
     restore_ms: float | None = None
     evict_ms: float | None = None
     copy_floor_ms: float | None = None
+    ping_ms: float | None = None
 
 
 def _owlvit(folder: Path) -> None:
@@ -162,6 +167,27 @@ class Host:
         assert released["ok"], released
         return took_ms
 
+    @contextmanager
+    def pinged(self) -> Iterator[list[float]]:
+        """Ask for its state over a connection of its own; yields the milliseconds of the answers."""
+        took_ms: list[float] = []
+        over = threading.Event()
+
+        def ask() -> None:
+            with WireClient(self._endpoint) as client:
+                while not over.wait(PING_EVERY_S):
+                    began = time.perf_counter()
+                    client.ask("ping")
+                    took_ms.append((time.perf_counter() - began) * 1e3)
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        try:
+            yield took_ms
+        finally:
+            over.set()
+            asking.join()
+
     def _server(self) -> int:
         """Pid of the server of imports, among the children of the host."""
         for pid in _children(self._process.pid):
@@ -209,7 +235,7 @@ def measure(family: Family, rounds: int) -> Iterator[Row]:
                 for _ in range(rounds):
                     host.unload()
                     loads.append(host.load_ms())
-                with WireClient(arbiter.endpoint) as other:
+                with WireClient(arbiter.endpoint) as other, host.pinged() as pings:
                     other.hello("other")
                     for _ in range(rounds):
                         evicts.append(host.evict_ms(other))
@@ -220,7 +246,7 @@ def measure(family: Family, rounds: int) -> Iterator[Row]:
         middle = statistics.median
         yield Row(
             family.name, count, cold_ms, middle(loads), middle(restores), middle(evicts),
-            middle(copies),
+            middle(copies), max(pings),
         )  # fmt: skip
         program = f"folder = {str(checkpoint)!r}\n{family.plain}"
         took = []
@@ -256,12 +282,13 @@ def table(rows: list[Row]) -> str:
         figures = {key: value for key, value in asdict(row).items() if key.endswith("_ms")}
         told = "  ".join(f"{key} {value:.0f}" for key, value in figures.items() if value)
         lines.append(f"{row.host} ({row.bytes / 1e6:.0f} MB): {told}")
-        if row.restore_ms and row.copy_floor_ms and row.evict_ms:
+        if row.restore_ms and row.copy_floor_ms and row.evict_ms and row.ping_ms:
             ratio, cold = row.restore_ms / row.copy_floor_ms, row.cold_start_ms / row.restore_ms
             lines.append(
                 f"  restore {ratio:.2f} x the copy {_met(ratio <= RESTORE_MAX)}; "
                 f"cold start {cold:.0f} x a restore {_met(cold >= COLD_MIN)}; "
-                f"eviction {_met(row.evict_ms <= EVICT_MAX_MS)}"
+                f"eviction {_met(row.evict_ms <= EVICT_MAX_MS)}; "
+                f"ping {_met(row.ping_ms <= PING_MAX_MS)}"
             )
     return "\n".join(lines)
 
