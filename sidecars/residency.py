@@ -85,6 +85,7 @@ class Residency:
         self._weights: asyncio.Task[int] | None = None  # on their way into host RAM, or there
         self._weights_bytes: int | None = None  # in host RAM, when they were there the last time
         self._left = asyncio.Event()  # the unload or parking in progress is over
+        self._called_off = asyncio.Event()  # the load in progress is not wanted any more
         self._ending = False
         self._running = 0
         self._last_use_s = time.monotonic()
@@ -459,7 +460,14 @@ class Residency:
             return unloads != self._unloads if lease is None else lease.given_up
 
         try:
-            self._weights_bytes = await asyncio.shield(self._fetch())
+            fetch = self._fetch()
+            self._called_off.clear()
+            called_off = asyncio.create_task(self._called_off.wait(), name="called off")
+            await asyncio.wait({fetch, called_off}, return_when=asyncio.FIRST_COMPLETED)
+            called_off.cancel()
+            if given_up():
+                raise self._unwanted()  # the weights may be read on, and are dropped then
+            self._weights_bytes = await asyncio.shield(fetch)
             model = self._model = await self._models.start()
             if given_up() or (lease and lease.state == "gone"):
                 raise self._unwanted()  # before a byte was loaded
@@ -533,6 +541,7 @@ class Residency:
         if self.state not in ("loading", "resident", "parked"):
             return
         began, loading = time.monotonic(), self.state == "loading"
+        self._called_off.set()
         self._to("unloading")
         self._left.clear()
         try:
