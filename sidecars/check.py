@@ -86,7 +86,7 @@ def check(wanted: Wanted) -> list[Finding]:
 
 
 def report(findings: Sequence[Finding], *, as_json: bool) -> int:
-    """Print the findings and return the exit code: 0, 1 if time may mend them, 2 if a person must."""
+    """Print the findings. Return the exit code: 0, 1 if time may mend them, 2 if a person must."""
     bad = [finding for finding in findings if finding.ok is False]
     if as_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=2))

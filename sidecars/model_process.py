@@ -4,7 +4,8 @@ A server (`multiprocessing`'s forkserver) imports the model's libraries once. Th
 from it, holds the weights in host RAM and touches no device. A *model process*, forked from the
 keeper for each residency, owns the device's context; its end returns every byte of it. The host
 speaks to both over socket pairs, one msgpack map each way at a time (`model_main`). Whatever goes
-wrong in them is a typed error here, never the end of the host. Must not know leases, wires or torch.
+wrong in them is a typed error here, never the end of the host. Must not know leases, wires or
+torch.
 """
 
 import asyncio

@@ -122,7 +122,8 @@ def install(
     the model's `load_state_dict` then takes.
 
     Their bytes stay integers: a model that is cast afterwards (`quantize_linear` comes last) leaves
-    them alone. A model on `meta` stays without bytes. Raises: ModelError for a packed weight of anything but a linear layer.
+    them alone. A model on `meta` stays without bytes. Raises: ModelError for a packed weight of
+    anything but a linear layer.
     """
     import torch
 

@@ -160,7 +160,7 @@ def nf4_of(manifest: RSkillManifest) -> Nf4 | None:
         )
     if importlib.util.find_spec("bitsandbytes") is None:
         raise UnsupportedQuantization(
-            f"{manifest.name}: quantization.dtype 'int4' needs bitsandbytes, which is not installed",
+            f"{manifest.name}: quantization.dtype 'int4' needs bitsandbytes, not installed here",
             hint="pip install bitsandbytes, or write dtype: bf16 where the GPU has room",
             details={"dtype": "int4", "supported": [*map(str, TORCH_NAMES)]},
         )

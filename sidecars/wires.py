@@ -4,8 +4,9 @@ Shapes are in `schemas.sidecar`; the host performs them. Every bad message gets 
 ends the sidecar. Both families can be spoken at once: `op` or `endpoint` decides.
 
 A request without `id` comes from a client of the field, which knows its family's shapes only: a
-policy's answer is `[actions, info]`, every judged picture has a probability of success, and an error
-of the endpoint family is a map of one key, which such a client tells by its size from actions.
+policy's answer is `[actions, info]`, every judged picture has a probability of success, and an
+error of the endpoint family is a map of one key, which such a client tells by its size from
+actions.
 """
 
 import functools

@@ -37,7 +37,7 @@ class State(Enum):
     FAILED = "failed"
 
 
-class Driver(Protocol):
+class CheckpointDriver(Protocol):
     """The calls of the CUDA driver that are needed. Each raises ActionFailed."""
 
     def check(self) -> None:
@@ -59,7 +59,7 @@ class Driver(Protocol):
 class CheckpointAction:
     """Suspend all CUDA processes of a program, or none of them."""
 
-    driver: Driver
+    driver: CheckpointDriver
     timeout_s: float
     machine: str = platform.machine()
     proc: Path = procfs.PROC
@@ -142,7 +142,7 @@ def _check_privileges(proc: Path) -> None:
 
 
 class CudaDriver:
-    """`Driver` through `cuda.bindings.driver`, or an object with its functions."""
+    """`CheckpointDriver` through `cuda.bindings.driver`, or an object with its functions."""
 
     def __init__(self, api: Any = None) -> None:
         self._given = api

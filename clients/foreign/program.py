@@ -30,7 +30,7 @@ def adopt_orphans() -> None:
         raise OSError(number, os.strerror(number))
 
 
-class Program:
+class ForeignProgram:
     """One run of a program. `stopping`: it is ended to make room, and is to be started again."""
 
     def __init__(self, child: asyncio.subprocess.Process, others: frozenset[int]) -> None:

@@ -25,7 +25,7 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
-from vram_arbiter.clients.foreign.program import Program
+from vram_arbiter.clients.foreign.program import ForeignProgram
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, RESIDUE_BYTES
 from vram_arbiter.schemas.errors import VramError
@@ -99,7 +99,7 @@ def lease_spec(spec: RunSpec) -> LeaseSpec:
 class Forwards(Protocol):
     """Passes signals on (`clients.cli.signals.Forwarding`)."""
 
-    def to(self, program: Program) -> None: ...
+    def to(self, program: ForeignProgram) -> None: ...
 
 
 class Supervisor:
@@ -109,7 +109,7 @@ class Supervisor:
         self._spec = spec
         self._client = client
         self._path = path
-        self._program: Program | None = None
+        self._program: ForeignProgram | None = None
         self._lease: AsyncLease | None = None
         self.peak_bytes = 0
         self._signals: Forwards | None = None
@@ -176,14 +176,14 @@ class Supervisor:
 
     # -- the program
     async def _start(self) -> None:
-        self._program = await Program.start(
+        self._program = await ForeignProgram.start(
             self._path, self._spec.command[1:], _environ(self.lease)
         )
         assert self._signals is not None
         self._signals.to(self._program)
         self._spawn(self._until_exit(self._program))
 
-    async def _until_exit(self, program: Program) -> None:
+    async def _until_exit(self, program: ForeignProgram) -> None:
         code = await program.wait()
         if not program.stopping:
             self._finish(code)
@@ -200,7 +200,7 @@ class Supervisor:
         if program.stopping and (count := await program.end_orphans()):
             say(f"ended {count} of its processes that outlived it")
 
-    async def _end_suspended(self, program: Program) -> None:
+    async def _end_suspended(self, program: ForeignProgram) -> None:
         grace_s = self._grace_s
         if await program.end(grace_s):
             say(f"it is suspended, did not end within {grace_s:g} s, and was killed")
@@ -369,7 +369,8 @@ class Supervisor:
                 self._measure(status)
                 self._decide(status)
             if self._program is not None and self._program.running and self._spec.comes_back:
-                self._program.reap()  # not while its successor is started, whose status it could take
+                # not while its successor is started, whose status it could take
+                self._program.reap()
             pause_s = LOOK_S
 
     def _measure(self, status: StatusReply) -> None:

@@ -40,8 +40,8 @@ class World:
     """One choice of `--env`.
 
     `cameras` None: those of the environment. `arm`, `scene`, `environment` and `robot` are those of
-    our own scene. `joints` are what a policy sees and moves, in the policy's order; `rest` is its start
-    (rad), None: wherever a reset leaves the world.
+    our own scene. `joints` are what a policy sees and moves, in the policy's order; `rest` is its
+    start (rad), None: wherever a reset leaves the world.
     """
 
     name: str

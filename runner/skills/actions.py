@@ -60,8 +60,8 @@ class ActionPlan:
     """A contract resolved for one robot.
 
     `joints` are those that it commands. `scales` turn the policy's numbers into m and rad, `bounds`
-    are the ends to which they are clipped before (None: none has any). `notes` are parts of the contract that change nothing on this
-    robot.
+    are the ends to which they are clipped before (None: none has any). `notes` are parts of the
+    contract that change nothing on this robot.
     """
 
     dim: int
@@ -219,9 +219,9 @@ class Stepper:
         short_m, short_rad = found.short_m, found.short_rad
         if short_m > 2 * REACHED_M or short_rad > 2 * REACHED_RAD:
             done.problem = (
-                f"{command.ee} stops {short_m * 1e3:.1f} mm and {math.degrees(short_rad):.1f}° short"
-                f" of a step of {asked_m * 1e3:.1f} mm and {math.degrees(asked_rad):.1f}°: the arm"
-                " reaches no further"
+                f"{command.ee} stops {short_m * 1e3:.1f} mm and {math.degrees(short_rad):.1f}° "
+                f"short of a step of {asked_m * 1e3:.1f} mm and {math.degrees(asked_rad):.1f}°: "
+                "the arm reaches no further"
             )
             done.withheld |= short_m > max(WITHHELD_BELOW * asked_m, 5 * REACHED_M) or (
                 short_rad > max(WITHHELD_BELOW * asked_rad, 5 * REACHED_RAD)

@@ -94,7 +94,7 @@ def wire_up(
         problems.append(
             Problem(
                 ("sensors_required",),
-                f"names no camera: give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
+                f"no camera: give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
             )
         )
     order, found = _joint_order(manifest, robot)

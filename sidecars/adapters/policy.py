@@ -134,7 +134,7 @@ class PolicyAdapter:
         )
 
     def _quantize(self, device: str) -> None:
-        """Quantize the linear layers to NF4 where the manifest says int4; on `meta`, choose them."""
+        """Quantize linear layers to NF4 where the manifest says int4; on `meta`, choose them."""
         nf4 = nf4_of(self._manifest)
         if nf4 is not None and device == META:
             nf4.chosen(self._policy)

@@ -1,4 +1,4 @@
-"""Policy families that a sidecar serves: checkpoint types, packages, precisions, observation queues.
+"""Policy families that a sidecar serves: types of checkpoints, packages, precisions, queues.
 
 A family is listed here once its actions were compared with lerobot's own, one by one
 (`tests/sidecars/adapters/test_policy_families.py`). Must not import torch or lerobot: `--check`

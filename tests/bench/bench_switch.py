@@ -169,7 +169,7 @@ class Host:
 
     @contextmanager
     def pinged(self) -> Iterator[list[float]]:
-        """Ask for its state over a connection of its own; yields the milliseconds of the answers."""
+        """Ask for its state over a connection of its own; yields the milliseconds it took."""
         took_ms: list[float] = []
         over = threading.Event()
 

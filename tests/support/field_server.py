@@ -1,9 +1,9 @@
 """Servers of the field for tests: one REP socket and one thread, which answers one request after
 the other in the field's own shapes. Written after their wire, not copied. Not a test module.
 
-What a test asks decides what happens: the text `hang` is answered once `release` is set, `fail` with
-the family's error, a key of `RAW` with those bytes, `list` with a list, `die` by closing the socket.
-Else `answer` is the model's text, and `action` maps names to arrays.
+What a test asks decides what happens: the text `hang` is answered once `release` is set, `fail`
+with the family's error, a key of `RAW` with those bytes, `list` with a list, `die` by closing the
+socket. Else `answer` is the model's text, and `action` maps names to arrays.
 """
 
 import io

@@ -195,7 +195,8 @@ def test_an_entry_keeps_what_a_person_wrote(tmp_path: Path) -> None:
     ).replace("by hand", '"measured 2026-01-02 on a GPU: 20 requests"\n  inference_peak: 1122MiB')
     assert path.stat().st_mode & 0o777 == 0o640
     entries.write(path, "three/model/int4", entry)
-    assert path.read_text().endswith("two/model: {load_peak: 1GB, steady: 1GB}\n\nthree/model/int4:\n"
+    assert path.read_text().endswith(
+        "two/model: {load_peak: 1GB, steady: 1GB}\n\nthree/model/int4:\n"
         "  load_peak: 6048MiB\n  steady: 1020MiB\n  residue: 301MiB\n  inference_peak: 1122MiB\n"
         '  source: "measured 2026-01-02 on a GPU: 20 requests"\n')  # fmt: skip
     found = read_footprints(path)

@@ -19,7 +19,7 @@ import pytest
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.foreign.program import Program
+from vram_arbiter.clients.foreign.program import ForeignProgram
 from vram_arbiter.clients.foreign.supervisor import RunSpec, Supervisor
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -329,7 +329,7 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     spec = RunSpec(command, "job", 1 << 30, "any", 40, None, False, "priority", None)
 
     class Signals:
-        def to(self, program: Program) -> None:
+        def to(self, program: ForeignProgram) -> None:
             self.program = program
 
     async with (

@@ -11,8 +11,8 @@ import pytest
 
 from vram_arbiter.clients.foreign.cuda_checkpoint import (
     CheckpointAction,
+    CheckpointDriver,
     CudaDriver,
-    Driver,
     State,
 )
 from vram_arbiter.schemas.errors import ActionFailed, CheckpointUnsupported
@@ -59,7 +59,7 @@ class SimulatedDriver:
         self.states[pid] = after
 
 
-def suspended(driver: Driver) -> CheckpointAction:
+def suspended(driver: CheckpointDriver) -> CheckpointAction:
     return CheckpointAction(driver, LIMIT_S)
 
 

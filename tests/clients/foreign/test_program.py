@@ -5,14 +5,14 @@ import signal
 
 import pytest
 
-from vram_arbiter.clients.foreign.program import Program
+from vram_arbiter.clients.foreign.program import ForeignProgram
 
 pytestmark = pytest.mark.anyio
 
 
 async def test_a_signal_to_a_program_that_has_just_ended_keeps_its_exit_code() -> None:
     """Regression: asyncio's own `send_signal` took the exit code, and 255 was reported."""
-    program = await Program.start("/bin/sh", ["-c", "exit 3"], os.environ)
+    program = await ForeignProgram.start("/bin/sh", ["-c", "exit 3"], os.environ)
     os.waitid(os.P_PID, program.pid, os.WEXITED | os.WNOWAIT)  # the loop has not seen it yet
     program.send_signal(signal.SIGTERM)
     assert await program.wait() == 3
@@ -22,4 +22,4 @@ async def test_a_signal_to_a_program_that_has_just_ended_keeps_its_exit_code() -
 
 async def test_a_program_that_cannot_be_executed_is_an_error() -> None:
     with pytest.raises(PermissionError):
-        await Program.start(__file__, [], os.environ)
+        await ForeignProgram.start(__file__, [], os.environ)

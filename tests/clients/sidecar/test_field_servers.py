@@ -1,5 +1,5 @@
-"""Our clients and the servers of the field: REP sockets, which answer in order, without `re`, and in
-their own shapes. None of their operations worked."""
+"""Our clients and the servers of the field: REP sockets, which answer in order, without `re`, and
+in their own shapes. None of their operations worked."""
 
 import asyncio
 import io

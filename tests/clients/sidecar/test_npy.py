@@ -119,7 +119,8 @@ def test_arrays_of_msgpack_numpy_are_read_and_its_pickles_are_not() -> None:
     assert npy.unpack({b"nd": False, b"type": "<i2", b"data": b"\x07\x00"}) == 7
     assert npy.unpack({"nd": "a name"}) == {"nd": "a name"}
     for changes in (
-        {b"kind": b"O"}, {b"kind": b"V", b"type": [["a", "<f4"]]}, {b"type": "|O"}, {b"type": "<c8"},
+        {b"kind": b"O"}, {b"kind": b"V", b"type": [["a", "<f4"]]}, {b"type": "|O"},
+        {b"type": "<c8"},
         {b"type": "no type"}, {b"type": "(2,)<f4"}, {b"type": "<f4" * 9}, {b"shape": [3, 1]},
         {b"shape": [-2, -1]}, {b"shape": [2.0, 1]}, {b"shape": 2}, {b"shape": [1] * 9 + [2]},
         {b"data": "text"}, {b"data": bytes(7)}, {b"nd": False},

@@ -79,7 +79,7 @@ action_contract:
   slots:
     - {range: [0, 5],   control_mode: "cartesian_delta",  ee: "panda_gripper", frame: "panda_link0"}
     - {range: [6, 6],   control_mode: "gripper_position", ee: "panda_gripper"}
-    - {range: [7, 9],   control_mode: "joint_velocity",   joint_names: ["base_x", "base_y", "base_yaw"]}
+    - {range: [7, 9], control_mode: joint_velocity, joint_names: [base_x, base_y, base_yaw]}
     - {range: [10, 10], discard: true}
     - {range: [11, 11], control_mode: "composite_mode"}
 """
@@ -320,7 +320,7 @@ def test_joint_steps_and_speeds_start_at_the_last_target(
 def test_a_gripper_among_joint_steps_goes_as_its_own_actuator_says(
     gripper: str, value: float, wanted: float
 ) -> None:
-    """Six joints in one vector: five deltas, and a gripper that is told where to be, or switched."""
+    """Six joints in one vector: five deltas, and a gripper told where to be, or switched."""
     robot = so101(simulated=True)
     manifest = skill(
         "actuators_required:\n  - {kind: joint_position, control_mode_semantics: {mode: delta}}\n"
@@ -358,7 +358,8 @@ def test_a_cartesian_pose_is_where_the_tool_goes(panda: Bench, rotation: Rotatio
 def test_a_representation_without_slots_moves_the_robots_one_tool(panda: Bench) -> None:
     words = (
         "actuators_required:\n"
-        "  - {kind: cartesian_delta, control_mode_semantics: {mode: delta, reference_frame: FRAME}}\n"
+        "  - {kind: cartesian_delta,\n"
+        "     control_mode_semantics: {mode: delta, reference_frame: FRAME}}\n"
         "  - {kind: gripper_position, control_mode_semantics: {mode: absolute,"
         " gripper_convention: normalized_open_unit}}\n"
         "action_contract: {dim: 7, representation: delta_ee_6d_plus_gripper,"
@@ -640,7 +641,8 @@ SCALE3 = "  cartesian_delta_scale: [1, 1, 1]\n"
         (
             slots(
                 3,
-                "range: [0, 2], control_mode: joint_velocity, joint_names: [base_x, base_y, base_yaw]",
+                "range: [0, 2], control_mode: joint_velocity, "
+                "joint_names: [base_x, base_y, base_yaw]",
             ),
             [
                 "action_contract.slots[0].joint_names: drives a base (base_x, base_y, base_yaw);"

@@ -129,8 +129,8 @@ def save_tdmpc(folder: Path, **options: Any) -> None:
 
     config = TDMPCConfig(
         **features(ONLY_CAMERA), image_encoder_hidden_dim=4, state_encoder_hidden_dim=8,
-        latent_dim=8, mlp_dim=16, q_ensemble_size=2, cem_iterations=2, n_gaussian_samples=8, n_pi_samples=2,
-        n_elites=4, **options,
+        latent_dim=8, mlp_dim=16, q_ensemble_size=2, cem_iterations=2, n_gaussian_samples=8,
+        n_pi_samples=2, n_elites=4, **options,
     )  # fmt: skip
     save(folder, config, ONLY_CAMERA)
 
@@ -184,7 +184,8 @@ def save_smolvla(folder: Path) -> None:
 
     small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
     text = small | {
-        "model_type": "llama", "vocab_size": WORDS, "num_hidden_layers": 2, "num_key_value_heads": 2,
+        "model_type": "llama", "vocab_size": WORDS, "num_hidden_layers": 2,
+        "num_key_value_heads": 2,
         "head_dim": 16,
     }  # fmt: skip
     vision = small | {"num_hidden_layers": 1, "image_size": 32, "patch_size": 8}

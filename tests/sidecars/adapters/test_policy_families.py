@@ -33,7 +33,8 @@ pytestmark = pytest.mark.heavy
 NAMES = tuple(policies.SAVERS)
 ROWS = {  # actions in one answer
     "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
-    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5, "evo1": 5,
+    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5,
+    "evo1": 5,
 }  # fmt: skip
 CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
 SEED = 2  # most policies draw their actions
@@ -190,7 +191,7 @@ def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: st
 
 
 def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weights]) -> None:
-    """One observation a chunk: the oldest of three leaves with the fourth, as in lerobot's queue."""
+    """One observation a chunk: the oldest of three leaves with the fourth, as in lerobot."""
     import numpy as np
     import torch
 
