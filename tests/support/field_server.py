@@ -35,9 +35,9 @@ def packed(value: Any) -> Any:
 
 
 def unpacked(value: dict[str, Any]) -> Any:
-    import numpy as np
-
     if "__ndarray_class__" in value:
+        import numpy as np
+
         return np.load(io.BytesIO(value["as_npy"]), allow_pickle=False)
     return value
 
@@ -70,6 +70,12 @@ class FieldServer:
         self._context.term()
 
     def _serve(self) -> None:
+        try:
+            self._answer()
+        finally:  # the end of its context waits for it
+            self._socket.close()
+
+    def _answer(self) -> None:
         while not self._ending:
             try:
                 request = msgpack.unpackb(self._socket.recv(), object_hook=unpacked)
@@ -94,7 +100,6 @@ class FieldServer:
                 reply = {"error": text} if "endpoint" in request else {"ok": False, "error": text}
             self._socket.send(msgpack.packb(reply, default=packed))
             self._ending |= request.get("op", request.get("endpoint")) in ("shutdown", "kill")
-        self._socket.close()
 
     def _op(self, op: str, **fields: Any) -> Any:
         match op:
