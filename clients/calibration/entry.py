@@ -8,11 +8,15 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import yaml
-
 from vram_arbiter.clients.calibration.series import MIB, Figures
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.yamltext import parse_yaml, read_text
+from vram_arbiter.schemas.yamltext import (
+    block_map,
+    parse_yaml,
+    read_text,
+    reads_as_text,
+    top_keys,
+)
 
 MARGIN = 0.02
 MARGIN_MAX_BYTES = 48 * MIB
@@ -71,13 +75,11 @@ def merged(text: str, name: str, key: str, entry: Entry) -> str:
     document = parse_yaml(text, name).data
     if not isinstance(document, dict):
         raise ConfigError(f"{name}: must be a map from models to footprints")
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    found = [value for at, value in root.value if at.value == key] if root is not None else []
-    if not found:
+    if key not in top_keys(text):
         ended = text if not text or text.endswith("\n") else f"{text}\n"
         after = f"{ended}\n{text_of(key, entry)}" if ended else text_of(key, entry)
     else:
-        after = _updated(text, name, key, found[0], entry)
+        after = _updated(text, name, key, entry)
     expected = {**document, key: {**(document.get(key) or {}), **entry}}
     if parse_yaml(after, name).data != expected:  # anchors, or an indentation of its own
         raise ConfigError(
@@ -87,18 +89,19 @@ def merged(text: str, name: str, key: str, entry: Entry) -> str:
     return after
 
 
-def _updated(text: str, name: str, key: str, node: yaml.Node, entry: Entry) -> str:
+def _updated(text: str, name: str, key: str, entry: Entry) -> str:
     """Put each value where the old one stands; new fields follow the last one."""
-    if not isinstance(node, yaml.MappingNode) or node.flow_style or not node.value:
+    block = block_map(text, key)
+    if block is None:
         raise ConfigError(
             f"{name}: {key} cannot be changed in place",
             hint="write its fields on lines of their own",
         )
-    spans = {at.value: (value.start_mark.index, value.end_mark.index) for at, value in node.value}
+    spans = block.values
     last = max(end for _, end in spans.values())
     line_end = text.find("\n", last)
     line_end = len(text) if line_end < 0 else line_end
-    indent = " " * node.value[0][0].start_mark.column
+    indent = " " * block.column
     added = [
         f"\n{indent}{field}: {_scalar(value)}"
         for field, value in entry.items()
@@ -121,6 +124,6 @@ def _size(count: int) -> str:
 
 def _scalar(value: str) -> str:
     """Return a text as YAML, plain where that means the same."""
-    if _PLAIN.fullmatch(value) and not value.endswith(" ") and yaml.safe_load(value) == value:
+    if _PLAIN.fullmatch(value) and not value.endswith(" ") and reads_as_text(value):
         return value
     return json.dumps(value, ensure_ascii=False)

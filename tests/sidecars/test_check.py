@@ -18,6 +18,8 @@ from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
 from vram_arbiter.sidecars.device.capacity import capacities
 
+pytestmark = pytest.mark.heavy
+
 GIB = 2**30
 CONFIGS = Path(__file__).parents[2] / "configs"
 PAGE = (CONFIGS.parent / "docs/models.md").read_text(encoding="utf-8")

@@ -64,7 +64,7 @@ class Kind:
     name: str
     rskill: str
     request: Callable[[], Message]
-    wrong: Message
+    wrong: Callable[[], Message]
     parks: bool = True  # it has weights that can stay in host RAM
 
 
@@ -72,25 +72,25 @@ KINDS = (
     Kind(
         "detector", "rskills/so101-detector",
         lambda: {"op": "detect", "image": picture(), "query": "red cube"},
-        {"op": "detect", "image": b"\x89PNG no picture", "query": "red cube"},
+        lambda: {"op": "detect", "image": b"\x89PNG no picture", "query": "red cube"},
     ),
     Kind(
         "scene-vlm", "rskills/so101-scene-vlm",
         lambda: {"op": "query", "image": picture(), "question": "is the red cube held?"},
-        {"op": "query", "image": picture(), "question": "held?", "max_new_tokens": -1},
+        lambda: {"op": "query", "image": picture(), "question": "held?", "max_new_tokens": -1},
     ),
     Kind(
         "policy", "rskills/so101-grab", lambda: observation(("front", "wrist")),
-        {"endpoint": "get_action", "data": {"observation": {"observation.state": [1.0]}}},
+        lambda: {"endpoint": "get_action", "data": {"observation": {"observation.state": [1.0]}}},
     ),
     Kind(
         "reward", "rskills/so101-progress",
         lambda: {"op": "score", "task": "grab the red cube", "images": [picture()]},
-        {"op": "score", "task": "grab the red cube", "images": []},
+        lambda: {"op": "score", "task": "grab the red cube", "images": []},
     ),
     Kind(
         "passthrough", "diagnostics/gpu-passthrough", lambda: observation(("front",)),
-        {"endpoint": "get_action", "data": {"observation": {}}}, parks=False,
+        lambda: {"endpoint": "get_action", "data": {"observation": {}}}, parks=False,
     ),
 )  # fmt: skip
 
@@ -297,7 +297,7 @@ def test_a_wait_that_is_called_off_leaves_nothing(host: Host) -> None:
 
 def test_bad_input_is_a_typed_error_and_costs_the_next_request_nothing(host: Host) -> None:
     expected = host.answer()
-    assert host.ask(host.kind.wrong)["code"] == "bad_request"
+    assert host.ask(host.kind.wrong())["code"] == "bad_request"
     assert host.ask({"op": "no such op"})["code"] == "unknown_op"
     for junk in (b"", b"\xc1", msgpack.packb([1, 2]), b"\x00" * 1000):
         host.client.send_raw(junk)

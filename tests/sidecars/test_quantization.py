@@ -24,6 +24,8 @@ from vram_arbiter.sidecars.quantization import (
 )
 from vram_arbiter.sidecars.weights import Weights, model_options
 
+pytestmark = pytest.mark.heavy
+
 FIELD = {
     "scheme": "nf4",
     "quantizer": "bitsandbytes",
@@ -86,7 +88,6 @@ def test_int4_without_bitsandbytes_is_refused(monkeypatch: pytest.MonkeyPatch) -
     assert nf4_of(manifest("fp16")) is None
 
 
-@pytest.mark.heavy
 class TestQuantizedLinear:
     @pytest.fixture
     def model(self) -> Any:
@@ -207,7 +208,6 @@ assert bnb.cuda_ops
 """
 
 
-@pytest.mark.heavy
 def test_bitsandbytes_is_imported_without_initializing_cuda() -> None:
     """Its import asks torch for the GPUs' capabilities, which initializes CUDA: no process forked
     from this one could use a GPU."""
@@ -240,7 +240,6 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: Any) -> Path:
     return place
 
 
-@pytest.mark.heavy
 def test_transformers_skips_all_but_the_chosen_layers() -> None:
     """transformers takes `layers.1` as the beginning of `layers.10`, too."""
     quantizers = pytest.importorskip("transformers.quantizers.quantizers_utils")
@@ -252,7 +251,6 @@ def test_transformers_skips_all_but_the_chosen_layers() -> None:
     ]
 
 
-@pytest.mark.heavy
 class TestTransformers:
     def load(self, folder: Path, device: str = "cpu", **extra: Any) -> Any:
         from transformers import AutoModelForImageTextToText
