@@ -42,7 +42,7 @@ demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8Gi
 	$(BIN)/vramctl demo --seed $(SEED) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)
 
 test: setup ## the whole product; ARGS goes to pytest
-	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not gpu" $(ARGS)
+	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not gpu and not nightly" $(ARGS)
 
 test-gpu: setup ## what needs an NVIDIA GPU, alone on it; skipped with the reason elsewhere
 	$(BIN)/pytest -q -rsP tests/gpu $(ARGS)
@@ -50,7 +50,8 @@ test-gpu: setup ## what needs an NVIDIA GPU, alone on it; skipped with the reaso
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not heavy and not e2e and not gpu" $(ARGS)
 
-nightly: setup ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n
+nightly: setup ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n; long tests
+	$(BIN)/pytest -q -m nightly
 	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \
 		$(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
 

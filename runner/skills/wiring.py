@@ -94,7 +94,8 @@ def wire_up(
         problems.append(
             Problem(
                 ("sensors_required",),
-                f"no camera: give a sensor of modality rgb a vla_feature_key {IMAGES_PREFIX}…",
+                "names no camera: give a sensor of modality rgb a vla_feature_key "
+                f"{IMAGES_PREFIX}…",
             )
         )
     order, found = _joint_order(manifest, robot)

@@ -12,6 +12,9 @@ from vram_arbiter.schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreO
 if TYPE_CHECKING:
     from torch.nn import Module
 
+LEROBOT = "vram_arbiter.sidecars.preload_lerobot"
+DIFFUSERS = "vram_arbiter.sidecars.preload_diffusers"
+"""Modules of lerobot's policies, for `ModelAdapter.modules`."""
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 
 

@@ -8,7 +8,7 @@ from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall
-from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, ModelCall
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
     family_of,
@@ -90,7 +90,8 @@ class PolicyAdapter:
     def modules(self) -> tuple[str, ...]:
         kind = model_type(self._weights, "type")
         own = f"lerobot.policies.{kind}.modeling_{kind}"
-        return ("torch", "lerobot.policies.factory", own, *_OWN_POLICIES)
+        first = DIFFUSERS if "diffusers" in self._family.packages else LEROBOT
+        return ("torch", first, own, *_OWN_POLICIES)
 
     def prepare(self) -> None:
         need_packages(self._manifest)

@@ -12,7 +12,7 @@ from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import ScoreOp
-from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.base import LEROBOT, ModelCall
 from vram_arbiter.sidecars.checkpoints import META, load_lerobot
 from vram_arbiter.sidecars.images import decode_all, of_one_size
 from vram_arbiter.sidecars.quantization import check_weights, nf4_of, quantize_linear
@@ -48,7 +48,7 @@ class RewardAdapter:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        return ("torch", "lerobot.rewards.factory", *_OWN_MODELS)
+        return ("torch", LEROBOT, "lerobot.rewards.factory", *_OWN_MODELS)
 
     def prepare(self) -> None:
         from lerobot.configs.rewards import RewardModelConfig

@@ -86,6 +86,7 @@ def test_a_comparison_names_its_floor(rows: list[dict[str, object]]) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.e2e
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> None:
     if not (HERE.parents[1] / "configs/models/so101-grab/model.safetensors").exists():

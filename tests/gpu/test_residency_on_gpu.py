@@ -11,7 +11,7 @@ from tests.gpu.weights_model import LAYER_BYTES
 from tests.support.process import vramctl
 from tests.support.waiting import until
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
+pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.nightly]
 
 
 def test_two_models_take_turns_and_leave_nothing(machine: Machine) -> None:

@@ -20,6 +20,7 @@ from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
 from vram_arbiter.schemas.errors import BadRequest, ModelError, OutOfMemory, WaitTimeout
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
+from vram_arbiter.sidecars.adapters.base import LEROBOT
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ModelProcess, ModelProcesses
 from vram_arbiter.sidecars.settings import Settings
@@ -224,7 +225,7 @@ async def test_the_keeper_has_one_thread_and_no_device_before_each_fork(place: P
     not survive a fork at all. The weights are in host RAM once, whatever is forked."""
     forkserver._forkserver._stop()  # type: ignore[attr-defined]  # the next one imports these
     processes = place.processes(adapter=functools.partial(matrix_for, MATRIX_BYTES))
-    processes.preload(("torch", "transformers", "lerobot.policies.factory"))
+    processes.preload(("torch", "transformers", LEROBOT))
     async with asyncio.timeout(4 * WAIT_S):
         assert await processes.load() == GB, "the weights stand for those of a production model"
         answers = []
@@ -238,13 +239,14 @@ async def test_the_keeper_has_one_thread_and_no_device_before_each_fork(place: P
             shared = shared_bytes(keeper)
             await model.end()
         server = parent(keeper)
-        imported = "libtorch" in Path(f"/proc/{server}/maps").read_text()
+        maps = Path(f"/proc/{server}/maps").read_text()
         assert os.listdir(f"/proc/{server}/task") == [str(server)]
         await processes.drop()
         dropped = shared_bytes(keeper)
         await processes.end()
     assert answers[0] == answers[1], "each process copied the same weights"
-    assert imported
+    assert "libtorch" in maps, "imported for all"
+    assert "bitsandbytes" not in maps, "its import initializes CUDA"
     assert threads == [str(keeper)]
     assert not [name for name in opened if "nvidia" in name]
     assert (shared, dropped) == (MATRIX_BYTES, 0)
