@@ -22,7 +22,7 @@ from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 SYSTEMD = Path("/lib/systemd/systemd")
 TOOLS = ("unshare", "nsenter", "setpriv", "pivot_root", "systemctl", "ldconfig")
 BOOT_S = 60.0
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 PATH = "/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 

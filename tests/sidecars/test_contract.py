@@ -66,6 +66,7 @@ class Kind:
     request: Callable[[], Message]
     wrong: Callable[[], Message]
     parks: bool = True  # it has weights that can stay in host RAM
+    slow: bool = False  # `make nightly` runs it
 
 
 KINDS = (
@@ -78,6 +79,7 @@ KINDS = (
         "scene-vlm", "rskills/so101-scene-vlm",
         lambda: {"op": "query", "image": picture(), "question": "is the red cube held?"},
         lambda: {"op": "query", "image": picture(), "question": "held?", "max_new_tokens": -1},
+        slow=True,
     ),
     Kind(
         "policy", "rskills/so101-grab", lambda: observation(("front", "wrist")),
@@ -87,6 +89,7 @@ KINDS = (
         "reward", "rskills/so101-progress",
         lambda: {"op": "score", "task": "grab the red cube", "images": [picture()]},
         lambda: {"op": "score", "task": "grab the red cube", "images": []},
+        slow=True,
     ),
     Kind(
         "passthrough", "diagnostics/gpu-passthrough", lambda: observation(("front",)),
@@ -219,7 +222,13 @@ def configs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.name)
+HOSTS = [  # the others run the same host around models of the same libraries
+    pytest.param(kind, id=kind.name, marks=pytest.mark.nightly if kind.slow else ())
+    for kind in KINDS
+]
+
+
+@pytest.fixture(scope="module", params=HOSTS)
 def host(request: pytest.FixtureRequest, configs: Path) -> Iterator[Host]:
     arbiter = ArbiterProcess("fake:8GiB").start()
     host = Host(request.param, arbiter, configs)
