@@ -465,7 +465,7 @@ class Residency:
             called_off = asyncio.create_task(self._called_off.wait(), name="called off")
             await asyncio.wait({fetch, called_off}, return_when=asyncio.FIRST_COMPLETED)
             called_off.cancel()
-            if given_up():
+            if given_up() or (lease and lease.state == "gone"):
                 raise self._unwanted()  # the weights may be read on, and are dropped then
             self._weights_bytes = await asyncio.shield(fetch)
             model = self._model = await self._models.start()

@@ -23,8 +23,8 @@ MACHINE: Final = "x86_64"
 CUDA_VERSION: Final = 12080
 """Of driver 570, the first with these calls."""
 CAP_SYS_PTRACE: Final = 19
-CAP_NEEDED, NOBODY = 2, 3
-"""Values of Yama's `ptrace_scope`: with CAP_SYS_PTRACE only, and nobody."""
+CAP_NEEDED, NO_ATTACH = 2, 3
+"""Values of Yama's `ptrace_scope`: with CAP_SYS_PTRACE only, and no attach."""
 
 
 class State(Enum):
@@ -132,12 +132,12 @@ def _check_privileges(proc: Path) -> None:
     for line in (proc / "self/status").read_text().splitlines():
         if line.startswith("CapEff:"):
             capable = bool(int(line.split()[1], 16) >> CAP_SYS_PTRACE & 1)
-    if scope >= NOBODY or (scope == CAP_NEEDED and not capable):
+    if scope >= NO_ATTACH or (scope == CAP_NEEDED and not capable):
         raise CheckpointUnsupported(
             f"cuda-checkpoint may not control processes: kernel.yama.ptrace_scope is {scope}",
             hint="run vramctl with CAP_SYS_PTRACE"
-            if scope < NOBODY
-            else "it allows nobody until the next boot",
+            if scope < NO_ATTACH
+            else "no process may attach until the next boot",
         )
 
 
