@@ -16,8 +16,8 @@ from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
 from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Robot
-from vram_arbiter.runner.goals import frames
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE
+from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, Kind, RSkillManifest
@@ -125,11 +125,12 @@ def sidecars_given(flags: list[str]) -> dict[str, str]:
 
 def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]) -> None:
     """Raise ConfigError for the address of a skill that is not installed: it is a typing error."""
-    installed = [manifest.name for manifest in manifests if manifest.kind is Kind.VLA]
+    served = (Kind.VLA, Kind.DETECTOR)
+    installed = [manifest.name for manifest in manifests if manifest.kind in served]
     for name in given:
         if name not in installed:
             raise ConfigError(
-                f"--sidecar {name}: no such policy is installed",
+                f"--sidecar {name}: no such policy or detector is installed",
                 hint=f"there is {', '.join(installed) or 'none'}",
             )
 
@@ -149,7 +150,7 @@ def warm_up() -> None:
     import numpy as np
 
     cv2.setNumThreads(1)
-    frames.encode(np.zeros((8, 8, 3), dtype=np.uint8), "png")
+    encode(np.zeros((8, 8, 3), dtype=np.uint8), "png")
 
 
 async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack) -> Any:

@@ -38,6 +38,7 @@ from vram_arbiter.runner.cli.deployment import (
     unkept,
     unused,
 )
+from vram_arbiter.runner.cli.watching import Watch, slots_of, watches, watching
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.control.thread import ControlThread
@@ -149,6 +150,7 @@ class Deploy:
         self._endpoint: str = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
         self._stopping = asyncio.Event()
         self._task_skill = ""
+        self._watches: tuple[Watch, ...] = ()
 
     async def run(self) -> int:
         """Check, then print the plan or carry it out."""
@@ -156,6 +158,8 @@ class Deploy:
         parts = make_parts(self._file, self._clock)
         manifests = read_manifests(self._args.skills or [default_skills()])
         check = self._offered(parts, manifests, None)
+        given = sidecars_given(self._args.sidecar)
+        self._watches = watches(self._file, manifests, given, os.environ)
         if self._file.robot.vla is not None:
             self._task_skill = skill_named(self._file.robot.vla, check.executable())
         if self._args.dry_run:
@@ -180,6 +184,7 @@ class Deploy:
             control = await self._start(runner, stack)
             if control is None:
                 return 0
+            await stack.enter_async_context(watching(self._watches, runner.robot, self._clock))
             await make_prompt(
                 control, first=self._args.realtime and leaves_room(self._file.robot.rate_hz)
             )
@@ -219,6 +224,7 @@ class Deploy:
             if manifest.kind is Kind.VLA
         ]
         arbiter = "none" if self._args.no_arbiter else self._args.arbiter or "the machine's own"
+        sidecars += [watch.line for watch in self._watches]
         return [*sidecars, ("goals", f"served on {self._endpoint}"), ("arbiter", arbiter)]
 
     def _identity(self, parts: Parts, arbiter: Arbiter | None) -> GoalData:
@@ -243,6 +249,7 @@ class Deploy:
             deadline_policy=DeadlinePolicy(robot.deadline_overrun_policy),
             clock=self._clock,
             topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
+            detections=slots_of(self._watches),
             on_estop=latch,
         )
 

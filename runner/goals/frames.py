@@ -7,17 +7,15 @@ know goals or the wire.
 from __future__ import annotations
 
 import asyncio
-from typing import Any, Literal, Protocol
+from typing import Protocol
 
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.protocols import Picture
-from vram_arbiter.schemas.errors import BadRequest, FrameStale, InternalError
+from vram_arbiter.runner.sensors.pictures import Encoding, encode
+from vram_arbiter.schemas.errors import BadRequest, FrameStale
 from vram_arbiter.schemas.goals import FrameReply
 
-Encoding = Literal["jpeg", "png"]
-JPEG_QUALITY = 90
-PNG_COMPRESSION = 1  # local sockets are fast, cores are few
 FIRST_FRAME_GRACE_S = (
     1.0  # a tick may be long once (scene set-up); a hung loop is refused after this at the latest
 )
@@ -29,20 +27,6 @@ class FrameSource(Protocol):
     def camera_names(self) -> tuple[str, ...]: ...
 
     def snapshot(self, camera: str, max_age_s: float) -> Picture: ...
-
-
-def encode(rgb: Any, encoding: Encoding) -> bytes:
-    """Compress an RGB picture. Raises InternalError if OpenCV refuses."""
-    import cv2
-
-    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    if encoding == "png":
-        done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
-    else:
-        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        raise InternalError(f"the picture could not be encoded as {encoding}")
-    return bytes(data)
 
 
 async def fetch(

@@ -28,6 +28,7 @@ from vram_arbiter.runner.protocols import (
     Transition,
 )
 from vram_arbiter.runner.safety.estop_latch import EstopLatch
+from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.pictures import FramePicture
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE, WorldStateAggregator
 from vram_arbiter.schemas.control import ControlMode
@@ -58,7 +59,7 @@ class HardwareRobot:
     """Implements `control.robot.Robot` on a HAL and camera readers.
 
     `readers` come with the greatest age of their frames (ms); `topics` names the cameras that are
-    published as well.
+    published as well, `detections` those that continuous detectors look at.
     """
 
     finished = False
@@ -73,12 +74,16 @@ class HardwareRobot:
         clock: Clock,
         latch: EstopLatch,
         topics: Mapping[str, str] | None = None,
+        detections: Sequence[DetectionSlot] = (),
         first_data_s: float = FIRST_DATA_S,
     ) -> None:
         self.hal = hal
         self.world: WorldState | None = None
+        self.detections = tuple(detections)
         self.aggregator = WorldStateAggregator(
-            {reader.sensor_id: age_ms for reader, age_ms in readers}, topics=topics
+            {reader.sensor_id: age_ms for reader, age_ms in readers},
+            topics=topics,
+            detections=self.detections,
         )
         self._readers = {reader.sensor_id: reader for reader, _ in readers}
         self._make_gate = make_gate
@@ -270,7 +275,9 @@ class HardwareRobot:
         return None
 
     def facts(self) -> GoalData:
-        return {}
+        if not self.detections:
+            return {}
+        return {"detectors": {slot.sensor_id: slot.facts() for slot in self.detections}}
 
     # -- cameras
     def camera_names(self) -> tuple[str, ...]:
@@ -331,6 +338,7 @@ def hardware_runner(
     deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
     clock: Clock | None = None,
     topics: Mapping[str, str] | None = None,
+    detections: Sequence[DetectionSlot] = (),
     on_estop: Callable[[str], None] | None = None,
     first_data_s: float = FIRST_DATA_S,
 ) -> HardwareRunner:
@@ -342,7 +350,14 @@ def hardware_runner(
     clock = clock or SystemClock()
     latch = EstopLatch(on_estop)
     robot = HardwareRobot(
-        hal, readers, make_gate, clock=clock, latch=latch, topics=topics, first_data_s=first_data_s
+        hal,
+        readers,
+        make_gate,
+        clock=clock,
+        latch=latch,
+        topics=topics,
+        detections=detections,
+        first_data_s=first_data_s,
     )
     return ControlLoop(
         robot, rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock, latch=latch

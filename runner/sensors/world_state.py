@@ -1,4 +1,4 @@
-"""World state: joint state and camera frames, each fresh or marked as stale.
+"""World state: joint state, camera frames and detections, each fresh or marked as stale.
 
 Fails closed. A component older than its limit is `stale` in `diagnostics`, a stale camera's frame
 is missing from `image_frames`, and both stay so (latched) until RECOVERY_UPDATES fresh values have
@@ -9,11 +9,18 @@ joint state there is no world state. Must not know sensors or robots; any thread
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.schemas.errors import StateStale
-from vram_arbiter.schemas.world import Diagnostic, JointState, SensorFrame, WorldState
+from vram_arbiter.schemas.world import (
+    DetectedObject,
+    Diagnostic,
+    JointState,
+    SensorFrame,
+    WorldState,
+)
 
 JOINT_STATE = "joint_state"  # its name among the components; no camera may be called so
 RATE_HZ = 30.0
@@ -90,6 +97,7 @@ class WorldStateAggregator:
         *,
         joint_max_age_ms: float = JOINT_MAX_AGE_MS,
         topics: Mapping[str, str] | None = None,
+        detections: Sequence[DetectionSlot] = (),
         rate_hz: float = RATE_HZ,
     ) -> None:
         if JOINT_STATE in max_age_ms:
@@ -97,6 +105,7 @@ class WorldStateAggregator:
         self._components = {name: _Component(round(age * 1e6)) for name, age in max_age_ms.items()}
         self._joints = self._components[JOINT_STATE] = _Component(round(joint_max_age_ms * 1e6))
         self._topics = dict(topics or {})
+        self._detections = tuple(detections)
         self._period_ns = round(1e9 / rate_hz)
         self._next_ns: int | None = None
         self._joint_state: JointState | None = None
@@ -160,11 +169,17 @@ class WorldStateAggregator:
                 diagnostics[name] = "stale" if component.stale else "ok"
                 if component.stale:
                     self._frames.pop(name, None)
+            detected: list[DetectedObject] = []
+            for slot in self._detections:
+                found = slot.fresh(now_ns)
+                diagnostics[slot.name] = "stale" if found is None else "ok"
+                detected += found or ()
             return WorldState(
                 stamp_ns=now_ns,
                 joint_state=self._joint_state,
                 images=self._topics,
                 image_frames=dict(self._frames),
+                detected_objects=tuple(detected),
                 diagnostics=diagnostics,
             )
 

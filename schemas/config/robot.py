@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, m
 
 from vram_arbiter.schemas.body import Body, Capability
 from vram_arbiter.schemas.manifest.contracts import Quantization, SafetyEnvelope
-from vram_arbiter.schemas.manifest.vocabulary import EmbodimentTag
+from vram_arbiter.schemas.manifest.vocabulary import DetectorMode, EmbodimentTag
 from vram_arbiter.schemas.yamltext import Path, YamlText, parse_yaml, validated
 
 RATE_HZ_MAX = 1000.0
@@ -62,6 +62,27 @@ class SensorReaderConfig(_Section):
         if self.publish_rate_hz is not None and not self.publish_to_ros:
             raise ValueError("publish_rate_hz without publish_to_ros publishes nothing")
         return self
+
+
+class DetectorConfig(_Section):
+    """One detector that looks at a camera all the time; its sidecar serves it under its lease."""
+
+    id: Text
+    """The installed rSkill of kind `detector`: OWNER/REPOSITORY."""
+    sensor_id: Text
+    """The camera that it looks at; one detector a camera."""
+    mode: DetectorMode | None = None
+    """null: as in its manifest, which has to say `continuous` then."""
+    queries: tuple[Text, ...] = ()
+    """What to look for; empty: the labels of its manifest."""
+    score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
+    rate_hz: Annotated[float, Field(gt=0, le=30, allow_inf_nan=False)] = 2.0
+    """Looks a second at most."""
+    max_age_ms: Positive = 1000.0
+    """Detections are absent once their picture was taken longer ago than this."""
+    reload_s: Positive | None = 10.0
+    """Interval at which an evicted model whose sidecar is not on standby is loaded again; null: it
+    stays away until something else loads it."""
 
 
 class HalConfig(_Section):
@@ -125,6 +146,8 @@ class RobotEnvironment(_Section):
     grippers are seen without being named here."""
     hal: HalConfig
     sensors: tuple[SensorReaderConfig, ...] = ()
+    detectors: tuple[DetectorConfig, ...] = ()
+    """Detectors that look all the time, for the world state's `detected_objects`."""
     task: TaskSpec | None = None
     vla: VlaSpec | None = None
     safety: SafetyEnvelope | None = None
@@ -142,6 +165,11 @@ class RobotEnvironment(_Section):
         names = [sensor.sensor_id for sensor in self.sensors]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"sensor_id must be unique; given twice: {', '.join(twice)}")
+        watched = [detector.sensor_id for detector in self.detectors]
+        if unknown := sorted(set(watched) - set(names)):
+            raise ValueError(f"detectors look at cameras that are not there: {', '.join(unknown)}")
+        if twice := sorted({name for name in watched if watched.count(name) > 1}):
+            raise ValueError(f"one detector a camera; given twice: {', '.join(twice)}")
         if (self.vla is None) != (self.task is None):
             raise ValueError("task and vla go together: give both, or neither to serve goals only")
         Body.model_validate({"embodiment_tags": self.known_tags, "capabilities": self.capabilities})
@@ -163,6 +191,7 @@ def known_keys() -> Mapping[Path, Collection[str]]:
         ("vla", "quantization"): list(Quantization.model_fields),
         ("safety",): list(SafetyEnvelope.model_fields),
         **{("sensors", index): list(SensorReaderConfig.model_fields) for index in range(64)},
+        **{("detectors", index): list(DetectorConfig.model_fields) for index in range(64)},
     }
 
 

@@ -456,3 +456,36 @@ def test_any_value_in_a_deployment_is_taken_or_found_fault_with(
     except ConfigError as error:
         said = error.message
     assert re.match(r"robot\.yaml(:\d+)*: ", said), said
+
+
+def test_a_continuous_detector_is_checked_against_the_installed_ones(dry_run: DryRun) -> None:
+    skills = ROOT / "configs/rskills/so101-detector"
+    cameras = (
+        "sensors:\n  - {sensor_id: front, backend_params: {device: 0}}\n"
+        "  - {sensor_id: wrist, backend_params: {device: 1}}\n"
+    )
+
+    def text(detector: str) -> str:
+        return f"{TWIN}{cameras}detectors:\n  - {{{detector}, sensor_id: front}}\n"
+
+    watched = text("id: vram-arbiter/so101-detector, mode: continuous, queries: [red cube]")
+    code, out, err = dry_run(watched, skills=skills)
+    assert (code, err) == (0, "")
+    (line,) = [line for line in out.splitlines() if line.startswith("detector ")]
+    assert "detector.sock looks at front, at most 2 times a second; at most 1000 ms old" in line
+    given = ("--sidecar", "vram-arbiter/so101-detector=ipc:///d.sock")
+    assert "so101-detector at ipc:///d.sock looks" in dry_run(watched, *given, skills=skills)[1]
+    assert "detectors" not in dry_run(TWIN)[1]  # off unless the file asks for it
+    for detector, expected in {
+        "id: vram-arbiter/so101-detector": "robot.yaml:7: detectors[0].mode:"
+        " vram-arbiter/so101-detector is on_demand by its manifest: write `mode: continuous`",
+        "id: a/b": "detectors[0].id: no such detector is installed: a/b; there is"
+        " vram-arbiter/so101-detector",
+    }.items():
+        code, _, err = dry_run(text(detector), skills=skills)
+        assert code == 2
+        assert expected in err
+    twice = watched + "  - {id: vram-arbiter/so101-detector, sensor_id: front}\n"
+    assert "one detector a camera; given twice: front" in dry_run(twice, skills=skills)[2]
+    blind = f"{TWIN}{cameras}detectors:\n  - {{id: a/b, sensor_id: rear}}\n"
+    assert "detectors look at cameras that are not there: rear" in dry_run(blind)[2]

@@ -12,6 +12,7 @@ import pytest
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals import frames
+from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas.errors import BadRequest, FrameStale
 from vram_arbiter.schemas.world import CameraModel
 
@@ -54,9 +55,7 @@ def test_png_is_lossless_and_in_rgb_order() -> None:
     import numpy as np
 
     picture = np.random.default_rng(1).integers(0, 255, (6, 8, 3), dtype=np.uint8)
-    decoded = cv2.imdecode(
-        np.frombuffer(frames.encode(picture, "png"), dtype=np.uint8), cv2.IMREAD_COLOR
-    )
+    decoded = cv2.imdecode(np.frombuffer(encode(picture, "png"), dtype=np.uint8), cv2.IMREAD_COLOR)
     assert (decoded[..., ::-1] == picture).all()
 
 
