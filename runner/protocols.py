@@ -163,6 +163,15 @@ class Stepped(Protocol):
     def fraction(self) -> float: ...
 
 
+@runtime_checkable
+class Paced(Protocol):
+    """A skill with a clock of its own, which stands while its actions are withheld."""
+
+    def withheld(self) -> None:
+        """The last step's action was not applied. Control thread."""
+        ...
+
+
 class Skill(Stepped, Protocol):
     """A skill that a goal can run. Life: `start` → `step`… → `finish` per goal, then `release`.
 

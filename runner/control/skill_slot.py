@@ -14,12 +14,14 @@ from dataclasses import dataclass, field
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.follow import GoalFollower
 from vram_arbiter.runner.control.robot import StaleInput
+from vram_arbiter.runner.control.withheld import LATE, Streak
 from vram_arbiter.runner.protocols import (
     Act,
     Done,
     Goal,
     GoalData,
     Hold,
+    Paced,
     Progress,
     SafetyGate,
     SkillEnded,
@@ -81,10 +83,9 @@ class _Active:
     goal: Goal
     on_end: Callable[[SkillEnded], None]
     gate: SafetyGate
+    streak: Streak
     ticks: int = 0
-    withheld_in_a_row: int = 0
-    late_in_a_row: int = 0
-    was_late: bool = False  # the action before
+    passed: bool = False  # an action of this tick passed the gate and was not late
     tally: Tally = field(default_factory=Tally)
     detail: str = ""
 
@@ -119,7 +120,7 @@ class SkillSlot:
         self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None], gate: SafetyGate
     ) -> None:
         """Give the robot to a skill."""
-        self._active = _Active(skill, goal, on_end, gate)
+        self._active = _Active(skill, goal, on_end, gate, Streak(goal.goal_id))
         key = str(skill.key)
         self.goals_by_skill[key] = self.goals_by_skill.get(key, 0) + 1
         self.traceparent, self.labels = goal.traceparent, {telemetry.ATTR_SKILL: goal.rskill_id}
@@ -148,12 +149,16 @@ class SkillSlot:
         active, self._active = self._active, None
         if active is not None:
             self.traceparent, self.labels = None, {}
+            active.streak.end("the goal ends")
         return active
 
     def tick_over(self) -> None:
-        """Count the tick that just ended."""
-        if self._active is not None:
-            self._active.ticks += 1
+        """Count the tick that just ended; an action that reached the motors ends a streak."""
+        if (active := self._active) is not None:
+            active.ticks += 1
+            if active.passed:
+                active.streak.end("actions pass again")
+            active.passed = False
 
     # -- one tick
     def decide(self, world: WorldState) -> Decision:
@@ -227,26 +232,10 @@ class SkillSlot:
         if decision.action is None:
             self._refused(active, problems[0])
         else:
-            self._allowed(active, clamped=bool(problems))
-
-    def _allowed(self, active: _Active, *, clamped: bool) -> None:
-        active.withheld_in_a_row = 0
-        if not active.was_late:
-            active.late_in_a_row = 0
-        active.was_late = False
-        active.tally.clamped += clamped
-        self.total.clamped += clamped
-        active.detail = ""
-
-    def _refused(self, active: _Active, problem: str) -> None:
-        self._withhold(active, problem)
-        active.withheld_in_a_row += 1
-        if active.withheld_in_a_row >= WITHHELD_IN_A_ROW_MAX:
-            error = ModelError(
-                f"{active.withheld_in_a_row} actions in a row were withheld: {problem}",
-                hint="the skill commands what this robot's envelope forbids",
-            )
-            self.end(SkillEnded({}, error))
+            active.passed = True
+            active.tally.clamped += bool(problems)
+            self.total.clamped += bool(problems)
+            active.detail = ""
 
     # -- actions that never reach the motors
     def input_stale(self, stale: StaleInput) -> Decision:
@@ -254,33 +243,43 @@ class SkillSlot:
         if (active := self._active) is not None:
             if stale.first:
                 self.violations.append(stale.problem)
-            self._withhold(active, stale.problem)
+            self._withhold(active, stale.problem, asked=False)
             if stale.error is not None:
                 self.end(SkillEnded({}, stale.error))
         return Decision(violations=(stale.problem,))
 
     def came_too_late(self) -> None:
-        """Count an action that the deadline policy withheld.
+        """Count an action that the deadline policy withheld."""
+        if (active := self._active) is not None:
+            active.passed = False
+            self._refused(active, LATE)
 
-        A skill does not notice that its actions are not sent: it would play to its end and report
-        success. Too many in a row therefore fail the goal.
+    def _refused(self, active: _Active, reason: str) -> None:
+        """Withhold an action. Too many in a row fail the goal, with the cause of the first one.
+
+        A skill does not have to notice that its actions are not sent: it would play to its end and
+        report success.
         """
-        if (active := self._active) is None:
+        self._withhold(active, reason, asked=True)
+        if isinstance(active.skill, Paced):
+            active.skill.withheld()
+        streak = active.streak
+        if streak.actions < WITHHELD_IN_A_ROW_MAX:
             return
-        active.was_late = True
-        active.late_in_a_row += 1
-        self._withhold(active, "it came too late")
-        if active.late_in_a_row >= WITHHELD_IN_A_ROW_MAX:
-            error = LimitExceeded(
-                f"{active.late_in_a_row} actions in a row came too late and were withheld",
-                hint="lower rate_hz, or look at what makes the ticks long",
-                details={"limit": "deadline"},
-            )
-            self.end(SkillEnded({}, error))
+        said = f"{streak.actions} actions in a row were withheld, the first because: {streak.first}"
+        details = {"causes": dict(streak.causes)}
+        if streak.first == LATE:
+            hint = "lower rate_hz, or look at what makes the ticks long"
+            late = LimitExceeded(said, hint=hint, details={**details, "limit": "deadline"})
+            self.end(SkillEnded({}, late))
+        else:
+            hint = "the skill commands what this robot's envelope forbids"
+            self.end(SkillEnded({}, ModelError(said, hint=hint, details=details)))
 
-    def _withhold(self, active: _Active, reason: str) -> None:
+    def _withhold(self, active: _Active, reason: str, *, asked: bool) -> None:
         tracing.event(telemetry.EVENT_ACTION_WITHHELD, reason=reason)
         meters.count(telemetry.METRIC_WITHHELD, self.labels)
         active.tally.withheld += 1
         self.total.withheld += 1
-        active.detail = f"withheld: {reason}"
+        active.streak.add(reason, asked=asked)
+        active.detail = f"withheld: {active.streak.first}"

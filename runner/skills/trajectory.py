@@ -230,6 +230,10 @@ class FollowJointTrajectory(SkillBase):
             )
         )
 
+    def withheld(self) -> None:
+        """Let the clock stand: a target that moved on while the arm stood would be too fast."""
+        self._ticks -= 1
+
     def _tolerance_rad(self, name: str) -> float:
         assert self._asked is not None, "only asked while a goal runs"
         given = [

@@ -2,8 +2,10 @@
 ends. Time moves only when told.
 """
 
+import asyncio
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,6 +25,8 @@ from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors import Feed
 from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
+from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadRequest,
     Cancelled,
@@ -34,8 +38,10 @@ from vram_arbiter.schemas.errors import (
     StateStale,
 )
 from vram_arbiter.schemas.manifest import load_manifest
-from vram_arbiter.schemas.world import SensorFrame, WorldState
+from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
+from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
 
+CONFIGS = Path(__file__).parents[3] / "configs/rskills"
 PERIOD_S = 1 / 30
 MakeRunner = Callable[..., HardwareRunner]
 
@@ -127,6 +133,74 @@ def test_what_a_skill_cannot_carry_out_is_withheld_and_fails_the_goal_if_it_last
     assert isinstance(ended[0].error, ModelError)
     assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
     assert not twin.sent
+
+
+class Slide:
+    """Kinematics of an arm whose tool is as many meters ahead as its elbow has rad."""
+
+    gripper_lever_m = 0.1
+
+    def points(self, joints: Mapping[str, float]) -> dict[str, tuple[float, float, float]]:
+        return {"tool": (joints["elbow_flex"], 0.0, 0.0)}
+
+
+def test_withheld_actions_are_reported_by_their_first_cause(
+    make_runner: MakeRunner, twin: Twin, clock: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Regression: a trajectory that left the workspace by 2 mm failed as too fast: its targets
+    moved on while the arm stood still, and the error had the last cause. The log said nothing.
+    """
+    manifest = load_manifest(CONFIGS / "so101-move/rskill.yaml")
+    box = SafetyEnvelope(workspace_box_max_xyz=(0.21, 1.0, 1.0))
+    own = RobotGate(
+        twin.description,
+        rate_hz=30.0,
+        kinematics=Slide(),
+        envelopes={"safety": box},
+        now_ns=clock.now_ns,
+    )
+    runner = make_runner(make_gate=lambda skill: own)
+    runner.activate()
+    twin.send_action(
+        Action(
+            control_mode=ControlMode.JOINT_POSITION,
+            joint_targets=((0.0,),),
+            joint_names=("elbow_flex",),
+        )
+    )
+    clock.advance(5.0)
+    skill = FollowJointTrajectory(manifest, own.limits, period_s=PERIOD_S)
+    points = [{"positions": [0.6], "time_from_start": {"sec": 3}}]
+    params = {"trajectory": {"joint_names": ["elbow_flex"], "points": points}}
+    asyncio.run(skill.start(Goal("g", manifest.name, params=params)))
+    ended: list[SkillEnded] = []
+    runner.begin_skill(skill, Goal("g", manifest.name), ended.append)
+    with caplog.at_level("WARNING", "vram_arbiter.runner.control.withheld"):
+        tick(runner, clock, 60)
+    (error,) = (end.error for end in ended)
+    assert isinstance(error, ModelError)
+    assert "the first because: the tool at (0.213, 0.000, 0.000) m is 3 mm outside" in str(error)
+    assert list(error.details["causes"].values()) == [WITHHELD_IN_A_ROW_MAX]
+    began, over = (record.getMessage() for record in caplog.records)
+    assert began.startswith("goal g: actions are withheld: the tool at (0.21")
+    assert over.startswith("goal g: the goal ends after 15 withheld: 15 × the tool at")
+
+
+def test_one_line_says_that_actions_pass_again(
+    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    runner = make_runner(deadline_policy=DeadlinePolicy.DROP)
+    runner.activate()
+    slow = iter([True, False, True, True, True] + 20 * [False])
+    begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S) if next(slow) else None))
+    with caplog.at_level("WARNING", "vram_arbiter.runner.control.withheld"):
+        tick(runner, clock, 9)
+    assert [record.getMessage() for record in caplog.records] == [
+        "goal g: actions are withheld: it came too late",
+        "goal g: actions pass again after 1 withheld: 1 × it came too late",
+        "goal g: actions are withheld: it came too late",
+        "goal g: actions pass again after 3 withheld: 3 × it came too late",
+    ]
 
 
 @pytest.mark.parametrize("cause", ["hangs", "ends", "is not there"])

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.protocols import Act, Done, Goal, Paced, StepOutcome
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.limits import Limits, own_limits
 from vram_arbiter.runner.skills.ros_standins import (
@@ -283,3 +283,16 @@ def test_what_it_drives_has_to_be_what_the_stand_in_drives() -> None:
         .refuses(changed(MOVE, actuators_required=legs))
         .startswith("it moves hip, knee; the robot has")
     )
+
+
+def test_the_clock_stands_while_targets_are_withheld() -> None:
+    """Regression: the targets moved on while the arm stood, until they were too far ahead for any
+    speed.
+    """
+    skill = started(trajectory((0.6,)))
+    first = skill.step(world())
+    for _ in range(20):
+        skill.withheld()
+        assert skill.step(world()) == first
+    assert isinstance(skill, Paced)
+    assert targets_of(skill)[0] == pytest.approx(2 * 0.6 * PERIOD_S), "the second period"
