@@ -4,6 +4,7 @@ profiles."""
 import logging
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +19,9 @@ from tests.support.wire import WireClient
 pytest_plugins = ["tests.support.leftovers"]
 _ROOT = Path(__file__).parents[1]
 machines.register()
+# Programs that tests start would compile all that they import, each time.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Programs that tests start import `tests.support` too.
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [f"{_ROOT}/src", str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
