@@ -4,11 +4,15 @@ It counts and decides nothing.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Final
 
 from vram_arbiter.arbiter.core.effects import Effect, Note
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.wire.notes import DeniedNote, GrantedNote, RevokeAskedNote, SwitchNote
+
+SHARES: Final = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+"""Waits that are shown: the one that this share of the jobs does not exceed."""
 
 
 @dataclass(slots=True)
@@ -16,22 +20,19 @@ class Tally:
     """Outcome of one consumer."""
 
     jobs: int = 0
-    waits_s: list[float] = field(
-        default_factory=list
-    )  # arrival of a job → its model is there; 0 if it was
     unserved: int = 0  # still waiting at the end; their wait so far is in waits_s
     loads: int = 0
     evicted: int = 0
     denied: int = 0
     loaded_bytes: int = 0
     ooms: int = 0
+    waits_s: list[float] = field(default_factory=list)
+    """From the arrival of a job until its model is there; 0 if it was."""
 
     def wait_s(self, share: float) -> float:
         """Return the wait that this share of the jobs does not exceed."""
-        if not self.waits_s:
-            return 0.0
         ordered = sorted(self.waits_s)
-        return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
+        return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else 0.0
 
 
 @dataclass(slots=True)
@@ -66,15 +67,11 @@ class Outcome:
                 case SwitchNote(switched=True):
                     self.switches += 1
 
-    # -- of all consumers
     @property
     def total(self) -> Tally:
-        every = Tally()
-        for tally in self.consumers.values():
-            every.waits_s += tally.waits_s
-            for name in ("jobs", "unserved", "loads", "evicted", "denied", "loaded_bytes", "ooms"):
-                setattr(every, name, getattr(every, name) + getattr(tally, name))
-        return every
+        """Of all consumers."""
+        columns = zip(*(asdict(tally).values() for tally in self.consumers.values()), strict=True)
+        return Tally(*(sum(column[1:], column[0]) for column in columns))
 
 
 def as_plain(outcome: Outcome) -> JsonObject:
@@ -92,15 +89,6 @@ def as_plain(outcome: Outcome) -> JsonObject:
 
 
 def _plain_tally(tally: Tally) -> JsonObject:
-    return {
-        "jobs": tally.jobs,
-        "unserved": tally.unserved,
-        "wait_p50_s": tally.wait_s(0.5),
-        "wait_p99_s": tally.wait_s(0.99),
-        "wait_max_s": tally.wait_s(1.0),
-        "loads": tally.loads,
-        "evicted": tally.evicted,
-        "denied": tally.denied,
-        "loaded_bytes": tally.loaded_bytes,
-        "ooms": tally.ooms,
-    }
+    counts = asdict(tally)
+    del counts["waits_s"]
+    return counts | {f"wait_{name}_s": tally.wait_s(share) for name, share in SHARES.items()}

@@ -1,6 +1,6 @@
-"""`vramctl replay` and `vramctl simulate`: start the arbiter's programs for them.
+"""`vramctl replay` and `vramctl simulate`: start the arbiter's program for them.
 
-They need the engine, which clients never import. Those programs parse the arguments, `--help` too.
+They need the engine, which clients never import. That program parses the arguments, `--help` too.
 """
 
 import os
@@ -12,21 +12,17 @@ from pathlib import Path
 
 from vram_arbiter.clients.configs import configs_folder
 
-REPLAY = "vram_arbiter.arbiter.eventlog"
 LABORATORY = "vram_arbiter.arbiter.lab"
 
 
 def run(command: str, arguments: Sequence[str]) -> int:
     """Start the program on this terminal. Returns its exit code, 128+n if signal n ended it."""
-    program = [LABORATORY, command]
     if command == "simulate":
         arguments = with_scenario(arguments)
-    elif not any(word.startswith("--policy") for word in arguments):
-        program = [REPLAY]
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the program's
     try:
         code = subprocess.run(
-            [sys.executable, "-m", *program, *arguments],
+            [sys.executable, "-m", LABORATORY, command, *arguments],
             check=False,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         ).returncode

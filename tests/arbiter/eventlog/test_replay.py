@@ -11,8 +11,8 @@ from tests.support.recording import write_log
 from tests.support.scenes import held
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import text
-from vram_arbiter.arbiter.eventlog.__main__ import main
 from vram_arbiter.arbiter.eventlog.logfile import LogError
+from vram_arbiter.arbiter.lab.__main__ import main
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def test_a_log_without_events_does_not_pass_for_a_proof(
     log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log.write_text(log.read_text().splitlines()[0] + "\n")
-    assert main([str(log)]) == 0
+    assert main(["replay", str(log)]) == 0
     assert "nothing was compared" in capsys.readouterr().out
 
 
@@ -198,16 +198,16 @@ def test_a_file_that_needs_an_earlier_one_says_so(log: Path) -> None:
 
 
 def test_the_program_prints_and_exits(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(log)]) == 0
+    assert main(["replay", str(log)]) == 0
     assert "identical" in capsys.readouterr().out
-    assert main([str(log), "--json"]) == 0
+    assert main(["replay", str(log), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"] is True
     tamper(log, 2, digest="0" * 16)
-    assert main([str(log)]) == 1
+    assert main(["replay", str(log)]) == 1
     assert "event 2 is decided otherwise" in capsys.readouterr().out
-    assert main([str(log), "--json"]) == 1
+    assert main(["replay", str(log), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["divergence"]["number"] == 2
-    assert main([str(log.parent / "no")]) == 1
+    assert main(["replay", str(log.parent / "no")]) == 1
     assert "vramctl: " in capsys.readouterr().err
-    assert main([str(log.parent / "no"), "--json"]) == 1
+    assert main(["replay", str(log.parent / "no"), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "bad_log"

@@ -9,6 +9,7 @@ import pytest
 from tests.support.core_driver import CoreDriver
 from tests.support.paths import ROOT
 from tests.support.recording import record_workload, write_log
+from vram_arbiter.arbiter.core.settings import SCHEDULING
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.lab import compare
 from vram_arbiter.arbiter.lab.__main__ import main
@@ -58,7 +59,7 @@ def test_another_policy_on_a_log_does_what_it_does_on_the_scenario(tmp_path: Pat
     log, _ = record_shipped("small-behind-large", tmp_path)
     found = extract(runner.load(log))
     made = shipped("small-behind-large")
-    for policy in ("fifo", "one_model", "ollama_rules"):
+    for policy in ("fifo", "one_model"):
         wanted = compare.under(workload_of(made), settings_of(made), policy)
         guessed = compare.under(found.workload, found.settings, policy)
         assert near(guessed.total.loads, wanted.total.loads, 0.15, 2), policy
@@ -175,7 +176,7 @@ def test_simulate_prints_decisions_and_tables(
     assert "revoke_asked  detector" in out
     assert main(["simulate", path, "--policy", "all", "--json", "--timeline", "3"]) == 0
     shown = json.loads(capsys.readouterr().out)
-    assert [entry["policy"] for entry in shown["policies"]] == list(compare.POLICIES)
+    assert [entry["policy"] for entry in shown["policies"]] == list(SCHEDULING)
     assert len(shown["policies"][0]["timeline"]) == 3
     broken = tmp_path / "broken.yaml"
     broken.write_text("about: x\n")

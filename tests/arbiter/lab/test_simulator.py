@@ -1,13 +1,11 @@
-"""Simulated consumers under the engine and under other programs' rules: safe, reproducible, and as
-each rule says."""
+"""Simulated consumers under the engine: safe and reproducible."""
 
 import pytest
 
 from tests.support.paths import ROOT
-from vram_arbiter.arbiter.core.settings import SCHEDULING, Settings
+from vram_arbiter.arbiter.core.settings import SCHEDULING
 from vram_arbiter.arbiter.lab import compare
 from vram_arbiter.arbiter.lab.outcome import Outcome, as_plain
-from vram_arbiter.arbiter.lab.rules import RULES, OneCardOnly
 from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
 from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 
@@ -111,9 +109,8 @@ def test_who_waits_too_long_is_denied_and_the_rest_goes_on() -> None:
 
 def test_a_request_that_never_fits_is_denied_at_once() -> None:
     text = "  huge: {load_peak: 20GiB, use_s: 1, arrivals: {at_s: [1, 2]}}"
-    for policy in ("default", "ollama_rules"):
-        tally = under(scenario_of(text), policy).of("huge")
-        assert (tally.denied, tally.loads) == (2, 0)
+    tally = under(scenario_of(text)).of("huge")
+    assert (tally.denied, tally.loads) == (2, 0)
 
 
 def test_whoever_still_waits_at_the_end_is_counted() -> None:
@@ -144,59 +141,3 @@ def test_stowaways_are_charged_and_come_and_go() -> None:
     outcome = under(scenario_of(text, more=more))
     assert outcome.total.ooms == 0
     assert 20.0 < outcome.of("a").waits_s[0] < 24.0
-
-
-# -- other programs' rules
-def test_without_anybody_to_decide_the_second_never_gets_in() -> None:
-    outcome = under(scenario_of(TWO), "unmanaged")
-    assert outcome.of("right").ooms > 50
-    assert outcome.of("right").unserved == 3
-    assert outcome.of("left").ooms == 0
-
-
-def test_llama_swap_starts_the_next_before_the_memory_is_back() -> None:
-    assert under(scenario_of(TWO, lag_s=0.5), "llama_swap_rules").total.ooms > 0
-    calm = under(scenario_of(TWO, lag_s=0.0), "llama_swap_rules")
-    assert (calm.total.ooms, calm.total.unserved, calm.switches) == (0, 0, 5)
-
-
-def test_llama_swap_holds_one_model_even_where_two_fit() -> None:
-    outcome = under(scenario_of(TWO, card="24GiB", lag_s=0.0), "llama_swap_rules")
-    assert outcome.switches == 5
-    assert under(scenario_of(TWO, card="24GiB")).switches == 0
-
-
-def test_ollama_waits_for_the_memory_and_loads_beside_what_fits() -> None:
-    outcome = under(scenario_of(TWO, lag_s=1.0), "ollama_rules")
-    assert (outcome.total.ooms, outcome.total.unserved, outcome.switches) == (0, 0, 5)
-    assert under(scenario_of(TWO, card="24GiB"), "ollama_rules").switches == 0
-
-
-def test_ollama_goes_on_after_five_seconds_anyway() -> None:
-    assert under(scenario_of(TWO, lag_s=8.0), "ollama_rules").total.ooms > 0
-    assert under(scenario_of(TWO, lag_s=8.0)).total.ooms == 0
-
-
-def test_a_small_model_waits_behind_a_large_one_with_ollama_and_not_here() -> None:
-    text = """
-  long: {load_peak: 4GiB, load_s: 1, use_s: 60, arrivals: {at_s: [0]}}
-  large: {load_peak: 6GiB, load_s: 1, use_s: 1, arrivals: {at_s: [5]}}
-  small: {load_peak: 1GiB, load_s: 1, use_s: 1, arrivals: {at_s: [10]}}
-"""
-    assert under(scenario_of(text), "ollama_rules").of("small").wait_s(1.0) > 40
-    assert under(scenario_of(text)).of("small").wait_s(1.0) < 2
-
-
-def test_the_ports_know_one_card_and_names_are_checked() -> None:
-    made = load_scenario(
-        "about: t\nseconds: 5\ncards: [{capacity: 8GiB}, {capacity: 8GiB}]\nconsumers:\n"
-        "  a: {load_peak: 1GiB, use_s: 1, arrivals: {at_s: [0, 1]}}\n  b: {load_peak: 7GiB, use_s: "
-        "1, gpu: '1', arrivals: {at_s: [0]}}",
-        "two.yaml",
-    )
-    for policy in RULES:
-        with pytest.raises(OneCardOnly):
-            under(made, policy)
-    assert under(made).total.unserved == 0
-    with pytest.raises(compare.UnknownPolicy, match="unknown policy 'best'"):
-        compare.under(workload_of(made), Settings(1, ()), "best")

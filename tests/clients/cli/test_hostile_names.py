@@ -21,6 +21,7 @@ from rich.text import Text
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.lab import compare as lab_text
+from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
 from vram_arbiter.schemas.ids import LeaseId
@@ -133,6 +134,12 @@ EVENT = {
     "wanted_by": "grab",
     "label": "detect",
 }
+
+
+def about(name: str) -> About:
+    return About(LeaseId("L1"), name, None)
+
+
 SAID: dict[str, Callable[[str], list[str]]] = {
     "status": lambda name: text.status_lines(
         {
@@ -165,7 +172,7 @@ SAID: dict[str, Callable[[str], list[str]]] = {
     "table": lambda name: text.table(["LEASE", "CONSUMER"], [["L1", name], [name, "x"]]),
     "table of the laboratory": lambda name: lab_text.table(["consumer", "waits"], [[name, 1]]),
     "timeline": lambda name: lab_text.timeline_lines(
-        name, [(1.0, Note(QueuedNote(1, None, name), About(LeaseId("L1"), name, None)))], 5
+        Outcome(name, 1.0, timeline=[(1.0, Note(QueuedNote(1, None, name), about(name)))]), 5
     ),
 }
 

@@ -136,7 +136,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     lines += [
         ["vram_arbiter.schemas", "check", flag],
         ["vram_arbiter.arbiter.lab", "replay", flag],
-        ["vram_arbiter.arbiter.eventlog", flag],
+        ["vram_arbiter.arbiter.lab", "simulate", flag],
     ]
     done = subprocess.run(
         [sys.executable, "-c", program, json.dumps(lines)],

@@ -1,7 +1,8 @@
-"""Ports of other programs' scheduling rules, against the same consumers and GPUs.
+"""Ports of other programs' scheduling rules, against the same consumers and GPUs:
+`python tests/bench/other_rules.py [SCENARIO …]` prints the tables of docs/policies.md.
 
-For comparison only, never part of a daemon. They get the same events and answer with the same
-effects as the engine, but decide as their originals do, by these sources:
+For comparison only. They get the same events and answer with the same effects as the engine, but
+decide as their originals do, by these sources:
 
 - `unmanaged`: no decision, every process loads at once, as without any of these programs.
 - `ollama_rules` (ollama, server/sched.go): first come first served. A model that fits into free
@@ -15,10 +16,17 @@ All of them start and end model processes, so nothing stays on the GPU after an 
 priorities, pins or load peaks.
 """
 
+import argparse
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
+if __name__ == "__main__":
+    sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).parents[2])]
+
+from tests.support.paths import ROOT
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
@@ -34,7 +42,13 @@ from vram_arbiter.arbiter.core.events import (
     UseEnded,
 )
 from vram_arbiter.arbiter.core.model.refusals import Revoked, TooLarge
-from vram_arbiter.arbiter.lab.workload import CardPlan
+from vram_arbiter.arbiter.core.settings import SCHEDULING
+from vram_arbiter.arbiter.lab import compare
+from vram_arbiter.arbiter.lab.outcome import Outcome
+from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
+from vram_arbiter.arbiter.lab.simulator import simulate
+from vram_arbiter.arbiter.lab.workload import CardPlan, Workload
+from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 from vram_arbiter.schemas.errors import CallerError
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, Token
 from vram_arbiter.schemas.wire.notes import About, AnyNote, GrantedNote, RevokeAskedNote, SwitchNote
@@ -298,3 +312,30 @@ RULES: Mapping[str, Callable[[Sequence[CardPlan]], Rules]] = {
     "ollama_rules": OllamaRules,
     "llama_swap_rules": LlamaSwapRules,
 }
+
+
+def under(workload: Workload, name: str) -> Outcome:
+    """Simulate a workload under another program's rules: its models are processes that end."""
+    return simulate(workload, RULES[name](workload.cards), name, holders_exit=True)
+
+
+def outcomes_of(scenario: Scenario) -> list[Outcome]:
+    """Return a scenario under every policy of the engine, then under the rules of other
+    programs."""
+    settings = settings_of(scenario)
+    ours = [compare.under(workload_of(scenario), settings, name) for name in SCHEDULING]
+    return ours + [under(workload_of(scenario), name) for name in RULES]
+
+
+def main() -> None:
+    shipped = sorted((ROOT / "configs" / "scenarios").glob("*.yaml"))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("scenarios", metavar="SCENARIO", type=Path, nargs="*", default=shipped)
+    for path in parser.parse_args().scenarios:
+        scenario = load_scenario(path.read_text(), path.name)
+        print(f"{path.stem}: {scenario.about}")
+        print("\n".join([*compare.tables(outcomes_of(scenario)), ""]))
+
+
+if __name__ == "__main__":
+    main()
