@@ -29,7 +29,7 @@ from vram_arbiter.schemas.plain import JsonMap, JsonObject
 log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 2
-"""1: rows without a digest."""
+"""1, of version 0.1: rows without a digest. It is put aside: its clients could not reattach."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS records
@@ -151,7 +151,7 @@ def _read(found: Found, check: Check | None) -> Found:
         rows = connection.execute("SELECT name, value FROM meta")
         found.meta = {_decoded(name): _decoded(value) for name, value in rows}
         schema = found.meta.get("schema")
-        if schema not in (None, "1", str(SCHEMA_VERSION)):
+        if schema not in (None, str(SCHEMA_VERSION)):
             raise sqlite3.DatabaseError(f"schema {schema}, this daemon knows {SCHEMA_VERSION}")
         rows = connection.execute(
             "SELECT CAST(key AS BLOB), CASE WHEN length(json) <= ? THEN json END, digest FROM "
@@ -160,7 +160,7 @@ def _read(found: Found, check: Check | None) -> Found:
         )
         for key, content, told in rows:
             try:
-                _take(found, key.decode(), content, told, schema, check)
+                _take(found, key.decode(), content, told, check)
             except ValueError as error:
                 found.damaged[key] = str(error)
     except BaseException:
@@ -169,16 +169,14 @@ def _read(found: Found, check: Check | None) -> Found:
     return found
 
 
-def _take(
-    found: Found, key: str, content: object, told: object, schema: str | None, check: Check | None
-) -> None:
+def _take(found: Found, key: str, content: object, told: object, check: Check | None) -> None:
     """One row. Raises ValueError for a damaged one."""
     if not isinstance(content, bytes):
         raise ValueError(f"longer than {RECORD_MAX_CHARS} characters, or not a text")
     text = content.decode()
     own = digest(key, text)
     found.total ^= int.from_bytes(own)
-    if told != own and not (schema == "1" and told is None):
+    if told != own:
         raise ValueError("its digest is not that of its text")
     record = strictjson.loads(text, max_chars=RECORD_MAX_CHARS)
     if not isinstance(record, dict):
@@ -208,9 +206,6 @@ def connect(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("PRAGMA synchronous=NORMAL")
         connection.executescript(_SCHEMA)
-        columns = {row[1] for row in connection.execute("PRAGMA table_info(records)")}
-        if b"json" in columns and b"digest" not in columns:
-            connection.execute("ALTER TABLE records ADD COLUMN digest BLOB")
     except BaseException:
         connection.close()
         raise

@@ -20,8 +20,8 @@ from vram_arbiter.arbiter.core.model.records import (
     LeaseRecord,
     ResidueRecord,
 )
-from vram_arbiter.schemas.plain import JsonMap, JsonObject
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 _ADAPTERS: Final[Mapping[str, TypeAdapter[Any]]] = {
     "lease": TypeAdapter(LeaseRecord),
@@ -30,7 +30,6 @@ _ADAPTERS: Final[Mapping[str, TypeAdapter[Any]]] = {
     DOUBT_KEY: TypeAdapter(DoubtRecord),
 }
 _SPEC = frozenset(field.name for field in fields(LeaseSpec))
-_SIZES = tuple(field.name for field in fields(Footprint))
 
 
 def record_of(key: str, data: JsonMap) -> AnyRecord:
@@ -39,8 +38,8 @@ def record_of(key: str, data: JsonMap) -> AnyRecord:
     adapter = _ADAPTERS.get(key.partition(":")[0])
     if adapter is None:
         raise ValueError("no part of the daemon writes such a record")
-    if isinstance(spec := data.get("spec"), dict):
-        data = {**data, "spec": _spec(spec)}
+    if isinstance(spec := data.get("spec"), dict):  # requests refuse fields that are not known
+        data = {**data, "spec": {name: spec[name] for name in spec.keys() & _SPEC}}
     try:
         found: AnyRecord = adapter.validate_json(to_json(data), strict=True)
     except ValidationError as error:
@@ -55,19 +54,3 @@ def record_of(key: str, data: JsonMap) -> AnyRecord:
 def records_of(data: Mapping[str, JsonMap]) -> dict[str, AnyRecord]:
     """Return the records by their keys. Raises ValueError."""
     return {key: record_of(key, record) for key, record in data.items()}
-
-
-def _spec(data: JsonObject) -> JsonObject:
-    """Return a spec as it is written now: version 0.1 wrote it flat."""
-    if "footprint" not in data:
-        gang = data.get("gang")
-        if isinstance(gang, list | tuple):
-            gang = dict(zip(("id", "size"), gang, strict=False))
-        data = {
-            **data,
-            "footprint": {name: data[name] for name in _SIZES if name in data},
-            "mode": "exclusive" if data.get("exclusive") else "shared",
-            "on_deadline": "deny" if data.get("deny_on_deadline") else "wait",
-            "gang": gang,
-        }
-    return {name: value for name, value in data.items() if name in _SPEC}

@@ -18,9 +18,8 @@ from vram_arbiter.schemas.runtime.printable import makes_printable, printable
 from vram_arbiter.schemas.sizes import format_bytes
 
 DECISIONS = frozenset(
-    "queued granted ready revoke_asked deadline_passed verified denied pressure standby "
-    "parked".split()
-)
+    ("queued", "granted", "ready", "revoke_asked", "deadline_passed", "verified", "denied")
+) | {"pressure", "standby", "parked"}
 """Kinds of notes that a timeline shows."""
 STARVED_S = 60.0
 """A job that waits longer than this counts as starved."""

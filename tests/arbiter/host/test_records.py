@@ -24,7 +24,6 @@ from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import JournalPut
 from vram_arbiter.arbiter.core.events import DOUBT_KEY, MemorySampled, Recovered, Tick
-from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.daemon import processes_of, try_records
 from vram_arbiter.arbiter.host.journal import Journal, Opened
@@ -32,7 +31,6 @@ from vram_arbiter.arbiter.host.records import record_of, records_of
 from vram_arbiter.arbiter.host.seal import digest
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
 Records = dict[str, dict[str, Any]]
 STARTED_S = 1000.0
@@ -129,37 +127,17 @@ NASTY = st.sampled_from(
 )  # fmt: skip
 
 
-def test_a_record_of_version_0_1_is_read() -> None:
-    """Its spec was flat, and said less."""
-    old = {
-        "lease_id": "L1-1", "token": [1, 2], "state": "held", "gpu": "GPU-0", "pid": 7,
-        "start_ticks": 9, "nonce": "n1", "charge_bytes": 5, "load_peak_bytes": 6,
-        "measured_bytes": None, "exiting": False, "said_ready": True, "estate": None,
-        "spec": {
-            "consumer": "det", "model_id": "owl", "revision": "r2", "gpu": "any",
-            "exclusive": True, "load_peak_bytes": 6, "steady_bytes": 5, "residue_bytes": 1,
-            "priority": 60, "evictable": False, "ttl_s": 4.0, "min_residency_s": 0.0,
-            "deny_on_deadline": True, "gang": ["pair", 2], "parent": None,
-        },
-    }  # fmt: skip
-    record = record_of("lease:L1-1", old)
-    assert isinstance(record, LeaseRecord)
-    assert record.spec == LeaseSpec(
-        consumer="det",
-        model_id="owl",
-        revision="r2",
-        mode="exclusive",
-        footprint=Footprint(6, 5, 1),
-        priority=60,
-        evictable=False,
-        ttl_s=4.0,
-        min_residency_s=0.0,
-        on_deadline="deny",
-        gang=Gang("pair", 2),
-    )
-    assert (record.token, record.users, record.held_from) == ((1, 2), (), None)
-    with pytest.raises(ValueError, match="steady_bytes"):
-        record_of("lease:L1-1", {**old, "spec": {**old["spec"], "steady_bytes": -1}})
+def test_a_record_of_another_version_is_read_or_named() -> None:
+    """A later version may write more; version 0.1 wrote its spec flat, for clients of another
+    wire."""
+    _, records = records_written()[0]
+    key = next(key for key in records if key.startswith("lease:"))
+    later = {**records[key], "color": 1, "spec": {**records[key]["spec"], "color": 1}}
+    assert record_of(key, later) == record_of(key, records[key])
+    flat = {**later["spec"], **later["spec"]["footprint"]}
+    del flat["footprint"]
+    with pytest.raises(ValueError, match=r"spec\.footprint: Field required"):
+        record_of(key, {**later, "spec": flat})
 
 
 @given(st.integers(0, 2), st.data())
