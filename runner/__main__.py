@@ -67,6 +67,8 @@ def main(argv: list[str] | None = None) -> int:
             if urgent
             else command("vram-runner", args.command, serves=args.serves) as running
         ):
+            if not urgent:
+                import_module("vram_arbiter.schemas.runtime.telemetry.process").observe_gpu()
             running.code = asyncio.run(args.run(args))
     except VramError as error:
         terminal.complain("vram-runner", error)

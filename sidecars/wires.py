@@ -114,14 +114,12 @@ class Wire:
                 outcome = "ok"
                 return reply
             except VramError as error:
-                outcome = error.code
+                outcome = labels[telemetry.ATTR_ERROR_TYPE] = error.code
                 raise
             finally:
                 labels[telemetry.ATTR_OUTCOME] = outcome
                 tracing.note(labels)
-                meters.measure(
-                    telemetry.METRIC_SIDECAR_REQUEST, (time.monotonic() - began) * 1e3, labels
-                )
+                meters.measure(telemetry.METRIC_SIDECAR_REQUEST, time.monotonic() - began, labels)
 
     async def _answer_by_the_model(self, name: str, call: Call, message: Message) -> Message:
         if name == "unload":

@@ -110,6 +110,7 @@ class ControlLoop[R: Robot]:
         self._pacing = Pacing(rate_hz, self.clock)
         self._stopping = threading.Event()
         self._first_tick = 0  # of the present run
+        self._obeyed = False  # the latched stop, at least once
 
     # -- life
     def activate(self) -> None:
@@ -172,6 +173,9 @@ class ControlLoop[R: Robot]:
         Returns: the stop, with what became of the motors.
         """
         if self.estop is not None:
+            if not self._obeyed:
+                self._obeyed = True
+                meters.count(telemetry.METRIC_ESTOPS)
             self.robot.stop()
             self.slot.end(SkillEnded({}, self.estop))
         return self.estop
@@ -316,7 +320,7 @@ class ControlLoop[R: Robot]:
             result.hal_ms,
             reset=tick.reset,
         )
-        meters.measure(telemetry.METRIC_TICK, result.tick_ms, labels)
+        meters.measure(telemetry.METRIC_TICK, result.tick_ms / 1e3, labels)
         self.slot.follower.tick_over(lambda goal: self._goal_tick(goal, tick, result))
         self.robot.ticked(result)
         if result.deadline_missed:

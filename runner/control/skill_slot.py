@@ -188,7 +188,7 @@ class SkillSlot:
             self.end(SkillEnded({}, InternalError(problem)))
             return decision
         decision.inference_ms = (self._clock.now_s() - asked_s) * 1e3
-        meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms, self.labels)
+        meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms / 1e3, self.labels)
         match outcome:
             case Act(action=action, chunk_index=chunk_index, prefetched=prefetched, problem=short):
                 decision.chunk_index = chunk_index

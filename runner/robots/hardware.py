@@ -40,6 +40,7 @@ from vram_arbiter.schemas.errors import (
     StateStale,
     VramError,
 )
+from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.world import Action, Pose, TickResult, WorldState
@@ -188,6 +189,8 @@ class HardwareRobot:
         sensed_s = self._clock.now_s()
         with tracing.span(telemetry.SPAN_WORLD):
             self.world = self._snapshot()
+        for name in self.world.stale:
+            meters.count(telemetry.METRIC_WORLD_STALE, {telemetry.ATTR_COMPONENT: name})
         return Sensed(
             sensors_ms=(sensed_s - started_s) * 1e3,
             world_state_ms=(self._clock.now_s() - sensed_s) * 1e3,
@@ -201,22 +204,36 @@ class HardwareRobot:
             try:
                 frame = reader.read_latest()
             except FrameStale as error:
+                meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: name})
                 self.aggregator.lose(name, error.message)
             else:
+                self._took(name, frame.stamp_monotonic_ns)
                 self.aggregator.update_image_frame(frame, self._clock.now_ns())
 
     def _read_joints(self) -> bool:
         """Update the joint state. Returns whether the robot answered."""
+        began_s = self._clock.now_s()
+        labels: dict[str, str] = {}
         try:
             state = self.hal.read_state()
         except EstopRequested as error:
+            labels[telemetry.ATTR_ERROR_TYPE] = error.code
             self._stopped_by_hardware(error)
             return False
         except VramError as error:  # one lost answer is harmless: the age of the last one decides
+            labels[telemetry.ATTR_ERROR_TYPE] = error.code
+            meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: JOINT_STATE})
             self.aggregator.note(JOINT_STATE, error.message)
             return False
+        finally:
+            meters.measure(telemetry.METRIC_HAL_READ, self._clock.now_s() - began_s, labels)
+        self._took(JOINT_STATE, state.stamp_ns)
         self.aggregator.update_joint_state(state, self._clock.now_ns())
         return True
+
+    def _took(self, sensor: str, stamp_ns: int) -> None:
+        age_s = (self._clock.now_ns() - stamp_ns) / 1e9
+        meters.measure(telemetry.METRIC_SENSOR_AGE, age_s, {telemetry.ATTR_SENSOR: sensor})
 
     def _stale_input(self, skill: Stepped, world: WorldState) -> StaleInput | None:
         needed = (JOINT_STATE, *skill.cameras)
@@ -244,16 +261,22 @@ class HardwareRobot:
     def apply(self, action: Action | None, *, skill_active: bool) -> Applied:
         if action is None:
             return Applied()
+        began_s = self._clock.now_s()
+        labels: dict[str, str] = {}
         try:
             self.hal.send_action(action)
             self._remember(action)
         except EstopRequested as error:
+            labels[telemetry.ATTR_ERROR_TYPE] = error.code
             self._stopped_by_hardware(error)
         except VramError as error:  # the motors keep their last target
+            labels[telemetry.ATTR_ERROR_TYPE] = error.code
             problem = f"{error.code}: {error.message}"
             return Applied(ended=SkillEnded({}, error), problem=problem)
         else:
             return Applied(action_applied=True)
+        finally:
+            meters.measure(telemetry.METRIC_HAL_SEND, self._clock.now_s() - began_s, labels)
         return Applied()
 
     def _remember(self, action: Action) -> None:

@@ -104,16 +104,16 @@ class ContinuousDetector:
 
     async def look(self) -> None:
         """Look once: the detections, or the reason why there are none, are then in the slot."""
-        outcome = "ok"
+        labels = {telemetry.ATTR_SENSOR: self._config.sensor_id}
         try:
             if not self._resident and not await self._become_resident():
                 return
             await self._look()
         except FrameStale as error:  # no picture, or the detector came to it too late
-            outcome = error.code
+            labels[telemetry.ATTR_ERROR_TYPE] = error.code
             self._slot.note(error.message)
         except VramError as error:
-            outcome = error.code
+            labels[telemetry.ATTR_ERROR_TYPE] = error.code
             self._resident = False
             gone = isinstance(error, Evicted | NotResident)
             if gone:
@@ -121,7 +121,6 @@ class ContinuousDetector:
             self._lose("its model was evicted" if gone else error.message)
         else:
             self._said = ""
-        labels = {telemetry.ATTR_SENSOR: self._config.sensor_id, telemetry.ATTR_OUTCOME: outcome}
         meters.count(telemetry.METRIC_LOOKS, labels)
 
     async def _look(self) -> None:

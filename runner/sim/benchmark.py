@@ -72,6 +72,7 @@ class Played:
     failed: bool = False  # by an error of the contestant's own
     seconds: float = 0.0
     video: str | None = None
+    trace_id: str | None = None  # of its span; None without telemetry
 
     @property
     def unjudged_error(self) -> bool:
@@ -281,13 +282,14 @@ class Benchmark:
         """None: stopped in its middle."""
         began_s = time.monotonic()
         path = self._video_of(contestant.name, seed)
-        recorder = None
+        recorder = trace_id = None
         if path is not None:
             recorder = VideoRecorder(path, fps=VIDEO_HZ / self._video_every, wait=True)
         attributes = {telemetry.ATTR_SKILL: contestant.name}
         try:
             with tracing.span(telemetry.SPAN_EPISODE, attributes=attributes):
                 traceparent = tracing.traceparent()
+                trace_id = tracing.log_ids().get("trace_id")
                 prompt, params = await self._on(worker, lambda: self._reset(seed))
                 goal = Goal(
                     f"seed-{seed}",
@@ -320,7 +322,8 @@ class Benchmark:
         video = (
             str(path) if recorder is not None and recorder.written and not recorder.error else None
         )
-        return replace(played, seconds=round(time.monotonic() - began_s, 3), video=video)
+        seconds = round(time.monotonic() - began_s, 3)
+        return replace(played, seconds=seconds, video=video, trace_id=trace_id)
 
     # -- worker thread
     def _reset(self, seed: int) -> Told:

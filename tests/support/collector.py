@@ -34,6 +34,7 @@ class ReceivedSpan:
     end_ns: int
     failed: bool
     status: str
+    kind: str = ""
     attributes: dict[str, Any] = field(default_factory=dict)
     events: tuple[SpanEvent, ...] = ()
 
@@ -48,6 +49,18 @@ class Point:
     attributes: dict[str, Any]
     value: float
     count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """One record of a program's log; ids "" outside any span."""
+
+    body: str
+    severity: str
+    service: str
+    trace_id: str
+    span_id: str
+    attributes: dict[str, Any]
 
 
 class _Server(ThreadingHTTPServer):
@@ -109,6 +122,7 @@ class Collector:
     def __init__(self) -> None:
         self._spans: list[ReceivedSpan] = []
         self._points: list[Point] = []
+        self._lines: list[LogLine] = []
         self._came = threading.Condition()
         self._waiting = threading.local()
         self._over = False
@@ -148,6 +162,7 @@ class Collector:
     def __enter__(self) -> Self:
         decode_spans(b"")  # imports what it needs, while nobody waits for an answer
         decode_points(b"")
+        decode_lines(b"")
         self._thread.start()
         return self
 
@@ -177,6 +192,12 @@ class Collector:
         with self._came:
             return [point for point in self._points if point.metric == metric]
 
+    def lines(self) -> list[LogLine]:
+        """All lines of logs that were sent until now."""
+        self._settle()
+        with self._came:
+            return list(self._lines)
+
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
         """Until `condition()` holds, looked at whenever something came. Raises AssertionError with
         what was waited for and what came."""
@@ -201,7 +222,9 @@ class Collector:
     def _take(self, path: str, body: bytes) -> None:
         spans = decode_spans(body) if path == "/v1/traces" else []
         points = decode_points(body) if path == "/v1/metrics" else []
+        lines = decode_lines(body) if path == "/v1/logs" else []
         with self._came:
+            self._lines += lines
             self._spans += spans
             self._points += points
             self._came.notify_all()
@@ -209,7 +232,7 @@ class Collector:
 
 def decode_spans(body: bytes) -> list[ReceivedSpan]:
     from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
-    from opentelemetry.proto.trace.v1.trace_pb2 import Status
+    from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 
     request = ExportTraceServiceRequest.FromString(body)
     return [
@@ -223,6 +246,7 @@ def decode_spans(body: bytes) -> list[ReceivedSpan]:
             end_ns=span.end_time_unix_nano,
             failed=span.status.code == Status.STATUS_CODE_ERROR,
             status=span.status.message,
+            kind=Span.SpanKind.Name(span.kind).removeprefix("SPAN_KIND_"),
             attributes=_attributes(span.attributes),
             events=tuple(
                 SpanEvent(event.name, event.time_unix_nano, _attributes(event.attributes))
@@ -232,6 +256,24 @@ def decode_spans(body: bytes) -> list[ReceivedSpan]:
         for group in request.resource_spans
         for scope in group.scope_spans
         for span in scope.spans
+    ]
+
+
+def decode_lines(body: bytes) -> list[LogLine]:
+    from opentelemetry.proto.collector.logs.v1.logs_service_pb2 import ExportLogsServiceRequest
+
+    return [
+        LogLine(
+            body=line.body.string_value,
+            severity=line.severity_text,
+            service=str(_attributes(group.resource.attributes).get("service.name", "")),
+            trace_id=line.trace_id.hex(),
+            span_id=line.span_id.hex(),
+            attributes=_attributes(line.attributes),
+        )
+        for group in ExportLogsServiceRequest.FromString(body).resource_logs
+        for scope in group.scope_logs
+        for line in scope.log_records
     ]
 
 

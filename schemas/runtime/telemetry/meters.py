@@ -8,6 +8,7 @@ error), never ids: each combination is a series that is kept as long as the proc
 import math
 from collections.abc import Mapping
 from functools import cache
+from typing import NamedTuple
 
 from opentelemetry import metrics
 
@@ -17,11 +18,33 @@ from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 Labels = Mapping[str, str]
 
 _METER = metrics.get_meter(telemetry.TRACER)  # a proxy: it finds the SDK whenever that comes
-_UNITS = {
-    telemetry.METRIC_TICK: "ms",
-    telemetry.METRIC_INFERENCE: "ms",
-    telemetry.METRIC_SIDECAR_REQUEST: "ms",
-    telemetry.METRIC_SIDECAR_LOAD: "s",
+
+
+class Instrument(NamedTuple):
+    """Unit and description of a metric, as a collector shows them."""
+
+    unit: str
+    description: str
+
+
+INSTRUMENTS: Mapping[str, Instrument] = {
+    telemetry.METRIC_TICK: Instrument("s", "One tick of the control loop"),
+    telemetry.METRIC_INFERENCE: Instrument("s", "One question to the active skill"),
+    telemetry.METRIC_DEADLINE_MISSES: Instrument("{tick}", "Ticks longer than their time budget"),
+    telemetry.METRIC_HAL_READ: Instrument("s", "One reading of the robot's joint state"),
+    telemetry.METRIC_HAL_SEND: Instrument("s", "One action sent to the motors"),
+    telemetry.METRIC_SENSOR_AGE: Instrument("s", "Age of the newest value when a tick reads it"),
+    telemetry.METRIC_STALE_READS: Instrument("{read}", "Reads that gave no fresh value"),
+    telemetry.METRIC_WORLD_STALE: Instrument("{state}", "World states with a stale component"),
+    telemetry.METRIC_ESTOPS: Instrument("{stop}", "Emergency stops"),
+    telemetry.METRIC_SAFETY_VIOLATIONS: Instrument("{violation}", "What the safety gate reported"),
+    telemetry.METRIC_WITHHELD: Instrument("{action}", "Actions that were not sent to the motors"),
+    telemetry.METRIC_LOOKS: Instrument("{look}", "Looks of continuous detectors"),
+    telemetry.METRIC_STALE_DETECTIONS: Instrument("{look}", "Detections that became too old"),
+    telemetry.METRIC_GOALS: Instrument("{goal}", "Goals that ended"),
+    telemetry.METRIC_TOOL_CALLS: Instrument("{call}", "Tool calls of the reasoner"),
+    telemetry.METRIC_SIDECAR_LOAD: Instrument("s", "One load of a model onto the GPU"),
+    telemetry.METRIC_SIDECAR_REQUEST: Instrument("s", "One request to a sidecar"),
 }
 
 
@@ -39,9 +62,11 @@ def measure(name: str, value: float, labels: Labels | None = None) -> None:
 
 @cache
 def _counter(name: str) -> metrics.Counter:
-    return _METER.create_counter(name, unit="1")
+    unit, description = INSTRUMENTS[name]
+    return _METER.create_counter(name, unit, description)
 
 
 @cache
 def _histogram(name: str) -> metrics.Histogram:
-    return _METER.create_histogram(name, unit=_UNITS[name])
+    unit, description = INSTRUMENTS[name]
+    return _METER.create_histogram(name, unit, description)

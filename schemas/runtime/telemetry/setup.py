@@ -28,8 +28,8 @@ from vram_arbiter.schemas.urls import collector_url
 
 log = logging.getLogger(__name__)
 
-type Signal = Literal["traces", "metrics"]
-SIGNALS: tuple[Signal, ...] = ("traces", "metrics")
+type Signal = Literal["traces", "metrics", "logs"]
+SIGNALS: tuple[Signal, ...] = ("traces", "metrics", "logs")
 EXTRA = "vram-arbiter[telemetry]"
 PROMETHEUS_PORT = 9464
 """Port that OpenTelemetry's specification gives to a Prometheus endpoint."""
@@ -43,16 +43,19 @@ _PROTOCOLS = {"": "http", "http/protobuf": "http", "grpc": "grpc"}
 
 _BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 _BOUNDS_WRITE_S = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.05, 0.25, 1.0, 5.0)
-_BOUNDS_MS = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 33.0, 40.0, 50.0, 100.0, 250.0,
-500.0, 1000.0, 5000.0)  # fmt: skip
+_BOUNDS_TICK_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.033, 0.04, 0.05,
+0.1, 0.25, 0.5, 1.0, 5.0)  # fmt: skip
 _BOUNDS: Mapping[str, Sequence[float]] = {
     telemetry.METRIC_WAIT: _BOUNDS_S,
     telemetry.METRIC_HANDOVER: _BOUNDS_S,
     telemetry.METRIC_SIDECAR_LOAD: _BOUNDS_S,
     telemetry.METRIC_JOURNAL_WRITE: _BOUNDS_WRITE_S,
-    telemetry.METRIC_TICK: _BOUNDS_MS,
-    telemetry.METRIC_INFERENCE: _BOUNDS_MS,
-    telemetry.METRIC_SIDECAR_REQUEST: _BOUNDS_MS,
+    telemetry.METRIC_TICK: _BOUNDS_TICK_S,
+    telemetry.METRIC_INFERENCE: _BOUNDS_TICK_S,
+    telemetry.METRIC_HAL_READ: _BOUNDS_TICK_S,
+    telemetry.METRIC_HAL_SEND: _BOUNDS_TICK_S,
+    telemetry.METRIC_SENSOR_AGE: _BOUNDS_TICK_S,
+    telemetry.METRIC_SIDECAR_REQUEST: _BOUNDS_TICK_S,
 }
 
 
@@ -68,10 +71,11 @@ class Plan:
     """Loopback address and port; port 0 chooses a free one."""
     ratio: float | None = None
     """Share of traces that begin here; None: the SDK reads the variables."""
+    logs: tuple[str, ...] = ()
 
     @property
     def on(self) -> bool:
-        return bool(self.traces or self.metrics) or self.prometheus is not None
+        return bool(self.traces or self.metrics or self.logs) or self.prometheus is not None
 
 
 class Telemetry:
@@ -163,7 +167,7 @@ def plan(
     if prometheus_port is not None or "prometheus" in wanted["metrics"]:
         prometheus = _prometheus(environ, prometheus_port)
     metrics = tuple(name for name in wanted["metrics"] if name != "prometheus")
-    return Plan(wanted["traces"], metrics, endpoint, prometheus, sample_ratio)
+    return Plan(wanted["traces"], metrics, endpoint, prometheus, sample_ratio, wanted["logs"])
 
 
 def _exporters(environ: Mapping[str, str], signal: Signal, endpoint: str | None) -> tuple[str, ...]:
@@ -222,6 +226,8 @@ def check(planned: Plan) -> None:
             _entry_point("traces", name)
         for name in planned.metrics:
             _entry_point("metrics", name)
+        for name in planned.logs:
+            _entry_point("logs", name)
         if planned.prometheus is not None and find_spec("prometheus_client") is None:
             raise ImportError("No module named 'prometheus_client'")
     except ImportError as error:
@@ -296,6 +302,11 @@ def _make(
         ends.append(tracers.shutdown)
         for exporter in exporters:
             tracers.add_span_processor(BatchSpanProcessor(exported.Legible(exporter)))
+    if planned.logs:
+        from vram_arbiter.schemas.runtime.telemetry import logs
+
+        shippers = [_exporter("logs", name, planned) for name in planned.logs]
+        ends.append(logs.install(resource, shippers))
     readers, port = _readers(planned, ends)
     if readers:
         meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False, views=_views())
@@ -303,7 +314,10 @@ def _make(
     if tracers is not None:
         trace.set_tracer_provider(tracers)
     if meters is not None:
+        from vram_arbiter.schemas.runtime.telemetry import process
+
         metrics.set_meter_provider(meters)
+        process.observe()
     return port
 
 
@@ -391,6 +405,7 @@ def _quieten() -> None:
     for name in (
         "opentelemetry.exporter.otlp.proto.http.trace_exporter",
         "opentelemetry.exporter.otlp.proto.http.metric_exporter",
+        "opentelemetry.exporter.otlp.proto.http._log_exporter",
         "opentelemetry.sdk._shared_internal",  # the queue of spans
         "opentelemetry.sdk.metrics._internal.export",
     ):

@@ -11,8 +11,10 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from opentelemetry import context as present_context
 from opentelemetry import trace
 from opentelemetry.context import Context
+from opentelemetry.trace import SpanKind
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
+from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.traceparent import read as read_traceparent
 
@@ -20,6 +22,13 @@ Attributes = Mapping[str, str | int | float]
 
 _TRACER = trace.get_tracer(telemetry.TRACER)  # a proxy: it finds the SDK whenever that comes
 _W3C = TraceContextTextMapPropagator()
+_KINDS = {
+    telemetry.SPAN_GOAL: SpanKind.SERVER,
+    telemetry.SPAN_SIDECAR_REQUEST: SpanKind.SERVER,
+    telemetry.SPAN_CHUNK: SpanKind.CLIENT,
+    telemetry.SPAN_TOOL: SpanKind.CLIENT,
+}
+"""Spans that answer or send a request; all others are internal."""
 _LEFT_OUT = present_context.create_key("left-out")
 
 
@@ -27,13 +36,32 @@ def span(
     name: str, traceparent: str | None = None, attributes: Attributes | None = None
 ) -> AbstractContextManager[trace.Span]:
     """A span, the present one's child, or the caller's when it sent a W3C traceparent. A bad one
-    begins a trace of its own."""
+    begins a trace of its own. An exception that leaves the block is its `error.type`."""
     if traceparent is None and present_context.get_value(_LEFT_OUT):
         return nullcontext(trace.get_current_span())
-    made: AbstractContextManager[trace.Span] = _TRACER.start_as_current_span(
-        name, context=_of(traceparent) if traceparent else None, attributes=attributes
-    )
-    return made
+    return _recorded(name, traceparent, attributes)
+
+
+@contextmanager
+def _recorded(
+    name: str, traceparent: str | None, attributes: Attributes | None
+) -> Iterator[trace.Span]:
+    with _TRACER.start_as_current_span(
+        name,
+        context=_of(traceparent) if traceparent else None,
+        kind=_KINDS.get(name, SpanKind.INTERNAL),
+        attributes=attributes,
+    ) as present:
+        try:
+            yield present
+        except Exception as error:
+            present.set_attribute(telemetry.ATTR_ERROR_TYPE, error_type(error))
+            raise
+
+
+def error_type(error: Exception) -> str:
+    """Return the value of `error.type`: the code of our errors, else the exception's class."""
+    return error.code if isinstance(error, VramError) else type(error).__qualname__
 
 
 def begin(
@@ -42,7 +70,10 @@ def begin(
     """A span for work that is spread over several tasks: `inside` makes it the present one, `end()`
     ends it."""
     return _TRACER.start_span(
-        name, context=_of(traceparent) if traceparent else None, attributes=attributes
+        name,
+        context=_of(traceparent) if traceparent else None,
+        kind=_KINDS.get(name, SpanKind.INTERNAL),
+        attributes=attributes,
     )
 
 

@@ -42,6 +42,39 @@ def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(navigate_manifest: Pa
     events = [event for span in later for event in span["events"]]  # its camera is gone
     assert events[:2] == [telemetry.EVENT_STALE, telemetry.EVENT_ACTION_WITHHELD]
     assert events.count(telemetry.EVENT_STALE) == 1
+    check_metrics(said["metrics"])
+
+
+def check_metrics(metrics: dict[str, Any]) -> None:
+    """Seven readings of which two failed, two actions, a camera that ended, a stop."""
+
+    def counts(name: str, label: str) -> dict[str | None, float]:
+        return {p["labels"].get(label): p["count"] for p in metrics[name]["points"]}
+
+    def mean_s(name: str) -> float:
+        points = metrics[name]["points"]
+        return float(sum(p["sum"] for p in points) / sum(p["count"] for p in points))
+
+    assert counts(telemetry.METRIC_HAL_READ, telemetry.ATTR_ERROR_TYPE) == {
+        None: 5,
+        "robot_fault": 2,
+    }
+    assert mean_s(telemetry.METRIC_HAL_READ) == pytest.approx(0.004)
+    assert counts(telemetry.METRIC_HAL_SEND, telemetry.ATTR_ERROR_TYPE) == {None: 2}
+    assert mean_s(telemetry.METRIC_HAL_SEND) == pytest.approx(0.008)
+    assert counts(telemetry.METRIC_SENSOR_AGE, telemetry.ATTR_SENSOR) == {
+        "joint_state": 5,
+        "front": 1,
+    }
+    stale = {"front": 3, "joint_state": 2}
+    assert counts(telemetry.METRIC_STALE_READS, telemetry.ATTR_SENSOR) == stale
+    assert counts(telemetry.METRIC_WORLD_STALE, telemetry.ATTR_COMPONENT)["front"] >= 3
+    assert counts(telemetry.METRIC_ESTOPS, "") == {None: 1}
+    assert set(counts(telemetry.METRIC_CPU_TIME, telemetry.ATTR_CPU_MODE)) == {"user", "system"}
+    assert counts(telemetry.METRIC_MEMORY, "")[None] > 1_000_000
+    assert all(metric["unit"] and metric["description"] for metric in metrics.values())
+    durations = [name for name in metrics if name.endswith((".duration", ".age"))]
+    assert {metrics[name]["unit"] for name in durations} == {"s"}
 
 
 def test_a_share_of_a_goals_ticks_is_traced_from_its_first_tick_on(navigate_manifest: Path) -> None:

@@ -25,6 +25,7 @@ from vram_arbiter.runner.sim.gym_env import GymEnv
 from vram_arbiter.runner.sim.policies import Policy, policy_of
 from vram_arbiter.runner.sim.robot import sim_runner
 from vram_arbiter.schemas.errors import SidecarUnavailable, UnknownSkill
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 HERE = Path(__file__).parents[1]
 ROOT = HERE.parents[1]
@@ -113,6 +114,15 @@ def test_a_policy_with_a_defect_fails_and_one_that_gives_up_is_judged(run_async:
     ]
     assert cell.episodes[2].truncated
     assert (cell.judged, cell.successes, cell.errors) == (3, 1, 0)
+    assert {e.trace_id for e in cell.episodes} == {None}
+
+
+@pytest.mark.heavy
+def test_an_episode_names_the_trace_that_it_is_in(run_async: Run) -> None:
+    trace_id = "a" * 32
+    with tracing.joined(f"00-{trace_id}-{'b' * 16}-01"):
+        cell: Cell = run_async(Counted().bench.run(PolicyContestant(policy_of(SEEK)), (20,)))
+    assert [e.trace_id for e in cell.episodes] == [trace_id]
 
 
 @pytest.mark.heavy

@@ -47,9 +47,17 @@ OTLP = ("otlp",)
     [
         ({}, Plan()),
         ({"OTEL_SERVICE_NAME": "robot", "OTEL_TRACES_SAMPLER": "always_on"}, Plan()),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE + "/"}, Plan(OTLP, OTLP)),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE + "/"}, Plan(OTLP, OTLP, logs=OTLP)),
+        ({"OTEL_LOGS_EXPORTER": "console"}, Plan(logs=("console",))),
         ({"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": BASE + "/own"}, Plan(OTLP)),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "none"}, Plan(OTLP)),
+        (
+            {
+                "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
+                "OTEL_METRICS_EXPORTER": "none",
+                "OTEL_LOGS_EXPORTER": "none",
+            },
+            Plan(OTLP),
+        ),
         ({"OTEL_TRACES_EXPORTER": "otlp, console"}, Plan(("otlp", "console"))),
         ({"OTEL_METRICS_EXPORTER": "prometheus"}, Plan(prometheus=("127.0.0.1", 9464))),
         (
@@ -59,11 +67,11 @@ OTLP = ("otlp",)
                 "OTEL_EXPORTER_PROMETHEUS_HOST": "::1",
                 "OTEL_EXPORTER_PROMETHEUS_PORT": "9500",
             },
-            Plan(OTLP, OTLP, prometheus=("::1", 9500)),
+            Plan(OTLP, OTLP, prometheus=("::1", 9500), logs=OTLP),
         ),
         (
             {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "prometheus"},
-            Plan(OTLP, prometheus=("127.0.0.1", 9464)),
+            Plan(OTLP, prometheus=("127.0.0.1", 9464), logs=OTLP),
         ),
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_SDK_DISABLED": "True"}, Plan()),
     ],
@@ -77,7 +85,7 @@ def test_the_environment_says_which_exporters_are_wanted(
 def test_a_configuration_wins_over_the_environment() -> None:
     environ = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://other:4318"}
     got = plan(environ, endpoint=BASE, prometheus_port=0, sample_ratio=0.5)
-    assert got == Plan(OTLP, OTLP, BASE, ("127.0.0.1", 0), 0.5)
+    assert got == Plan(OTLP, OTLP, BASE, ("127.0.0.1", 0), 0.5, OTLP)
 
 
 @pytest.mark.parametrize(
@@ -161,8 +169,9 @@ def test_packages_that_are_missing_are_asked_for() -> None:
 
 # -- on
 PROGRAM = """
-import sys, vram_arbiter.schemas.runtime.telemetry.setup as o
+import logging, sys, vram_arbiter.schemas.runtime.telemetry.setup as o
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry, spans as tracing
+from vram_arbiter.schemas.errors import RobotFault
 from opentelemetry import metrics
 made_before = metrics.get_meter(telemetry.TRACER).create_counter(telemetry.METRIC_GOALS)
 t = o.set_up('vram-runner', attributes={'robot.model': 'so101'})
@@ -170,8 +179,13 @@ assert t.on and o.set_up('other') is t
 with tracing.span(telemetry.SPAN_GOAL, sys.argv[1] if len(sys.argv) > 1 else None):
     with tracing.span(telemetry.SPAN_TICK):
         tracing.event(telemetry.EVENT_ESTOP, who='operator')
+        logging.getLogger('robot').warning('a \\udcff name')
+        logging.getLogger('urllib3.pool').warning('of the export itself')
         print(tracing.traceparent())
         assert tracing.traceparent()[3:-3] == '-'.join(tracing.log_ids().values())
+    try:
+        with tracing.span(telemetry.SPAN_SEND): raise RobotFault('the bus is silent')
+    except RobotFault: logging.getLogger('robot').exception('it failed')
 made_before.add(3, {telemetry.ATTR_OUTCOME: 'succeeded'})
 assert tracing.log_ids() == {}
 """
@@ -188,8 +202,20 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
             PROGRAM, environ
         )  # nothing is due before the end: it is the end that sends
         assert (result.returncode, result.stderr) == (0, "")
-        tick, goal = collector.spans()
+        tick, sent, goal = collector.spans()
         assert [tick.name, goal.name] == ["rskill.tick", "rskill.goal"]
+        assert [tick.kind, goal.kind, sent.kind] == ["INTERNAL", "SERVER", "INTERNAL"]
+        assert (sent.failed, sent.attributes) == (True, {"error.type": "robot_fault"})
+        named, failed = collector.lines()  # not what the export itself logs
+        assert (named.body, named.severity, named.service) == (
+            r"a \udcff name",
+            "WARN",
+            "vram-runner",
+        )
+        assert (named.trace_id, named.span_id) == (tick.trace_id, tick.span_id)
+        assert (failed.severity, failed.span_id) == ("ERROR", goal.span_id)
+        assert failed.attributes["exception.type"] == "RobotFault"
+        assert "the bus is silent" in failed.attributes["exception.stacktrace"]
         assert (tick.parent_id, goal.parent_id) == (goal.span_id, "")
         assert result.stdout.startswith(f"00-{tick.trace_id}-{tick.span_id}-")
         assert [(event.name, event.attributes) for event in tick.events] == [
@@ -205,7 +231,7 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
 
 
 @needs_sdk
-@pytest.mark.parametrize(("flag", "kept"), [("01", 2), ("00", 0)])
+@pytest.mark.parametrize(("flag", "kept"), [("01", 3), ("00", 0)])
 def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, kept: int) -> None:
     parent = f"00-{'a' * 32}-{'b' * 16}-{flag}"
     with Collector() as collector:
@@ -345,7 +371,9 @@ def test_an_operators_time_limits_win_over_ours() -> None:
         "t(0.1)\n",
         {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_EXPORTER_OTLP_METRICS_TIMEOUT": "0.25"},
     )
-    assert ast.literal_eval(result.stdout) == {"spans": 3.0, "metrics": 0.25}, result.stderr
+    assert ast.literal_eval(result.stdout) == {"spans": 3.0, "metrics": 0.25, "logs": 3.0}, (
+        result.stderr
+    )
 
 
 @needs_sdk

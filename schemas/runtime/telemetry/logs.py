@@ -1,0 +1,101 @@
+"""Log records to a collector: a handler of the standard library's `logging` on the SDK's logs.
+
+The SDK's own handler is deprecated, and one undecodable text in it would lose a whole batch.
+Imported only where logs are exported.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from opentelemetry import trace
+from opentelemetry._logs import LogRecord, SeverityNumber
+from opentelemetry.context import Context, get_current
+from opentelemetry.sdk._logs import LoggerProvider
+from opentelemetry.sdk._logs.export import BatchLogRecordProcessor
+from opentelemetry.sdk.resources import Resource
+
+from vram_arbiter.schemas.runtime.telemetry import exported
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+
+OWN = ("opentelemetry", "urllib3", "requests")
+"""Loggers of the export itself: a collector that is away must not be told so, again and again."""
+_SEVERITIES = {
+    logging.DEBUG: (SeverityNumber.DEBUG, "DEBUG"),
+    logging.INFO: (SeverityNumber.INFO, "INFO"),
+    logging.WARNING: (SeverityNumber.WARN, "WARN"),
+    logging.ERROR: (SeverityNumber.ERROR, "ERROR"),
+    logging.CRITICAL: (SeverityNumber.FATAL, "FATAL"),
+}
+_STACKTRACE = logging.Formatter()
+
+
+def install(resource: Resource, exporters: Sequence[Any]) -> Callable[[], object]:
+    """Send what the root logger gets to the exporters. Returns what ends it."""
+    provider = LoggerProvider(resource=resource, shutdown_on_exit=False)
+    for exporter in exporters:
+        provider.add_log_record_processor(BatchLogRecordProcessor(exporter))
+    handler = OtlpHandler(provider)
+    logging.getLogger().addHandler(handler)
+
+    def end() -> None:
+        logging.getLogger().removeHandler(handler)
+        provider.shutdown()
+
+    return end
+
+
+class OtlpHandler(logging.Handler):
+    """Hands each record to the SDK, which sends it from a thread of its own."""
+
+    def __init__(self, provider: LoggerProvider) -> None:
+        super().__init__()
+        self._provider = provider
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.name.partition(".")[0] in OWN:
+            return
+        try:
+            self._provider.get_logger(record.name).emit(converted(record))
+        except Exception:  # noqa: BLE001 - a log line must not fail the program
+            self.handleError(record)
+
+
+def converted(record: logging.LogRecord) -> LogRecord:
+    """Return the record as OpenTelemetry's, with the span that it belongs to."""
+    number, word = _SEVERITIES.get(record.levelno, (SeverityNumber.UNSPECIFIED, record.levelname))
+    attributes: dict[str, str | int] = {
+        "code.function.name": record.funcName or "",
+        "code.line.number": record.lineno,
+        "thread.name": record.threadName or "",
+    }
+    if record.exc_info and (error := record.exc_info[1]) is not None:
+        attributes[telemetry.ATTR_EXCEPTION_TYPE] = type(error).__qualname__
+        attributes[telemetry.ATTR_EXCEPTION_MESSAGE] = str(error)
+        stacktrace = _STACKTRACE.formatException(record.exc_info)
+        attributes[telemetry.ATTR_EXCEPTION_STACKTRACE] = stacktrace
+    return LogRecord(
+        timestamp=int(record.created * 1e9),
+        observed_timestamp=time.time_ns(),
+        context=_context(record),
+        severity_text=word,
+        severity_number=number,
+        body=exported.text(record.getMessage()),
+        attributes=dict(exported.attributes(attributes)),
+        event_name=exported.text(str(getattr(record, "event", None) or "")) or None,
+    )
+
+
+def _context(record: logging.LogRecord) -> Context:
+    """Return the record's own span, named by its ids (the daemon's lines), else the present one."""
+    ids = getattr(record, "trace", None)
+    if not isinstance(ids, dict) or not {"trace_id", "span_id"} <= ids.keys():
+        return get_current()
+    span = trace.SpanContext(
+        int(ids["trace_id"], 16),
+        int(ids["span_id"], 16),
+        is_remote=False,
+        trace_flags=trace.TraceFlags(trace.TraceFlags.SAMPLED),
+    )
+    return trace.set_span_in_context(trace.NonRecordingSpan(span), Context())
