@@ -16,7 +16,7 @@ load, another request) are not looked at. Every request may carry "id" (echoed a
 have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
 unless it is the sidecar's current one) and "traceparent". Images are PNG or JPEG bytes of RGB,
 and a video is a list of them. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}` (numpy's
-.npy format, pickle never allowed).
+.npy format, pickle never allowed). `get_action` may carry "rtc", what its chunk shall continue.
 
 `load` makes the model resident (acquiring the lease) and answers with the lease id and token, so
 that a caller can mark a use of its own on it at the arbiter: a goal that spans many `get_action`
@@ -25,7 +25,7 @@ calls is one use.
 
 from typing import Annotated, Literal, NotRequired, Self, TypedDict
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, model_validator
 
 from vram_arbiter.schemas.limits import Seconds
 from vram_arbiter.schemas.plain import Message
@@ -38,6 +38,7 @@ Side = Annotated[int, Field(ge=1, le=4096)]
 
 PICTURES_MAX = 32  # of one `query` or `score`
 QUERIES_MAX = 64  # of one `detect`
+LEFT_OVER_MAX = 100  # rows of a chunk that guide the next one
 
 
 class _Call(BaseModel):
@@ -153,9 +154,27 @@ OpRequest = Annotated[
 OP_REQUEST: TypeAdapter[OpRequest] = TypeAdapter(OpRequest)
 
 
+ActionRow = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=1000)]
+
+
+class RealTimeChunking(BaseModel):
+    """What a chunk shall continue, for policies that lerobot guides so (`rtc`).
+
+    `left_over`: the actions of the chunk before for the control steps from this observation on, as
+    the policy answered them. The first `inference_delay` of them are played in any case; the
+    influence of the others ends at `execution_horizon` steps.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    left_over: Annotated[tuple[ActionRow, ...], Field(min_length=1, max_length=LEFT_OVER_MAX)]
+    inference_delay: Annotated[int, Field(ge=0, le=1000)]
+    execution_horizon: Annotated[int, Field(ge=1, le=LEFT_OVER_MAX)]
+
+
 class EndpointCall(_Call):
     endpoint: Literal["ping", "load", "reset", "get_action", "unload", "shutdown"]
     data: Message | None = None
+    rtc: RealTimeChunking | None = None  # of `get_action`; the field's clients have no such field
     api_token: str | None = None  # of the field's wire; not used on ipc
 
 

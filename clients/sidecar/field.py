@@ -118,6 +118,12 @@ def grounded(answer: object, norm: object, size: tuple[int, int], query: str) ->
 
 def _policy_request(op: str, given: Message) -> tuple[str, Message]:
     data = given.get("data") or {}
+    if "rtc" in given:
+        raise BadRequest(
+            "a server of the field takes no left-over chunk",
+            hint="leave rtc out of policy_extras, or serve the policy with vram-sidecar",
+            details={"fields": ["rtc"]},
+        )
     if op == "get_action":
         return op, {"data": {"options": None, **data}}
     if op == "reset":  # a server calls reset(**data), which knows `options`

@@ -7,6 +7,7 @@ from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.sidecar import RealTimeChunking
 
 
 class PolicyClient(SidecarClient):
@@ -44,11 +45,13 @@ class PolicyClient(SidecarClient):
         observation: JsonMap,
         *,
         options: JsonMap | None = None,
+        rtc: RealTimeChunking | None = None,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
     ) -> Message:
         """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`.
 
+        `rtc` says what they shall continue; a policy that cannot be guided refuses it (BadRequest).
         Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory,
         SidecarUnavailable.
         """
@@ -56,9 +59,8 @@ class PolicyClient(SidecarClient):
             "observation": npy.pack(dict(observation)),
             "options": npy.pack(dict(options)) if options else None,
         }
-        result = npy.unpack(
-            await self.call("get_action", {"data": data}, token=token, timeout_s=timeout_s)
-        )
+        fields: Message = {"data": data} | ({"rtc": rtc.model_dump()} if rtc is not None else {})
+        result = npy.unpack(await self.call("get_action", fields, token=token, timeout_s=timeout_s))
         if isinstance(result, list) and result:  # the field's servers answer [actions, info]
             result = result[0]
         if not isinstance(result, dict):

@@ -2,12 +2,12 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.sidecar import EndpointCall
+from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
 from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, ModelCall
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
@@ -44,6 +44,14 @@ _OURS: Final = {
 }
 """Fields of configurations that the sidecar decides."""
 _ACTION: Final = "action"
+
+
+class Guidance(TypedDict, total=False):
+    """Arguments of `predict_action_chunk` for real-time chunking; empty: none."""
+
+    prev_chunk_left_over: "Tensor"  # (1, rows, D), normalized
+    inference_delay: int
+    execution_horizon: int
 
 
 class PolicyAdapter:
@@ -85,6 +93,7 @@ class PolicyAdapter:
         self._after: Any = None
         self._observations: Observations | None = None
         self._device = "cpu"
+        self._guided = False  # lerobot's real-time chunking was enabled
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -123,6 +132,7 @@ class PolicyAdapter:
         )
         if device != META:
             _need_trained(policy, self._weights.source)
+        self._guided = False
         self._policy = policy if self._has_own_dtype else policy.to(torch_type(self._dtype))
         self._quantize(device)
         self._make_processors()
@@ -194,19 +204,22 @@ class PolicyAdapter:
                 hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
             )
         assert self._observations is not None
-        return {"action": self._act(self._observations.read(observation))}
+        return {"action": self._act(self._observations.read(observation), call.rtc)}
 
-    def _act(self, steps: list[Batch]) -> "NDArray[Any]":
+    def _act(self, steps: list[Batch], rtc: RealTimeChunking | None) -> "NDArray[Any]":
         import torch
 
         dtype = torch_type(self._dtype)
         casts = dtype != torch.float32 and not self._has_own_dtype
+        guidance: Guidance = {} if rtc is None else self._guidance(steps[-1], rtc)
         with (
-            torch.inference_mode(),
+            # the guidance is a gradient, which inference mode forbids
+            torch.no_grad() if guidance else torch.inference_mode(),
             # operations that the policy's code does in float32 meet weights of another type
             torch.autocast(torch.device(self._device).type, dtype, enabled=casts),
         ):
-            chunk = self._predict([_inputs(self._before(step), dtype, casts) for step in steps])
+            inputs = [_inputs(self._before(step), dtype, casts) for step in steps]
+            chunk = self._predict(inputs, guidance)
             rows = [
                 self._after(chunk[:, step].to(torch.float32)) for step in range(chunk.shape[1])
             ]  # postprocessors take (B, D), as lerobot's own server does
@@ -218,10 +231,51 @@ class PolicyAdapter:
         numbers: NDArray[Any] = actions.numpy()
         return numbers
 
-    def _predict(self, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
+    def _guidance(self, step: Batch, rtc: RealTimeChunking) -> Guidance:
+        """Return the arguments of lerobot's real-time chunking.
+
+        The checkpoint's preprocessor, which normalizes actions in training, turns the left-over
+        rows into the policy's own numbers. Raises BadRequest for a policy that is not guided.
+        """
+        import torch
+
+        if self._selects or not self._policy.supports_rtc():
+            raise BadRequest(
+                f"a policy of type {self._config.type} takes no left-over chunk",
+                hint="leave rtc out of policy_extras in the skill's manifest",
+                details={"fields": ["rtc"]},
+            )
+        width = self._config.output_features[_ACTION].shape[0]
+        if any(len(row) != width for row in rtc.left_over):
+            raise BadRequest(
+                f"rows of rtc.left_over must have {width} numbers",
+                details={"fields": ["rtc.left_over"]},
+            )
+        self._enable_guidance()
+        rows = torch.tensor(rtc.left_over, dtype=torch.float32)[None]
+        with torch.no_grad():
+            left_over = self._before({**step, _ACTION: rows})[_ACTION]
+        return {
+            "prev_chunk_left_over": left_over,
+            "inference_delay": rtc.inference_delay,
+            "execution_horizon": rtc.execution_horizon,
+        }
+
+    def _enable_guidance(self) -> None:
+        if self._guided:
+            return
+        from lerobot.policies.rtc.configuration_rtc import RTCConfig
+
+        self._config.rtc_config = RTCConfig()
+        if hasattr(self._policy, "init_rtc_processor"):  # others read the configuration
+            self._policy.init_rtc_processor()
+        self._policy.requires_grad_(False)  # else each step would keep its activations
+        self._guided = True
+
+    def _predict(self, steps: Sequence[Mapping[str, Any]], guidance: Guidance) -> "Tensor":
         """Return the actions (B, T, D) after the last of `steps`, which are oldest first."""
         if not self._selects:
-            chunk: Tensor = self._policy.predict_action_chunk(dict(steps[-1]))
+            chunk: Tensor = self._policy.predict_action_chunk(dict(steps[-1]), **guidance)
             if self._config.type == "pi0_fast" and not chunk.any():
                 raise ModelError(  # lerobot logs the reason and answers zeros
                     "the policy's tokens cannot be decoded into actions",

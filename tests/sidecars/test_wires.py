@@ -121,6 +121,14 @@ def test_both_families_reach_the_host():
         ({"endpoint": "load", "data": {"timeout_s": "soon"}}, "bad_request", "timeout_s"),
         ({"endpoint": "get_action", "data": [1]}, "bad_request", "data"),
         ({"op": "ping", "id": 1, "token": 7}, "bad_request", "token"),
+        (
+            {
+                "endpoint": "get_action",
+                "rtc": {"left_over": [], "inference_delay": 1, "execution_horizon": 1},
+            },
+            "bad_request",
+            "left_over",
+        ),
     ],
 )
 def test_a_bad_message_gets_a_typed_error_that_names_the_field(message, code, told):

@@ -30,6 +30,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.sidecar import RealTimeChunking
 
 pytestmark = pytest.mark.anyio
 
@@ -196,6 +197,9 @@ async def test_what_it_would_answer_wrongly_is_refused(folder: Path) -> None:
         async with PolicyClient(server.endpoint) as policy:
             with pytest.raises(UnknownOp, match="no get_actions"):
                 await policy.call("get_actions")
+            rtc = RealTimeChunking(left_over=((0.5,),), inference_delay=1, execution_horizon=1)
+            with pytest.raises(BadRequest, match="takes no left-over chunk"):
+                await policy.get_action({}, rtc=rtc)
 
 
 async def test_a_server_may_be_replaced_by_one_of_the_other_kind(folder: Path) -> None:

@@ -368,6 +368,63 @@ def test_a_processor_runs_no_code_of_others(
     assert not touched.exists()
 
 
+GUIDED = ("smolvla", "pi05", "evo1")
+
+
+@pytest.mark.parametrize("name", GUIDED)
+def test_a_guided_chunk_continues_the_one_before(
+    checkpoint: Callable[[str], Weights], name: str
+) -> None:
+    """lerobot guides a chunk to its left-over rows, which have to be in the policy's own numbers:
+    rows as they were answered, in the robot's units, would draw it somewhere else.
+    """
+    import numpy as np
+    import torch
+
+    adapter = loaded(name, checkpoint(name))
+    observation = observations(1)[0]
+    left_over = np.random.default_rng(2).normal(3.0, 2.0, (4, DIM)).astype(np.float32)
+    policy = adapter._policy
+
+    def answer(rtc: dict[str, Any] | None) -> Any:
+        torch.manual_seed(SEED)
+        call = {"endpoint": "get_action", "data": {"observation": observation}}
+        return adapter.run(EndpointCall.model_validate(call | ({"rtc": rtc} if rtc else {})))
+
+    free = answer(None)["action"]
+    heard: list[Any] = []
+    predict = policy.predict_action_chunk
+
+    def hear(batch: Any, **guidance: Any) -> Any:
+        heard.append(guidance)
+        return predict(batch, **guidance)
+
+    policy.predict_action_chunk = hear
+    rtc = {"left_over": left_over.tolist(), "inference_delay": 3, "execution_horizon": 4}
+    guided = answer(rtc)["action"]
+    off = [np.abs(chunk[:3] - left_over[:3]).mean() for chunk in (guided, free)]
+    assert off[0] < off[1] / 2, "its first rows are those that are played meanwhile"
+    assert not any(parameter.requires_grad for parameter in policy.parameters())
+    told = adapter._after(heard[0]["prev_chunk_left_over"][:, 0])[0]
+    np.testing.assert_allclose(told, left_over[0], rtol=1e-4)
+    np.testing.assert_array_equal(answer(None)["action"], free)
+    with pytest.raises(BadRequest, match="must have 6 numbers"):
+        answer(rtc | {"left_over": [[0.0]]})
+
+
+@pytest.mark.parametrize("name", ["act", "act ensembling", "diffusion"])
+def test_a_policy_that_cannot_be_guided_refuses_a_left_over_chunk(
+    checkpoint: Callable[[str], Weights], name: str
+) -> None:
+    adapter = loaded(name, checkpoint(name))
+    rtc = {"left_over": [[0.0] * DIM], "inference_delay": 1, "execution_horizon": 1}
+    data = {"observation": observations(1)[0]}
+    with pytest.raises(BadRequest, match="takes no left-over chunk"):
+        adapter.run(
+            EndpointCall.model_validate({"endpoint": "get_action", "data": data, "rtc": rtc})
+        )
+
+
 def test_tokens_that_are_no_actions_never_leave(
     checkpoint: Callable[[str], Weights], monkeypatch: pytest.MonkeyPatch
 ) -> None:
