@@ -1,6 +1,6 @@
 """A policy's action vector as commands of this robot.
 
-`ActionPlan.rows` turns a chunk into rows in m and rad; `Stepper.step` turns one row into joint
+`ActionPlan.rows` turns a chunk into rows in m and rad, `numbers` turns them back; `Stepper.step` turns one row into joint
 targets and a body twist. Rows of absolute joint targets need no step. Nothing here is a limit:
 every command passes the safety gate. `action_contract` makes the plans.
 """
@@ -79,8 +79,8 @@ class ActionPlan:
             and self.commands[0].at == tuple(range(self.dim))
         )
 
-    def rows(self, actions: Any, most: int | None) -> list[Row]:
-        """Return the first `most` rows of a chunk in m and rad.
+    def rows(self, actions: Any) -> list[Row]:
+        """Return the rows of a chunk in m and rad.
 
         Raises ModelError for a wrong shape or numbers that are not finite.
         """
@@ -94,12 +94,20 @@ class ActionPlan:
             raise ModelError(
                 "the policy commands numbers that are not finite", hint="its weights are broken"
             )
-        actions = actions[:most]
         if self.bounds is not None:
             actions = np.clip(actions, *np.array(self.bounds).T)
         if self.scales is not None:
             actions = actions * [s.scale for s in self.scales] + [s.offset for s in self.scales]
         return [tuple(map(float, row)) for row in actions]
+
+    def numbers(self, rows: Sequence[Row]) -> tuple[Row, ...]:
+        """Return rows of a chunk (m and rad) as the policy's numbers."""
+        if self.scales is None:
+            return tuple(rows)
+        return tuple(
+            tuple(scale.of(value) for scale, value in zip(self.scales, row, strict=True))
+            for row in rows
+        )
 
 
 # -- one step

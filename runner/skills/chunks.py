@@ -1,9 +1,15 @@
-"""Playback of action chunks in order: nothing twice, nothing dropped, one request at a time.
+"""Playback of action chunks: rows aligned with the control steps they were predicted for.
 
 The owner is the control thread: it alone pops rows and asks for the next chunk. A chunk is fetched
 elsewhere (`fetch` returns a future at once). With `prefetch_at` 0 the next observation is taken
-when the last row was played; with n > 0 it is taken when n rows are left, and the new chunk plays
-after them. Any chunk size works with any `prefetch_at`.
+when the last row was played; with n > 0 it is taken when n rows are left, which play meanwhile.
+
+Row k of a chunk belongs to the k-th control step after its observation. As many of its rows as were
+played since are skipped; the next `keep` replace what is left of the chunk before. A step in which
+the robot stands still skips no row: the robot is still where the chunk expects it.
+
+In a simulator whose world waits (`wait_s`), a chunk is taken when the rows before it are played, as
+if the policy took that long: when its answer comes must not decide what an episode is.
 
 A chunk after the first is a *hit* when it was there as its first row was due, a *miss* when the
 robot (or the simulated world) waited.
@@ -38,8 +44,10 @@ class Played:
 
 
 class ChunkPlayer:
-    """`wait_s` is how long `next_row` may wait for a pending chunk: in a simulator the world
-    waits.
+    """Player of one goal's chunks.
+
+    `keep` rows of a chunk are played, behind those that are skipped; None: all. `wait_s` is how
+    long `next_row` may wait for a chunk that is due.
     """
 
     def __init__(
@@ -47,15 +55,19 @@ class ChunkPlayer:
         fetch: Callable[[Any], concurrent.futures.Future[Rows]],
         *,
         prefetch_at: int = 0,
+        keep: int | None = None,
         wait_s: float = 0.0,
     ) -> None:
         if prefetch_at < 0:
             raise ValueError(f"prefetch_at must be 0 or more, not {prefetch_at}")
         self._fetch = fetch
         self._prefetch_at = prefetch_at
+        self._keep = keep
         self._wait_s = wait_s
         self._rows: deque[tuple[int, Row]] = deque()
+        self._cut: Rows = ()  # of the newest chunk: its rows behind those that are played
         self._under_way: concurrent.futures.Future[Rows] | None = None
+        self._asked_at = 0  # rows played before the observation of the chunk under way
         self._late = False  # the chunk that is awaited was due and not there
         self._begun = -1  # the newest chunk of which a row was played
         self.chunks = 0
@@ -68,6 +80,18 @@ class ChunkPlayer:
         """
         return self._under_way is None and len(self._rows) <= self._prefetch_at + ahead
 
+    @property
+    def delay(self) -> int:
+        """Number of rows that may play before the first row of a chunk that is asked for now."""
+        return len(self._rows)
+
+    def left_over(self, limit: int) -> list[Row]:
+        """Return what the chunks so far say about the next control steps, at most `limit` of them:
+        the rows to be played, then those that were cut off.
+        """
+        rows = [row for _, row in self._rows]
+        return [*rows, *self._cut][:limit]
+
     def next_row(self, observation: Any) -> Played | None:
         """Return what to play now, or None while the next chunk is pending.
 
@@ -78,15 +102,17 @@ class ChunkPlayer:
                 raise ModelError(
                     "no observation for the next chunk", hint="the world state came without frames"
                 )
+            self._asked_at = self.played
             self._under_way = self._fetch(observation)
         if (future := self._under_way) is not None:
             if not self._rows and not future.done():
                 self._late = True
                 concurrent.futures.wait([future], self._wait_s)
-            if future.done():
+            if future.done() and not (self._rows and self._wait_s):
                 self._under_way = None
                 self._collect(future)
         if not self._rows:
+            self._late = True
             return None
         self.played += 1
         chunk, row = self._rows.popleft()
@@ -109,7 +135,11 @@ class ChunkPlayer:
             raise ModelError("the policy gave no chunk in time") from error
         if not 0 < len(rows) <= CHUNK_ROWS_MAX:
             raise ModelError(f"a chunk of {len(rows)} actions; 1 to {CHUNK_ROWS_MAX} are accepted")
-        self._rows.extend((self.chunks, row) for row in rows)
+        first = self.played - self._asked_at
+        end = len(rows) if self._keep is None else first + self._keep
+        if first < len(rows):  # else it says nothing about the steps to come
+            self._rows = deque((self.chunks, row) for row in rows[first:end])
+            self._cut = rows[end:]
         self.chunks += 1
 
     def close(self) -> None:
@@ -118,3 +148,4 @@ class ChunkPlayer:
             self._under_way.cancel()
             self._under_way = None
         self._rows.clear()
+        self._cut = ()

@@ -51,7 +51,7 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.sidecar import LoadResult
+from vram_arbiter.schemas.sidecar import LoadResult, RealTimeChunking
 from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
@@ -185,6 +185,7 @@ class SidecarPolicy(SkillBase):
         self._player = ChunkPlayer(
             lambda observation: self._request(observation, token),
             prefetch_at=self._wiring.rollout.prefetch_at,
+            keep=self._wiring.steps_per_chunk,
             wait_s=self._wait_s,
         )
 
@@ -246,14 +247,16 @@ class SidecarPolicy(SkillBase):
         finally:
             await self._client.close()
 
-    async def _fetch(self, observation: JsonMap, token: tuple[int, ...] | None) -> list[Row]:
+    async def _fetch(
+        self, observation: JsonMap, token: tuple[int, ...] | None, rtc: RealTimeChunking | None
+    ) -> list[Row]:
         """Request a chunk; the tick that asked is the span's parent, or the goal if it is not
         recorded.
         """
         parent = None if tracing.recorded() else self._traceparent
         with tracing.span(telemetry.SPAN_CHUNK, parent, {telemetry.ATTR_SKILL: self.key.rskill_id}):
             answer = await self._client.get_action(
-                observation, token=token, timeout_s=CHUNK_TIMEOUT_S
+                observation, rtc=rtc, token=token, timeout_s=CHUNK_TIMEOUT_S
             )
             return self._rows(answer)
 
@@ -406,7 +409,22 @@ class SidecarPolicy(SkillBase):
     ) -> concurrent.futures.Future[Sequence[Row]]:
         if self._loop is None:
             raise BadState(f"{self.key} has no event loop")
-        return asyncio.run_coroutine_threadsafe(self._fetch(observation, token), self._loop)
+        fetch = self._fetch(observation, token, self._real_time())
+        return asyncio.run_coroutine_threadsafe(fetch, self._loop)
+
+    def _real_time(self) -> RealTimeChunking | None:
+        """Return what the chunks so far say about the next steps; None: nothing, or not asked."""
+        told, player = self._wiring.rollout.rtc, self._player
+        if told is None or player is None:
+            return None
+        rows = player.left_over(told.execution_horizon)
+        if not rows:
+            return None
+        return RealTimeChunking(
+            left_over=self._wiring.actions.numbers(rows),
+            inference_delay=player.delay,
+            execution_horizon=told.execution_horizon,
+        )
 
     def _rows(self, answer: JsonMap) -> list[Row]:
         """Return rows in m and rad.
@@ -421,7 +439,7 @@ class SidecarPolicy(SkillBase):
             actions = np.asarray(answer[ACTION_KEY], dtype=float)
         except (TypeError, ValueError) as error:
             raise ModelError(f"the policy's actions are no numbers: {error}") from error
-        return self._wiring.actions.rows(actions, self._wiring.steps_per_chunk)
+        return self._wiring.actions.rows(actions)
 
 
 def _joint_action(targets: Mapping[str, float], twist: Twist | None, world: WorldState) -> Action:

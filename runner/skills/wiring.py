@@ -24,6 +24,7 @@ from vram_arbiter.schemas.control import JOINT_MODES
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, RSkillManifest
 from vram_arbiter.schemas.manifest.problems import Problem
+from vram_arbiter.schemas.sidecar import LEFT_OVER_MAX
 
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
 IMAGES_PREFIX = "observation.images."
@@ -37,6 +38,13 @@ class View(BaseModel):
     size_px: tuple[int, int] | None = None
 
 
+class RealTime(BaseModel):
+    """Real-time chunking: the first `execution_horizon` rows of a chunk continue the one before."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    execution_horizon: int = Field(default=10, ge=1, le=LEFT_OVER_MAX)  # lerobot's own default
+
+
 class Rollout(BaseModel):
     """Part of `policy_extras` that the runner reads; other keys belong to the sidecar's adapter."""
 
@@ -47,6 +55,7 @@ class Rollout(BaseModel):
     stop_when_still: bool = True
     views: dict[str, View] = Field(default_factory=dict)
     prefetch_at: int = Field(default=0, ge=0, le=1000)
+    rtc: RealTime | None = None  # for policies that lerobot guides by the chunk before
     n_obs_steps: int = Field(default=1, ge=1, le=16)  # consecutive observations that a chunk needs
     targets_lead: bool = (
         False  # its targets are set points far ahead of the arm: a robot goes there step by step
@@ -117,6 +126,22 @@ def wire_up(
         rollout = Rollout.model_validate(manifest.policy_extras)
     except ValidationError as error:
         problems.append(Problem(("policy_extras",), error.errors()[0]["msg"]))
+    if rollout.rtc is not None and not rollout.prefetch_at:
+        problems.append(
+            Problem(
+                ("policy_extras", "rtc"),
+                "needs prefetch_at: a chunk that is asked for after the last action has none to "
+                "continue",
+            )
+        )
+    if manifest.chunk_size and rollout.prefetch_at >= manifest.chunk_size:
+        problems.append(
+            Problem(
+                ("policy_extras", "prefetch_at"),
+                f"must be less than chunk_size, {manifest.chunk_size}: all of a chunk would be "
+                "past when it is due",
+            )
+        )
     if problems:
         raise ManifestError(manifest.name, problems)
     rollout_s = manifest.latency_budget.max_execution_s or ROLLOUT_S

@@ -1,7 +1,8 @@
-"""Whatever sizes chunks have, whenever answers come, wherever requests fail: rows play in order,
-once each, and the play goes on.
+"""Whatever sizes chunks have, whenever answers come, wherever requests fail: each row plays in the
+step that it was predicted for, and the play goes on.
 
-A chunk counts as in time exactly if the robot did not have to stand still before it: told by what
+A row is predicted for the step that is as many rows behind its observation as its place in the
+chunk; steps are counted in rows played, as the robot moves by nothing else. A chunk counts as in time exactly if the robot did not have to stand still before it: told by what
 was played, not by the player.
 """
 
@@ -26,13 +27,13 @@ class Answers:
     def __init__(self, sizes: list[int], delays: list[int | None]) -> None:
         self.sizes, self.delays = sizes, delays
         self.asked = 0
-        self.answered: list[Row] = []  # in the order in which they must be played
         self.chunk = 0
         self.failures = 0
         self._future: concurrent.futures.Future[list[Row]] | None = None
         self._left: int | None = None
 
-    def fetch(self, _: Any) -> Any:
+    def fetch(self, step: Any) -> Any:
+        self._asked_at = step
         assert self._future is None or self._future.done(), "one request at a time"
         self._future = concurrent.futures.Future()
         self._left = self.delays[self.asked % len(self.delays)]
@@ -56,9 +57,8 @@ class Answers:
     def _answer(self) -> None:
         assert self._future is not None
         size = self.sizes[self.chunk % len(self.sizes)]
-        rows = [(float(self.chunk), float(i)) for i in range(size)]
+        rows = [(float(self.chunk), float(self._asked_at + i)) for i in range(size)]
         self.chunk += 1
-        self.answered += rows
         self._future.set_result(rows)
 
 
@@ -80,26 +80,23 @@ def test_any_sizes_any_prefetch_any_lateness(
     played: list[Played] = []
     stood_still, failures = False, 0
     # each row costs at most one request, each request at most 13 steps and one failure before it
-    for step in range(ROWS_MAX * 13 * len(failed)):
+    for _ in range(ROWS_MAX * 13 * len(failed)):
         try:
-            row = player.next_row(step)
+            row = player.next_row(len(played))
         except Evicted:
             failures += 1
-            stood_still = len(played) == len(
-                answers.answered
-            )  # else the failed one was not yet due
+            stood_still = player.delay == 0  # else the failed one was not yet due
         else:
             if row is not None:
                 played.append(row)
                 first = len(played) == 1 or played[-2].chunk != row.chunk
                 assert row.prefetched == ((not stood_still) if first and row.chunk > 0 else None)
+                assert row.row == (row.chunk, len(played) - 1)
             stood_still = row is None
         if len(played) == ROWS_MAX:
             break
         answers.step()
     assert len(played) == ROWS_MAX, "it must not come to a stop"
-    assert [row.row for row in played] == answers.answered[:ROWS_MAX]
-    assert [row.chunk for row in played] == [int(row.row[0]) for row in played]
     assert player.played == ROWS_MAX
     assert player.chunks <= answers.chunk <= player.chunks + 1
     assert answers.failures - failures in (0, 1), (
@@ -111,14 +108,10 @@ def test_any_sizes_any_prefetch_any_lateness(
 @settings(max_examples=20, deadline=None)
 def test_answers_of_another_thread_that_are_waited_for(size: int, prefetch_at: int) -> None:
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        numbers = iter(range(1000))
 
-        def fetch(_: Any) -> Any:
-            number = float(next(numbers))
-            return pool.submit(lambda: [(number, float(i)) for i in range(size)])
+        def fetch(step: Any) -> Any:
+            return pool.submit(lambda: [(float(step + i),) for i in range(size)])
 
         player = ChunkPlayer(fetch, prefetch_at=prefetch_at, wait_s=60.0)
-        rows = [player.next_row("o") for _ in range(40)]
-    assert [row.row for row in rows if row is not None] == [
-        (n // size, n % size) for n in range(40)
-    ]
+        rows = [player.next_row(step) for step in range(40)]
+    assert [row.row for row in rows if row is not None] == [(n,) for n in range(40)]

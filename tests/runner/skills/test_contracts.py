@@ -139,7 +139,7 @@ class Bench:
             period_s=1 / HZ,
             longest={n: 0.98 * v / HZ for n, v in self.gate.limits.speeds_rad_s.items()},
         )
-        for row in wiring.actions.rows(np.array(actions), None):
+        for row in wiring.actions.rows(np.array(actions)):
             world = self.world()
             step = stepper.step(row, {**self.measured(), **self.hal.sent()})
             self.said += [step.problem] if step.problem else []
@@ -233,7 +233,7 @@ def test_joints_in_the_policys_order_in_degrees_with_a_gripper_in_percent() -> N
     wiring = wire_up(manifest, robot, None)
     assert wiring.actions.direct
     told = [25.0, -90.0, 45.0, 30.0, -60.0, 10.0]
-    (row,) = wiring.actions.rows(np.array([told]), None)
+    (row,) = wiring.actions.rows(np.array([told]))
     targets = dict(zip(wiring.joints, row, strict=True))
     lower, upper = -0.17453, 1.74533
     assert targets["gripper"] == pytest.approx(lower + 0.25 * (upper - lower))
@@ -283,12 +283,12 @@ def test_joint_steps_and_speeds_start_at_the_last_target(
     wiring = wire_up(manifest, robot, None)
     stepper = Stepper(wiring.actions, robot, None, period_s=1 / HZ)
     start = dict.fromkeys(robot.joint_names, 0.25)
-    (made,) = wiring.actions.rows(np.array([[*row, 1.0, 0.0]]), None)
+    (made,) = wiring.actions.rows(np.array([[*row, 1.0, 0.0]]))
     step = stepper.step(made, start)
     expected = {name: 0.25 + by for name, by in moved.items()}
     assert step.targets == pytest.approx({**expected, "gripper": -0.17453})
     assert not step.terminated
-    (last,) = wiring.actions.rows(np.array([[*row, 0.0, 1.0]]), None)
+    (last,) = wiring.actions.rows(np.array([[*row, 0.0, 1.0]]))
     step = stepper.step(last, start)
     assert step.targets["gripper"] == pytest.approx(1.74533)
     assert step.terminated
@@ -329,7 +329,7 @@ def test_a_gripper_among_joint_steps_goes_as_its_own_actuator_says(
     wiring = wire_up(manifest, robot, None)
     lower, span = -0.17453, 1.74533 + 0.17453
     start = {**dict.fromkeys(robot.joint_names, 0.0), "gripper": lower + 0.5 * span}
-    (row,) = wiring.actions.rows(np.array([[0.1, 0, 0, 0, 0, value]]), None)
+    (row,) = wiring.actions.rows(np.array([[0.1, 0, 0, 0, 0, value]]))
     step = Stepper(wiring.actions, robot, None, period_s=1 / HZ).step(row, start)
     assert step.targets["shoulder_pan"] == pytest.approx(0.1)
     assert step.targets["gripper"] == pytest.approx(lower + wanted * span)
@@ -381,7 +381,7 @@ def test_raw_numbers_are_clipped_to_the_slots_bounds(panda: Bench) -> None:
         'frame: "panda_link0"', 'frame: "panda_link0", input_bounds: [-1, 1]'
     )
     (row,) = wire_up(skill(text), panda.robot, None).actions.rows(
-        np.array([[3.0, -3.0, 0.5, 0, 0, 2.0, 0, 0, 0, 0, 0, 5.0]]), None
+        np.array([[3.0, -3.0, 0.5, 0, 0, 2.0, 0, 0, 0, 0, 0, 5.0]])
     )
     assert row[:6] == pytest.approx((0.05, -0.05, 0.025, 0.0, 0.0, 0.5))
 

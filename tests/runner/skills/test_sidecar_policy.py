@@ -4,6 +4,7 @@ A real socket, a small real server.
 """
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -75,6 +76,7 @@ class Sidecar:
         self.calls: list[str] = []
         self.tokens: list[Any] = []
         self.observations: list[Any] = []
+        self.guidance: list[Any] = []  # "rtc" of each request for actions
         self.serial = 1
         self.action: Any = None
         self.error: VramError | None = None
@@ -126,6 +128,7 @@ class Sidecar:
             }
         elif endpoint == "get_action":
             self.observations.append(npy.unpack(message["data"]["observation"]))
+            self.guidance.append(message.get("rtc"))
             number = len(self.observations) - 1
             action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
@@ -320,6 +323,31 @@ def test_a_policy_with_a_history_sees_consecutive_steps(tmp_path: Path, run_asyn
     scenario(run_async, Bench(manifest, f"ipc://{tmp_path}/grab.sock", None), play)
 
 
+def test_a_chunk_asked_for_early_is_told_what_is_left_and_begins_behind_it(
+    tmp_path: Path, run_async: Run
+) -> None:
+    """Left-over rows go to the policy in its own unit, those behind `n_action_steps` too."""
+    text = MANIFEST.replace("chunk_size: 3", "chunk_size: 3\nn_action_steps: 2").replace(
+        "steps: 7,", "steps: 4, prefetch_at: 1, rtc: {execution_horizon: 2},"
+    )
+    degrees = parse_manifest(text.replace("{dim: 2}", "{dim: 2, joint_units: degrees}"))
+
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        rows, _ = await b.play()
+        to_rad = math.pi / 180
+        assert rows == [
+            pytest.approx((n / 100 * to_rad, i / 100 * to_rad))
+            for n, i in [(0, 0), (0, 1), (1, 1), (1, 2)]
+        ]
+        first, second, *_ = b.sidecar.guidance
+        assert first is None
+        assert second.pop("left_over") == [pytest.approx((0.0, n / 100)) for n in (1, 2)]
+        assert second == {"inference_delay": 1, "execution_horizon": 2}
+
+    scenario(run_async, Bench(degrees, f"ipc://{tmp_path}/grab.sock", None), play)
+
+
 def test_the_arm_goes_to_its_start_pose_before_the_policy_sees_anything(
     policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
@@ -467,6 +495,8 @@ def test_a_policy_that_stands_still_has_ended(
         ({"sensors_required": ()}, "names no camera"),
         ({"starting_pose": (0.0,)}, "starting_pose"),
         ({"policy_extras": {"rollout_steps": 0}}, "policy_extras"),
+        ({"policy_extras": {"rtc": {}}}, "needs prefetch_at"),
+        ({"policy_extras": {"prefetch_at": 3}}, "must be less than chunk_size, 3"),
     ],
 )
 def test_a_manifest_that_does_not_fit_the_robot_is_refused(
