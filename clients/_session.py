@@ -259,11 +259,12 @@ class Session:
             return
         connection = self.protocol.connection
         while True:
-            for message in connection.take_outgoing():
+            outgoing, connection.outgoing = connection.outgoing, []
+            for message in outgoing:
                 if self._dealer is None or not self._dealer.send(message):
                     connection.contact_lost("the socket takes no more messages")
                     break
-            events = connection.take_events()
+            events, connection.events = connection.events, []
             if not events:
                 break
             for event in events:
@@ -343,7 +344,7 @@ class Session:
         """Close the socket, end the tasks; a caller that still waits gets ArbiterUnreachable."""
         self._open = False
         self.protocol.connection.contact_lost("closed")
-        self.protocol.connection.take_events()
+        self.protocol.connection.events.clear()
         for answer in self._replies.values():
             answer.fail(closed())
         for wait in self._waits.values():

@@ -2,8 +2,8 @@
 
 It knows no sockets, no event loop, no clock (messages are maps; time is passed in as `now`, in
 monotonic seconds) and no leases: those are the `Above` (`clients._protocol.protocol`), which gets
-the pushes. The owner (`clients._session`) feeds `receive`, performs what `take_outgoing` and
-`take_events` return, and on `ContactLost` opens a fresh socket and calls `connected`.
+the pushes. The owner (`clients._session`) feeds `receive`, takes what it finds in `outgoing` and
+`events`, and on `ContactLost` opens a fresh socket and calls `connected`.
 
 `phase`: `down` → `greeting` (hello is sent) → `reattaching` (if a lease has to be reattached) →
 `up`. On the way up every request without a reply is sent again, which is safe because every op is
@@ -65,13 +65,10 @@ class Above(Protocol):
         """Apply a push."""
         ...
 
-    def expects_grants(self) -> bool:
-        """Return whether a grant may come: then its age has to be known, by pings."""
-        ...
-
 
 class Connection:
-    """`phase`, and what the arbiter said of itself: `epoch`, `heartbeat_s`, `grace_s`."""
+    """`phase`, what the arbiter said of itself (`epoch`, `heartbeat_s`, `grace_s`), and what its
+    owner takes: `outgoing` messages and `events`."""
 
     def __init__(self, above: Above, *, name: str, instance: str, role: str) -> None:
         self.instance = instance
@@ -90,8 +87,8 @@ class Connection:
             "role": role,
         }
         self._next_id = 1
-        self._outgoing: list[Message] = []
-        self._events: list[Event] = []
+        self.outgoing: list[Message] = []
+        self.events: list[Event] = []
         self._pending: dict[int, Pending] = {}
         self._phase_deadline: float | None = None
         self._handshake_id = 0
@@ -100,17 +97,9 @@ class Connection:
         self._pinged = False
 
     # -- for the owner -----------------------------------------------------------------------------
-    def take_outgoing(self) -> list[Message]:
-        taken, self._outgoing = self._outgoing, []
-        return taken
-
-    def take_events(self) -> list[Event]:
-        taken, self._events = self._events, []
-        return taken
-
     def connected(self, now: float) -> None:
         """Send hello on a fresh socket."""
-        self._outgoing.clear()
+        self.outgoing.clear()
         self._pinged = False
         self.phase = "greeting"
         self._send_handshake(self._hello, now)
@@ -121,10 +110,10 @@ class Connection:
             return
         self.phase = "down"
         self._phase_deadline = None
-        self._outgoing.clear()
+        self.outgoing.clear()
         for request in self._pending.values():
             request.sent_at = None
-        self._events.append(ContactLost(reason))
+        self.events.append(ContactLost(reason))
 
     def receive(self, message: Message, now: float) -> None:
         """One message from the arbiter. Replies to forgotten requests are ignored."""
@@ -195,18 +184,15 @@ class Connection:
         ]:
             del self._pending[request_id]
 
-    def tell(self, event: Event) -> None:
-        """Report an event to the owner."""
-        self._events.append(event)
-
     # -- time --------------------------------------------------------------------------------------
-    def deadlines(self) -> Iterator[float]:
+    def deadlines(self, expects_grants: bool) -> Iterator[float]:
+        """`expects_grants`: a grant may come, so its age has to be known, by pings."""
         for request in self._pending.values():
             yield request.deadline
         if self._phase_deadline is not None:
             yield self._phase_deadline
         if self.phase == "up":
-            yield self._silent_at() if self._pinged else self._ping_at()
+            yield self._silent_at() if self._pinged else self._ping_at(expects_grants)
 
     def wait_ends_at(self, deadline: float | None) -> float:
         """Return when a wait ends here. While in contact, the arbiter ends it first."""
@@ -229,26 +215,25 @@ class Connection:
             self.contact_lost(f"the arbiter said nothing for {now - self._heard_at:.1f} s")
         return self.phase == "up"
 
-    def ping_if_silent(self, now: float) -> None:
-        if not self._pinged and now >= self._ping_at():
+    def ping_if_silent(self, now: float, expects_grants: bool) -> None:
+        if not self._pinged and now >= self._ping_at(expects_grants):
             self._pinged = True
             self.ask({"op": "ping"}, now, quiet=True)
 
     def _silent_at(self) -> float:
         return self._heard_at + SILENCE_BEATS * self.heartbeat_s
 
-    def _ping_at(self) -> float:
-        """Ping after a silence; while a grant may come also beside pushes, so that its age is
-        known."""
-        waits = self._above.expects_grants()
-        return (min(self._heard_at, self.asked_at) if waits else self._heard_at) + self.heartbeat_s
+    def _ping_at(self, expects_grants: bool) -> float:
+        """Ping after a silence; while a grant may come also beside pushes."""
+        since = min(self._heard_at, self.asked_at) if expects_grants else self._heard_at
+        return since + self.heartbeat_s
 
     # -- steps: greeting ---------------------------------------------------------------------------
     def _send_handshake(self, message: Message, now: float) -> None:
         """Send hello or the reattachment, which come before any request."""
         self._handshake_id, self._handshake_at = self._new_id(), now
         self._phase_deadline = now + HELLO_TIMEOUT_S
-        self._outgoing.append({**message, "id": self._handshake_id})
+        self.outgoing.append({**message, "id": self._handshake_id})
 
     def _handshake_reply(self, message: Message, now: float) -> None:
         if not message.get("ok"):
@@ -256,7 +241,7 @@ class Connection:
             if isinstance(error, UnknownSession):
                 self.contact_lost("the arbiter forgot the session")
                 return
-            self._events.append(Refused(error))
+            self.events.append(Refused(error))
             self._phase_deadline = now + REFUSED_RETRY_S
             return
         if self.phase == "greeting":
@@ -275,7 +260,7 @@ class Connection:
         self.phase = "up"
         self._phase_deadline = None
         assert self.epoch is not None
-        self._events.append(Up(self.epoch))
+        self.events.append(Up(self.epoch))
         unanswered = list(self._pending.values())
         self._above.say_again(now)
         for request in unanswered:
@@ -310,18 +295,18 @@ class Connection:
         if request.on_reply is not None:
             request.on_reply(reply, now)
         if not request.quiet:
-            self._events.append(Replied(request_id, reply))
+            self.events.append(Replied(request_id, reply))
 
     def _fail(self, request_id: int, error: VramError, now: float) -> None:
         request = self._pending.pop(request_id)
         if request.on_error is not None:
             request.on_error(error, now)
         if not request.quiet:
-            self._events.append(Failed(request_id, error))
+            self.events.append(Failed(request_id, error))
 
     def _send(self, request: Pending, now: float) -> None:
         request.sent_at = now
-        self._outgoing.append(request.message)
+        self.outgoing.append(request.message)
 
     def _new_id(self) -> int:
         self._next_id += 1

@@ -54,6 +54,6 @@ class ForeignUses:
     def _begin_again(self, use_id: str, use: ForeignUseRecord, now: float) -> None:
         def lost(error: VramError, _: float) -> None:
             if self._uses.pop(use_id, None) is not None:
-                self._connection.tell(UseLost(use_id, error))
+                self._connection.events.append(UseLost(use_id, error))
 
         self._connection.ask(use.begin(use_id), now, on_error=lost, quiet=True)

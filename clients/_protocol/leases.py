@@ -166,10 +166,6 @@ class Holdings:
         self._cancel(record, now)
 
     # -- from the arbiter --------------------------------------------------------------------------
-    def hold(self, record: LeaseRecord) -> None:
-        """Keep a lease that is granted."""
-        self.held[record.lease_id] = record
-
     def returned(self, view: LeaseView) -> None:
         """Apply the grant of a lease that is asleep: its record goes on under the new token."""
         record = self.asleep.get(view.lease_id)
@@ -185,8 +181,8 @@ class Holdings:
         )  # as for the first grant
         record.held = record.released = False
         record.measured_bytes = record.revoke = None
-        self.hold(record)
-        self._connection.tell(Returned(record))
+        self.held[record.lease_id] = record
+        self._connection.events.append(Returned(record))
 
     def denied(self, lease_id: str, error: VramError) -> None:
         """Apply the end of a wait without a grant: of a resize, or of a reacquire."""
@@ -203,7 +199,7 @@ class Holdings:
         record = self.held.get(push.lease_id)
         if record is not None and record.token == token_of(push.token):
             first, record.revoke = record.revoke is None, push
-            self._connection.tell(RevokeAsked(record, push, first))
+            self._connection.events.append(RevokeAsked(record, push, first))
 
     def lost(self, push: LostPush) -> None:
         record = self._record(push.lease_id)
@@ -394,7 +390,7 @@ class Holdings:
 
     def _resized(self, record: LeaseRecord, error: VramError | None = None) -> None:
         record.resizing = None
-        self._connection.tell(Resized(record, error))
+        self._connection.events.append(Resized(record, error))
 
     def _cancel(self, record: LeaseRecord, now: float) -> None:
         self._connection.ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)
@@ -429,7 +425,7 @@ class Holdings:
         self._connection.drop_unsent(
             lambda m: m.get("lease_id") == record.lease_id and m["op"] in ("revoke_ack", "use_end")
         )
-        self._connection.tell(Gone(record, error, fenced))
+        self._connection.events.append(Gone(record, error, fenced))
 
 
 def waited_in_vain(spec: Message, what: str, waited_s: float | None = None) -> WaitTimeout:

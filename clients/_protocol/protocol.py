@@ -9,7 +9,7 @@ served.
 It knows no sockets, no event loop and no clock.
 """
 
-from collections.abc import Iterator
+from itertools import chain
 
 from vram_arbiter.clients._protocol.connection import Connection
 from vram_arbiter.clients._protocol.foreign_uses import ForeignUses
@@ -31,8 +31,8 @@ from vram_arbiter.schemas.wire.replies import ReattachReply
 
 
 class ClientProtocol:
-    """One client. After each call on it or its parts, perform `connection.take_outgoing` and
-    `take_events`, and wake up at `next_deadline`."""
+    """One client. After each call on it or its parts, take `connection.outgoing` and `events`, and
+    wake up at `next_deadline`."""
 
     def __init__(self, *, name: str, instance: str, role: str = "client") -> None:
         self.connection = Connection(self, name=name, instance=instance, role=role)
@@ -52,7 +52,12 @@ class ClientProtocol:
     # -- time --------------------------------------------------------------------------------------
     def next_deadline(self) -> float | None:
         """Return when `tick` is due at the latest."""
-        return min(self._deadlines(), default=None)
+        ends = chain(
+            self.connection.deadlines(self._expects_grants()),
+            self.waits.deadlines(),
+            self.holdings.deadlines(),
+        )
+        return min(ends, default=None)
 
     def tick(self, now: float) -> None:
         """1. Fence leases. 2. End requests and waits past their deadline. 3. Declare silence. 4.
@@ -63,17 +68,12 @@ class ClientProtocol:
         self.holdings.end_overdue(now)
         if self.connection.stays_up(now):  # 3
             self.holdings.renew(now)  # 4
-            self.connection.ping_if_silent(now)
+            self.connection.ping_if_silent(now, self._expects_grants())
 
-    def _deadlines(self) -> Iterator[float]:
-        yield from self.connection.deadlines()
-        yield from self.waits.deadlines()
-        yield from self.holdings.deadlines()
+    def _expects_grants(self) -> bool:
+        return bool(self.waits.waiters or self.holdings.asleep)
 
     # -- for the connection (`clients._protocol.connection.Above`) ---------------------------------
-    def expects_grants(self) -> bool:
-        return bool(self.waits) or bool(self.holdings.asleep)
-
     def reattachments(self) -> list[Message]:
         return self.holdings.reattachments()
 
@@ -103,4 +103,4 @@ class ClientProtocol:
             case LostPush():
                 self.holdings.lost(push)
             case EventPush():
-                self.connection.tell(HistoryEvent(push.event))
+                self.connection.events.append(HistoryEvent(push.event))

@@ -5,7 +5,6 @@ uses. Plain data.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError, from_wire
 from vram_arbiter.schemas.ids import Token
@@ -171,6 +170,7 @@ class LeaseRecord:
     token: TokenPair
     nonce: str
     spec: Message
+    ttl_s: float
     view: LeaseView
     confirmed_at: float  # when the last message that the arbiter confirmed was *sent*
     renewed_at: float
@@ -187,10 +187,6 @@ class LeaseRecord:
     resizing: Message | None = None  # the footprint that its owner waits for
     resizing_until: float | None = None  # None: no limit
     resize_id: int | None = None  # the newest request that asked for it
-
-    @property
-    def ttl_s(self) -> float:
-        return float(self.spec.get("ttl_s", d.LEASE_TTL_S))
 
     def ref(self) -> Message:
         """`schemas.wire.LeaseRef`."""

@@ -10,6 +10,7 @@ The module must not know what becomes of a lease once it is granted.
 """
 
 from collections.abc import Iterator
+from functools import partial
 
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S, Connection
 from vram_arbiter.clients._protocol.leases import Holdings, waited_in_vain
@@ -20,6 +21,7 @@ from vram_arbiter.clients._protocol.records import (
     Waiter,
     token_of,
 )
+from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.decode import AnyReply
@@ -28,15 +30,12 @@ from vram_arbiter.schemas.wire.views import LeaseView
 
 
 class Waits:
-    """False while there is none."""
+    """`waiters` by their nonces."""
 
     def __init__(self, connection: Connection, holdings: Holdings) -> None:
         self._connection = connection
         self._holdings = holdings
-        self._waiters: dict[str, Waiter] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._waiters)
+        self.waiters: dict[str, Waiter] = {}
 
     # -- requests of the owner ---------------------------------------------------------------------
     def acquire(
@@ -52,12 +51,12 @@ class Waits:
         deadline = None if wait_timeout_s is None else now + wait_timeout_s
         extra = {"traceparent": traceparent} if traceparent else {}
         waiter = Waiter(nonce, dict(spec), extra, now, deadline)
-        self._waiters[nonce] = waiter
+        self.waiters[nonce] = waiter
         self._ask(waiter, now)
 
     def cancel(self, nonce: str, now: float) -> None:
         """Give up a wait. A grant that is on its way already is released when it comes."""
-        waiter = self._waiters.get(nonce)
+        waiter = self.waiters.get(nonce)
         if waiter is None:
             return
         waiter.abandoned = True
@@ -81,29 +80,29 @@ class Waits:
 
     # -- contact and time --------------------------------------------------------------------------
     def say_again(self, now: float) -> None:
-        for waiter in self._waiters.values():
+        for waiter in self.waiters.values():
             if not self._connection.awaits(waiter.request_id):
                 self._ask(waiter, now)
 
     def deadlines(self) -> Iterator[float]:
-        for waiter in self._waiters.values():
+        for waiter in self.waiters.values():
             if waiter.deadline is not None:
                 yield self._connection.wait_ends_at(waiter.deadline)
 
     def end_overdue(self, now: float) -> None:
         """End waits that are over while the arbiter cannot be reached."""
         ends_at = self._connection.wait_ends_at
-        for waiter in [w for w in self._waiters.values() if now >= ends_at(w.deadline)]:
+        for waiter in [w for w in self.waiters.values() if now >= ends_at(w.deadline)]:
             if not waiter.abandoned:
                 error = waited_in_vain(waiter.spec, "a lease", now - waiter.asked_at)
-                self._connection.tell(Denied(waiter.nonce, error))
+                self._connection.events.append(Denied(waiter.nonce, error))
             waiter.abandoned, waiter.deadline = True, None
             if waiter.lease_id is not None:
                 self._ask_to_cancel(waiter, now)
 
     # -- steps -------------------------------------------------------------------------------------
     def _of(self, lease_id: str) -> Waiter | None:
-        return next((w for w in self._waiters.values() if w.lease_id == lease_id), None)
+        return next((w for w in self.waiters.values() if w.lease_id == lease_id), None)
 
     def _ask(self, waiter: Waiter, now: float) -> None:
         left_s = None if waiter.deadline is None else max(0.0, waiter.deadline - now)
@@ -115,21 +114,19 @@ class Waits:
             **waiter.extra,
         }
 
-        def replied(reply: AnyReply, at: float) -> None:
-            assert isinstance(reply, AcquireReply)
-            if waiter.nonce in self._waiters:
-                self._replied(waiter, reply, at)
-
         waiter.request_id = self._connection.ask(
             message,
             now,
             REQUEST_TIMEOUT_S if left_s is None else max(REQUEST_TIMEOUT_S, left_s),
-            on_reply=replied,
+            on_reply=partial(self._replied, waiter),
             on_error=lambda error, _: self._denied(waiter, error),
             quiet=True,
         )
 
-    def _replied(self, waiter: Waiter, reply: AcquireReply, now: float) -> None:
+    def _replied(self, waiter: Waiter, reply: AnyReply, now: float) -> None:
+        assert isinstance(reply, AcquireReply)
+        if waiter.nonce not in self.waiters:
+            return
         view = reply.lease
         waiter.lease_id = view.lease_id
         if reply.state == "loading":  # not by its token: one that was away shows its last one
@@ -140,13 +137,14 @@ class Waits:
     def _granted(self, waiter: Waiter, view: LeaseView, now: float) -> None:
         """Keep a grant. The message may have waited longer than the TTL: it is known only that it
         was sent after the newest request that the arbiter has answered."""
-        self._waiters.pop(waiter.nonce, None)
+        self.waiters.pop(waiter.nonce, None)
         heard_at = self._connection.asked_at
         record = LeaseRecord(
             lease_id=view.lease_id,
             token=token_of(view.token),
             nonce=waiter.nonce,
             spec=waiter.spec,
+            ttl_s=float(waiter.spec.get("ttl_s", d.LEASE_TTL_S)),
             view=view,
             confirmed_at=heard_at,
             renewed_at=heard_at,
@@ -156,16 +154,16 @@ class Waits:
                 {"op": "release", **record.ref(), "exiting": False}, now, quiet=True
             )
             return
-        self._holdings.hold(record)
-        self._connection.tell(Granted(waiter.nonce, record))
+        self._holdings.held[record.lease_id] = record
+        self._connection.events.append(Granted(waiter.nonce, record))
 
     def _denied(self, waiter: Waiter, error: VramError) -> None:
-        if self._waiters.pop(waiter.nonce, None) is not None and not waiter.abandoned:
-            self._connection.tell(Denied(waiter.nonce, error))
+        if self.waiters.pop(waiter.nonce, None) is not None and not waiter.abandoned:
+            self._connection.events.append(Denied(waiter.nonce, error))
 
     def _ask_to_cancel(self, waiter: Waiter, now: float) -> None:
         def over(_: object, __: float) -> None:
-            self._waiters.pop(waiter.nonce, None)
+            self.waiters.pop(waiter.nonce, None)
 
         message = {"op": "cancel", "lease_id": waiter.lease_id}
         self._connection.ask(message, now, on_reply=over, on_error=over, quiet=True)

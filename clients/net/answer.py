@@ -30,12 +30,12 @@ class Answer[T]:
         return self._error is not None
 
     def set(self, value: T) -> None:
-        if not self.done:
+        if not self._event.is_set():
             self._value = value
             self._event.set()
 
     def fail(self, error: BaseException) -> None:
-        if not self.done:
+        if not self._event.is_set():
             self._error = error
             self._event.set()
 

@@ -15,11 +15,10 @@ import anyio.lowlevel
 import msgpack
 import zmq
 
-from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.clients.net.link import MESSAGE_LIMIT_BYTES, Link
 from vram_arbiter.schemas.errors import MessageTooLarge, ModelError, VramError
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.runtime.msgpack_codec import count_values
+from vram_arbiter.schemas.runtime.msgpack_codec import count_values, pack
 from vram_arbiter.schemas.runtime.trust import Program
 
 log = logging.getLogger(__name__)
@@ -169,11 +168,8 @@ class Dealer:
                 log.warning("dropped a frame that is not msgpack: %s", error)
                 continue
             if self._enveloped or isinstance(message, dict):
-                self._hand_on(message)
+                try:
+                    self._received(message)
+                except Exception:
+                    log.exception("a message from %s was not understood", self._endpoint)
         return True
-
-    def _hand_on(self, message: Any) -> None:
-        try:
-            self._received(message)
-        except Exception:
-            log.exception("a message from %s was not understood", self._endpoint)

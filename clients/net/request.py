@@ -9,11 +9,11 @@ import os
 import time
 from typing import TYPE_CHECKING
 
-from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.schemas.defaults import WIRE_VERSION
 from vram_arbiter.schemas.errors import UntrustedServer, VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+from vram_arbiter.schemas.runtime.msgpack_codec import pack
 
 if TYPE_CHECKING:
     import zmq

@@ -16,14 +16,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
-from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
 from vram_arbiter.schemas.errors import LimitExceeded, MessageTooLarge, VramError
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.connection import Connection, Limits
 from vram_arbiter.schemas.runtime.endpoints import socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
-from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
+from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, pack, unpack_map
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 

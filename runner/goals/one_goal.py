@@ -15,7 +15,6 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
-from vram_arbiter.clients._protocol.codec import pack
 from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
@@ -32,6 +31,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.goals import FeedbackPush, ResultPush, SendGoal
 from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.runtime.msgpack_codec import pack
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing

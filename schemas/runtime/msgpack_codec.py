@@ -1,4 +1,5 @@
-"""Bounded msgpack decoding, shared by every server: bytes of a peer → one map, at a bounded cost.
+"""Messages as msgpack: `pack` for every sender, and bounded decoding for every server: bytes of a
+peer → one map, at a bounded cost.
 
 `unpack_map` counts the values of a message before it builds any of them: a message of 1 MiB can
 hold a million lists, and building, validating and freeing those holds an event loop for seconds.
@@ -11,7 +12,18 @@ import msgpack
 
 from vram_arbiter.schemas.defaults import LISTED_MAX, MESSAGE_MAX_BYTES, VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
-from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.plain import JsonMap, Message
+
+
+def pack(message: JsonMap | list[Message]) -> bytes:
+    """Texts that UTF-8 has no bytes for (halves of surrogate pairs: undecodable file names,
+    arguments) are sent as `\\udcff`: an emergency stop is not lost for its words. Raises TypeError,
+    ValueError and OverflowError for what msgpack does not carry."""
+    try:
+        packed: bytes = msgpack.packb(message, use_bin_type=True)
+    except UnicodeEncodeError:
+        packed = msgpack.packb(message, use_bin_type=True, unicode_errors="backslashreplace")
+    return packed
 
 
 @dataclass(frozen=True, slots=True)

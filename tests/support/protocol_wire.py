@@ -83,13 +83,14 @@ class Wire:
         self.now = 100.0
 
     def sent(self) -> list[dict[str, Any]]:
-        messages = self.connection.take_outgoing()
+        messages, self.connection.outgoing = self.connection.outgoing, []
         for message in messages:
             wire.REQUEST.validate_python(message)
         return messages
 
     def told(self) -> list[r.Event]:
-        return self.connection.take_events()
+        events, self.connection.events = self.connection.events, []
+        return events
 
     def one(self, op: str) -> dict[str, Any]:
         (message,) = self.sent()
