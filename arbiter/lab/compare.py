@@ -57,8 +57,8 @@ def consumer_lines(outcomes: Sequence[Outcome]) -> list[str]:
             tally = outcome.of(name)
             waits = (f"{tally.wait_s(share):.1f} s" for share in SHARES.values())
             counts = (tally.loads, tally.evicted, tally.denied, format_bytes(tally.loaded_bytes))
-            head = (name, outcome.policy, tally.jobs, tally.unserved)
-            rows.append((*head, *waits, *counts, tally.ooms))
+            whose = (name, outcome.policy, tally.jobs, tally.unserved)
+            rows.append((*whose, *waits, *counts, tally.ooms))
     head = ("consumer", "policy", "jobs", "unserved", "p50", "p99", "max")
     return table((*head, "loads", "evicted", "denied", "moved", "OOM"), rows, left=2)
 
