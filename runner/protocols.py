@@ -381,8 +381,9 @@ class SensorReader(Protocol):
     """One camera. `start` and `stop` on one thread, reads on any.
 
     `read_latest` returns the newest frame without waiting; it raises FrameStale when there is none,
-    or it is older than `max_age_ms` (None: the configured age). `read_synced` waits for the first
-    frame taken after the call, until the monotonic `deadline_ns`; then FrameStale. A source that
+    or it is older than `max_age_ms` (None: the configured age). `read_synced` waits for a frame
+    taken after `after_ns` (None: the call), until the monotonic `deadline_ns`; then FrameStale. A
+    source that
     ended or broke raises FrameStale with the reason: its last frame is never served again.
     """
 
@@ -392,6 +393,6 @@ class SensorReader(Protocol):
 
     def read_latest(self, max_age_ms: float | None = None) -> SensorFrame: ...
 
-    def read_synced(self, deadline_ns: int) -> SensorFrame: ...
+    def read_synced(self, deadline_ns: int, after_ns: int | None = None) -> SensorFrame: ...
 
     def stop(self) -> None: ...

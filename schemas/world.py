@@ -55,7 +55,6 @@ class FrameEncoding(StrEnum):
     DEPTH16 = "depth16"
     JPEG = "jpeg"
     PNG = "png"
-    CUDA_NV12 = "cuda_nv12"
     RAW = "raw"
 
 
@@ -68,9 +67,10 @@ _BYTES_PER_PIXEL = {
 
 
 class SensorFrame(_Frozen):
-    """One picture of one camera: its bytes, or where they are (a topic, or a handle on the device).
+    """One picture of one camera: its bytes, or the topic where they are.
 
-    Exactly one of `data`, `topic` and `handle` is set; empty bytes and empty texts count as unset.
+    Exactly one of `data` and `topic` is set; empty bytes and empty texts count as unset. `handle`
+    is of the field's wire, for memory of a device: nothing here makes or takes one.
     `data` is bytes in Python and msgpack, standard base64 in JSON. Uncompressed data must have
     exactly the bytes that width, height and encoding ask for.
     """
@@ -84,7 +84,7 @@ class SensorFrame(_Frozen):
     channels: Annotated[int, Field(gt=0)] = 3
     data: bytes | None = None
     topic: str | None = None
-    handle: str | int | None = None
+    handle: None = None
     metadata: JsonObject = {}
 
     @field_validator("data", mode="before")
@@ -110,11 +110,10 @@ class SensorFrame(_Frozen):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        given = [name for name in ("data", "topic", "handle") if getattr(self, name) is not None]
+        given = [name for name in ("data", "topic") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(
-                "exactly one of data, topic and handle must be set, not "
-                f"{', '.join(given) or 'none'}"
+                f"exactly one of data and topic must be set, not {', '.join(given) or 'none'}"
             )
         per_pixel = _BYTES_PER_PIXEL.get(self.encoding)
         if self.data is not None and per_pixel is not None:

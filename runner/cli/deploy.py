@@ -250,6 +250,7 @@ class Deploy:
             clock=self._clock,
             topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
             detections=slots_of(self._watches),
+            sync=robot.sync,
             on_estop=latch,
         )
 

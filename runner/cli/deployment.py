@@ -311,6 +311,9 @@ def plan(
             f"{sensor.sensor_id} by {sensor.backend}, at most {sensor.max_age_ms:g} ms old{topic}"
         )
         lines.append(("camera", text))
+    if robot.sync is not None:
+        names, spread = ", ".join(robot.sync.sensor_ids), robot.sync.max_spread_ms
+        lines.append(("together", f"{names}, taken within {spread:g} ms"))
     lines.append(("rate", f"{robot.rate_hz:g} Hz; late actions: {robot.deadline_overrun_policy}"))
     if robot.safety is not None:
         given = robot.safety.model_dump(exclude_unset=True)

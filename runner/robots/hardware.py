@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -20,17 +19,19 @@ from vram_arbiter.runner.protocols import (
     DeadlinePolicy,
     GoalData,
     Hal,
-    MobileBase,
     SafetyGate,
     SensorReader,
     SkillEnded,
     Stepped,
     Transition,
 )
+from vram_arbiter.runner.robots.mobile import with_base
 from vram_arbiter.runner.safety.estop_latch import EstopLatch
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.pictures import FramePicture
+from vram_arbiter.runner.sensors.synced import FrameSet, SyncedCameras
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE, WorldStateAggregator
+from vram_arbiter.schemas.config.robot import SyncConfig
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -43,7 +44,7 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.world import Action, Pose, TickResult, WorldState
+from vram_arbiter.schemas.world import Action, TickResult, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +61,8 @@ class HardwareRobot:
     """Implements `control.robot.Robot` on a HAL and camera readers.
 
     `readers` come with the greatest age of their frames (ms); `topics` names the cameras that are
-    published as well, `detections` those that continuous detectors look at.
+    published as well, `detections` those that continuous detectors look at, `sync` those that are
+    read together.
     """
 
     finished = False
@@ -76,6 +78,7 @@ class HardwareRobot:
         latch: EstopLatch,
         topics: Mapping[str, str] | None = None,
         detections: Sequence[DetectionSlot] = (),
+        sync: SyncConfig | None = None,
         first_data_s: float = FIRST_DATA_S,
     ) -> None:
         self.hal = hal
@@ -87,6 +90,10 @@ class HardwareRobot:
             detections=self.detections,
         )
         self._readers = {reader.sensor_id: reader for reader, _ in readers}
+        self._synced: SyncedCameras | None = None
+        if sync is not None:
+            paired = {name: self._readers[name] for name in sync.sensor_ids}
+            self._synced = SyncedCameras(paired, sync.max_spread_ms, clock)
         self._make_gate = make_gate
         self._clock = clock
         self._latch = latch
@@ -107,6 +114,8 @@ class HardwareRobot:
         deadline_ns = self._clock.now_ns() + round(self._first_data_s * 1e9)
         for reader in self._readers.values():
             self._await_first(reader, deadline_ns, stopping)
+        if self._synced is not None:
+            self._synced.start()
         self.hal.connect()
         for _ in range(FIRST_STATE_TRIES):
             if self._read_joints():
@@ -140,6 +149,8 @@ class HardwareRobot:
     def close(self) -> None:
         """Stop the cameras and disconnect; the adapter decides how its motors end. Repeatable."""
         with contextlib.ExitStack() as stack:  # each is stopped, whatever another one raises
+            if self._synced is not None:
+                stack.callback(self._synced.stop)  # last: stopped cameras wake it
             for reader in self._readers.values():
                 stack.callback(reader.stop)
             try:
@@ -200,9 +211,21 @@ class HardwareRobot:
     def _read_cameras(self) -> None:
         if not self.aggregator.due(self._clock.now_ns()):
             return
+        paired = () if self._synced is None else self._synced.names
+        together: FrameSet | FrameStale = {}
+        if self._synced is not None:
+            try:
+                together = self._synced.latest()
+            except FrameStale as error:
+                together = error
         for name, reader in self._readers.items():
             try:
-                frame = reader.read_latest()
+                if name not in paired:
+                    frame = reader.read_latest()
+                elif isinstance(together, FrameStale):
+                    raise together
+                else:
+                    frame = together[name]
             except FrameStale as error:
                 meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: name})
                 self.aggregator.lose(name, error.message)
@@ -315,40 +338,6 @@ class HardwareRobot:
         return FramePicture(self._readers[camera].read_latest(max_age_s * 1e3))
 
 
-def with_base(world: WorldState, base: MobileBase) -> WorldState:
-    """Return the world state with pose and velocity of a base instead of the base's joints, if its
-    joint state has them; a base that is not measured has no pose.
-    """
-    state = world.joint_state
-    place = {name: index for index, name in enumerate(state.name)}
-    if not all(name in place for name in base.joints):
-        return world
-    x, y, yaw = (state.position[place[name]] for name in base.joints)
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    twist = None
-    if state.velocity:
-        vx, vy, wz = (state.velocity[place[name]] for name in base.joints)
-        twist = (cosine * vx + sine * vy, cosine * vy - sine * vx, 0.0, 0.0, 0.0, wz)
-    pose = Pose(
-        xyz=(x, y, 0.0),
-        quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
-        frame_id=base.world_frame,
-    )
-    arm = [index for name, index in place.items() if name not in base.joints]
-    rows = {
-        field: tuple(values[index] for index in arm)
-        for field in ("name", "position", "velocity", "effort")
-        if (values := getattr(state, field))
-    }
-    return world.model_copy(
-        update={
-            "base_pose": pose,
-            "base_twist": twist,
-            "joint_state": state.model_copy(update=rows),
-        }
-    )
-
-
 HardwareRunner = ControlLoop[HardwareRobot]
 
 
@@ -362,6 +351,7 @@ def hardware_runner(
     clock: Clock | None = None,
     topics: Mapping[str, str] | None = None,
     detections: Sequence[DetectionSlot] = (),
+    sync: SyncConfig | None = None,
     on_estop: Callable[[str], None] | None = None,
     first_data_s: float = FIRST_DATA_S,
 ) -> HardwareRunner:
@@ -380,6 +370,7 @@ def hardware_runner(
         latch=latch,
         topics=topics,
         detections=detections,
+        sync=sync,
         first_data_s=first_data_s,
     )
     return ControlLoop(

@@ -118,9 +118,7 @@ class ContinuousDetector:
             gone = isinstance(error, Evicted | NotResident)
             if gone:
                 self._wait_to_load()
-            self._lose("its model was evicted" if gone else error.message)
-        else:
-            self._said = ""
+            self._lose("its model was evicted" if gone else error.message, error.code)
         meters.count(telemetry.METRIC_LOOKS, labels)
 
     async def _look(self) -> None:
@@ -150,8 +148,12 @@ class ContinuousDetector:
             raise ModelError(
                 f"the detector's answer is not valid: {error.errors()[0]['msg']}"
             ) from error
-        if not self._slot.put(objects, taken.stamp_ns, self._clock.now_ns()):
-            self._say(f"its answer came too late: {self._slot.why}")
+        if self._slot.put(objects, taken.stamp_ns, self._clock.now_ns()):
+            if self._said:
+                log.info("detections of camera %s are there again", sensor_id)
+            self._said = ""
+        else:
+            self._say(f"its answer came too late: {self._slot.why}", "late")
 
     async def _become_resident(self) -> bool:
         """Return whether the model is there, loading it where that is due."""
@@ -181,12 +183,12 @@ class ContinuousDetector:
         again_s = self._config.reload_s
         self._load_after_s = None if again_s is None else self._clock.now_s() + again_s
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, why: str, kind: str = "") -> None:
         self._slot.lose(why)
-        self._say(why)
+        self._say(why, kind)
 
-    def _say(self, why: str) -> None:
-        """Log a problem once, not with every look."""
-        if why != self._said:
-            self._said = why
+    def _say(self, why: str, kind: str = "") -> None:
+        """Log a problem once, not with every look; `kind` where its words may vary."""
+        if (kind or why) != self._said:
+            self._said = kind or why
             log.warning("no detections of camera %s: %s", self._config.sensor_id, why)

@@ -43,6 +43,7 @@ PACKAGES = {
     "nvh264dec": "gstreamer1.0-plugins-bad and the card's driver",
     "nvh265dec": "gstreamer1.0-plugins-bad and the card's driver",
     "nvv4l2decoder": "nvidia-l4t-gstreamer",
+    "nvarguscamerasrc": "nvidia-l4t-gstreamer; only a Jetson has it",
     "nvvidconv": "nvidia-l4t-gstreamer",
     "rtspsrc": "gstreamer1.0-plugins-good",
     "v4l2src": "gstreamer1.0-plugins-good",

@@ -1,6 +1,6 @@
 """Camera frames as arrays for skills and encoders: RGB uint8, height × width × 3.
 
-A frame without colors (depth, a handle on a device, a topic's name) is refused. Compressed frames
+A frame without colors (depth, a topic's name) is refused. Compressed frames
 come from cameras and networks: their bytes and their header are checked before a decoder sees them.
 """
 
@@ -20,6 +20,13 @@ JPEG_QUALITY: Final = 90
 PNG_COMPRESSION: Final = 1  # local sockets are fast, cores are few
 COMPRESSED_MAX_BYTES: Final = IMAGE_MESSAGE_MAX_BYTES
 PIXELS_MAX: Final = 4096 * 4096  # 50 MB as RGB; a robot's cameras have a tenth
+
+_DTYPES: Final = {
+    FrameEncoding.BGR8: "u1",
+    FrameEncoding.RGB8: "u1",
+    FrameEncoding.MONO8: "u1",
+    FrameEncoding.DEPTH16: "<u2",
+}
 
 
 def encode(rgb: Any, encoding: Encoding) -> bytes:
@@ -61,6 +68,27 @@ def as_rgb(frame: SensorFrame) -> Any:
             return _decoded(frame, frame.data)
         case encoding:
             raise ModelError(f"a frame of {encoding} from {frame.sensor_id} has no colors")
+
+
+def scaled_down(frame: SensorFrame, width: int) -> SensorFrame:
+    """Return a frame that is no wider than `width`, in its proportions; a narrower one as it is.
+
+    Depths are picked, colors averaged. Raises ValueError for a frame whose pixels are not at hand:
+    a compressed one is not decoded for it.
+    """
+    import cv2
+    import numpy as np
+
+    if frame.width <= width:
+        return frame
+    if frame.data is None or frame.encoding not in _DTYPES:
+        raise ValueError(f"frames of {frame.encoding} are not scaled")
+    shape = (frame.height, frame.width, -1)
+    pixels = np.frombuffer(frame.data, dtype=_DTYPES[frame.encoding]).reshape(shape)
+    height = max(1, round(frame.height * width / frame.width))
+    how = cv2.INTER_NEAREST if frame.encoding is FrameEncoding.DEPTH16 else cv2.INTER_AREA
+    small = cv2.resize(pixels, (width, height), interpolation=how)
+    return frame.model_copy(update={"width": width, "height": height, "data": small.tobytes()})
 
 
 def _decoded(frame: SensorFrame, data: bytes) -> Any:

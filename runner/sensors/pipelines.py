@@ -25,7 +25,7 @@ RTSP_TIMEOUT_S = (
     5  # a server that is silent for this long is gone; GStreamer's own 20 s suit films, not robots
 )
 
-Source = Literal["v4l2", "rtsp", "file", "test"]
+Source = Literal["v4l2", "csi", "rtsp", "file", "test"]
 Codec = Literal["raw", "mjpeg", "h264", "h265"]
 Encoding = Literal["bgr8", "rgb8", "mono8", "depth16", "jpeg"]
 Text = Annotated[str, Field(min_length=1, max_length=4096)]
@@ -44,6 +44,8 @@ class GStreamerParams(BackendParams):
     source: Source | None = None
     device: Value | None = None
     """v4l2: /dev/video0."""
+    sensor_index: Annotated[int, Field(ge=0, le=15)] | None = None
+    """csi: which camera of a Jetson's Argus, from 0."""
     url: Value | None = None
     """rtsp: rtsp:// or rtsps://. A user and password in it never show up in messages."""
     path: Value | None = None
@@ -58,10 +60,10 @@ class GStreamerParams(BackendParams):
     `jpeg` passes on what an mjpeg camera sends; `depth16` (mm) is taken only from a depth device.
     """
     width: Pixels | None = None
-    """v4l2 and test: asked of the source. rtsp and file: scaled to."""
+    """v4l2, csi and test: asked of the source. rtsp and file: scaled to."""
     height: Pixels | None = None
     fps: Annotated[float, Field(gt=0, le=FPS_MAX, allow_inf_nan=False)] | None = None
-    """v4l2 and test: asked of the source."""
+    """v4l2, csi and test: asked of the source."""
     transport: Literal["tcp", "udp"] = "tcp"
     """rtsp: tcp loses no packet, udp is sooner there."""
     latency_ms: Annotated[int, Field(ge=0, le=LATENCY_MAX_MS)] = 100
@@ -102,6 +104,8 @@ class GStreamerParams(BackendParams):
             )
         if self.path is not None:
             demuxer(self.path, self.codec_used)
+        if self.source == "csi" and self.encoding in ("depth16", "jpeg"):
+            raise ValueError(f"a CSI camera gives colors, not {self.encoding}")
         if self.encoding == "depth16" and (
             self.source not in ("v4l2", "test") or self.codec_used != "raw"
         ):
@@ -126,6 +130,7 @@ class GStreamerParams(BackendParams):
 _NEEDED: Mapping[str, frozenset[str]] = {
     "pipeline": frozenset(),
     "v4l2": frozenset({"device"}),
+    "csi": frozenset({"sensor_index"}),
     "rtsp": frozenset({"url"}),
     "file": frozenset({"path"}),
     "test": frozenset(),
@@ -133,6 +138,7 @@ _NEEDED: Mapping[str, frozenset[str]] = {
 _OPTIONAL: Mapping[str, frozenset[str]] = {
     "pipeline": frozenset(),
     "v4l2": frozenset({"codec", "width", "height", "fps", "platform"}),
+    "csi": frozenset({"width", "height", "fps"}),
     "rtsp": frozenset({"codec", "width", "height", "transport", "latency_ms", "platform"}),
     "file": frozenset({"codec", "width", "height", "loop", "platform"}),
     "test": frozenset({"pattern", "width", "height", "fps"}),
@@ -180,6 +186,8 @@ _DECODERS: Mapping[Platform, Mapping[Codec, str]] = {
     # in a large package
     Platform.CPU_ONLY: {"mjpeg": "jpegdec", "h264": "avdec_h264", "h265": "avdec_h265"},
 }
+CSI_CAPS = "video/x-raw(memory:NVMM),format=NV12"
+_FROM_NVMM = ("nvvidconv", "video/x-raw,format=BGRx")
 _LATEST_ONLY = "queue leaky=downstream max-size-buffers=1 max-size-bytes=0 max-size-time=0"
 
 
@@ -247,6 +255,14 @@ def _source(params: GStreamerParams) -> list[str]:
             else _COMPRESSED.get(codec, "video/x-raw")
         )
         return [f"v4l2src device={quoted(params.device or '')}", form + _asked(params)]
+    if params.source == "csi":
+        # Argus gives NV12 in NVMM memory; the engine that copies it out converts as well
+        return [
+            f"nvarguscamerasrc sensor-id={params.sensor_index}",
+            f"{CSI_CAPS}{_asked(params)}",
+            _LATEST_ONLY,
+            *_FROM_NVMM,
+        ]
     if params.source == "rtsp":
         microseconds = RTSP_TIMEOUT_S * 1_000_000
         head = (
@@ -272,7 +288,8 @@ def _decode(params: GStreamerParams, platform: Platform) -> list[str]:
     if platform is Platform.TEGRA:
         # only there are decoded pictures in NVMM memory; the engine that copies them out scales as
         # well
-        elements += ["nvvidconv", f"video/x-raw,format=BGRx{scaled}"]
+        copied, form = _FROM_NVMM
+        elements += [copied, form + scaled]
     elif scaled:
         elements += ["videoscale", f"video/x-raw{scaled}"]
     return elements

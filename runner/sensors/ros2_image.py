@@ -16,6 +16,7 @@ from vram_arbiter.runner.sensors.params import (
     refuse_field,
     require_module,
 )
+from vram_arbiter.runner.sensors.pictures import scaled_down
 from vram_arbiter.runner.sensors.ros2_dds import (
     DOMAIN_MAX,
     MessageKind,
@@ -96,7 +97,10 @@ def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
     require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
     try:
         return RosImagePublisher(
-            config.publish_topic or "", domain_of(), rate_hz=config.publish_rate_hz
+            config.publish_topic or "",
+            domain_of(),
+            rate_hz=config.publish_rate_hz,
+            width=config.publish_width,
         )
     except ValueError as error:
         raise refuse_field(config, "publish_topic", str(error)) from error
@@ -268,9 +272,16 @@ class RosImagePublisher:
     `dropped`, and the first of a series is logged.
     """
 
-    def __init__(self, topic: str, domain_id: int, *, rate_hz: float | None = None) -> None:
-        """Raises ValueError if `topic` is not a ROS name. `rate_hz` limits the pictures per
-        second.
+    def __init__(
+        self,
+        topic: str,
+        domain_id: int,
+        *,
+        rate_hz: float | None = None,
+        width: int | None = None,
+    ) -> None:
+        """Raises ValueError if `topic` is not a ROS name. `rate_hz` limits the pictures per second,
+        `width` their pixels.
         """
         self.topic = full_topic(topic)
         self.domain_id = domain_id
@@ -278,6 +289,7 @@ class RosImagePublisher:
         self.dropped = 0
         self._period_ns = 0.0 if rate_hz is None else 1e9 / rate_hz
         self._next_ns = 0.0
+        self._width = width
         self._failing = False
         self._kind: MessageKind | None = None
         self._writer: Any = None
@@ -290,8 +302,10 @@ class RosImagePublisher:
         try:
             if frame.data is None:
                 raise ValueError("the frame's bytes are not in this process")
+            if self._width is not None:
+                frame = scaled_down(frame, self._width)
             picture = ImageContent(
-                frame.encoding, frame.width, frame.height, frame.channels, frame.data
+                frame.encoding, frame.width, frame.height, frame.channels, frame.data or b""
             )
             message = message_of(picture, frame.stamp_wall_ns, frame.sensor_id)
             kind: MessageKind = "image" if isinstance(message, RosImage) else "compressed"

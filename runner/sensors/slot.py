@@ -67,15 +67,16 @@ class LatestSlot:
             raise self._too_old(age_ms, limit_ms)
         return frame
 
-    def synced(self, deadline_ns: int) -> SensorFrame:
-        """Wait for the first frame taken after this call.
+    def synced(self, deadline_ns: int, after_ns: int | None = None) -> SensorFrame:
+        """Wait for a frame taken after `after_ns` (None: after this call).
 
         Raises FrameStale at the monotonic `deadline_ns`, and as soon as the source ends.
         """
         begun_ns = self._clock.now_ns()
+        after_ns = begun_ns if after_ns is None else after_ns
         with self._changed:
             while True:
-                if self._frame is not None and self._frame.stamp_monotonic_ns > begun_ns:
+                if self._frame is not None and self._frame.stamp_monotonic_ns > after_ns:
                     return self._frame
                 left_s = (deadline_ns - self._clock.now_ns()) / 1e9
                 if self._ended or (left_s <= 0 and self._frame is None):
@@ -197,8 +198,8 @@ class SlotReader(ABC):
     def read_latest(self, max_age_ms: float | None = None) -> SensorFrame:
         return self.slot.latest(max_age_ms)
 
-    def read_synced(self, deadline_ns: int) -> SensorFrame:
-        return self.slot.synced(deadline_ns)
+    def read_synced(self, deadline_ns: int, after_ns: int | None = None) -> SensorFrame:
+        return self.slot.synced(deadline_ns, after_ns)
 
     def stop(self) -> None:
         """Close the source and the tee. Readers that wait are woken with FrameStale first."""

@@ -54,14 +54,26 @@ class SensorReaderConfig(_Section):
     publish_topic: Text | None = None
     publish_rate_hz: Positive | None = None
     """At most so many frames a second are published; null: all."""
+    publish_width: Annotated[int, Field(gt=0, le=16_384)] | None = None
+    """Wider frames are published scaled down to this width; null: as they are."""
 
     @model_validator(mode="after")
     def _topic_goes_with_publishing(self) -> Self:
         if self.publish_to_ros != (self.publish_topic is not None):
             raise ValueError("publish_to_ros and publish_topic go together: give both or neither")
-        if self.publish_rate_hz is not None and not self.publish_to_ros:
-            raise ValueError("publish_rate_hz without publish_to_ros publishes nothing")
+        for name in ("publish_rate_hz", "publish_width"):
+            if getattr(self, name) is not None and not self.publish_to_ros:
+                raise ValueError(f"{name} without publish_to_ros publishes nothing")
         return self
+
+
+class SyncConfig(_Section):
+    """Cameras whose frames are shown together, as pictures of one moment."""
+
+    sensor_ids: Annotated[tuple[Text, ...], Field(min_length=2)]
+    max_spread_ms: Positive = 20.0
+    """Frames that were taken further apart are not shown; less than half a period of the slowest
+    camera needs cameras that are triggered together."""
 
 
 class DetectorConfig(_Section):
@@ -146,6 +158,8 @@ class RobotEnvironment(_Section):
     grippers are seen without being named here."""
     hal: HalConfig
     sensors: tuple[SensorReaderConfig, ...] = ()
+    sync: SyncConfig | None = None
+    """Cameras that are read together; null: each by itself."""
     detectors: tuple[DetectorConfig, ...] = ()
     """Detectors that look all the time, for the world state's `detected_objects`."""
     task: TaskSpec | None = None
@@ -165,6 +179,11 @@ class RobotEnvironment(_Section):
         names = [sensor.sensor_id for sensor in self.sensors]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"sensor_id must be unique; given twice: {', '.join(twice)}")
+        paired = () if self.sync is None else self.sync.sensor_ids
+        if unknown := sorted(set(paired) - set(names)):
+            raise ValueError(f"sync names cameras that are not there: {', '.join(unknown)}")
+        if len(set(paired)) != len(paired):
+            raise ValueError("sync names a camera twice")
         watched = [detector.sensor_id for detector in self.detectors]
         if unknown := sorted(set(watched) - set(names)):
             raise ValueError(f"detectors look at cameras that are not there: {', '.join(unknown)}")
@@ -185,6 +204,7 @@ def known_keys() -> Mapping[Path, Collection[str]]:
     """The keys of each section, for suggestions."""
     return {
         (): list(RobotEnvironment.model_fields),
+        ("sync",): list(SyncConfig.model_fields),
         ("hal",): list(HalConfig.model_fields),
         ("task",): list(TaskSpec.model_fields),
         ("vla",): list(VlaSpec.model_fields),

@@ -58,10 +58,10 @@ class FedCamera(SlotReader):
             self.show()
         return super().read_latest(max_age_ms)
 
-    def read_synced(self, deadline_ns: int) -> SensorFrame:
+    def read_synced(self, deadline_ns: int, after_ns: int | None = None) -> SensorFrame:
         if self.always:
             return self.read_latest()
-        return super().read_synced(deadline_ns)
+        return super().read_synced(deadline_ns, after_ns)
 
 
 class Twin(KinematicTwin):

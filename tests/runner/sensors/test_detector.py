@@ -40,6 +40,7 @@ class Model:
         self.takes_s = 0.0
         self.label = "red cube"
         self.breaks = False
+        self.faults = 0
         self.loads: list[float | None] = []
         self.asked: list[tuple[str, float]] = []
 
@@ -60,7 +61,8 @@ class Model:
         if call.token is None or tuple(call.token) != (1, self.tokens) or not self.resident:
             raise Evicted("another token")
         if self.breaks:
-            raise ModelError("no memory left")
+            self.faults += 1
+            raise ModelError(f"no memory left, the {self.faults}. time")
         self.asked.append((call.query, call.fresh_s))
         self.clock.advance(self.takes_s)
         box = [1.0, 2.0, 3.0, 4.0]
@@ -202,16 +204,24 @@ async def test_an_evicted_model_sees_nothing_and_is_not_brought_back_from_standb
 
 @pytest.mark.parametrize("fault", ["breaks", "an answer that is none", "its server is gone"])
 async def test_a_detector_that_fails_is_absent_and_comes_back(
-    detector: ContinuousDetector, runner: HardwareRunner, model: Model, fault: str
+    detector: ContinuousDetector,
+    runner: HardwareRunner,
+    model: Model,
+    fault: str,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """Also a regression: a problem whose words vary was logged with every look."""
     await detector.look()
+    caplog.clear()
     model.breaks = fault == "breaks"
     if fault == "an answer that is none":
         model.label = ""
     elif fault == "its server is gone":
         model.tokens += 1  # a new process: the old token is none of its own
-    await detector.look()
-    assert seen(runner) == ([], "stale")
+    for _ in range(3 if fault == "breaks" else 1):
+        await detector.look()
+        assert seen(runner) == ([], "stale")
+    assert sum("no detections" in line for line in caplog.messages) == 1
     model.breaks, model.label = False, "ball"
     await detector.look()
     assert seen(runner) == (["ball"], "ok")

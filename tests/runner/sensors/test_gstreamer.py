@@ -16,9 +16,15 @@ import pytest
 
 from tests.runner.sensors.reading import CLOCK, WAIT_S, end_of, frame_of, soon
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.sensors.gstreamer import _Run, load, make, without_credentials
+from vram_arbiter.runner.sensors.gstreamer import (
+    GStreamerReader,
+    _Run,
+    load,
+    make,
+    without_credentials,
+)
 from vram_arbiter.runner.sensors.pipelines import GStreamerParams, build
-from vram_arbiter.runner.sensors.platform import probe_platform
+from vram_arbiter.runner.sensors.platform import Platform, probe_platform
 from vram_arbiter.runner.sensors.slot import SlotReader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError, FrameStale
@@ -265,6 +271,31 @@ def test_a_file_that_is_no_video(reader: Callable[..., SlotReader], tmp_path: Pa
     with pytest.raises(FrameStale, match="cannot be opened") as caught:
         reader(source="file", path=str(path), platform="cpu_only")
     assert caught.value.details["ended"]
+
+
+def test_a_csi_pipeline_negotiates_and_is_refused_where_argus_is_not() -> None:
+    """Here with a test picture in place of the camera and the CPU in place of its converter."""
+    params = GStreamerParams(source="csi", sensor_index=0, width=64, height=48, fps=30)
+    text = build(params, Platform.TEGRA)
+    gst = load().gst
+    caps = gst.Caps.from_string(next(part for part in text.split(" ! ") if "NVMM" in part))
+    assert caps.get_features(0).to_string() == "memory:NVMM"
+    assert caps.get_structure(0).to_string().startswith("video/x-raw, format=(string)NV12")
+    for jetsons, everyones in {
+        "nvarguscamerasrc sensor-id=0": "videotestsrc is-live=true pattern=red",
+        "(memory:NVMM)": "",
+        "nvvidconv": "videoconvert",
+    }.items():
+        assert jetsons in text
+        text = text.replace(jetsons, everyones)
+    source = GStreamerReader("wrist", 60_000.0, params, text, CLOCK)
+    source.start()
+    frame = frame_of(source)
+    source.stop()
+    assert (frame.width, frame.height, frame.encoding) == (64, 48, "bgr8")
+    if gst.ElementFactory.find("nvarguscamerasrc") is None:
+        with pytest.raises(ConfigError, match="only a Jetson has it"):
+            make(camera(source="csi", sensor_index=0), CLOCK, None)
 
 
 # -- ends

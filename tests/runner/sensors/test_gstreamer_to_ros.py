@@ -39,6 +39,7 @@ def test_recorders_see_the_same_pictures(monkeypatch: pytest.MonkeyPatch) -> Non
             max_age_ms=WAIT_NS / 1e6,
             publish_to_ros=True,
             publish_topic=topic,
+            publish_width=11,
         ),
         CLOCK,
     )
@@ -56,5 +57,6 @@ def test_recorders_see_the_same_pictures(monkeypatch: pytest.MonkeyPatch) -> Non
     finally:
         camera.stop()
         recorder.stop()
-    assert (seen.encoding, seen.width, seen.height, seen.data) == ("bgr8", 33, 17, own.data)
+    assert (seen.encoding, seen.width, seen.height) == ("bgr8", 11, 6)  # scaled for the topic alone
+    assert seen.data == b"\x00\x00\xff" * (11 * 6)
     assert own.data == b"\x00\x00\xff" * (33 * 17)

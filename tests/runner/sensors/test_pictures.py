@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.runner.sensors.pictures import COMPRESSED_MAX_BYTES, as_rgb
+from vram_arbiter.runner.sensors.pictures import COMPRESSED_MAX_BYTES, as_rgb, scaled_down
 from vram_arbiter.schemas.errors import FrameStale, ModelError
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
@@ -36,6 +36,18 @@ def test_compressed_frames() -> None:
         as_rgb(frame_of(FrameEncoding.PNG, png, width=3))
     with pytest.raises(FrameStale, match="broken"):
         as_rgb(frame_of(FrameEncoding.JPEG, b"no picture at all"))
+
+
+def test_frames_are_scaled_down_and_never_up() -> None:
+    gray = frame_of(FrameEncoding.MONO8, bytes([10, 20, 30, 40]), width=4)
+    small = scaled_down(gray, 2)
+    assert (small.width, small.height, small.data) == (2, 1, bytes([15, 35]))  # averaged
+    depth = struct.pack("<8H", *([100] * 4 + [900] * 4))
+    far = scaled_down(frame_of(FrameEncoding.DEPTH16, depth, width=4, height=2), 2)
+    assert struct.unpack("<2H", far.data or b"")[0] in (100, 900)  # picked: no depth in between
+    assert scaled_down(gray, 4) is gray
+    with pytest.raises(ValueError, match="jpeg are not scaled"):
+        scaled_down(frame_of(FrameEncoding.JPEG, b"\xff\xd8"), 1)
 
 
 @pytest.mark.parametrize(

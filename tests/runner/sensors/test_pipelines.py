@@ -28,6 +28,18 @@ def test_a_raw_camera() -> None:
     )
 
 
+def test_a_csi_camera_of_a_jetson() -> None:
+    assert text(source="csi", sensor_index=1, width=1280, height=720, fps=60) == (
+        "nvarguscamerasrc sensor-id=1 !"
+        " video/x-raw(memory:NVMM),format=NV12,width=1280,height=720,framerate=60/1 !"
+        " queue leaky=downstream max-size-buffers=1 max-size-bytes=0 max-size-time=0 !"
+        " nvvidconv ! video/x-raw,format=BGRx ! videoconvert ! appsink name=sink"
+    )
+    assert "source csi needs sensor_index" in refusal(source="csi")
+    assert "not for csi: device" in refusal(source="csi", sensor_index=0, device="/dev/video0")
+    assert "gives colors, not jpeg" in refusal(source="csi", sensor_index=0, encoding="jpeg")
+
+
 H264_FILE = {"source": "file", "path": "/data/run.mp4"}
 
 

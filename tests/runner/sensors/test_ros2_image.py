@@ -366,8 +366,8 @@ def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: s
     for at_ms in range(1000, 2000, 33):
         publisher.publish(plain(at_ms * 1_000_000))
     assert (publisher.published, publisher.dropped) == (10, 0)
-    publisher.publish(plain(3_000_000_000, handle=7))
-    publisher.publish(plain(3_000_000_000, FrameEncoding.CUDA_NV12))
+    publisher.publish(plain(3_000_000_000, topic="/elsewhere"))
+    publisher.publish(plain(3_000_000_000, FrameEncoding.RAW))
     publisher.publish(plain(3_000_000_000, FrameEncoding.JPEG))
     assert (publisher.published, publisher.dropped) == (10, 3)
     publisher.close()

@@ -165,6 +165,6 @@ def test_frames_become_the_messages_that_they_came_from(encoding: str) -> None:
     message = image(encoding=encoding, step=3 * per_pixel, data=bytes(6 * per_pixel))
     assert message_of(picture_of(message), 5, "cam") == message
     with pytest.raises(ValueError, match="no name in ROS"):
-        message_of(ImageContent(FrameEncoding.CUDA_NV12, 2, 2, 3, b"123456"), 5, "cam")
+        message_of(ImageContent(FrameEncoding.RAW, 2, 2, 3, b"123456"), 5, "cam")
     with pytest.raises(ValueError, match="2038"):
         message_of(picture_of(message), 2**31 * 10**9, "cam")

@@ -17,7 +17,8 @@ from tests.support.paths import ROOT
 from vram_arbiter.runner.protocols import Goal, MobileBase, RobotDescription, SkillEnded
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.factory import make_hal
-from vram_arbiter.runner.robots.hardware import hardware_runner, with_base
+from vram_arbiter.runner.robots.hardware import hardware_runner
+from vram_arbiter.runner.robots.mobile import with_base
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
 from vram_arbiter.runner.safety.gate import RobotGate
