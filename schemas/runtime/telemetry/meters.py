@@ -45,6 +45,8 @@ INSTRUMENTS: Mapping[str, Instrument] = {
     telemetry.METRIC_TOOL_CALLS: Instrument("{call}", "Tool calls of the reasoner"),
     telemetry.METRIC_SIDECAR_LOAD: Instrument("s", "One load of a model onto the GPU"),
     telemetry.METRIC_SIDECAR_REQUEST: Instrument("s", "One request to a sidecar"),
+    telemetry.GEN_AI_TOKENS: Instrument("{token}", "Tokens of a request to a language model"),
+    telemetry.GEN_AI_DURATION: Instrument("s", "One request to a language model, all tries"),
 }
 
 

@@ -47,6 +47,7 @@ EVENT_DEADLINE_PASSED = "vram.event.deadline_passed"
 EVENT_SIGNALLED = "vram.event.signalled"
 EVENT_UNLOADING = "vram.event.unloading"
 EVENT_VERDICT = "vram.event.verdict"  # within lease.verify: one that allows no grant yet
+EVENT_ANSWER_REJECTED = "vram.event.answer_rejected"  # within reasoner.plan: asked again
 EVENT_DAEMON_STOPPED = "vram.event.daemon_stopped"  # the lease goes on, its span cannot
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
 EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
@@ -121,3 +122,18 @@ ATTR_VERSION = "version"
 ATTR_PYTHON = "python"
 ATTR_COMMAND = "cli.command"
 ATTR_EXIT_CODE = "process.exit.code"  # spans only
+
+# -- OpenTelemetry's conventions for language models: one span `chat MODEL` a request
+GEN_AI_TOKENS = "gen_ai.client.token.usage"  # {token}, by model and type
+GEN_AI_DURATION = "gen_ai.client.operation.duration"  # s, by model and error
+ATTR_CHAT_OPERATION = "gen_ai.operation.name"
+ATTR_PROVIDER = "gen_ai.provider.name"
+ATTR_REQUEST_MODEL = "gen_ai.request.model"
+ATTR_REQUEST_MAX_TOKENS = "gen_ai.request.max_tokens"  # spans only, as all below but two
+ATTR_RESPONSE_MODEL = "gen_ai.response.model"
+ATTR_FINISH_REASONS = "gen_ai.response.finish_reasons"
+ATTR_INPUT_TOKENS = "gen_ai.usage.input_tokens"
+ATTR_OUTPUT_TOKENS = "gen_ai.usage.output_tokens"
+ATTR_TOKEN_TYPE = "gen_ai.token.type"  # metrics only
+ATTR_SERVER = "server.address"
+ATTR_SERVER_PORT = "server.port"

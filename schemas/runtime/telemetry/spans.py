@@ -5,7 +5,7 @@ The wire is W3C `traceparent` whatever `OTEL_PROPAGATORS` says: it is a field of
 Without an SDK a caller's trace is not recorded here, but handed on to what is called next.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from opentelemetry import context as present_context
@@ -33,23 +33,29 @@ _LEFT_OUT = present_context.create_key("left-out")
 
 
 def span(
-    name: str, traceparent: str | None = None, attributes: Attributes | None = None
+    name: str,
+    traceparent: str | None = None,
+    attributes: Attributes | None = None,
+    *,
+    client: bool = False,
 ) -> AbstractContextManager[trace.Span]:
     """A span, the present one's child, or the caller's when it sent a W3C traceparent. A bad one
-    begins a trace of its own. An exception that leaves the block is its `error.type`."""
+    begins a trace of its own. An exception that leaves the block is its `error.type`. `client`: a
+    request to a server of others, whatever its name."""
     if traceparent is None and present_context.get_value(_LEFT_OUT):
         return nullcontext(trace.get_current_span())
-    return _recorded(name, traceparent, attributes)
+    kind = SpanKind.CLIENT if client else _KINDS.get(name, SpanKind.INTERNAL)
+    return _recorded(name, traceparent, attributes, kind)
 
 
 @contextmanager
 def _recorded(
-    name: str, traceparent: str | None, attributes: Attributes | None
+    name: str, traceparent: str | None, attributes: Attributes | None, kind: SpanKind
 ) -> Iterator[trace.Span]:
     with _TRACER.start_as_current_span(
         name,
         context=_of(traceparent) if traceparent else None,
-        kind=_KINDS.get(name, SpanKind.INTERNAL),
+        kind=kind,
         attributes=attributes,
     ) as present:
         try:
@@ -158,6 +164,11 @@ def event(name: str, **attributes: str | float) -> None:
 def note(attributes: Attributes) -> None:
     """Add attributes to the present span."""
     trace.get_current_span().set_attributes(dict(attributes))
+
+
+def note_texts(name: str, texts: Sequence[str]) -> None:
+    """Add an attribute that is a list of texts to the present span."""
+    trace.get_current_span().set_attribute(name, list(texts))
 
 
 def _of(traceparent: str) -> Context:
