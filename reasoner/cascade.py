@@ -18,6 +18,7 @@ from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.tools import (
     ExecuteRskill,
     LocateInView,
+    Look,
     QueryScene,
     QueryTaskProgress,
     ToolCall,
@@ -34,6 +35,7 @@ MEANING: dict[Status, str] = {
     "not_seen": "the detector looked and does not see it in this picture",
     "answered": "the model looked and answered; its words are an opinion about the pictures",
     "succeeded": "the goal was reached",
+    "shown": "the camera's present picture is attached; no model has looked at it",
     "failed": "the goal ended without success",
     "canceled": "the goal was called off before its end",
     "done": "it was done",
@@ -46,12 +48,17 @@ MEANING: dict[Status, str] = {
 }
 
 
+RAN = "the policy ran to its end; whether it reached its aim was not judged: look, or ask"
+NOT_SHOWN = "the picture is not shown any more; look again"
+
 SOURCE: dict[type[ToolCall], str] = {
     LocateInView: "detector",
     QueryScene: "scene_vlm",
     QueryTaskProgress: "reward_model",
     ExecuteRskill: "runner",
+    Look: "camera",
 }
+PICTURES_MAX = 2  # shown at once, the newest; each costs as many tokens as a long episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +79,12 @@ class Called:
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """What came of the call with this id."""
+    """What came of the call with this id. `picture` is a JPEG, or empty."""
 
     id: str
     text: str
     is_error: bool = False
+    picture: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +101,10 @@ def conversation(episode: Episode, palette: Palette) -> list[Turn]:
     """Return task, steps and notes in order; a running goal comes last, without an outcome yet."""
     turns: list[Turn] = [Words(episode.task)]
     notes = list(episode.notes)
+    pictures = [n for n, step in enumerate(episode.steps) if step.outcome.picture]
     for number, step in enumerate(episode.steps):
         turns += _notes(notes, number)
-        turns += _step(number, step, palette)
+        turns += _step(number, step, palette, shown=number in pictures[-PICTURES_MAX:])
     if episode.running is None:
         return turns + _notes(notes, len(episode.steps))
     number = len(episode.steps)
@@ -115,20 +124,26 @@ def _notes(notes: list[Note], after: int) -> list[Turn]:
     return [Words(f"{note.source}: {_short(note.text)}") for note in due]
 
 
-def _step(number: int, step: Step, palette: Palette) -> list[Turn]:
-    text = json.dumps(told(step.call, step.outcome), ensure_ascii=False, allow_nan=False)
-    return [
-        _called(number, step.call, palette),
-        Answered(_id(number), text, step.outcome.status in ("refused", "error")),
-    ]
+def _step(number: int, step: Step, palette: Palette, *, shown: bool) -> list[Turn]:
+    fields = told(step.call, step.outcome, palette.manipulation)
+    if step.outcome.picture and not shown:
+        fields["meaning"] = NOT_SHOWN
+    text = json.dumps(fields, ensure_ascii=False, allow_nan=False)
+    picture = step.outcome.picture if shown else b""
+    is_error = step.outcome.status in ("refused", "error")
+    return [_called(number, step.call, palette), Answered(_id(number), text, is_error, picture)]
 
 
-def told(call: ToolCall, outcome: Outcome) -> JsonObject:
-    """Return an outcome for a model: status, its meaning, source, text, numbers."""
+def told(call: ToolCall, outcome: Outcome, policies: frozenset[str] = frozenset()) -> JsonObject:
+    """Return an outcome for a model: status, its meaning, source, text, numbers.
+
+    `policies` are the learned skills: of them "succeeded" says less.
+    """
     source = SOURCE.get(type(call), "reasoner")
+    learned = isinstance(call, ExecuteRskill) and call.rskill_id in policies
     fields = {
         "status": outcome.status,
-        "meaning": MEANING[outcome.status],
+        "meaning": RAN if learned and outcome.status == "succeeded" else MEANING[outcome.status],
         "source": source,
         "text": _short(outcome.text),
     }

@@ -15,19 +15,20 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
 from vram_arbiter.schemas.errors import EstopRequested, VramError
-from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.reasoner import Result
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.tools import (
     ExecuteRskill,
     LocateInView,
+    Look,
     QueryScene,
     QueryTaskProgress,
     StopGoal,
@@ -56,32 +57,6 @@ Dispatch = Callable[[ToolCall], Awaitable[Outcome]]
 
 class _NoDecision(Finish):
     """The planner gave none: ends an episode, but no goal that runs."""
-
-
-class StepRecord(TypedDict):
-    call: JsonObject
-    status: str
-    code: str
-    text: str
-
-
-class NoteRecord(TypedDict):
-    source: str
-    text: str
-    after: int
-
-
-class Result(TypedDict):
-    """What an episode came to; the shape of the result file."""
-
-    task: str
-    status: Literal["success", "failure"]
-    reason: str
-    attempts: int
-    vlm_confirmed: bool
-    vlm_answers: list[str]
-    steps: list[StepRecord]
-    notes: list[NoteRecord]
 
 
 async def run_episode(
@@ -370,7 +345,7 @@ def _refused_in_a_row(episode: Episode) -> int:
 
 
 def _is_look(call: ToolCall) -> bool:
-    return isinstance(call, LocateInView | QueryScene | QueryTaskProgress)
+    return isinstance(call, LocateInView | QueryScene | Look | QueryTaskProgress)
 
 
 def _looks_in_a_row(episode: Episode) -> int:
@@ -385,6 +360,20 @@ def describe(call: ToolCall) -> str:
     fields = call.model_dump(exclude={"tool", "rationale"}, exclude_defaults=True)
     text = ", ".join(f"{key}={value!r}" for key, value in fields.items())
     return f"({text})" + (f": {call.rationale}" if call.rationale else "")
+
+
+def nothing_done(task: str, reason: str) -> Result:
+    """Return the result of a task that ended without an episode, or broke one off."""
+    return {
+        "task": task,
+        "status": "failure",
+        "reason": reason,
+        "attempts": 0,
+        "vlm_confirmed": False,
+        "vlm_answers": [],
+        "steps": [],
+        "notes": [],
+    }
 
 
 def _result(episode: Episode, finish: Finish, palette: Palette) -> Result:

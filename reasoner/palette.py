@@ -22,6 +22,7 @@ from vram_arbiter.schemas.tools import (
     FunctionTool,
     LifecycleTransition,
     LocateInView,
+    Look,
     QueryScene,
     QueryTaskProgress,
     StopGoal,
@@ -37,7 +38,7 @@ from vram_arbiter.schemas.tools import (
 
 EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
 WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
-ASKED = ("locate_in_view", "query_scene", "query_task_progress")
+ASKED = ("locate_in_view", "query_scene", "look", "query_task_progress")
 OPERATOR = "/operator"
 
 _USED_AS = {
@@ -68,6 +69,7 @@ class Skill:
 @dataclass(frozen=True, slots=True)
 class Palette:
     """`can_locate`, `can_query` and `can_judge` are independent: different sidecars provide them.
+    `can_look`: the planner may see pictures itself.
 
     `managed` names the components that `lifecycle_transition` may touch, `topics` where
     `emit_prompt` may publish; empty: the tool is not there. `only` restricts all of it to the tools
@@ -78,6 +80,10 @@ class Palette:
     can_locate: bool = True
     can_query: bool = True
     can_judge: bool = False
+    can_look: bool = False
+    cameras: tuple[str, ...] = ()
+    """Of the robot, the default one first; empty: not known."""
+    body: Body = UNKNOWN_BODY
     managed: frozenset[str] = frozenset()
     topics: frozenset[str] = frozenset()
     only: frozenset[str] | None = None
@@ -106,6 +112,7 @@ class Palette:
             "execute_rskill": bool(self.executable),
             "locate_in_view": self.can_locate,
             "query_scene": self.can_query,
+            "look": self.can_look,
             "query_task_progress": self.can_judge,
             "lifecycle_transition": bool(self.managed),
             "emit_prompt": bool(self.topics),
@@ -162,6 +169,15 @@ class Palette:
                 return NotPermitted("no detector is provided", hint="start the detector sidecar")
             case QueryScene() if not self.can_query:
                 return NotPermitted("no scene VLM is provided", hint="start the scene-VLM sidecar")
+            case Look() if not self.can_look:
+                return NotPermitted(
+                    "no pictures are shown to this planner", hint="start the reasoner with --look"
+                )
+            case LocateInView() | QueryScene() | Look() if self._no_camera(call.camera):
+                return BadRequest(
+                    f"there is no camera {call.camera}",
+                    hint=f"choose from {', '.join(self.cameras)}",
+                )
             case QueryTaskProgress() if not self.can_judge:
                 return NotPermitted(
                     "no reward model is provided",
@@ -180,6 +196,9 @@ class Palette:
                 )
             case _:
                 return None
+
+    def _no_camera(self, name: str) -> bool:
+        return bool(name and self.cameras) and name not in self.cameras
 
     def _check_skill(self, call: ExecuteRskill) -> CallerError | None:
         skill = self.executable.get(call.rskill_id)
@@ -229,7 +248,17 @@ class Palette:
                 skill_function(skill.id, skill.description, skill.goal_params_schema)
                 for skill in self.executable.values()
             ]
-        offered += function_schemas(name for name in ASKED if name in tools)
+        asked = function_schemas(name for name in ASKED if name in tools)
+        for function in asked:
+            properties = function["function"]["parameters"]["properties"]
+            if self.cameras and "camera" in properties:
+                what = f"Name of the camera; without it: {self.cameras[0]}."
+                properties["camera"] = {
+                    "type": "string",
+                    "enum": [*self.cameras],
+                    "description": what,
+                }
+        offered += asked
         for tool, parameter, allowed in (
             (LifecycleTransition, "node", self.managed),
             (EmitPrompt, "target_topic", self.topics),
@@ -263,6 +292,8 @@ def palette_of(
     can_locate: bool,
     can_query: bool,
     can_judge: bool = False,
+    can_look: bool = False,
+    cameras: Iterable[str] = (),
     allow_noncommercial: bool = False,
     managed: Iterable[str] = (),
     topics: Iterable[str] = (),
@@ -293,6 +324,9 @@ def palette_of(
         can_locate=can_locate,
         can_query=can_query,
         can_judge=can_judge,
+        can_look=can_look,
+        cameras=tuple(cameras),
+        body=body,
         managed=frozenset(managed),
         topics=frozenset(topics),
     )

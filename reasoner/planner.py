@@ -19,7 +19,8 @@ Status = Literal[
     "found",  # locate_in_view: the object, with its place
     "not_seen",  # locate_in_view: the detector looked and it is not there
     "answered",  # query_scene, query_task_progress
-    "succeeded",  # execute_rskill
+    "shown",  # look: the picture is in the outcome
+    "succeeded",  # execute_rskill; of a learned policy: it ran to its end
     "failed",  # execute_rskill ended without success
     "canceled",  # execute_rskill was called off, by the planner or by a person
     "done",  # lifecycle_transition, emit_prompt
@@ -32,12 +33,15 @@ Status = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of one tool call. `text` is for people and language models, `data` for scripts."""
+    """Result of one tool call. `text` is for people and language models, `data` for scripts,
+    `picture` (JPEG) for models that see.
+    """
 
     status: Status
     text: str
     code: str = ""
     data: JsonMap = field(default_factory=dict)
+    picture: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,17 +13,27 @@ from pydantic import ValidationError
 
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, reason_of
+from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
     BadRequest,
+    BadState,
     ReasonerUnreachable,
     UnknownOp,
     VramError,
     from_wire,
 )
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.reasoner import OPS, REASONER_REQUEST, CancelEpisode, GetEpisode, Say
+from vram_arbiter.schemas.reasoner import (
+    OPS,
+    REASONER_REQUEST,
+    CancelEpisode,
+    ConfirmMotion,
+    GetEpisode,
+    Say,
+    StateReply,
+)
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +46,16 @@ class OperatorServer:
     Raises AlreadyRunning when another reasoner serves there.
     """
 
-    def __init__(self, endpoint: str, task: str, inbox: Inbox) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        task: str,
+        inbox: Inbox,
+        confirmations: Confirmations | None = None,
+    ) -> None:
         self._task_text = task
         self._inbox = inbox
+        self._confirmations = confirmations
         self._server = RouterServer(
             endpoint, lambda error: _refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
         )
@@ -71,9 +88,20 @@ class OperatorServer:
                 self._inbox.put(Said(text))
             case CancelEpisode(reason=reason):
                 self._inbox.put(Cancel(reason or "by an operator"))
+            case ConfirmMotion(motion=number, yes=yes, reason=reason):
+                if self._confirmations is None:
+                    raise BadState(
+                        "this reasoner asks for no confirmation",
+                        hint="start it with --require-confirmation",
+                    )
+                self._confirmations.answer(number, yes=yes, reason=reason)
             case GetEpisode():
-                return {"task": self._task_text, "pid": os.getpid()}
+                return dict(self._state())
         return {"pid": os.getpid()}
+
+    def _state(self) -> StateReply:
+        motion = None if self._confirmations is None else self._confirmations.pending
+        return {"task": self._task_text, "pid": os.getpid(), "motion": motion}
 
 
 def _parse(message: Message) -> Any:

@@ -47,6 +47,7 @@ from vram_arbiter.schemas.tools import (
     ExecuteRskill,
     LifecycleTransition,
     LocateInView,
+    Look,
     QueryScene,
     QueryTaskProgress,
     ToolCall,
@@ -128,6 +129,8 @@ class Tools:
                     return await self._locate(call)
                 case QueryScene():
                     return await self._query(call)
+                case Look():
+                    return await self._show(call)
                 case QueryTaskProgress():
                     return await self._progress(call)
                 case ExecuteRskill():
@@ -208,6 +211,12 @@ class Tools:
         return Outcome(
             "answered", answer, data={"camera": frame["camera"], "question": call.question}
         )
+
+    async def _show(self, call: Look) -> Outcome:
+        frame = await self._runner.frame(call.camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="jpeg")
+        age_s = frame["age_ms"] / 1e3
+        text = f"{frame['camera']}, {frame['width']} × {frame['height']}, {age_s:.1f} s old"
+        return Outcome("shown", text, data={"camera": frame["camera"]}, picture=frame["data"])
 
     async def _progress(self, call: QueryTaskProgress) -> Outcome:
         """Judge by what the camera showed within the window, up to now: no picture now is no

@@ -119,9 +119,6 @@ class LocateInView(_Tool):
     camera: Annotated[
         str, Field(max_length=128, description="Name of the camera; empty: the default one.")
     ] = ""
-    detector: Annotated[
-        str, Field(max_length=256, description="Name of the detector; empty: the default one.")
-    ] = ""
 
 
 class QueryScene(_Tool):
@@ -131,6 +128,15 @@ class QueryScene(_Tool):
     question: Annotated[
         Text, Field(min_length=1, description="A question that the picture can answer.")
     ]
+    camera: Annotated[
+        str, Field(max_length=128, description="Name of the camera; empty: the default one.")
+    ] = ""
+
+
+class Look(_Tool):
+    """Look at a camera's present picture yourself. Moves nothing."""
+
+    tool: Literal["look"] = "look"
     camera: Annotated[
         str, Field(max_length=128, description="Name of the camera; empty: the default one.")
     ] = ""
@@ -172,7 +178,6 @@ class EmitPrompt(_Tool):
         str, Field(pattern=r"^/\S+$", max_length=256, description="Where to, starting with `/`.")
     ]
     text: Annotated[Text, Field(min_length=1)]
-    metadata_json: Text = ""
 
 
 class Wait(_Tool):
@@ -191,6 +196,7 @@ ToolCall = (
     ExecuteRskill
     | LocateInView
     | QueryScene
+    | Look
     | QueryTaskProgress
     | LifecycleTransition
     | EmitPrompt
@@ -202,6 +208,7 @@ TOOLS: dict[str, type[ToolCall]] = {
     "execute_rskill": ExecuteRskill,
     "locate_in_view": LocateInView,
     "query_scene": QueryScene,
+    "look": Look,
     "query_task_progress": QueryTaskProgress,
     "lifecycle_transition": LifecycleTransition,
     "emit_prompt": EmitPrompt,

@@ -3,14 +3,15 @@
 Facts: the public API, version 2023-06-01. `POST /v1/messages` with `x-api-key`; a call is a
 `tool_use` block of the assistant and its result a `tool_result` block at the head of the next user
 message; adjacent messages of one role are merged; no text may be empty. `tool_choice: any` demands
-a call, and `disable_parallel_tool_use` limits it to one.
+a call, and `disable_parallel_tool_use` limits it to one. A result may have a picture in it.
 """
 
+import base64
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
-from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner
+from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner, tokens
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.tools import FunctionTool
 
@@ -20,6 +21,7 @@ VERSION = "2023-06-01"
 class AnthropicPlanner(LlmPlanner):
     """`BASE_URL` is the server without `/v1`; by default Anthropic's own."""
 
+    provider: ClassVar[str] = "anthropic"
     default_base_url: ClassVar[str] = "https://api.anthropic.com"
 
     def _headers(self) -> dict[str, str]:
@@ -58,7 +60,16 @@ class AnthropicPlanner(LlmPlanner):
             for block in blocks
             if block["type"] == "tool_use"
         ]
-        return Answer(" ".join(words), tuple(calls))
+        usage = body.get("usage") or {}
+        read = ("input_tokens", "cache_creation_input_tokens", "cache_read_input_tokens")
+        return Answer(
+            " ".join(words),
+            tuple(calls),
+            str(body.get("stop_reason") or ""),
+            str(body.get("model") or ""),
+            sum(tokens(usage.get(name)) for name in read),
+            tokens(usage.get("output_tokens")),
+        )
 
 
 def _input(value: Any) -> JsonMap | str:
@@ -89,6 +100,15 @@ def _block(turn: Turn) -> tuple[str, JsonObject]:
                 "name": name,
                 "input": arguments,
             }
-        case Answered(call_id, text, is_error):
-            result = {"type": "tool_result", "tool_use_id": call_id, "content": text}
+        case Answered(call_id, text, is_error, picture):
+            content = [{"type": "text", "text": text}, _shown(picture)] if picture else text
+            result = {"type": "tool_result", "tool_use_id": call_id, "content": content}
             return "user", result | {"is_error": True} if is_error else result
+
+
+def _shown(picture: bytes) -> JsonObject:
+    data = base64.b64encode(picture).decode()
+    return {
+        "type": "image",
+        "source": {"type": "base64", "media_type": "image/jpeg", "data": data},
+    }

@@ -1,15 +1,21 @@
-"""One JSON request to a model server that may be slow, broken or hostile.
+"""One JSON request to a model server that may be slow, busy, broken or hostile.
 
 Bounded in time, bytes and tries. The limit is on the whole exchange: a server that sends a byte a
-second is as late as a silent one. A busy or failing server (`RETRY_STATUSES`) and a broken
-connection are tried again after a pause; a wrong key or a wrong request is not.
+second is as late as a silent one. A busy server (`BUSY_STATUSES`) is asked again until `busy_s` have
+passed, after the pause that its `Retry-After` names; a failing one and a broken connection
+`TRIES_MAX` times; a wrong key or a wrong request is not repeated.
 """
 
 import asyncio
 import importlib.util
 import json
 import logging
-from collections.abc import Mapping
+import math
+import random
+from collections.abc import Awaitable, Callable, Mapping
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from time import monotonic
 from typing import Any, Self
 from urllib.parse import urlsplit, urlunsplit
 
@@ -19,15 +25,25 @@ from vram_arbiter.schemas.plain import JsonObject
 
 log = logging.getLogger(__name__)
 
-TRIES_MAX = 3
-RETRY_PAUSE_S = 0.5  # doubled each time
-RETRY_STATUSES = frozenset({408, 429, 500, 502, 503, 504, 529})
+TRIES_MAX = 3  # of a server that fails, or a connection that breaks
+BUSY_S = 240.0  # for a busy server to find time, all pauses and refusals together
+PAUSE_S, PAUSE_MAX_S = 0.5, 30.0  # doubled each time, where the server names none
+BUSY_STATUSES = frozenset({429, 503, 529})
+FAILING_STATUSES = frozenset({408, 500, 502, 504})
 ANSWER_MAX_BYTES = 1 << 20
 COMPLAINT_MAX_CHARS = 300
 
 
-class _Busy(Exception):
-    """Worth another try."""
+Pause = Callable[[float], Awaitable[None]]
+
+
+class _TryAgain(Exception):
+    """Worth another try, `after_s` from now if the server says so."""
+
+    def __init__(self, problem: str, *, busy: bool = False, after_s: float | None = None) -> None:
+        super().__init__(problem)
+        self.busy = busy
+        self.after_s = after_s
 
 
 def check_installed() -> None:
@@ -43,11 +59,17 @@ class JsonHttp:
     """
 
     def __init__(
-        self, headers: Mapping[str, str], timeout_s: float, *, retry_pause_s: float = RETRY_PAUSE_S
+        self,
+        headers: Mapping[str, str],
+        timeout_s: float,
+        *,
+        busy_s: float = BUSY_S,
+        pause: Pause = asyncio.sleep,
     ) -> None:
         self._headers = dict(headers)
         self._timeout_s = timeout_s
-        self._retry_pause_s = retry_pause_s
+        self._busy_s = busy_s
+        self._pause = pause
         self._http: Any = None
         # its line for each request has the whole address in it, with a password or a key; our
         # errors carry the rest
@@ -67,11 +89,9 @@ class JsonHttp:
         """Return the answer's JSON object. Raises LlmError for every failure."""
         shown = without_credentials(url)
         content = json.dumps(body, ensure_ascii=False).encode(errors="replace")
-        problem = ""
-        for number in range(TRIES_MAX):
-            if number:
-                log.warning("%s: %s; trying again", shown, problem)
-                await asyncio.sleep(self._retry_pause_s * 2 ** (number - 1))
+        left_s, failures, asked = self._busy_s, 0, 0
+        while True:
+            began_s = monotonic()
             try:
                 async with asyncio.timeout(self._timeout_s):
                     return await self._once(url, content)
@@ -80,12 +100,25 @@ class JsonHttp:
                     f"no answer from {shown} within {self._timeout_s:g} s",
                     hint="raise VRAM_REASONER_LLM_TIMEOUT_S",
                 ) from error
-            except _Busy as error:
-                problem = str(error)
-        raise LlmError(
-            f"{shown}: {problem}, {TRIES_MAX} times",
-            hint="is the server running, and does it keep up?",
-        )
+            except _TryAgain as error:
+                refused = error
+            failures += not refused.busy
+            if failures >= TRIES_MAX:
+                raise LlmError(
+                    f"{shown}: {refused}, {TRIES_MAX} times",
+                    hint="is the server running, and does it keep up?",
+                )
+            pause_s = _pause_s(asked) if refused.after_s is None else refused.after_s
+            left_s -= monotonic() - began_s + pause_s
+            if left_s < 0:
+                raise LlmError(
+                    f"{shown}: {refused}; the next try is due in {pause_s:g} s, and"
+                    f" {self._busy_s:g} s are allowed in all",
+                    hint="raise VRAM_REASONER_LLM_BUSY_S, or ask a server with more room",
+                )
+            asked += 1
+            log.warning("%s: %s; asking again in %.1f s", shown, refused, pause_s)
+            await self._pause(pause_s)
 
     async def _once(self, url: str, content: bytes) -> JsonObject:
         import httpx  # only installed with the reasoner's extra
@@ -100,17 +133,21 @@ class JsonHttp:
                 "POST", url, content=content, headers={"content-type": "application/json"}
             ) as response:
                 answer = await self._read(shown, response)
-                status = int(response.status_code)
+                status, headers = int(response.status_code), dict(response.headers)
         except httpx.TimeoutException as error:
             raise TimeoutError from error
         except httpx.TransportError as error:
-            raise _Busy(f"{type(error).__name__}: {error}") from error
+            raise _TryAgain(f"{type(error).__name__}: {error}") from error
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             raise LlmError(
                 f"{shown}: {error}", hint="is VRAM_REASONER_LLM_BASE_URL right?"
             ) from error
-        if status in RETRY_STATUSES:
-            raise _Busy(f"HTTP status {status}: {_complaint(answer)}")
+        # `x-should-retry: false` stands at an empty account, which is a 429 too
+        if status in BUSY_STATUSES | FAILING_STATUSES and headers.get("x-should-retry") != "false":
+            after_s = retry_after_s(headers)
+            busy = status in BUSY_STATUSES or after_s is not None
+            problem = f"HTTP status {status}: {_complaint(answer)}"
+            raise _TryAgain(problem, busy=busy, after_s=after_s)
         if status != 200:
             raise LlmError(
                 f"{shown}: HTTP status {status}: {_complaint(answer)}",
@@ -134,6 +171,39 @@ class JsonHttp:
                 raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
             parts.append(part)
         return b"".join(parts)
+
+
+def _pause_s(asked: int) -> float:
+    """Return the pause before the next try, shortened at random: clients that were refused together
+    do not come back together.
+    """
+    return min(PAUSE_S * 2.0 ** min(asked, 16), PAUSE_MAX_S) * random.uniform(0.75, 1.0)
+
+
+def retry_after_s(headers: Mapping[str, str]) -> float | None:
+    """Return the seconds that `retry-after-ms` or `retry-after` (seconds, or a date) names.
+
+    None where neither can be read. Names of headers are lower case.
+    """
+    for name, unit_s in (("retry-after-ms", 1e-3), ("retry-after", 1.0)):
+        text = headers.get(name, "")
+        try:
+            seconds = float(text) * unit_s
+        except ValueError:
+            seconds = _until_s(text)
+        if math.isfinite(seconds):
+            return max(0.0, seconds)
+    return None
+
+
+def _until_s(date: str) -> float:
+    try:
+        then = parsedate_to_datetime(date)
+    except ValueError:
+        return math.nan
+    # a date without a zone is in UTC
+    then = then if then.tzinfo is not None else then.replace(tzinfo=UTC)
+    return (then - datetime.now(UTC)).total_seconds()
 
 
 def without_credentials(url: str) -> str:

@@ -68,7 +68,9 @@ def language_model() -> Iterator[str]:
             function = {"name": name, "arguments": json.dumps(arguments)}
             call = {"id": "c", "type": "function", "function": function}
             message = {"role": "assistant", "content": None, "tool_calls": [call]}
-            body = json.dumps({"choices": [{"message": message}]}).encode()
+            answer = {"message": message, "finish_reason": "tool_calls"}
+            usage = {"prompt_tokens": 1200, "completion_tokens": 34}
+            body = json.dumps({"choices": [answer], "usage": usage}).encode()
             self.send_response(200)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
@@ -262,6 +264,10 @@ def judge(trace: Trace, collector: Collector) -> None:
     )  # several where news came meanwhile, as of a picture that is late
     assert "execute_rskill" in [plan.attributes[telemetry.ATTR_OUTCOME] for plan in plans]
 
+    chats = [chat for plan in plans for chat in trace.below(plan, "chat m")]
+    assert {chat.attributes[telemetry.ATTR_PROVIDER] for chat in chats} == {"openai"}
+    assert 1200 in [chat.attributes.get(telemetry.ATTR_INPUT_TOKENS) for chat in chats]
+
     look, _ = trace.below(task, telemetry.SPAN_REASONER_TICK)
     (seen,) = trace.below(look, telemetry.SPAN_TOOL)
     detect, *again = trace.below(
@@ -313,6 +319,7 @@ def judge(trace: Trace, collector: Collector) -> None:
         (RUNNER, telemetry.METRIC_GOALS),
         (POLICY, telemetry.METRIC_SIDECAR_LOAD),
         (REASONER, telemetry.METRIC_TOOL_CALLS),
+        (REASONER, telemetry.GEN_AI_TOKENS),
         (ARBITER, telemetry.METRIC_GRANTS),
     ):
         assert service in {point.service for point in collector.points(metric)}

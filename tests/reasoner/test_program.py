@@ -60,7 +60,7 @@ def test_usage(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--task", " "], "--task says nothing"),
+        (["--task", " "], "the task says nothing"),
         (
             ["--task", "x", "--result", "/proc/none/result.json"],
             "--result /proc/none/result.json cannot be written",
@@ -68,6 +68,10 @@ def test_usage(tmp_path: Path) -> None:
         (
             ["--task", "x", "--planner", "openai"],
             "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set",
+        ),
+        (
+            ["--task", "x", "--look"],
+            "--look is for a language model (--planner openai or anthropic",
         ),
         (["--task", "x", "--runner", "runner.sock"], "'runner.sock' is not an endpoint"),
         (["--task", "x", "--listen", "tcp://127.0.0.1:7"], "any user of the machine"),

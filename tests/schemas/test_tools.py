@@ -27,6 +27,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "execute_rskill": {"rskill_id": "acme/rskill-grab", "prompt": "grab the red cube"},
     "locate_in_view": {"query": "red cube"},
     "query_scene": {"question": "Is the cube held?", "camera": "wrist"},
+    "look": {"camera": "wrist"},
     "query_task_progress": {"window_s": 4.0, "task": "grab the red cube"},
     "lifecycle_transition": {"node": "detector", "transition": "deactivate"},
     "emit_prompt": {"target_topic": "/operator", "text": "I cannot find it."},

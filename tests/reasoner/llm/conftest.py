@@ -2,6 +2,7 @@
 drips, floods, hang-ups.
 """
 
+import asyncio
 import json
 import threading
 from collections.abc import Callable, Iterator
@@ -9,6 +10,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import pytest
+
+from tests.support.llm_apis import KEY, PALETTE, Anthropic, OpenAi
+from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.planner import Episode
 
 Answer = Callable[[BaseHTTPRequestHandler], None]
 
@@ -59,8 +65,8 @@ class StandIn:
 
         self.answers.append(answer)
 
-    def json(self, body: Any, status: int = 200) -> None:
-        self.body(json.dumps(body).encode(), status)
+    def json(self, body: Any, status: int = 200, headers: dict[str, str] | None = None) -> None:
+        self.body(json.dumps(body).encode(), status, headers)
 
     def hangs(self) -> None:
         """Takes the request and says nothing while the test lasts."""
@@ -104,3 +110,33 @@ def stand_in() -> Iterator[StandIn]:
     server.server.shutdown()
     server.server.server_close()
     thread.join()
+
+
+@pytest.fixture(params=[OpenAi, Anthropic])
+def api(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+@pytest.fixture
+def decide(api: Any, stand_in: Any) -> Callable[..., Any]:
+    def run(
+        episode: Episode | None = None,
+        *,
+        timeout_s: float = 20.0,
+        palette: Palette = PALETTE,
+        pauses: list[float] | None = None,
+        **more: Any,
+    ) -> Any:
+        config = LlmConfig(stand_in.url + api.base, "m", KEY, timeout_s)
+
+        async def pause(seconds: float) -> None:
+            if pauses is not None:
+                pauses.append(seconds)
+
+        async def once() -> Any:
+            async with api.planner(config, palette, pause=pause, **more) as planner:
+                return await planner.decide(episode or Episode("grab the red cube"))
+
+        return asyncio.run(once())
+
+    return run

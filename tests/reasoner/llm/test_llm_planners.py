@@ -5,142 +5,22 @@ HTTP.
 import asyncio
 import json
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from tests.support.llm_apis import KEY, PALETTE, SCHEMA, Anthropic
 from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
-from vram_arbiter.reasoner.llm.base import LlmConfig, LlmPlanner
-from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
-from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Step
 from vram_arbiter.schemas.errors import ConfigError, LlmError
 from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, Wait
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
-SCHEMA = {
-    "type": "object",
-    "properties": {"turn_rad": {"type": "number", "maximum": 3.2}},
-    "additionalProperties": False,
-}
-PALETTE = Palette(
-    (
-        Skill("lab/navigate", "ros_action", "drive", ("navigate",), SCHEMA),
-        Skill("lab/grab", "vla", "grab", ("grasp",)),
-        Skill("lab/vlm", "vlm", "look", ("query",)),
-    )
-)
-KEY = "sk-very-secret"
 
-
-class OpenAi:
-    """How this API's server answers, and how its requests read."""
-
-    planner: type[LlmPlanner] = OpenAiPlanner
-    base = "/v1"
-    path = "/v1/chat/completions"
-
-    @staticmethod
-    def says(*calls: tuple[str, str], text: str = "") -> Any:
-        made = [
-            {"id": f"c{n}", "type": "function", "function": {"name": name, "arguments": arguments}}
-            for n, (name, arguments) in enumerate(calls)
-        ]
-        return {
-            "choices": [
-                {
-                    "message": {
-                        "role": "assistant",
-                        "content": text or None,
-                        "tool_calls": made or None,
-                    }
-                }
-            ]
-        }
-
-    @staticmethod
-    def offered(body: dict[str, Any]) -> dict[str, Any]:
-        return {tool["function"]["name"]: tool["function"]["parameters"] for tool in body["tools"]}
-
-    @staticmethod
-    def told(body: dict[str, Any]) -> list[str]:
-        """Everything that is said to the model after the instructions, in order: words, calls,
-        results.
-        """
-        found = []
-        for message in body["messages"]:
-            if message["role"] == "system":
-                continue
-            for call in message.get("tool_calls", ()):
-                found.append(f"{call['function']['name']} {call['function']['arguments']}")
-            if message["content"] is not None:
-                found.append(message["content"])
-        return found
-
-
-class Anthropic:
-    planner: type[LlmPlanner] = AnthropicPlanner
-    base = ""
-    path = "/v1/messages"
-
-    @staticmethod
-    def says(*calls: tuple[str, str], text: str = "") -> Any:
-        content: list[dict[str, Any]] = [{"type": "text", "text": text}] if text else []
-        for n, (name, arguments) in enumerate(calls):
-            try:
-                value = json.loads(arguments)
-            except ValueError:
-                value = arguments
-            content.append({"type": "tool_use", "id": f"toolu_{n}", "name": name, "input": value})
-        return {
-            "type": "message",
-            "role": "assistant",
-            "content": content,
-            "stop_reason": "tool_use",
-        }
-
-    @staticmethod
-    def offered(body: dict[str, Any]) -> dict[str, Any]:
-        return {tool["name"]: tool["input_schema"] for tool in body["tools"]}
-
-    @staticmethod
-    def told(body: dict[str, Any]) -> list[str]:
-        found = []
-        for message in body["messages"]:
-            for block in message["content"]:
-                match block["type"]:
-                    case "text":
-                        found.append(block["text"])
-                    case "tool_use":
-                        found.append(
-                            f"{block['name']} {json.dumps(block['input'], separators=(',', ':'))}"
-                        )
-                    case "tool_result":
-                        found.append(block["content"])
-        return found
-
-
-@pytest.fixture(params=[OpenAi, Anthropic])
-def api(request: pytest.FixtureRequest) -> Any:
-    return request.param
-
-
-@pytest.fixture
-def decide(api: Any, stand_in: Any) -> Callable[..., Any]:
-    def run(
-        episode: Episode | None = None, *, timeout_s: float = 20.0, palette: Palette = PALETTE
-    ) -> Any:
-        config = LlmConfig(stand_in.url + api.base, "m", KEY, timeout_s)
-
-        async def once() -> Any:
-            async with api.planner(config, palette, retry_pause_s=0.0) as planner:
-                return await planner.decide(episode or Episode("grab the red cube"))
-
-        return asyncio.run(once())
-
-    return run
+async def at_once(seconds: float) -> None:
+    pass
 
 
 def test_a_call_is_decoded_and_only_what_may_be_used_is_offered(
@@ -316,21 +196,6 @@ def test_a_flood_is_cut_off(stand_in: Any, decide: Any) -> None:
         decide()
 
 
-@pytest.mark.parametrize("status", [429, 500, 503, 529])
-def test_a_busy_server_is_asked_again(api: Any, stand_in: Any, decide: Any, status: int) -> None:
-    stand_in.json({"error": {"message": "overloaded"}}, status)
-    stand_in.hangs_up()
-    stand_in.json(api.says(("locate_in_view", '{"query": "cube"}')))
-    assert decide() == LocateInView(query="cube")
-
-
-def test_a_server_that_stays_busy_is_given_up_with_its_words(stand_in: Any, decide: Any) -> None:
-    for _ in range(3):
-        stand_in.json({"error": {"message": "overloaded"}}, 529)
-    with pytest.raises(LlmError, match=r"HTTP status 529: overloaded, 3 times"):
-        decide()
-
-
 @pytest.mark.parametrize("status", [302, 400, 401, 404])
 def test_a_wrong_request_is_not_repeated_and_the_key_stays_secret(
     stand_in: Any, decide: Any, status: int
@@ -374,9 +239,8 @@ def test_garbage_is_a_typed_error(stand_in: Any, decide: Any, body: bytes) -> No
 
 def test_nobody_there_is_a_typed_error(api: Any) -> None:
     async def ask() -> None:
-        async with api.planner(
-            LlmConfig("http://127.0.0.1:1", "m"), PALETTE, retry_pause_s=0.0
-        ) as planner:
+        config = LlmConfig("http://127.0.0.1:1", "m")
+        async with api.planner(config, PALETTE, pause=at_once) as planner:
             await planner.decide(Episode("x"))
 
     with pytest.raises(LlmError, match="3 times"):
@@ -440,7 +304,7 @@ def test_a_password_in_the_address_stands_in_no_message(
     caplog.set_level(logging.DEBUG)
 
     async def once(config: LlmConfig) -> None:
-        async with api.planner(config, PALETTE, retry_pause_s=0.0) as planner:
+        async with api.planner(config, PALETTE, pause=at_once) as planner:
             await planner.decide(Episode("grab the red cube"))
 
     stand_in.json({"not": "an answer"})

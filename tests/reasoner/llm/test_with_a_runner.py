@@ -136,12 +136,15 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             assert len(stand_in.asked) == 3
             assert "operator: slowly" in json.dumps(stand_in.asked[1]["messages"])
 
-            # a signal ends the reasoner, and its goal with it
+            # a signal ends the reasoner, and its goal with it; the result tells of both
             stand_in.json(anthropic(TURN, goal_params={"turn_rad": 6.2}))
             async with programs.reasoner("anthropic") as reasoner:
                 running = await comes_true(goal)
                 reasoner.send_signal(signal.SIGTERM)
                 assert await reasoner.wait() == 1
+            result = programs.result()
+            assert result["reason"] == "canceled: by SIGTERM"
+            assert [step["status"] for step in result["steps"]] == ["canceled"]
             assert (await client.call("result", {"goal_id": running}))["status"] == "canceled"
             assert await goal() is None
 

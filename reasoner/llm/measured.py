@@ -1,0 +1,94 @@
+"""Tokens and requests of a language model: the tally of a task, and OpenTelemetry's `gen_ai.*`.
+
+One span `chat MODEL` a request, below `reasoner.plan`, with every try of the request in it.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import monotonic
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.reasoner import LlmUsage
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+
+if TYPE_CHECKING:
+    from vram_arbiter.reasoner.llm.base import Answer
+
+
+@dataclass(slots=True)
+class Tally:
+    """What a task's decisions cost."""
+
+    requests: int = 0
+    failed: int = 0
+    rejected: int = 0
+    input_tokens: int = 0
+    output_tokens: int = 0
+
+    def as_result(self, model: str) -> LlmUsage:
+        return {
+            "model": model,
+            "requests": self.requests,
+            "failed": self.failed,
+            "rejected": self.rejected,
+            "input_tokens": self.input_tokens,
+            "output_tokens": self.output_tokens,
+        }
+
+
+class Chat:
+    """One request while it is measured."""
+
+    def __init__(self, tally: Tally, labels: dict[str, str]) -> None:
+        self._tally = tally
+        self._labels = labels
+
+    def answered(self, answer: "Answer") -> None:
+        self._tally.input_tokens += answer.input_tokens
+        self._tally.output_tokens += answer.output_tokens
+        noted: dict[str, str | int] = {
+            telemetry.ATTR_INPUT_TOKENS: answer.input_tokens,
+            telemetry.ATTR_OUTPUT_TOKENS: answer.output_tokens,
+        }
+        if answer.model:
+            noted[telemetry.ATTR_RESPONSE_MODEL] = answer.model
+        tracing.note(noted)
+        if answer.finish_reason:
+            tracing.note_texts(telemetry.ATTR_FINISH_REASONS, [answer.finish_reason])
+        for kind, tokens in (("input", answer.input_tokens), ("output", answer.output_tokens)):
+            labels = self._labels | {telemetry.ATTR_TOKEN_TYPE: kind}
+            meters.measure(telemetry.GEN_AI_TOKENS, tokens, labels)
+
+
+@contextmanager
+def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Chat]:
+    """Measure one request, whatever becomes of it."""
+    labels = {
+        telemetry.ATTR_CHAT_OPERATION: "chat",
+        telemetry.ATTR_PROVIDER: provider,
+        telemetry.ATTR_REQUEST_MODEL: config.model,
+    }
+    address = urlsplit(config.base_url)
+    attributes: dict[str, str | int] = {
+        **labels,
+        telemetry.ATTR_REQUEST_MAX_TOKENS: config.max_tokens,
+        telemetry.ATTR_SERVER: address.hostname or "",
+        telemetry.ATTR_SERVER_PORT: address.port or (443 if address.scheme == "https" else 80),
+    }
+    tally.requests += 1
+    began_s = monotonic()
+    with tracing.span(f"chat {config.model}", attributes=attributes, client=True):
+        try:
+            yield Chat(tally, labels)
+        except VramError as error:
+            tally.failed += 1
+            labels = labels | {telemetry.ATTR_ERROR_TYPE: error.code}
+            raise
+        finally:
+            meters.measure(telemetry.GEN_AI_DURATION, monotonic() - began_s, labels)

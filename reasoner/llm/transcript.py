@@ -1,0 +1,89 @@
+"""Transcript of a language model: every request, answer and rejection as a line of JSON.
+
+Holds what was said to the model and what it said, without the key, which travels in a header;
+pictures are left out.
+"""
+
+import base64
+import logging
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.reasoner import TranscriptLine
+
+log = logging.getLogger(__name__)
+
+PICTURE_MIN_CHARS = 1024  # a shorter text is no picture
+
+
+class Transcript:
+    """Lines are appended to the file until it is closed. None: nothing is written.
+
+    Raises ConfigError for a file that cannot be written.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._file: IO[str] | None = None
+        if path is not None:
+            try:
+                self._file = path.open("a", encoding="utf-8", errors="backslashreplace")
+            except OSError as error:
+                raise ConfigError(
+                    f"--transcript {path} cannot be written: {error.strerror}",
+                    hint="name a file in a folder of your own",
+                ) from error
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def answered(self, request: JsonObject, answer: JsonObject) -> None:
+        self._add(TranscriptLine(kind="answered", request=request, answer=answer, at=_now()))
+
+    def failed(self, request: JsonObject, problem: str) -> None:
+        """The server gave no answer of its API."""
+        self._add(TranscriptLine(kind="failed", request=request, problem=problem, at=_now()))
+
+    def rejected(self, problem: str) -> None:
+        """The answer before was not taken: the model is told why and asked again."""
+        self._add(TranscriptLine(kind="rejected", problem=problem, at=_now()))
+
+    def _add(self, line: TranscriptLine) -> None:
+        if self._file is not None:
+            request = without_pictures(line.request)
+            line = line.model_copy(update={"request": request})
+            try:
+                self._file.write(line.model_dump_json(exclude_none=True) + "\n")
+                self._file.flush()  # a reasoner that is killed has said this much
+            except OSError as error:  # a full disk stops no robot
+                log.error("the transcript ends here: %s", error)
+                self._file = None
+
+
+def without_pictures(value: object) -> object:
+    """Return the same JSON with the length of each picture in its place."""
+    match value:
+        case dict():
+            return {key: without_pictures(item) for key, item in value.items()}
+        case list():
+            return [without_pictures(item) for item in value]
+        case str() if len(value) >= PICTURE_MIN_CHARS and _is_picture(value):
+            return f"… {len(value)} characters of a picture"
+        case _:
+            return value
+
+
+def _is_picture(text: str) -> bool:
+    encoded = text.rpartition(";base64,")[2]
+    try:
+        return bool(base64.b64decode(encoded, validate=True))
+    except ValueError:
+        return False
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

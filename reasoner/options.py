@@ -1,0 +1,167 @@
+"""Options of `vram-reasoner`, and what is wrong with them before anything is waited for."""
+
+import argparse
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
+from vram_arbiter.reasoner.llm.base import LlmPlanner
+from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
+from vram_arbiter.reasoner.playbooks import Playbook, load_playbook
+from vram_arbiter.schemas.errors import BadRequest, ConfigError
+from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP
+from vram_arbiter.schemas.runtime import logging as logs
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint
+from vram_arbiter.schemas.runtime.version import add_version
+
+LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
+MANAGED = ("detector", "scene-vlm", "reward")
+TASK_MAX_CHARS = 4000  # with what a planner says around it, a tool's text
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="vram-reasoner",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_version(parser)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--task", help='what to do, e.g. "grab the red cube"')
+    what.add_argument(
+        "--say", metavar="TEXT", help="tell the planner of a running reasoner something, and end"
+    )
+    what.add_argument(
+        "--cancel",
+        metavar="REASON",
+        help="end the episode of a running reasoner and its goal, and end",
+    )
+    parser.add_argument(
+        "--planner",
+        choices=("scripted", *LLM_PLANNERS),
+        default="scripted",
+        help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS,"
+        "BUSY_S} configure them",
+    )
+    what.add_argument(
+        "--confirm",
+        action="store_true",
+        help="let the motion begin that waits in a running reasoner, and end",
+    )
+    what.add_argument(
+        "--deny",
+        metavar="REASON",
+        help="refuse the motion that waits in a running reasoner, and end",
+    )
+    parser.add_argument(
+        "--require-confirmation",
+        action="store_true",
+        help="the operator confirms each motion: y on this terminal, or --confirm elsewhere",
+    )
+    parser.add_argument(
+        "--look",
+        action="store_true",
+        help="let the planner see the cameras' pictures: for language models that read images",
+    )
+    parser.add_argument(
+        "--transcript",
+        type=Path,
+        metavar="FILE",
+        help="append what a language model is asked, answers, and has rejected, as lines of JSON",
+    )
+    parser.add_argument(
+        "--playbook",
+        type=Path,
+        metavar="RSKILL.YAML",
+        help="the procedure that a language model follows",
+    )
+    parser.add_argument(
+        "--manage",
+        action="append",
+        default=[],
+        choices=MANAGED,
+        help="a sidecar that the planner may load and unload (repeatable;"
+        " default: none, the arbiter decides)",
+    )
+    parser.add_argument(
+        LICENSE_FLAG,
+        action="store_true",
+        help=LICENSE_HELP,
+    )
+    parser.add_argument(
+        "--listen", help="where to hear operators (default: ipc://RUNTIME/reasoner.sock)"
+    )
+    parser.add_argument(
+        "--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)"
+    )
+    parser.add_argument(
+        "--detector", help='endpoint of the detector sidecar; "none": there is none'
+    )
+    parser.add_argument(
+        "--scene-vlm", help='endpoint of the scene-VLM sidecar; "none": there is none'
+    )
+    parser.add_argument(
+        "--log-format", choices=logs.FORMS, default="human", help="json: one object a line"
+    )
+    parser.add_argument(
+        "--reward",
+        nargs="?",
+        const="",
+        metavar="ENDPOINT",
+        help="ask a reward model for progress (default endpoint: ipc://RUNTIME/reward.sock);"
+        " without this flag there is none",
+    )
+    parser.add_argument(
+        "--reward-camera", default="wrist", help="which camera it looks at (default: %(default)s)"
+    )
+    parser.add_argument("--result", type=Path, help="write the result as JSON into this file")
+    return parser
+
+
+def endpoint(given: str | None, name: str) -> str:
+    """Return the given endpoint, or the program's own."""
+    return given or program_endpoint(name, os.environ, os.getuid())
+
+
+def check_task(task: str) -> None:
+    """Raise BadRequest for a task that no planner could work with."""
+    if not task.strip():
+        raise BadRequest("the task says nothing", hint='e.g. "grab the red cube"')
+    if len(task) > TASK_MAX_CHARS:
+        raise BadRequest(
+            f"the task has more than {TASK_MAX_CHARS} characters", hint="say it shorter"
+        )
+    try:
+        task.encode()
+    except UnicodeEncodeError:
+        raise BadRequest("the task has bytes that are not UTF-8") from None
+
+
+def language_model(
+    arguments: argparse.Namespace, environ: Mapping[str, str]
+) -> tuple[LlmConfig | None, Playbook | None]:
+    """Return the language model and the playbook that were asked for; None: none was.
+
+    Raises ConfigError for options that only a language model can use, and what the configuration
+    and the playbook raise.
+    """
+    check_output("--result", arguments.result)
+    check_output("--transcript", arguments.transcript)
+    kind = LLM_PLANNERS.get(arguments.planner)
+    if kind is not None:
+        llm = LlmConfig.from_environ(environ, base_url=kind.default_base_url)
+        return llm, load_playbook(arguments.playbook) if arguments.playbook else None
+    playbook = load_playbook(arguments.playbook) if arguments.playbook else None
+    unused = [
+        f"{flag} is for a language model"
+        for flag, given in (("--look", arguments.look), ("--transcript", arguments.transcript))
+        if given
+    ]
+    if playbook is not None:
+        unused.insert(0, "a playbook is read by a language model")
+    if unused:
+        raise ConfigError(unused[0], hint=f"--planner {' or '.join(LLM_PLANNERS)}")
+    return None, None

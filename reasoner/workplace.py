@@ -1,0 +1,165 @@
+"""Connections of a reasoner to the runner and the sidecars, and the work on one task with them."""
+
+import argparse
+import asyncio
+import contextlib
+from typing import Self
+
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
+from vram_arbiter.reasoner.confirm import Confirmations
+from vram_arbiter.reasoner.history import RATE_HZ, Past
+from vram_arbiter.reasoner.inbox import Inbox
+from vram_arbiter.reasoner.llm.base import LlmPlanner
+from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.llm.scripted import ScriptedPlanner
+from vram_arbiter.reasoner.llm.transcript import Transcript
+from vram_arbiter.reasoner.loop import STEPS_MAX, THINK_MAX_S, run_episode
+from vram_arbiter.reasoner.options import LLM_PLANNERS, endpoint
+from vram_arbiter.reasoner.palette import OPERATOR, Palette, palette_of
+from vram_arbiter.reasoner.planner import Planner
+from vram_arbiter.reasoner.playbooks import Playbook
+from vram_arbiter.reasoner.tools import FRAME_MAX_AGE_MS, Judge, Tools
+from vram_arbiter.reasoner.watch import watch
+from vram_arbiter.schemas.body import read_body
+from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.reasoner import Result
+
+
+class Workplace:
+    """`async with Workplace(arguments, llm, playbook) as workplace: await workplace.perform(…)`.
+
+    Skills, cameras and body are asked for at each task: a runner may have been restarted.
+    """
+
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        llm: LlmConfig | None,
+        playbook: Playbook | None,
+        confirmations: Confirmations | None,
+    ) -> None:
+        self._arguments = arguments
+        self._llm = llm
+        self._playbook = playbook
+        self._confirmations = confirmations
+        self._transcript = Transcript(arguments.transcript)
+        at = endpoint(arguments.runner, "runner")
+        self._runner, self._watching, self._eyes = (RunnerClient(at) for _ in range(3))
+        self._detector = _given(DetectorClient, arguments.detector, "detector")
+        self._vlm = _given(SceneVlmClient, arguments.scene_vlm, "scene-vlm")
+        reward = "none" if arguments.reward is None else arguments.reward
+        self._reward = _given(RewardClient, reward, "reward")
+        self.began = False
+        """Whether an episode began: from then on its inbox takes a cancel."""
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for client in (self._detector, self._vlm, self._reward):
+            if client is not None:
+                await client.close()
+        for runner in (self._runner, self._watching, self._eyes):
+            await runner.close()
+        self._transcript.close()
+
+    async def perform(self, task: str, inbox: Inbox) -> Result:
+        """Perform one task to its end.
+
+        Raises RunnerUnreachable, and for a task that this planner cannot do on this robot
+        BadRequest, UnknownSkill or ConfigError.
+        """
+        installed = await self._runner.skills()
+        manifests = [RSkillManifest.model_validate(manifest) for manifest in installed["skills"]]
+        named: dict[str, SidecarClient | None] = {
+            "detector": self._detector,
+            "scene-vlm": self._vlm,
+            "reward": self._reward,
+        }
+        components = {name: client for name, client in named.items() if client is not None}
+        palette = palette_of(
+            manifests,
+            can_locate=self._detector is not None,
+            can_query=self._vlm is not None,
+            can_judge=self._reward is not None,
+            can_look=self._arguments.look,
+            cameras=(await self._runner.state()).get("cameras") or (),
+            allow_noncommercial=self._arguments.allow_noncommercial,
+            managed=[name for name in self._arguments.manage if name in components],
+            topics=[OPERATOR],
+            body=read_body(installed.get("body")),
+        )
+        if self._playbook is not None:
+            palette = self._playbook.narrow(palette)
+        async with contextlib.AsyncExitStack() as stack:
+            judge = self._judge(task, manifests, stack)
+            planner = await self._planner(task, palette, stack)
+            beside = asyncio.create_task(watch(self._watching, inbox))
+            stack.callback(beside.cancel)
+            tools = Tools(
+                self._runner,
+                self._detector,
+                self._vlm,
+                judge=judge,
+                palette=palette,
+                components=components,
+            )
+            confirm = self._confirmations
+            self.began = True
+            result = await run_episode(
+                task,
+                planner,
+                palette,
+                tools if confirm is None else confirm.before(tools),
+                inbox=inbox,
+                steps_max=_steps_max(self._playbook),
+                think_max_s=_think_max_s(self._llm),
+            )
+        if isinstance(planner, LlmPlanner):
+            result["llm"] = planner.tally.as_result(planner.config.model)
+        return result
+
+    def _judge(
+        self, task: str, manifests: list[RSkillManifest], stack: contextlib.AsyncExitStack
+    ) -> Judge | None:
+        """Return the reward model with a history of pictures, taken as often as its manifest wants
+        them.
+
+        The pictures have a connection of their own.
+        """
+        if self._reward is None:
+            return None
+        camera = self._arguments.reward_camera
+        rates = [manifest.reward.target_fps for manifest in manifests if manifest.reward]
+        past = Past(
+            lambda: self._eyes.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png"),
+            rate_hz=min(rates, default=RATE_HZ),
+        )
+        looking = asyncio.create_task(past.run(), name="past")
+        stack.callback(looking.cancel)
+        return Judge(self._reward, past, task)
+
+    async def _planner(
+        self, task: str, palette: Palette, stack: contextlib.AsyncExitStack
+    ) -> Planner:
+        if self._llm is None:
+            return ScriptedPlanner(task, palette)
+        kind = LLM_PLANNERS[self._arguments.planner]
+        procedure = self._playbook.procedure if self._playbook is not None else ""
+        planner = kind(self._llm, palette, procedure=procedure, transcript=self._transcript)
+        return await stack.enter_async_context(planner)
+
+
+def _given[C: SidecarClient](kind: type[C], given: str | None, name: str) -> C | None:
+    return None if given == "none" else kind(endpoint(given, name))
+
+
+def _steps_max(playbook: Playbook | None) -> int:
+    return STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.max_steps)
+
+
+def _think_max_s(llm: LlmConfig | None) -> float:
+    """Return the limit of a decision: a busy server's whole time fits."""
+    return THINK_MAX_S if llm is None else max(THINK_MAX_S, llm.busy_s + llm.timeout_s)

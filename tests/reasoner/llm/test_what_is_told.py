@@ -1,0 +1,150 @@
+"""What both APIs are told of this robot, and what is written down of their answers."""
+
+import asyncio
+import base64
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.llm_apis import KEY, PALETTE, OpenAi
+from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.llm.prompt import instructions
+from vram_arbiter.reasoner.llm.transcript import Transcript
+from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.planner import Episode, Outcome, Step
+from vram_arbiter.schemas.body import Body
+from vram_arbiter.schemas.errors import LlmError
+from vram_arbiter.schemas.reasoner import TranscriptLine
+from vram_arbiter.schemas.tools import ExecuteRskill, Look, QueryScene
+
+pytest.importorskip("httpx", reason="needs the reasoner extra")
+
+LOOK = ("look", '{"camera": "wrist"}')
+SEEING = dataclasses.replace(PALETTE, can_look=True, cameras=("front", "wrist"))
+PICTURE = b"\xff\xd8 a picture of the gripper" * 64
+
+
+def test_current_parameters(api: Any, stand_in: Any, decide: Any) -> None:
+    """Models that think first refuse `max_tokens` and any temperature but their own."""
+    stand_in.json(api.says(("query_scene", '{"question": "?"}')))
+    decide()
+    (body,) = stand_in.asked
+    assert "temperature" not in body
+    if api is OpenAi:
+        assert body["max_completion_tokens"] == 4096
+        assert body["parallel_tool_calls"] is False
+        assert "max_tokens" not in body
+    else:
+        assert body["max_tokens"] == 4096
+        assert body["tool_choice"]["disable_parallel_tool_use"] is True
+
+
+def test_cameras_are_a_choice_and_another_one_is_told_back(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
+    stand_in.json(api.says(("query_scene", '{"question": "?", "camera": "rear"}')))
+    stand_in.json(api.says(("query_scene", '{"question": "?", "camera": "wrist"}')))
+    assert decide(palette=SEEING) == QueryScene(question="?", camera="wrist")
+    offered = api.offered(stand_in.asked[0])
+    for name in ("locate_in_view", "query_scene", "look"):
+        assert offered[name]["properties"]["camera"]["enum"] == ["front", "wrist"]
+    assert set(offered["locate_in_view"]["properties"]) == {"query", "camera", "rationale"}
+    assert "there is no camera rear" in api.told(stand_in.asked[1])[-1]
+
+
+def test_a_picture_is_shown_and_the_oldest_is_shown_no_more(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
+    stand_in.json(api.says(LOOK))
+    shown = [
+        Step(Look(camera="wrist"), Outcome("shown", "wrist", picture=PICTURE + str(n).encode()))
+        for n in range(3)
+    ]
+    assert decide(Episode("x", shown), palette=SEEING) == Look(camera="wrist")
+    (body,) = stand_in.asked
+    decoded = [base64.b64decode(text) for text in api.pictures(body)]
+    assert decoded == [step.outcome.picture for step in shown[1:]]
+    results = [json.loads(text) for text in api.told(body) if text.startswith("{")]
+    assert "not shown any more" in results[0]["meaning"]
+    assert "is attached" in results[1]["meaning"]
+
+
+def test_a_policy_that_ran_is_not_called_a_success(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(api.says(("finish", '{"success": false, "reason": "x"}')))
+    ran = [
+        Step(ExecuteRskill(rskill_id=name), Outcome("succeeded", ""))
+        for name in ("lab/grab", "lab/navigate")
+    ]
+    decide(Episode("x", ran))
+    grabbed, drove = (
+        json.loads(text) for text in api.told(stand_in.asked[0]) if text.startswith('{"status')
+    )
+    assert "not judged" in grabbed["meaning"]
+    assert drove["meaning"] == "the goal was reached"
+
+
+def test_an_answer_without_its_end_says_what_to_raise(api: Any, stand_in: Any, decide: Any) -> None:
+    stand_in.json(api.is_cut_off("Let me think about this cube"))
+    with pytest.raises(LlmError, match=r"cut off after 4096 tokens.*LLM_MAX_TOKENS"):
+        decide()
+
+
+def test_tokens_and_rejected_answers_are_written_down(
+    api: Any, stand_in: Any, tmp_path: Path
+) -> None:
+    stand_in.json(api.says(("locate_in_view", "{}")))
+    stand_in.json({"error": {"message": "no such model"}}, 404)
+    file = tmp_path / "transcript.jsonl"
+    seen = Step(Look(), Outcome("shown", "front", picture=PICTURE))
+
+    async def once() -> Any:
+        config = LlmConfig(stand_in.url + api.base, "m", KEY)
+        transcript = Transcript(file)
+        async with api.planner(config, SEEING, transcript=transcript) as planner:
+            with pytest.raises(LlmError):
+                await planner.decide(Episode("find it", [seen]))
+            transcript.close()
+            return planner.tally.as_result("m")
+
+    assert asyncio.run(once()) == {
+        "model": "m",
+        "requests": 2,
+        "failed": 1,
+        "rejected": 1,
+        "input_tokens": 1200,
+        "output_tokens": 34,
+    }
+    text = file.read_text()
+    assert KEY not in text
+    assert base64.b64encode(PICTURE).decode()[:40] not in text
+    lines = [TranscriptLine.model_validate_json(line) for line in text.splitlines()]
+    assert [line.kind for line in lines] == ["answered", "rejected", "failed"]
+    assert isinstance(lines[0].request, dict)
+    assert "find it" in json.dumps(lines[0].request)
+    assert "characters of a picture" in json.dumps(lines[0].request)
+    assert "query" in (lines[1].problem or "")
+    assert "no such model" in (lines[2].problem or "")
+
+
+def test_only_what_is_there_is_named_in_the_instructions() -> None:
+    target = {"type": "object", "properties": {"target_point": {"type": "object"}}}
+    go = Skill("lab/go", "ros_action", "drive", ("navigate",), target)
+    full = Palette(
+        (go, Skill("lab/grab", "vla", "grab", ("grasp",))),
+        cameras=("front", "wrist"),
+        body=Body(embodiment_tags=("so101_follower",), capabilities={"payload_kg": 0.3}),
+    )
+    said = instructions(full, "Turn left first.")
+    assert "so101_follower" in said
+    assert "payload_kg: 0.3" in said
+    assert "front (the default), wrist" in said
+    assert "execute_rskill__lab__go" in said
+    assert 'query_scene, camera "wrist"' in said
+    assert said.endswith("Turn left first.")
+    bare = instructions(Palette((), can_locate=False, can_query=False))
+    for name in ("execute_rskill__", "locate_in_view", "query_scene", "look,", "camera"):
+        assert name not in bare
+    assert "Nothing here moves the robot" in bare
