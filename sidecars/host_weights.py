@@ -6,7 +6,7 @@ device, and no process copies or reads them again. Must not know adapters, devic
 
 import mmap
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -15,57 +15,76 @@ if TYPE_CHECKING:
     from torch.nn import Module
 
 _ALIGNMENT = 64  # bytes: the widest vector load
+_PRIVATE = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | mmap.MAP_POPULATE
 
-type _Allocate = Callable[[int], Tensor]
 
+class HostWeights:
+    """Parameters and buffers of networks, one behind the other in shared memory of `size_bytes`.
 
-def share(networks: "Iterable[Module]", label: str) -> int:
-    """Move the parameters and buffers of networks into memory that forked processes share.
-
-    Returns its bytes. Tensors that were one (tied weights) stay one.
+    Making one moves them there. Tensors that were one (tied weights) stay one.
     """
-    import torch
 
-    networks = tuple(networks)
-    size = sum(_aligned(length) for length in _extents(networks))
-    if not size:
-        return 0
+    def __init__(self, networks: "Iterable[Module]", label: str) -> None:
+        self._networks = tuple(networks)
+        lengths = dict(_extent(tensor) for tensor in self._tensors()).values()
+        self.size_bytes = sum(_aligned(length) for length in lengths)
+        self._memory: mmap.mmap | None = None  # it lives as long as a tensor in it, too
+        if self.size_bytes:
+            self._memory = _shared(self.size_bytes, label)
+            self._fill(self._memory)
+
+    def own(self) -> None:
+        """Copy the weights into memory of this process alone.
+
+        In one piece, of pages that the kernel hands out at once: one by one, as the tensors of a
+        new process touch them, they cost several times the copy.
+        """
+        if self._memory is None:
+            return
+        copy = mmap.mmap(-1, self.size_bytes, flags=_PRIVATE)
+        copy[:] = self._memory
+        begin = _bytes_of(self._memory, 0, 1).data_ptr()
+        for tensor in self._tensors():
+            at, length = _extent(tensor)
+            _point(tensor, _bytes_of(copy, at - begin, length))
+
+    def drop(self) -> None:
+        """Free the weights; they are to be loaded again before their use."""
+        import torch
+
+        for tensor in self._tensors():
+            tensor.data = torch.empty(0, dtype=tensor.dtype)
+        self._memory = None
+
+    def _fill(self, memory: mmap.mmap) -> None:
+        """Copy each tensor, and let go of its old bytes one by one: two copies of a whole model may
+        not fit."""
+        import torch
+
+        moved: dict[tuple[int, int], Tensor] = {}
+        end = 0
+        for tensor in self._tensors():
+            at, length = _extent(tensor)
+            if (at, length) not in moved:
+                first = tensor.storage_offset() * tensor.element_size()
+                old = torch.empty(0, dtype=torch.uint8)
+                old.set_(tensor.untyped_storage(), first, (length,), (1,))
+                moved[at, length] = _bytes_of(memory, end, length).copy_(old)
+                end += _aligned(length)
+            _point(tensor, moved[at, length])
+
+    def _tensors(self) -> "Iterator[Tensor]":
+        tensors = (chain(network.parameters(), network.buffers()) for network in self._networks)
+        return (tensor for tensor in chain.from_iterable(tensors) if tensor.numel())
+
+
+def _shared(size_bytes: int, label: str) -> mmap.mmap:
     file = os.memfd_create(f"weights of {label}"[:200], os.MFD_CLOEXEC)
     try:
-        os.ftruncate(file, size)
-        memory = mmap.mmap(file, size)  # lives as long as a tensor in it
+        os.ftruncate(file, size_bytes)
+        return mmap.mmap(file, size_bytes)
     finally:
         os.close(file)
-    at = 0
-
-    def allocate(length: int) -> "Tensor":
-        nonlocal at
-        begin, at = at, at + _aligned(length)
-        return torch.frombuffer(memory, dtype=torch.uint8, count=length, offset=begin)
-
-    _move(networks, allocate)
-    return size
-
-
-def own(networks: "Iterable[Module]") -> None:
-    """Copy the parameters and buffers of networks into memory of this process alone."""
-    import torch
-
-    _move(tuple(networks), lambda length: torch.empty(length, dtype=torch.uint8))
-
-
-def drop(networks: "Iterable[Module]") -> None:
-    """Free the parameters and buffers of networks; they are to be loaded again before their use."""
-    import torch
-
-    for tensor in _tensors(networks):
-        tensor.data = torch.empty(0, dtype=tensor.dtype)
-
-
-def _tensors(networks: "Iterable[Module]") -> "Iterable[Tensor]":
-    return chain.from_iterable(
-        chain(network.parameters(), network.buffers()) for network in networks
-    )
 
 
 def _extent(tensor: "Tensor") -> tuple[int, int]:
@@ -75,31 +94,19 @@ def _extent(tensor: "Tensor") -> tuple[int, int]:
     return tensor.data_ptr(), (last + 1) * tensor.element_size()
 
 
-def _extents(networks: "Iterable[Module]") -> "Iterable[int]":
-    """Return the bytes of each tensor, tied ones once."""
-    return dict(_extent(tensor) for tensor in _tensors(networks) if tensor.numel()).values()
-
-
-def _move(networks: "Iterable[Module]", allocate: _Allocate) -> None:
-    """Copy each tensor into bytes of `allocate`, and let go of those it had, one by one: two copies
-    of a whole model may not fit."""
+def _bytes_of(memory: mmap.mmap, begin: int, length: int) -> "Tensor":
+    """Return a view of memory. Raises ValueError where it would reach outside."""
     import torch
 
-    moved: dict[tuple[int, int], Tensor] = {}
-    for tensor in _tensors(networks):
-        if not tensor.numel():
-            continue
-        extent = _extent(tensor)
-        if extent not in moved:
-            old = torch.empty(0, dtype=torch.uint8).set_(
-                tensor.untyped_storage(),
-                tensor.storage_offset() * tensor.element_size(),
-                (extent[1],),
-                (1,),
-            )
-            moved[extent] = allocate(extent[1]).copy_(old)
-        fresh = torch.empty(0, dtype=tensor.dtype)
-        tensor.data = fresh.set_(moved[extent].untyped_storage(), 0, tensor.shape, tensor.stride())
+    return torch.frombuffer(memory, dtype=torch.uint8, count=length, offset=begin)
+
+
+def _point(tensor: "Tensor", place: "Tensor") -> None:
+    """Let the tensor have its bytes at a place."""
+    import torch
+
+    fresh = torch.empty(0, dtype=tensor.dtype)
+    tensor.data = fresh.set_(place.untyped_storage(), 0, tensor.shape, tensor.stride())
 
 
 def _aligned(length: int) -> int:

@@ -28,10 +28,10 @@ from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.schemas.errors import ModelError, OutOfMemory, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.sidecars import host_weights
 from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
 from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
 from vram_arbiter.sidecars.device.open import open_memory
+from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.quantization import check_precision
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.weights import Weights
@@ -72,7 +72,8 @@ def keep(
                     stream.close()
                     host.close()
                     births.close()
-                    _live(settings, keeper.adapter, threads, (host_pid, keeper_pid), ours)
+                    model = _Model(settings, keeper.adapter, keeper.weights)
+                    _live(model, threads, (host_pid, keeper_pid), ours)
                 ours.close()
                 _send(stream, {"pid": pid})
             else:
@@ -85,6 +86,7 @@ def keep(
 class _Keeper:
     def __init__(self, settings: Settings, adapter: ModelAdapter) -> None:
         self.adapter = adapter
+        self.weights: HostWeights | None = None
         self._settings = settings
 
     def answer(self, message: Message) -> Message:
@@ -96,7 +98,9 @@ class _Keeper:
                 case "load":
                     return {"bytes": self._load()}
                 case "drop":
-                    host_weights.drop(self.adapter.networks)
+                    if self.weights is not None:
+                        self.weights.drop()
+                        self.weights = None
                     gc.collect()
                     return {}
                 case "reap":
@@ -114,7 +118,8 @@ class _Keeper:
         if (torch := sys.modules.get("torch")) is not None:
             torch.set_num_threads(1)
         self.adapter.load("cpu")
-        count = host_weights.share(self.adapter.networks, settings.name)
+        self.weights = HostWeights(self.adapter.networks, settings.name)
+        count = self.weights.size_bytes
         gc.collect()
         gc.freeze()  # collections need not walk the imported code, nor copy its pages after a fork
         if not count or not _stands_in(settings):
@@ -124,13 +129,7 @@ class _Keeper:
         return max(count, settings.footprint.steady_bytes)
 
 
-def _live(
-    settings: Settings,
-    adapter: ModelAdapter,
-    threads: int,
-    others: tuple[int, ...],
-    host: socket.socket,
-) -> NoReturn:
+def _live(model: "_Model", threads: int, others: tuple[int, ...], host: socket.socket) -> NoReturn:
     """Serve the host as a model process; ends with the host or the keeper (`others`: their pids),
     through which the arbiter knows that its bytes are the sidecar's."""
     code = 1
@@ -139,7 +138,6 @@ def _live(
         os.environ[THREADS_VARIABLE] = str(threads)
         if (torch := sys.modules.get("torch")) is not None:
             torch.set_num_threads(threads)
-        model = _Model(settings, adapter)
         with host, host.makefile("rwb") as stream:
             while message := _receive(stream):
                 _send(stream, model.answer(message))
@@ -155,9 +153,12 @@ def _live(
 
 
 class _Model:
-    def __init__(self, settings: Settings, adapter: ModelAdapter) -> None:
+    def __init__(
+        self, settings: Settings, adapter: ModelAdapter, weights: HostWeights | None
+    ) -> None:
         self._settings = settings
         self._adapter = adapter
+        self._weights = weights
         self._memory: DeviceMemory | None = None
 
     def answer(self, message: Message) -> Message:
@@ -192,8 +193,8 @@ class _Model:
         memory.touch()
         if self._adapter.networks:  # a passthrough computes in whatever it likes
             check_precision(settings.manifest, memory.torch_device)
-        if memory.torch_device == "cpu":  # simulated, or none: a copy all the same
-            host_weights.own(self._adapter.networks)
+        if self._weights is not None and memory.torch_device == "cpu":
+            self._weights.own()  # simulated, or none: a copy all the same
         self._adapter.place(memory.torch_device)
         used = memory.used_bytes()
         if used is None or not _stands_in(settings):

@@ -12,8 +12,9 @@ from vram_arbiter.schemas.errors import CODES, ConfigError, UnsupportedQuantizat
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.contracts import Quantization
 from vram_arbiter.schemas.manifest.load import load_manifest
-from vram_arbiter.sidecars import host_weights, quantization
+from vram_arbiter.sidecars import quantization
 from vram_arbiter.sidecars.checkpoints import load_transformers
+from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.quantization import (
     Nf4,
     check_precision,
@@ -126,7 +127,7 @@ class TestQuantizedLinear:
             wanted = model(tokens)
             quantize_linear(model, int4(compute_dtype="float32"))
             found = model(tokens)
-            host_weights.share([model], "test")
+            HostWeights([model], "test")
             assert model(tokens).equal(found)
         quantized = {name for name, part in model.named_modules() if isinstance(part, Linear4bit)}
         assert quantized == {"layers.0", "layers.1", "narrow"}
@@ -316,11 +317,11 @@ class TestTransformers:
         wanted = self.logits(model)
         layer = next(iter(nf4_layers(model).values()))
         before = layer.weight.data_ptr()
-        size = host_weights.share([model], "test")
-        assert size >= sum(tensor.nbytes for tensor in model.parameters())
+        weights = HostWeights([model], "test")
+        assert weights.size_bytes >= sum(tensor.nbytes for tensor in model.parameters())
         shared = layer.weight.data_ptr()
         assert shared != before, "the first answer must not have repacked it either"
         assert self.logits(model).equal(wanted)
         assert layer.weight.data_ptr() == shared, "an answer leaves the weights shared"
-        host_weights.own([model])
+        weights.own()
         assert self.logits(model.to("cpu")).equal(wanted)
