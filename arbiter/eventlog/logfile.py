@@ -2,13 +2,13 @@
 
     record/20261121T144512-000003-0000.jsonl      start of the daemon, epoch, number of the file
     within this start
-    {"log": 2, "version": …, "engine": …, "epoch": …, "segment": …, "cause": …, "at_wall_s": …,
+    {"log": 1, "version": …, "engine": …, "epoch": …, "segment": …, "cause": …, "at_wall_s": …,
     "now": …, "settings": …, "state": …}
     {"t": 812.25, "event": "UseBegan", "data": {…}, "effects": "Reply Note:use_began", "digest":
     "77c0…"}
 
 `state` is null in the first file of a start: the engine begins empty. Every later file begins with
-the whole state (`snapshot`), so the oldest files may go. `digest` is null where the engine raised. Reads files
+the whole state, so the oldest files may go. `digest` is null where the engine raised. Reads files
 and nothing else.
 """
 
@@ -30,9 +30,9 @@ from vram_arbiter.arbiter.eventlog.codec import decode_event, digest, summary, t
 from vram_arbiter.schemas import defaults, ids
 from vram_arbiter.schemas.codec import CodecError, from_map, to_map
 from vram_arbiter.schemas.errors import OperatorError
+from vram_arbiter.schemas.plain import JsonMap
 
-FORMAT = 2
-"""1: the state as a graph in JSON."""
+FORMAT = 1
 SUFFIX = ".jsonl"
 FOLDER = "record"
 """Inside the daemon's state folder."""
@@ -56,7 +56,7 @@ class Header:
     at_wall_s: float
     now: float
     settings: Settings
-    state: str | None
+    state: JsonMap | None
 
 
 @dataclass(frozen=True, slots=True)

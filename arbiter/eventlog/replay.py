@@ -23,7 +23,7 @@ from vram_arbiter.arbiter.eventlog.logfile import (
     find_files,
     read_file,
 )
-from vram_arbiter.arbiter.eventlog.snapshot import unpack
+from vram_arbiter.arbiter.eventlog.snapshot import from_plain
 from vram_arbiter.schemas.plain import JsonObject
 
 CONTEXT = 5
@@ -90,7 +90,7 @@ def engine_of(header: Header) -> Arbiter:
     if header.state is None:
         return Arbiter(header.settings, header.now)
     try:
-        return unpack(header.state)
+        return from_plain(header.state)
     except ValueError as error:
         raise LogError(
             f"{error} (recorded by version {header.version})", hint="replay it with that version"

@@ -27,7 +27,7 @@ from vram_arbiter.arbiter.eventlog.logfile import (
     file_name,
     header_line,
 )
-from vram_arbiter.arbiter.eventlog.snapshot import freeze, pack
+from vram_arbiter.arbiter.eventlog.snapshot import freeze, thaw, to_plain
 from vram_arbiter.arbiter.host.disk_writer import DiskFailed, DiskWriter
 from vram_arbiter.schemas.plain import JsonMap
 
@@ -231,7 +231,7 @@ class _Files:
             at_wall_s=begin.at_wall_s,
             now=begin.now,
             settings=self._settings,
-            state=None if begin.frozen is None else pack(begin.frozen),
+            state=None if begin.frozen is None else to_plain(thaw(begin.frozen)),
         )
         line = header_line(header)
         path = self.folder / file_name(self._started_wall_s, self._settings.epoch, begin.segment)

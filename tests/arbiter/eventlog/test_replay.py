@@ -129,7 +129,7 @@ def test_a_defect_that_is_new_is_a_divergence(log: Path) -> None:
     ("old", "new", "says"),
     [
         ('{"log"', 'hello\n{"log"', "no event log of an arbiter"),
-        ('"log":2', '"log":1', "a log of format 1"),
+        ('"log":1', '"log":2', "a log of format 2"),
         ('"epoch"', '"epoche"', "Header has no field epoche"),
         ('"event":"Tick"', '"event":"Tock"', "no event is called Tock"),
         ('"digest"', '"digits"', "not a line of an event log"),
