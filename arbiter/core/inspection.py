@@ -6,8 +6,7 @@ from types import MappingProxyType
 from typing import Any, Self
 
 from vram_arbiter.arbiter.core.hooks import Feature
-from vram_arbiter.arbiter.core.learning.costs import Costs
-from vram_arbiter.arbiter.core.learning.footprints import Footprints
+from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refusals, Timers

@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     Reacquired,
@@ -27,7 +28,6 @@ from vram_arbiter.arbiter.core.events import (
 )
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
-from vram_arbiter.arbiter.core.learning import footprints
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import (
@@ -195,7 +195,7 @@ class Standby(Feature):
         request.gpus = tuple(gpu.info.id for gpu in admission.selected(core, lease.spec))
         request.evicted = []
         request.answered = True
-        request.load_peak_bytes, request.steady_bytes = footprints.expected_bytes(core, lease.spec)
+        request.load_peak_bytes, request.steady_bytes = learning.expected_bytes(core, lease.spec)
         absence.since = core.now
         self.away[lease.id] = lease
         core.record_lease(lease)
@@ -286,7 +286,7 @@ class Standby(Feature):
     ) -> None:
         """Queue a lease that is away, as it is asked for now. Raises Refused."""
         client, request = core.clients[event.client], lease.request
-        load_peak, steady = footprints.expected_bytes(core, spec)
+        load_peak, steady = learning.expected_bytes(core, spec)
         gpus = admission.places(core, spec, load_peak)
         check_waiters(core, client, spec.priority)
         request.load_peak_bytes, request.steady_bytes = load_peak, steady

@@ -163,7 +163,7 @@ class Departure:
 
 @dataclass(slots=True)
 class Observed:
-    """Bytes of a lease by its holder's word and by readings (`learning.footprints`)."""
+    """Bytes of a lease by its holder's word and by readings (`learning`)."""
 
     reported_bytes: int | None = None  # by the holder
     peak_bytes: int = 0  # largest reading while it loaded

@@ -23,8 +23,7 @@ from vram_arbiter.arbiter.core.effects import (
     Sample,
 )
 from vram_arbiter.arbiter.core.hooks import Feature
-from vram_arbiter.arbiter.core.learning.costs import Costs
-from vram_arbiter.arbiter.core.learning.footprints import Footprints
+from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
 from vram_arbiter.arbiter.core.model.lease import (

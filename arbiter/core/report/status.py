@@ -10,8 +10,8 @@ from heapq import merge, nsmallest
 from itertools import islice
 from math import inf
 
+from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.events import ProcessUse
-from vram_arbiter.arbiter.core.learning import footprints
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -58,7 +58,7 @@ def view(core: Core, lease: Lease) -> LeaseView:
         if lease.state in EXPIRING:
             ttl_left_s = max(0.0, lease.expires_at - core.now)
         if lease.state is not LeaseState.LOADING:
-            drift_bytes = footprints.drift_bytes(core, gpu, lease)
+            drift_bytes = learning.drift_bytes(core, gpu, lease)
     shown = LeaseView(
         lease_id=lease.id,
         token=lease.token,

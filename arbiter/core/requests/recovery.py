@@ -14,7 +14,7 @@ sub-lease are each charged their own bytes until they are measured gone.
 
 from dataclasses import replace
 
-from vram_arbiter.arbiter.core import eviction
+from vram_arbiter.arbiter.core import eviction, learning
 from vram_arbiter.arbiter.core.events import (
     DOUBT_KEY,
     MemorySampled,
@@ -23,7 +23,6 @@ from vram_arbiter.arbiter.core.events import (
     Recovered,
     Resumed,
 )
-from vram_arbiter.arbiter.core.learning import footprints
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState, Request, Use
@@ -296,7 +295,7 @@ def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
         raise Refused(no.UnknownGpu(spec.gpu, tuple(core.gpus)))
     # the journal that knew its GPU is lost: it is where most of the process's bytes are seen
     gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
-    peak, steady = footprints.expected_bytes(core, spec)
+    peak, steady = learning.expected_bytes(core, spec)
     charge = steady if item.state == "held" else peak
     if item.state == "held" and item.measured_bytes is not None:
         charge = max(item.measured_bytes, spec.footprint.residue_bytes)

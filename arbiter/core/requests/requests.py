@@ -5,7 +5,7 @@ Permission: leases belong to a process, so a request on a lease must come from a
 process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
-from vram_arbiter.arbiter.core import eviction
+from vram_arbiter.arbiter.core import eviction, learning
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     CancelRequested,
@@ -19,8 +19,7 @@ from vram_arbiter.arbiter.core.events import (
     RevokeAcknowledged,
     UnloadStarted,
 )
-from vram_arbiter.arbiter.core.learning import footprints
-from vram_arbiter.arbiter.core.learning.costs import check_load
+from vram_arbiter.arbiter.core.learning import check_load
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
 from vram_arbiter.arbiter.core.model.refusals import Limit, LimitReached, Misfit, Refused, Share
@@ -123,7 +122,7 @@ def acquire(core: Core, event: AcquireRequested) -> Lease | None:
     if known is not None:
         _answer_again(core, event, known)
         return None
-    load_peak, steady = footprints.expected_bytes(core, spec)  # 2
+    load_peak, steady = learning.expected_bytes(core, spec)  # 2
     gpus = admission.places(core, spec, load_peak)
     check_waiters(core, client, spec.priority)  # 3
     owned, most = len(core.of_client.get(client.id, ())), core.settings.leases_per_client_max
@@ -342,8 +341,8 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     core.move(lease, LeaseState.HELD, Why.READY)
     lease.ready_at = lease.uses.last_at = core.now
     lease.observed.reported_bytes = measured_bytes
-    footprints.on_ready(core, lease, measured_bytes)
-    core.costs.failures.pop(footprints.model_name(lease.spec), None)
+    learning.on_ready(core, lease, measured_bytes)
+    core.costs.failures.pop(learning.model_name(lease.spec), None)
     steady = request.steady_bytes
     if measured_bytes is not None:
         steady = max(measured_bytes, lease.spec.footprint.residue_bytes)
@@ -475,7 +474,7 @@ def oom(core: Core, event: OomReported) -> None:
     wanted = min(allocated + event.requested_bytes, gpu.ledger.budget_bytes)
     learnt = wanted if wanted > charge else None
     if learnt is not None:
-        core.footprints.out_of_memory(footprints.model_name(lease.spec), learnt)
+        core.footprints.out_of_memory(learning.model_name(lease.spec), learnt)
     core.want_sample(gpu, core.now)
     core.reply(event.client, event.request, OomReply(learnt))
     note = OomNote(

@@ -16,7 +16,7 @@ from vram_arbiter.arbiter.core.events import (
     JournalFailed,
     ProcessDied,
 )
-from vram_arbiter.arbiter.core.learning.footprints import model_name
+from vram_arbiter.arbiter.core.learning import model_name
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core

@@ -19,8 +19,8 @@ to that process. The verdict is pure: it starts nothing and changes nothing.
 from collections import Counter
 from dataclasses import dataclass
 
+from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.core.learning import footprints
 from vram_arbiter.arbiter.core.ledger import Account, GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import LEAVING, LeaseState, Verdict, Verification
@@ -75,7 +75,7 @@ def take(core: Core, gpu: Gpu, reading: MemorySampled) -> None:
     if reading.processes is None:
         return
     # 3. bytes per process: footprints, stowaways that are new or have grown, retained bytes
-    footprints.on_evidence(core, gpu)
+    learning.on_evidence(core, gpu)
     for use in ledger.stowaways.values():
         before = known.get(use.process)
         if before is None or use.held_bytes > before.held_bytes + tolerance_bytes:

@@ -8,9 +8,9 @@
 The bytes stay charged until then. A failed reading means unknown: it frees nothing.
 """
 
+from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
-from vram_arbiter.arbiter.core.learning import footprints
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Verdict, Verification
 from vram_arbiter.arbiter.core.model.state import Core
@@ -38,14 +38,14 @@ def begin_for_lease(
         fenced_at: When the holder has fenced itself, in monotonic seconds.
     """
     baseline = lease.departure.baseline or gpu.sample or gpu.before_sleep
-    footprints.on_leaving(core, lease)
+    learning.on_leaving(core, lease)
     vanishes = lease.departure.exiting or not alive
     verification = Verification(
         key=lease.id,
         process=lease.process,
         lease=lease.id,
         consumer=lease.spec.consumer,
-        model=footprints.model_name(lease.spec),
+        model=learning.model_name(lease.spec),
         retained_bytes=0 if vanishes else lease.spec.footprint.residue_bytes,
         baseline=baseline,
         baseline_comparable=baseline is not None and 0.0 < lease.ready_at <= baseline.taken_at,
@@ -286,7 +286,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         gpu.ledger.retain(process, 0, core.now)
         core.record_residue(gpu, process, 0)
         return
-    footprints.on_verdict(core, gpu, verification)
+    learning.on_verdict(core, gpu, verification)
     retained_bytes = gpu.ledger.drop(
         lease_id, judgement.residue_bytes, verification.retained_bytes, core.now
     )

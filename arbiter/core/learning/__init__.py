@@ -1,1 +1,0 @@
-"""Learned footprints (`footprints`), durations, returns, switches and failed loads (`costs`)."""
