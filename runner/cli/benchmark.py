@@ -136,10 +136,14 @@ async def run(args: argparse.Namespace) -> int:
     Returns: 0 if every episode got a verdict or the world does not judge, 1 after errors or a stop.
     The report lists what was played in either case.
     """
+    from vram_arbiter.runner.gpu_lease import RENDERER_BYTES, RENDERING, gpu_lease, rendering_gpu
+
     async with contextlib.AsyncExitStack() as stack:
         arbiter = None
         if args.skill and not args.no_arbiter:
             arbiter = await connect_arbiter(args.arbiter, stack)
+            gpu = rendering_gpu(os.environ)
+            await stack.enter_async_context(gpu_lease(arbiter, gpu, RENDERING, RENDERER_BYTES))
         entries = entries_of(args, arbiter)
         check_output("--out", args.out / REPORT)
         if args.videos:

@@ -44,6 +44,7 @@ from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
 from vram_arbiter.runner.goals.server import GoalServer
+from vram_arbiter.runner.gpu_lease import DECODER_BYTES, DECODING, cuda_uuid, gpu_lease
 from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData, Skill
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
@@ -175,6 +176,11 @@ class Deploy:
             mark.refuse_if_left()
             arbiter = (
                 None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
+            )
+            decoders = sum(getattr(one, "decodes_on_gpu", False) for one in parts.readers)
+            gpu = cuda_uuid(0) if decoders else None  # where GStreamer's decoders run
+            await stack.enter_async_context(
+                gpu_lease(arbiter, gpu, DECODING, decoders * DECODER_BYTES)
             )
             runner = self._runner(parts, mark)
             runner.spans.share = self._args.trace_ticks

@@ -105,6 +105,7 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
     from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
     from vram_arbiter.runner.goals.server import GoalServer
+    from vram_arbiter.runner.gpu_lease import RENDERER_BYTES, RENDERING, gpu_lease, rendering_gpu
     from vram_arbiter.runner.protocols import DeadlinePolicy
     from vram_arbiter.runner.recording.video import VideoRecorder
     from vram_arbiter.runner.sim.policies import policy_of
@@ -137,6 +138,9 @@ async def run(args: argparse.Namespace) -> int:
     async with contextlib.AsyncExitStack() as stack:
         alone = args.no_arbiter or policy is not None  # such a policy needs no GPU memory
         arbiter = None if alone else await connect_arbiter(args.arbiter, stack)
+        if arbiter is not None:  # before the first picture is rendered
+            gpu = rendering_gpu(os.environ)
+            await stack.enter_async_context(gpu_lease(arbiter, gpu, RENDERING, RENDERER_BYTES))
         recorder = None
         if args.video is not None:
             patient = policy is not None and args.rate == 0  # nothing else waits for this world

@@ -180,6 +180,7 @@ class GStreamerReader(SlotReader):
     ) -> None:
         super().__init__(sensor_id, max_age_ms, clock, tee)
         self._text = text
+        self.decodes_on_gpu = re.search(r"\bnv\w+dec\b", text) is not None
         self._params = params
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
