@@ -16,9 +16,6 @@ MACHINE ?=
 # Mutants of `make mutation`; 0: all.
 SAMPLE ?= 300
 
-# Programs would compile all that they import at each start: 14 s of a core for one with lerobot.
-unexport PYTHONDONTWRITEBYTECODE
-
 BIN := .venv/bin
 CORE := .venv-core/bin
 # Test tools import `tests.support` from here.

@@ -22,6 +22,7 @@ from typing import Any
 import pytest
 
 from tests.support.fakegpu_check import check_log
+from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.clients.client import AsyncClient
@@ -95,7 +96,7 @@ class Programs:
     def __init__(self) -> None:
         self.arbiter = ArbiterProcess(prepared=True).start()
         self.runtime = self.arbiter.runtime
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.running: dict[str, subprocess.Popen[bytes] | Forked] = {}
         for name, manifest in MANIFESTS.items():
             (self.runtime / name).mkdir()
             (self.runtime / name / "rskill.yaml").write_text(manifest)
@@ -110,16 +111,23 @@ class Programs:
 
     def sidecar(self, model: str, size: int, *flags: str, name: str = "") -> None:
         name, folder = name or model, self.runtime / model
-        self.start(
-            name, str(HERE / "episode_sidecar.py"), str(folder), "--name", name, "--rskill",
-            f"{folder}/rskill.yaml",
-            "--device", f"fake:{self.arbiter.card}", "--footprint",
-            f"{size},{size},{CONTEXT_BYTES}", *flags,
-        )  # fmt: skip
+        if not self.runs(name):
+            arguments = [
+                str(folder), "--name", name, "--rskill", f"{folder}/rskill.yaml",
+                "--device", f"fake:{self.arbiter.card}",
+                "--footprint", f"{size},{size},{CONTEXT_BYTES}", *flags,
+            ]  # fmt: skip
+            environ = self.arbiter.environ | {"OMP_NUM_THREADS": "1"}
+            with (self.runtime / "programs.log").open("ab") as log:
+                self.running[name] = start(
+                    "episode", arguments, environ, log.fileno(), log.fileno()
+                )
+
+    def runs(self, name: str) -> bool:
+        return name in self.running and self.running[name].poll() is None
 
     def start(self, name: str, *words: str, **environ: str) -> None:
-        known = self.running.get(name)
-        if known is not None and known.poll() is None:
+        if self.runs(name):
             return
         with (self.runtime / "programs.log").open("ab") as log:
             self.running[name] = subprocess.Popen(

@@ -67,12 +67,7 @@ class Sidecar:
     def model_pid(self):
         """Pid of the model's process: forked from the keeper of the weights, which was forked from
         the server of imports."""
-        (server,) = [
-            pid
-            for pid in children(self.process.pid)
-            if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text()
-        ]
-        (keeper,) = children(server)
+        (keeper,) = children(server_of_imports(self.process.pid))
         (model,) = children(keeper)
         return model
 
@@ -84,6 +79,16 @@ class Sidecar:
 def children(pid):
     listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
     return [int(child) for child in listed.split()]
+
+
+def server_of_imports(sidecar):
+    """Return the pid of the sidecar's child from which its keeper is forked."""
+    (server,) = [
+        pid
+        for pid in children(sidecar)
+        if "resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_text()
+    ]
+    return server
 
 
 class Box:

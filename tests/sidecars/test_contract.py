@@ -9,8 +9,6 @@ import os
 import select
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,8 +18,9 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.sidecars.conftest import children
+from tests.sidecars.conftest import children, server_of_imports
 from tests.support.fakegpu_check import check_log
+from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import until
 from tests.support.wire import WireClient
@@ -109,19 +108,18 @@ class Host:
         self.client = WireClient(f"ipc://{arbiter.runtime}/{kind.name}.sock")
         self.operator = WireClient(arbiter.endpoint).hello("operator", role="operator")
         self.other = WireClient(arbiter.endpoint).hello("other")
-        self.process: subprocess.Popen[bytes]
+        self.process: Forked
         self.start()
 
     def start(self) -> None:
-        command = [
-            sys.executable, "-m", "vram_arbiter.sidecars", "--name", self.kind.name,
-            "--rskill", str(self.configs / self.kind.rskill / "rskill.yaml"),
+        arguments = [
+            "--name", self.kind.name, "--rskill", str(self.configs / self.kind.rskill / "rskill.yaml"),
             "--configs", str(self.configs), "--footprint", "1GB,1GB,100MB",
             "--device", f"fake:{self.arbiter.card}", "--min-residency-s", "0", "--nice", "0",
         ]  # fmt: skip
         environ = {**self.arbiter.environ, "OMP_NUM_THREADS": "1"}
         with (self.arbiter.runtime / f"{self.kind.name}.log").open("ab") as log:
-            self.process = subprocess.Popen(command, env=environ, stdout=log, stderr=log)
+            self.process = start("vram-sidecar", arguments, environ, log.fileno(), log.fileno())
 
     def close(self) -> None:
         for client in (self.client, self.operator, self.other):
@@ -191,11 +189,7 @@ class Host:
 
     # -- its processes
     def keeper(self) -> int:
-        (server,) = [
-            pid
-            for pid in children(self.process.pid)
-            if "forkserver" in Path(f"/proc/{pid}/cmdline").read_text()
-        ]
+        server = server_of_imports(self.process.pid)
         until(lambda: len(children(server)) == 1)
         return int(children(server)[0])
 
@@ -230,7 +224,7 @@ HOSTS = [  # the others run the same host around models of the same libraries
 
 @pytest.fixture(scope="module", params=HOSTS)
 def host(request: pytest.FixtureRequest, configs: Path) -> Iterator[Host]:
-    arbiter = ArbiterProcess("fake:8GiB").start()
+    arbiter = ArbiterProcess("fake:8GiB", prepared=True).start()
     host = Host(request.param, arbiter, configs)
     try:
         host.answer()

@@ -7,6 +7,7 @@ import takes 0.3 to 0.6 s of a core, a fork some milliseconds. `start` returns w
 
 import atexit
 import contextlib
+import gc
 import json
 import os
 import select
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 
+from tests.support import fork_server
 from tests.support.paths import ROOT
 
 MESSAGE_MAX = 1 << 17
@@ -31,12 +33,18 @@ INTERPRETER = ("PYTHON", "LANG", "LC_")
 @dataclass(frozen=True, slots=True)
 class Program:
     """A program of the product: its `main` takes the arguments from `sys.argv` and may return the
-    exit code. `imports`: what it would import later."""
+    exit code. `imports`: what it would import later. `forks`: it starts a server of imports."""
 
     module: str
     imports: Sequence[str] = ()
+    forks: bool = False
 
 
+SIDECAR = (
+    "anyio._backends._asyncio",
+    "vram_arbiter.sidecars.host",
+    "vram_arbiter.sidecars.model_main",
+)
 PROGRAMS: Mapping[str, Program] = {
     "vram-arbiter": Program(
         "vram_arbiter.arbiter.__main__",
@@ -60,8 +68,12 @@ PROGRAMS: Mapping[str, Program] = {
             "vram_arbiter.clients.cli.why",
         ),
     ),
-    "echo": Program(
-        "tests.sidecars.echo_sidecar", ("anyio._backends._asyncio", "vram_arbiter.sidecars.host")
+    "echo": Program("tests.sidecars.echo_sidecar", SIDECAR, forks=True),
+    "episode": Program("tests.e2e.episode_sidecar", (*SIDECAR, "numpy"), forks=True),
+    "vram-sidecar": Program(
+        "vram_arbiter.sidecars.__main__",
+        (*SIDECAR, "transformers", "vram_arbiter.sidecars.preload_lerobot"),
+        forks=True,
     ),
 }
 
@@ -145,12 +157,15 @@ def _server(program: str) -> socket.socket:
     """Start the server of a program, once in this process."""
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     here.settimeout(PATIENCE_S)
+    environ = {**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+    if PROGRAMS[program].forks:
+        environ |= fork_server.importing()
     with there:
         process = subprocess.Popen(
             [sys.executable, "-u", "-m", "tests.support.prepared", program, str(there.fileno())],
             pass_fds=(there.fileno(),),
             stdin=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"},
+            env=environ,
             cwd=ROOT,
         )
 
@@ -215,7 +230,10 @@ if __name__ == "__main__":
     for imported in PROGRAMS[name].imports:
         import_module(imported)
     main = import_module(PROGRAMS[name].module).main
+    gc.freeze()  # collections in the children need not copy these pages
     given = serve(socket.socket(fileno=int(descriptor)))
     if given is not None:
         sys.argv = [name, *given]
+        if PROGRAMS[name].forks:
+            fork_server.lend()
         sys.exit(main())
