@@ -2,6 +2,7 @@
 knows no robot and no GPU."""
 
 import asyncio
+import contextlib
 import os
 import uuid
 from collections.abc import AsyncIterator
@@ -10,6 +11,7 @@ from typing import Literal, Self, cast
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.estop import Stopped, stop
+from vram_arbiter.clients.net.link import somebody_listens
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.schemas.errors import (
     BadState,
@@ -36,6 +38,7 @@ class Goal:
         self._client = client
         self._feedback: asyncio.Queue[FeedbackPush | None] = asyncio.Queue()
         self._result: asyncio.Future[ResultPush] = asyncio.get_running_loop().create_future()
+        self._news = asyncio.Event()  # the result is there, or contact was lost
 
     @property
     def done(self) -> bool:
@@ -48,18 +51,20 @@ class Goal:
         self._feedback.put_nowait(None)  # a second reader ends too
 
     async def result(self, timeout_s: float | None = None) -> ResultPush:
-        """Raises TimeoutError (the goal goes on), RunnerUnreachable when the runner is gone,
+        """Raises TimeoutError (the goal goes on), RunnerUnreachable as soon as the runner is gone,
         BadRequest when it forgot the goal."""
         async with asyncio.timeout(timeout_s):
             while not self._result.done():
-                await asyncio.wait({self._result}, timeout=RESULT_POLL_S)
+                self._news.clear()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._news.wait(), RESULT_POLL_S)
                 if not self._result.done():
                     await self._client.check_result(self)
         return self._result.result()
 
     async def cancel(self) -> None:
         """Ask for the end; the result (status `canceled`) still comes."""
-        await self._client.call("cancel", {"goal_id": self.goal_id})
+        await self._client.ask_about(self, "cancel")
 
     def fed(self, push: FeedbackPush) -> None:
         if self._feedback.qsize() >= FEEDBACK_MAX:
@@ -69,7 +74,12 @@ class Goal:
     def ended(self, result: ResultPush) -> None:
         if not self._result.done():
             self._result.set_result(result)
+            self._news.set()
             self._feedback.put_nowait(None)
+
+    def contact_lost(self) -> None:
+        """Make `result` ask for what may have passed by."""
+        self._news.set()
 
 
 class RunnerClient:
@@ -86,7 +96,13 @@ class RunnerClient:
         self.endpoint = endpoint or program_endpoint("runner", os.environ, os.getuid())
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
-        self._rpc = RpcClient(self.endpoint, program="runner", lost=self._lost, pushed=self._pushed)
+        self._rpc = RpcClient(
+            self.endpoint,
+            program="runner",
+            lost=self._lost,
+            pushed=self._pushed,
+            dropped=self._dropped,
+        )
         self._goals: dict[str, Goal] = {}
 
     async def __aenter__(self) -> Self:
@@ -146,11 +162,20 @@ class RunnerClient:
     async def check_result(self, goal: Goal) -> None:
         """Ask for a result that may have passed us by while contact was lost."""
         try:
-            reply = await self.call("result", {"goal_id": goal.goal_id})
+            reply = await self.ask_about(goal, "result")
         except BadState:
             return  # it runs; the error of a runner that forgot the goal is the caller's
         if reply.get("status") in ENDED:
             self._end(cast(ResultPush, reply))
+
+    async def ask_about(self, goal: Goal, op: str) -> Message:
+        """Ask the runner that accepted the goal: another one that starts does not know it.
+
+        Raises RunnerUnreachable at once where no process serves the socket any more.
+        """
+        if not self._rpc.proven and not somebody_listens(self.endpoint):
+            raise self._lost("it has ended")
+        return await self.call(op, {"goal_id": goal.goal_id})
 
     # -- reads -------------------------------------------------------------------------------------
     async def frame(
@@ -223,6 +248,10 @@ class RunnerClient:
                     goal.fed(cast(FeedbackPush, message))
             case "result":
                 self._end(cast(ResultPush, message))
+
+    def _dropped(self) -> None:
+        for goal in self._goals.values():
+            goal.contact_lost()
 
     def _end(self, result: ResultPush) -> None:
         if goal := self._goals.pop(result["goal_id"], None):

@@ -29,6 +29,8 @@ from vram_arbiter.schemas.runtime.trust import (
 
 MESSAGE_LIMIT_BYTES: Final = 64 * 1024 * 1024  # a reply is never near it; libzmq hangs up beyond
 
+KNOCK_S: Final = 1.0  # a server whose backlog is full lets a connection wait
+
 NEVER_MS: Final = 2**31 - 1
 """Pause before libzmq's own reconnect: 24 days. Its -1 ("none") discards what was received and not
 read yet at a hang-up."""
@@ -169,6 +171,23 @@ def _address(endpoint: str, program: Program) -> str | bytes:
             )
         return f"tcp://127.0.0.1:{port}"
     return b"ipc://" + os.fsencode(socket_path(endpoint))  # bytes: a path need not be text
+
+
+def somebody_listens(endpoint: str) -> bool:
+    """Return False for a socket that is missing or that no process serves, True where only an
+    exchange can tell.
+    """
+    if not endpoint.startswith("ipc://"):
+        return True
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knock:
+        knock.settimeout(KNOCK_S)
+        try:
+            knock.connect(socket_path(endpoint))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:
+            return True
+    return True
 
 
 def ms_until(deadline: float) -> int:

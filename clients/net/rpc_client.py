@@ -26,7 +26,8 @@ REQUEST_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * KIB  # our servers refuse mor
 
 class RpcClient:
     """`lost(reason)` makes the error that requests fail with when contact is lost;
-    `pushed(message)` gets what is not a reply. `enveloped` as in `Dealer`."""
+    `pushed(message)` gets what is not a reply, `dropped` is called when a connection ends.
+    `enveloped` as in `Dealer`."""
 
     def __init__(
         self,
@@ -35,6 +36,7 @@ class RpcClient:
         program: Program,
         lost: Callable[[str], VramError],
         pushed: Callable[[Message], None] = lambda message: None,
+        dropped: Callable[[], None] = lambda: None,
         enveloped: bool = False,
     ) -> None:
         self.proven = False
@@ -46,6 +48,7 @@ class RpcClient:
         self._program: Program = program
         self._lost = lost
         self._pushed = pushed
+        self._dropped = dropped
         self._ids = itertools.count(1)
         self._waiting: dict[int, Answer[Any]] = {}
         self._dealer: Dealer | None = None
@@ -81,6 +84,7 @@ class RpcClient:
         waiting, self._waiting = self._waiting, {}
         for answer in waiting.values():
             answer.fail(error)
+        self._dropped()
 
     def _connected(self) -> Dealer:
         if self._dealer is None:

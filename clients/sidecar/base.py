@@ -13,12 +13,12 @@ one of the other kind. It gets one request at a time, in the shapes of `clients.
 
 import asyncio
 import contextlib
-import socket
 from collections.abc import Sequence
 from time import monotonic
 from typing import Any, ClassVar, Self, cast
 
 from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.net.link import somebody_listens
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.sidecar import field
 from vram_arbiter.clients.sidecar.spawn import Child, SpawnSpec
@@ -80,6 +80,11 @@ class SidecarClient:
     def of_field(self) -> bool:
         """Whether the present connection is to a server of the field: no lease, no `unload`."""
         return self._rpc.in_order is True
+
+    @property
+    def connected(self) -> bool:
+        """Whether the server that answered last still holds the connection."""
+        return self._rpc.proven
 
     # -- ops of both families
     async def ping(self, *, timeout_s: float = PROBE_S) -> PingResult:
@@ -193,18 +198,7 @@ class SidecarClient:
                 )
 
     def _somebody_listens(self) -> bool:
-        """Return False at once for a missing or dead ipc path; otherwise a ping decides."""
-        if not self.endpoint.startswith("ipc://"):
-            return True
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knock:
-            knock.settimeout(PROBE_S)
-            try:
-                knock.connect(self.endpoint.removeprefix("ipc://"))
-            except (ConnectionRefusedError, FileNotFoundError):
-                return False
-            except OSError:
-                return True
-        return True
+        return somebody_listens(self.endpoint)
 
     async def _answers(self, timeout_s: float = PROBE_S) -> bool:
         try:
