@@ -95,17 +95,28 @@ class Goal:
 
 
 @dataclass(frozen=True, slots=True)
+class ChunkStart:
+    """How a chunk came: seconds from its request to its answer, and whether it was there when it
+    was due (None: the goal's first, which is waited for in any case).
+    """
+
+    latency_s: float
+    in_time: bool | None
+    over_budget: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Act:
     """Apply this one-step action now.
 
-    `prefetched` comes with the first action of a chunk: whether the chunk was there when it was
-    due. None: unknown. `problem` says how the action falls short of what was asked for.
+    `chunk` comes with the first action of a chunk. `problem` says how the action falls short of
+    what was asked for.
     """
 
     action: Action
     chunk_index: int | None = None
     inference_ms: float = 0.0
-    prefetched: bool | None = None
+    chunk: ChunkStart | None = None
     problem: str = ""
 
 
@@ -114,11 +125,13 @@ class Hold:
     """Nothing to apply this tick (an answer is under way): keep the pose.
 
     `withheld`: there was an action, and it cannot be carried out; `reason` is a violation.
+    `standing`: an action was due in the middle of a motion, and there was none.
     """
 
     reason: str
     inference_ms: float = 0.0
     withheld: bool = False
+    standing: bool = False
 
 
 @dataclass(frozen=True, slots=True)

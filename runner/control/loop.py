@@ -30,7 +30,7 @@ from vram_arbiter.runner.control.pacing import Pacing, Slot
 from vram_arbiter.runner.control.robot import Applied, Robot, Sensed
 from vram_arbiter.runner.control.skill_slot import Decision, SkillSlot
 from vram_arbiter.runner.control.tick_spans import TickSpans
-from vram_arbiter.runner.control.timings import Timings, mean, percentile
+from vram_arbiter.runner.control.timings import Timings, mean, percentile, spread
 from vram_arbiter.runner.protocols import (
     DeadlineMissed,
     DeadlinePolicy,
@@ -49,8 +49,6 @@ from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.world import Action, RunResult, TickResult, WorldState
-
-_SHARES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
 
 
 class Video(Protocol):
@@ -310,7 +308,7 @@ class ControlLoop[R: Robot]:
         result = self._measured(tick)
         labels = self.slot.labels
         self.tick_idx += 1
-        self.slot.tick_over()
+        self.slot.tick_over(None if math.isinf(tick.slot.deadline_s) else result.late_ms)
         self.spans.applied(result.action_applied)
         self.timings.add(
             tick.started_s,
@@ -398,7 +396,7 @@ class ControlLoop[R: Robot]:
             "deadline_policy": self.deadline_policy.value,
             "deadline_misses": self.deadline_misses,
             "late_actions_withheld": self.late_actions_withheld,
-            "start_late_ms": {name: percentile(late_ms, share) for name, share in _SHARES.items()},
+            "start_late_ms": spread(late_ms),
             **self.slot.total.as_data(),
             "goals_by_skill": dict(self.slot.goals_by_skill),
             **({} if sink is None else {"recorded": dict(sink.facts())}),

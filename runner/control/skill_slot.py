@@ -14,9 +14,11 @@ from dataclasses import dataclass, field
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.follow import GoalFollower
 from vram_arbiter.runner.control.robot import StaleInput
+from vram_arbiter.runner.control.tally import Tally
 from vram_arbiter.runner.control.withheld import LATE, Streak
 from vram_arbiter.runner.protocols import (
     Act,
+    ChunkStart,
     Done,
     Goal,
     GoalData,
@@ -51,33 +53,6 @@ class Decision:
 
 
 @dataclass(slots=True)
-class Tally:
-    """Counts of a goal's actions and chunks, or of a whole run's."""
-
-    withheld: int = 0
-    clamped: int = 0
-    prefetch_hits: int = 0
-    prefetch_misses: int = 0
-
-    def count_chunk(self, in_time: bool) -> None:
-        if in_time:
-            self.prefetch_hits += 1
-        else:
-            self.prefetch_misses += 1
-
-    def as_data(self) -> GoalData:
-        """Return the counts for a result; chunks only where one followed another."""
-        data: GoalData = {"withheld": self.withheld, "clamped": self.clamped}
-        if chunks := self.prefetch_hits + self.prefetch_misses:
-            data["prefetch"] = {
-                "hits": self.prefetch_hits,
-                "misses": self.prefetch_misses,
-                "hit_rate": self.prefetch_hits / chunks,
-            }
-        return data
-
-
-@dataclass(slots=True)
 class _Active:
     skill: Stepped
     goal: Goal
@@ -85,6 +60,7 @@ class _Active:
     gate: SafetyGate
     streak: Streak
     ticks: int = 0
+    acted: bool = False  # it gave an action
     passed: bool = False  # an action of this tick passed the gate and was not late
     tally: Tally = field(default_factory=Tally)
     detail: str = ""
@@ -152,10 +128,18 @@ class SkillSlot:
             active.streak.end("the goal ends")
         return active
 
-    def tick_over(self) -> None:
-        """Count the tick that just ended; an action that reached the motors ends a streak."""
+    def tick_over(self, late_ms: float | None) -> None:
+        """Count the tick that just ended; an action that reached the motors ends a streak.
+
+        `late_ms`: how far behind its slot it began; None without slots. Ticks before the goal's
+        first action are its start-up and not counted as late.
+        """
         if (active := self._active) is not None:
             active.ticks += 1
+            if active.acted and late_ms is not None:
+                active.tally.late_ms.append(late_ms)
+                self.total.late_ms.append(late_ms)
+                meters.measure(telemetry.METRIC_START_LATE, late_ms / 1e3, self.labels)
             if active.passed:
                 active.streak.end("actions pass again")
             active.passed = False
@@ -190,17 +174,20 @@ class SkillSlot:
         decision.inference_ms = (self._clock.now_s() - asked_s) * 1e3
         meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms / 1e3, self.labels)
         match outcome:
-            case Act(action=action, chunk_index=chunk_index, prefetched=prefetched, problem=short):
+            case Act(action=action, chunk_index=chunk_index, chunk=chunk, problem=short):
+                active.acted = True
                 decision.chunk_index = chunk_index
-                if prefetched is not None:
-                    self._count_chunk(active, prefetched)
+                if chunk is not None:
+                    self._count_chunk(active, chunk)
                 self._check(active, action, world, decision, short)
             case Hold(reason=reason, withheld=True):
                 decision.violations = (reason,)
                 self.violations.append(reason)
                 self._refused(active, reason)
-            case Hold(reason=reason):
+            case Hold(reason=reason, standing=standing):
                 active.detail = reason
+                if standing:
+                    self._count_standing(active)
             case Done(data=data):
                 self.end(SkillEnded(dict(data)))
         self._show_progress(active)
@@ -211,10 +198,20 @@ class SkillSlot:
             fraction = min(max(active.skill.fraction, 0.0), 1.0)
             self.progress = Progress(fraction, "running", active.ticks, active.detail)
 
-    def _count_chunk(self, active: _Active, in_time: bool) -> None:
-        tracing.event(telemetry.EVENT_PREFETCH_HIT if in_time else telemetry.EVENT_PREFETCH_MISS)
-        active.tally.count_chunk(in_time)
-        self.total.count_chunk(in_time)
+    def _count_chunk(self, active: _Active, chunk: ChunkStart) -> None:
+        active.tally.count_chunk(chunk)
+        self.total.count_chunk(chunk)
+        if chunk.in_time is None:
+            return
+        hit = chunk.in_time
+        tracing.event(telemetry.EVENT_PREFETCH_HIT if hit else telemetry.EVENT_PREFETCH_MISS)
+        labels = {**self.labels, telemetry.ATTR_OUTCOME: "hit" if hit else "miss"}
+        meters.count(telemetry.METRIC_PREFETCH, labels)
+
+    def _count_standing(self, active: _Active) -> None:
+        active.tally.standing_steps += 1
+        self.total.standing_steps += 1
+        meters.count(telemetry.METRIC_STANDING, self.labels)
 
     def _check(
         self, active: _Active, action: Action, world: WorldState, decision: Decision, short: str

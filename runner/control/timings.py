@@ -16,6 +16,8 @@ TIMINGS_KEPT = (
     36_000  # twenty minutes at 30 Hz; older timings leave the percentiles, never the counts
 )
 
+_SHARES = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+
 
 def percentile(values: Sequence[float], share: float) -> float:
     """Return a percentile by linear interpolation between ranks; 0.0 for no values.
@@ -29,6 +31,12 @@ def percentile(values: Sequence[float], share: float) -> float:
     low = math.floor(rank)
     high = min(low + 1, len(ordered) - 1)
     return ordered[low] + (ordered[high] - ordered[low]) * (rank - low)
+
+
+def spread(values: Iterable[float]) -> dict[str, float]:
+    """Return median, 99th percentile and maximum."""
+    kept = list(values)
+    return {name: percentile(kept, share) for name, share in _SHARES.items()}
 
 
 def mean(values: Sequence[float]) -> float:

@@ -34,12 +34,13 @@ CHUNK_ROWS_MAX = 1000
 class Played:
     """A row to play now, and its chunk.
 
-    `prefetched` comes with the first row of every chunk but the first: whether the chunk was in
-    time.
+    `first`: it is the first row that is played of its chunk. `prefetched` comes with it for every
+    chunk but the first: whether the chunk was in time.
     """
 
     chunk: int
     row: Row
+    first: bool = False
     prefetched: bool | None = None
 
 
@@ -116,13 +117,10 @@ class ChunkPlayer:
             return None
         self.played += 1
         chunk, row = self._rows.popleft()
-        return Played(chunk, row, self._in_time(chunk))
-
-    def _in_time(self, chunk: int) -> bool | None:
         if chunk == self._begun:
-            return None
+            return Played(chunk, row)
         late, self._late, self._begun = self._late, False, chunk
-        return None if chunk == 0 else not late
+        return Played(chunk, row, first=True, prefetched=None if chunk == 0 else not late)
 
     def _collect(self, future: concurrent.futures.Future[Rows]) -> None:
         """Take the rows of an answered request. Raises what it failed with."""

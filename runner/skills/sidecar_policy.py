@@ -13,6 +13,7 @@ import asyncio
 import concurrent.futures
 import contextlib
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
@@ -20,6 +21,7 @@ from typing import Any, Protocol
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import (
     Act,
+    ChunkStart,
     Done,
     Goal,
     Hold,
@@ -41,6 +43,7 @@ from vram_arbiter.schemas.errors import (
     LeaseRevoking,
     ModelError,
     NotResident,
+    SidecarUnavailable,
     StaleToken,
     UnknownLease,
     UnknownOp,
@@ -49,6 +52,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.sidecar import LoadResult, RealTimeChunking
@@ -59,7 +63,9 @@ log = logging.getLogger(__name__)
 LOAD_TRIES_MAX = 20
 RETRY_S = 0.2
 WITHDRAW_S = 3.0  # to take a load back; then the goal ends all the same
-CHUNK_TIMEOUT_S = 30.0  # a policy that needs longer for one chunk is gone
+HUNG_AFTER = 5.0  # times the manifest's time for a chunk: a policy that needs longer hangs …
+HUNG_MIN_S = 2.0  # … but a busy machine may take so long for any
+HUNG_FIRST_MIN_S = 10.0  # for a goal's first chunk, after which the model is warm
 LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
 STEP_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 STILL_WINDOW = (
@@ -164,6 +170,7 @@ class SidecarPolicy(SkillBase):
         self._player: ChunkPlayer | None = None
         self._recent: deque[Row] = deque(maxlen=STILL_WINDOW)
         self._seen: deque[Message] = deque(maxlen=wiring.rollout.n_obs_steps)
+        self._latency_s = 0.0  # of the newest chunk that was answered
         self._target: dict[str, float] = {}
 
     # -- event loop
@@ -248,17 +255,44 @@ class SidecarPolicy(SkillBase):
             await self._client.close()
 
     async def _fetch(
-        self, observation: JsonMap, token: tuple[int, ...] | None, rtc: RealTimeChunking | None
+        self,
+        observation: JsonMap,
+        token: tuple[int, ...] | None,
+        rtc: RealTimeChunking | None,
+        limit_s: float,
     ) -> list[Row]:
         """Request a chunk; the tick that asked is the span's parent, or the goal if it is not
         recorded.
         """
         parent = None if tracing.recorded() else self._traceparent
         with tracing.span(telemetry.SPAN_CHUNK, parent, {telemetry.ATTR_SKILL: self.key.rskill_id}):
-            answer = await self._client.get_action(
-                observation, rtc=rtc, token=token, timeout_s=CHUNK_TIMEOUT_S
-            )
+            asked_s = time.monotonic()
+            try:
+                async with asyncio.timeout(limit_s):
+                    answer = await self._client.get_action(observation, rtc=rtc, token=token)
+            except TimeoutError:
+                raise SidecarUnavailable(
+                    f"{self.key} hangs: no chunk within {limit_s:g} s, {self._budget()}",
+                    hint="see the sidecar's log; a slow policy needs a larger "
+                    "latency_budget.per_chunk_ms",
+                    details={"limit_s": limit_s, "endpoint": self._client.endpoint},
+                ) from None
+            self._latency_s = time.monotonic() - asked_s
+            labels = {telemetry.ATTR_SKILL: self.key.rskill_id}
+            meters.measure(telemetry.METRIC_CHUNK, self._latency_s, labels)
             return self._rows(answer)
+
+    def _budget(self) -> str:
+        budget_ms = self.manifest.latency_budget.per_chunk_ms
+        return f"{HUNG_AFTER:g} times its latency_budget.per_chunk_ms of {budget_ms:g} or more"
+
+    def _limit_s(self, *, first: bool) -> float:
+        """Return the time after which a policy that has not answered hangs."""
+        budget = self.manifest.latency_budget
+        if not first:
+            return max(HUNG_MIN_S, HUNG_AFTER * budget.per_chunk_ms / 1e3)
+        budget_ms = budget.per_chunk_ms + (budget.warmup_ms or 0.0)
+        return max(HUNG_FIRST_MIN_S, HUNG_AFTER * budget_ms / 1e3)
 
     # -- control thread
     def wants_frames(self) -> bool:
@@ -274,6 +308,12 @@ class SidecarPolicy(SkillBase):
             raise BadState(f"{self.key} was stepped without a goal")
         if self._use is not None and self._use.lost is not None:
             raise self._use.lost
+        if not self._client.connected:
+            raise SidecarUnavailable(
+                f"contact to {self._client.endpoint} was lost within the goal",
+                hint="the next goal starts or finds the sidecar again; see its log",
+                details={"endpoint": self._client.endpoint},
+            )
         measured = joint_positions(world, self._read)
         if not self._running:
             if not self._at_start(measured):
@@ -286,7 +326,7 @@ class SidecarPolicy(SkillBase):
             self._seen.append(self._observation(world, measured))
         played = player.next_row(self._history() if player.wants_observation() else None)
         if played is None:
-            return Hold("the policy thinks")
+            return Hold("the policy thinks", standing=player.played > 0)
         self.fraction = player.played / self._steps
         if self._stepper is not None:
             return self._stepped(self._stepper, played, measured, world)
@@ -298,7 +338,13 @@ class SidecarPolicy(SkillBase):
             joint_names=self._wiring.joints,
             stamp_ns=world.stamp_ns,
         )
-        return Act(action, chunk_index=played.chunk, prefetched=played.prefetched)
+        return Act(action, chunk_index=played.chunk, chunk=self._chunk_start(played))
+
+    def _chunk_start(self, played: Played) -> ChunkStart | None:
+        if not played.first:
+            return None
+        budget_s = self.manifest.latency_budget.per_chunk_ms / 1e3
+        return ChunkStart(self._latency_s, played.prefetched, self._latency_s > budget_s)
 
     def _stepped(
         self, stepper: Stepper, played: Played, measured: Mapping[str, float], world: WorldState
@@ -325,7 +371,7 @@ class SidecarPolicy(SkillBase):
         return Act(
             _joint_action(targets, step.twist, world),
             chunk_index=played.chunk,
-            prefetched=played.prefetched,
+            chunk=self._chunk_start(played),
             problem=step.problem,
         )
 
@@ -409,7 +455,9 @@ class SidecarPolicy(SkillBase):
     ) -> concurrent.futures.Future[Sequence[Row]]:
         if self._loop is None:
             raise BadState(f"{self.key} has no event loop")
-        fetch = self._fetch(observation, token, self._real_time())
+        first = self._player is None or self._player.chunks == 0
+        limit_s = self._limit_s(first=first)
+        fetch = self._fetch(observation, token, self._real_time(), limit_s)
         return asyncio.run_coroutine_threadsafe(fetch, self._loop)
 
     def _real_time(self) -> RealTimeChunking | None:

@@ -80,7 +80,7 @@ actuators_required:
   - {{kind: joint_position, control_mode_semantics: {{mode: absolute, joint_order: {JOINTS}}}}}
 weights_uri: hf://test/policy
 chunk_size: 10
-latency_budget: {{per_chunk_ms: 100, max_execution_s: 5}}
+latency_budget: {{per_chunk_ms: 6000, max_execution_s: 5}}
 description: holds the arm still
 actions: [grasp]
 action_contract: {{dim: 6}}

@@ -30,6 +30,12 @@ class Instrument(NamedTuple):
 INSTRUMENTS: Mapping[str, Instrument] = {
     telemetry.METRIC_TICK: Instrument("s", "One tick of the control loop"),
     telemetry.METRIC_INFERENCE: Instrument("s", "One question to the active skill"),
+    telemetry.METRIC_CHUNK: Instrument("s", "From the request of a policy's chunk to its answer"),
+    telemetry.METRIC_PREFETCH: Instrument(
+        "{chunk}", "Chunks that were, or were not, there in time"
+    ),
+    telemetry.METRIC_STANDING: Instrument("{step}", "Steps of a motion without an action to play"),
+    telemetry.METRIC_START_LATE: Instrument("s", "How far behind its slot a goal's tick began"),
     telemetry.METRIC_DEADLINE_MISSES: Instrument("{tick}", "Ticks longer than their time budget"),
     telemetry.METRIC_HAL_READ: Instrument("s", "One reading of the robot's joint state"),
     telemetry.METRIC_HAL_SEND: Instrument("s", "One action sent to the motors"),

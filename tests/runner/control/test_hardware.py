@@ -110,7 +110,8 @@ def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
     assert seen[0].image_frames["front"].data == bytes([255, 0, 0, 0, 0, 255])  # inline, untouched
     assert seen[0].diagnostics == {"front": "ok", "joint_state": "ok"}
     tick(runner, clock, 3)
-    assert ended == [SkillEnded({"ticks": 3, "withheld": 0, "clamped": 0, "nods": 3})]
+    on_time = {"late_starts_ms": {"p50": 0.0, "p99": 0.0, "max": 0.0}}
+    assert ended == [SkillEnded({"ticks": 3, "withheld": 0, "clamped": 0, **on_time, "nods": 3})]
     assert len(twin.sent) == 3
     assert not tick(runner, clock).action_applied  # without a skill nothing is sent
     runner.deactivate()

@@ -18,9 +18,11 @@ from vram_arbiter.runner.protocols import (
     DeadlineMissed,
     DeadlinePolicy,
     Goal,
+    Hold,
     InferenceRunner,
     Picture,
     SafetyGate,
+    SkillEnded,
     SkillKey,
     StepOutcome,
     Stepped,
@@ -250,11 +252,29 @@ def test_how_far_behind_its_slot_a_tick_began_is_kept(clock: Any, tmp_path: Path
     result = runner.run(max_ticks=3)
     assert runner.timings.late_ms == pytest.approx([0.0, 3.0, 0.0])
     assert result.metadata["start_late_ms"] == pytest.approx({"p50": 0.0, "p99": 2.94, "max": 3.0})
+    assert result.metadata["late_starts_ms"] == result.metadata["start_late_ms"]
     runner.timings.write(tmp_path / "ticks.jsonl")
     lines = [json.loads(line) for line in (tmp_path / "ticks.jsonl").read_text().splitlines()]
     assert [line["started_s"] for line in lines] == pytest.approx([100.0, 100.103, 100.2])
     assert [line["tick_ms"] for line in lines] == pytest.approx([10.0, 20.0, 0.0])
     assert [line["reset"] for line in lines] == [False] * 3
+
+
+class Starting(Thinker):
+    """Gives no action in its first two ticks."""
+
+    def step(self, world: WorldState) -> StepOutcome:
+        outcome = super().step(world)
+        return Hold("starting") if len(self.began_s) <= 2 else outcome
+
+
+def test_late_starts_are_counted_from_a_goals_first_action_on(clock: Any) -> None:
+    sleeper = Oversleeper(clock, [0.009, 0.003, 0.0, 0.0])
+    loop = ControlLoop(Desk(clock, 0.0), clock=sleeper, rate_hz=10)
+    ended: list[SkillEnded] = []
+    loop.begin_skill(Starting(clock, [0.0] * 4), Goal("g", "a/thinker", max_ticks=3), ended.append)
+    assert loop.run(max_ticks=4).metadata["start_late_ms"]["max"] == pytest.approx(9.0)
+    assert ended[0].data["late_starts_ms"]["max"] == pytest.approx(3.0)
 
 
 def test_only_so_many_timings_are_kept() -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import (
     Act,
+    ChunkStart,
     DeadlinePolicy,
     Done,
     Goal,
@@ -497,16 +498,24 @@ def test_goals_and_runs_say_what_became_of_chunks_and_actions(make_runner: Make)
     runner = make_runner(rate_hz=0, seed=3)
     runner.identity = {"robot": "arm", "scene": "table"}
     script = [
-        Act(joints(0.1), chunk_index=0),
-        Act(joints(9.0), chunk_index=1, prefetched=True),
+        Act(joints(0.1), chunk_index=0, chunk=ChunkStart(0.9, None)),
+        Act(joints(9.0), chunk_index=1, chunk=ChunkStart(0.25, True)),
         Act(joints(0.6), chunk_index=1),
-        Act(joints(0.1), chunk_index=2, prefetched=False),
-        Act(joints(0.1), chunk_index=3, prefetched=True),
+        Hold("the policy thinks", standing=True),
+        Act(joints(0.1), chunk_index=2, chunk=ChunkStart(0.75, False, over_budget=True)),
+        Act(joints(0.1), chunk_index=3, chunk=ChunkStart(0.5, True)),
         Evicted("gone"),
     ]
-    _, ended = play_script(runner, script, 6)
-    counts = {"withheld": 1, "clamped": 1, "prefetch": {"hits": 2, "misses": 1, "hit_rate": 2 / 3}}
-    assert ended[0].data == {"ticks": 5, **counts}
+    _, ended = play_script(runner, script, 7)
+    counts = {
+        "withheld": 1,
+        "clamped": 1,
+        "chunk_latency_ms": {"first": 900.0, "p50": 500.0, "p99": 745.0, "max": 750.0},
+        "chunks_over_budget": 1,
+        "standing_steps": 1,
+        "prefetch": {"hits": 2, "misses": 1, "hit_rate": 2 / 3},
+    }
+    assert ended[0].data == {"ticks": 6, **counts}
     metadata = runner.result().metadata
     assert metadata.items() >= {**counts, "robot": "arm", "scene": "table", "seed": 3}.items()
     assert metadata["goals_by_skill"] == {"test/skill": 1}

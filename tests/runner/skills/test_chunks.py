@@ -119,7 +119,7 @@ def test_without_prefetch_the_observation_is_taken_after_the_last_row() -> None:
     assert not player.wants_observation()
     policy.answer()
     assert [player.next_row(None) for _ in range(3)] == [
-        Played(0, (0.0, float(i))) for i in range(3)
+        Played(0, (0.0, float(i)), first=i == 0) for i in range(3)
     ]
     assert player.wants_observation()
     assert player.next_row("o3") is None
@@ -137,7 +137,7 @@ def test_a_chunk_that_is_there_is_played_at_once_when_waiting_is_allowed() -> No
         future.set_result([(1.0,)])
         return future
 
-    assert ChunkPlayer(fetch, wait_s=1.0).next_row("o") == Played(0, (1.0,))
+    assert ChunkPlayer(fetch, wait_s=1.0).next_row("o") == Played(0, (1.0,), first=True)
 
 
 @pytest.mark.parametrize("error", [Evicted("gone"), ModelError("no")])
@@ -231,4 +231,4 @@ def test_an_answer_that_comes_right_behind_the_wait_is_no_timeout(wait_s: float)
     """Regression: an answer between the end of the wait and the check counted as the policy's
     time-out."""
     player = ChunkPlayer(lambda _: AnsweredAsOneLooks(), wait_s=wait_s)
-    assert player.next_row("o") == Played(0, (1.0,))
+    assert player.next_row("o") == Played(0, (1.0,), first=True)

@@ -27,6 +27,7 @@ from vram_arbiter.schemas.errors import (
     LeaseRevoking,
     ManifestInvalid,
     ModelError,
+    SidecarUnavailable,
     VramError,
     WaitTimeout,
 )
@@ -86,6 +87,7 @@ class Sidecar:
         self.wanted = False  # somebody waits for the model
         self.late_s = 0.0  # how long it lets a ping wait
         self.loads: asyncio.Event | None = None  # set once a load has come, which is never answered
+        self.hangs = False  # it answers no request for actions
 
     @asynccontextmanager
     async def served(self, endpoint: str) -> AsyncIterator[None]:
@@ -109,6 +111,8 @@ class Sidecar:
             self.tokens.append(message.get("token"))
         if endpoint == "load" and self.loads is not None:
             self.loads.set()
+            return
+        if endpoint == "get_action" and self.hangs:
             return
         error = self.load_error if endpoint == "load" else self.error
         if endpoint in ("load", "get_action") and error is not None:
@@ -389,6 +393,52 @@ def test_a_lost_use_fails_the_goal(policy_bench: Callable[..., Bench], run_async
     scenario(run_async, policy_bench(Arbiter()), play)
 
 
+@pytest.mark.parametrize("answered", [0, 1])
+def test_a_policy_that_hangs_is_noticed_by_its_latency_budget(
+    policy_bench: Callable[..., Bench],
+    run_async: Run,
+    answered: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Regression: every policy was given 30 s for a chunk."""
+    for name in ("HUNG_MIN_S", "HUNG_FIRST_MIN_S"):
+        monkeypatch.setattr(f"vram_arbiter.runner.skills.sidecar_policy.{name}", 0.0)
+    # the manifest's 100 ms; the first chunk waits for the server's own loop, too
+    monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.HUNG_AFTER", 20.0)
+
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        b.sidecar.hangs = not answered
+        assert isinstance(await b.step(), Hold), "at the start pose"
+        for _ in range(3 * answered):
+            assert isinstance(await b.step(), Act)
+        b.sidecar.hangs = True
+        monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.HUNG_AFTER", 0.5)
+        with pytest.raises(SidecarUnavailable, match="hangs: no chunk within") as raised:
+            await b.step()
+        assert raised.value.details["limit_s"] == pytest.approx(0.05)
+
+    scenario(run_async, policy_bench(Arbiter()), play)
+
+
+def test_a_sidecar_that_ends_between_two_chunks_is_noticed_at_once(
+    policy_bench: Callable[..., Bench], run_async: Run
+) -> None:
+    """Regression: the next chunk tried to reach it for as long as one may take to start."""
+
+    async def play(b: Bench) -> None:
+        await b.skill.start(GOAL)
+        await b.step()
+        assert isinstance(await b.step(), Act)
+        await b.sidecar.server.__aexit__()
+        while b.client.connected:
+            await asyncio.sleep(0)
+        with pytest.raises(SidecarUnavailable, match="lost within the goal"):
+            await b.step()
+
+    scenario(run_async, policy_bench(Arbiter()), play)
+
+
 def test_eviction_in_the_middle_fails_the_goal(
     policy_bench: Callable[..., Bench], run_async: Run
 ) -> None:
@@ -626,7 +676,8 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
             "asked on this very thread: the request is still on its way"
         )
         await b.skill.finish()
-        await b.client.unload()  # sent behind it, on the same socket
+        await b.client.unload()
+        await b.client.ping(timeout_s=60.0)  # sent behind it, on the same socket
         tokens = dict(zip(b.sidecar.calls, b.sidecar.tokens, strict=True))
         assert tokens["get_action"] == [1, 1]
 
