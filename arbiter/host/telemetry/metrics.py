@@ -7,6 +7,7 @@ is not shown at all.
 """
 
 import asyncio
+import operator
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -27,6 +28,9 @@ CONSUMERS_MAX = 200
 lives as long as the daemon."""
 OTHERS = "(others)"
 
+type _Read = Callable[[Figures], Iterable[Observation]]
+"""A figure of the engine as a gauge shows it."""
+
 
 class LeaseMetrics:
     """`watch` on the loop's thread begins the pictures, `close` ends them."""
@@ -36,82 +40,60 @@ class LeaseMetrics:
     ) -> None:
         self._clock = clock
         self._consumers: set[str] = set()
-        self._picture: tuple[float, Figures] | None = (
-            None  # swapped as a whole: read by other threads
-        )
+        # swapped as a whole: other threads read it
+        self._picture: tuple[float, Figures] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._grants = meter.create_counter(names.METRIC_GRANTS, "{grant}", "Leases granted")
-        self._denials = meter.create_counter(
-            names.METRIC_DENIALS, "{denial}", "Leases refused or denied"
-        )
-        self._wait = meter.create_histogram(names.METRIC_WAIT, "s", "From the request to the grant")
-        self._evictions = meter.create_counter(
-            names.METRIC_EVICTIONS,
-            "{eviction}",
-            "Leases that were asked to leave and measured gone, or not",
-        )
-        self._handover = meter.create_histogram(
-            names.METRIC_HANDOVER, "s", "From the first ask to the grant that needed the room"
-        )
-        for name, read, unit, what in (
-            (names.METRIC_WAITERS, _waiters, "{lease}", "Leases that wait"),
-            (names.METRIC_CHARGED, self._charged, "By", "Bytes that are leased"),
-            (names.METRIC_MEASURED, self._measured, "By", "Bytes that are held, by consumer"),
-            (
-                names.METRIC_USED,
-                _by_gpu(lambda gpu: gpu.used_bytes),
-                "By",
-                "Bytes that are held on the GPU",
-            ),
-            (
-                names.METRIC_CAPACITY,
-                _by_gpu(lambda gpu: gpu.capacity_bytes),
-                "By",
-                "Bytes of the GPU",
-            ),
-            (
-                names.METRIC_PRESSURE,
-                _by_gpu(lambda gpu: gpu.pressure_bytes),
-                "By",
-                "Bytes held beyond what was granted",
-            ),
-            (
-                names.METRIC_READING_AGE,
-                self._reading_age,
-                "s",
-                "Since the newest successful reading",
-            ),
-            (
-                names.METRIC_DRAINED,
-                _flag(lambda figures: figures.drained),
-                "",
-                "1 while an operator's drain stops grants",
-            ),
-            (
-                names.METRIC_JOURNAL_HEALTHY,
-                _flag(lambda figures: figures.journal_healthy),
-                "",
-                "1 while the journal can be written",
-            ),
-        ):
-            meter.create_observable_gauge(name, [self._shown(read)], unit, what)
-        self._journal_write = meter.create_histogram(
+        count, span = meter.create_counter, meter.create_histogram
+        self._grants = count(names.METRIC_GRANTS, "{grant}", "Leases granted")
+        self._denials = count(names.METRIC_DENIALS, "{denial}", "Leases refused or denied")
+        self._wait = span(names.METRIC_WAIT, "s", "From the request to the grant")
+        left = "Leases that were asked to leave and measured gone, or not"
+        self._evictions = count(names.METRIC_EVICTIONS, "{eviction}", left)
+        made_room = "From the first ask to the grant that needed the room"
+        self._handover = span(names.METRIC_HANDOVER, "s", made_room)
+        self._journal_write = span(
             names.METRIC_JOURNAL_WRITE, "s", "One transaction of the journal"
         )
-        self._journal_failures = meter.create_counter(
-            names.METRIC_JOURNAL_FAILURES, "{failure}", "Transactions of the journal that failed"
-        )
+        failed = "Transactions of the journal that failed"
+        self._journal_failures = count(names.METRIC_JOURNAL_FAILURES, "{failure}", failed)
         self._journal_failures.add(0)  # the series exists before the first failure
-        build = Observation(
-            1, {names.ATTR_VERSION: version, names.ATTR_PYTHON: platform.python_version()}
-        )
+        for name, unit, what, read in self._gauges():
+            meter.create_observable_gauge(name, [self._shown(read)], unit, what)
+        labels = {names.ATTR_VERSION: version, names.ATTR_PYTHON: platform.python_version()}
+        build = [Observation(1, labels)]
         meter.create_observable_gauge(
-            names.METRIC_BUILD, [lambda _: [build]], "", "Version of the daemon"
+            names.METRIC_BUILD, [lambda _: build], "", "Version of the daemon"
+        )
+
+    def _gauges(self) -> Iterable[tuple[str, str, str, _Read]]:
+        """Name, unit, meaning and reader of each figure that is shown as it is."""
+        used, capacity = operator.attrgetter("used_bytes"), operator.attrgetter("capacity_bytes")
+        over = operator.attrgetter("pressure_bytes")
+        since = "Since the newest successful reading"
+        drained, healthy = (
+            "while an operator's drain stops grants",
+            "while the journal can be written",
+        )
+        yield names.METRIC_WAITERS, "{lease}", "Leases that wait", _waiters
+        yield names.METRIC_CHARGED, "By", "Bytes that are leased", self._charged
+        yield names.METRIC_MEASURED, "By", "Bytes that are held, by consumer", self._measured
+        yield names.METRIC_USED, "By", "Bytes that are held on the GPU", _by_gpu(used)
+        yield names.METRIC_CAPACITY, "By", "Bytes of the GPU", _by_gpu(capacity)
+        yield names.METRIC_PRESSURE, "By", "Bytes held beyond what was granted", _by_gpu(over)
+        yield names.METRIC_READING_AGE, "s", since, self._reading_age
+        yield names.METRIC_DRAINED, "", f"1 {drained}", _flag(lambda seen: seen.drained)
+        yield (
+            names.METRIC_JOURNAL_HEALTHY,
+            "",
+            f"1 {healthy}",
+            _flag(lambda seen: seen.journal_healthy),
         )
 
     def granted(
         self, consumer: str, waited_s: float, handover_s: float | None, context: Context
     ) -> None:
+        """`handover_s`: from the first revoke to the grant, where an eviction made room. `context`:
+        its span, for exemplars."""
         labels = {names.ATTR_CONSUMER: self._name(consumer)}
         self._grants.add(1, labels, context)
         self._wait.record(waited_s, labels, context)
@@ -142,9 +124,7 @@ class LeaseMetrics:
             self._timer = None
         self._picture = None
 
-    def _shown(
-        self, read: Callable[[Figures], Iterable[Observation]]
-    ) -> Callable[[CallbackOptions], Iterable[Observation]]:
+    def _shown(self, read: _Read) -> Callable[[CallbackOptions], Iterable[Observation]]:
         def callback(_: CallbackOptions) -> Iterable[Observation]:
             picture = self._picture
             if picture is None or self._clock() - picture[0] > PICTURE_MAX_AGE_S:
@@ -190,9 +170,7 @@ def _waiters(figures: Figures) -> Iterable[Observation]:
     yield Observation(figures.waiters)
 
 
-def _by_gpu(
-    figure: Callable[[GpuFigures], int | None],
-) -> Callable[[Figures], Iterable[Observation]]:
+def _by_gpu(figure: Callable[[GpuFigures], int | None]) -> _Read:
     """The gauge of one figure of each GPU; an unknown one (None) has no series."""
 
     def read(figures: Figures) -> Iterable[Observation]:
@@ -203,7 +181,7 @@ def _by_gpu(
     return read
 
 
-def _flag(flag: Callable[[Figures], bool]) -> Callable[[Figures], Iterable[Observation]]:
+def _flag(flag: Callable[[Figures], bool]) -> _Read:
     def read(figures: Figures) -> Iterable[Observation]:
         yield Observation(int(flag(figures)))
 

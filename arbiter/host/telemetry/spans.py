@@ -18,7 +18,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from opentelemetry import trace
 from opentelemetry.context import Context
@@ -27,6 +26,7 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.model.refusals import LimitReached
+from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.telemetry import names as names
 from vram_arbiter.schemas.wire.errors import Refusal
@@ -69,22 +69,6 @@ _STEPS: Mapping[type, str] = {
 _GOOD_VERDICTS = frozenset({"verified", "residue"})
 
 
-class Counts(Protocol):
-    """Where the numbers go (`otel_metrics.LeaseMetrics`)."""
-
-    def granted(
-        self, consumer: str, waited_s: float, handover_s: float | None, context: Context
-    ) -> None:
-        """`handover_s`: from the first revoke to the grant, where an eviction made room. `context`:
-        its span, for exemplars."""
-
-    def denied(self, code: str) -> None: ...
-
-    def evicted(self, verdict: str) -> None: ...
-
-    def wrote(self, seconds: float, *, failed: bool) -> None: ...
-
-
 @dataclass(slots=True)
 class _Acquire:
     """The open spans of a lease that is asked for and not ready. Times in nanoseconds
@@ -113,7 +97,7 @@ class LeaseTelemetry:
     event of the history, `close` at the end."""
 
     def __init__(
-        self, tracer: trace.Tracer, counts: Counts, wall_ns: Callable[[], int] = time.time_ns
+        self, tracer: trace.Tracer, counts: LeaseMetrics, wall_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._tracer = tracer
         self._counts = counts
