@@ -7,9 +7,6 @@ not count until holders and readings say it again.
    at best: its holders are believed, and grants wait as long as any holder may keep what it has.
 3. `account_for`, `serve`: nothing is granted until every recovered lease is accounted for
    (reattached, given up, its process dead, or its GPU read as empty).
-
-A record of a sub-lease, as versions before 0.2.0 wrote it, comes back as a plain lease: parent and
-sub-lease are each charged their own bytes until they are measured gone.
 """
 
 from dataclasses import replace
