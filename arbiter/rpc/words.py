@@ -79,6 +79,7 @@ _MISFITS: Final[Mapping[r.Misfit, str]] = {
     r.Misfit.NO_PARK_BYTES: "it cannot be parked: its spec has no park_bytes",
     r.Misfit.HOLDS_NOTHING: "it holds nothing",
     r.Misfit.NO_SUCH_USE: "it has no use {no.use_id} of yours to yield",
+    r.Misfit.NOT_REATTACHED: "reattach it first, the arbiter was restarted",
 }
 
 _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {

@@ -63,6 +63,7 @@ class Misfit(StrEnum):
     NO_PARK_BYTES = "no_park_bytes"
     HOLDS_NOTHING = "holds_nothing"
     NO_SUCH_USE = "no_such_use"
+    NOT_REATTACHED = "not_reattached"
 
 
 class BadLeaseState(Refusal, code="bad_state"):

@@ -131,7 +131,7 @@ def release_dead(core: Core, lease: Lease, order: Order) -> None:
         raise _impractical(lease, Impractical.NOT_HELD)
     if lease.uses:
         raise _impractical(lease, Impractical.IN_USE)
-    silent_s = core.now - (lease.expires_at - lease.spec.ttl_s)
+    silent_s = max(0.0, core.now - (lease.expires_at - lease.spec.ttl_s))
     if lease.attached and silent_s < lease.spec.ttl_s * SILENT_SHARE:
         raise _impractical(lease, Impractical.HOLDER_LIVES, silent_s)
     note = OperatorNote("release_dead", order.by, order.reason, silent_s=silent_s)

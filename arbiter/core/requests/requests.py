@@ -363,7 +363,9 @@ def renew(core: Core, event: Renewed) -> None:
         lease = core.leases.get(lease_id)
         try:
             if lease is None or lease.state is not LeaseState.QUEUED or lease.process != process:
-                own_lease(core, LeaseRequest(event.client, event.request, lease_id, token))
+                lease = own_lease(core, LeaseRequest(event.client, event.request, lease_id, token))
+                if not lease.attached:  # its time to live runs on: saying "alive" would be untrue
+                    raise bad_state(lease, Misfit.NOT_REATTACHED)
             alive.append(lease_id)
         except Refused as refused:
             gone.append(GoneLease(lease_id, refused.refusal.view()))

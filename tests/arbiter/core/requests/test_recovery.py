@@ -1,7 +1,6 @@
 """A restart of the daemon alone: what the journal names stays charged, holders come back, and
 nobody is granted before."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
@@ -152,6 +151,23 @@ def test_an_acquire_repeated_after_a_restart_reattaches_the_lease_that_it_finds(
         driver.advance(3.0)
         det.renew((lease, det.token(lease)))
     assert driver.state(lease) == "held"
+
+
+def test_a_renewal_without_a_reattachment_is_refused() -> None:
+    """Regression: it was answered as alive, while the lease's time to live ran on to its end."""
+    driver = CoreDriver(8 * GIB)
+    det, lease, token = held_with_token(driver, "det", 5, ttl_s=10.0)
+    driver.restart()
+    det.connect()
+    renewed = answer(det.renew((lease, token)))
+    assert renewed["alive"] == []
+    (gone,) = renewed["gone"]
+    assert (gone["error"]["code"], gone["error"]["details"]["misfit"]) == (
+        "bad_state",
+        "not_reattached",
+    )
+    det.reattach(lease, token)
+    assert answer(det.renew((lease, token)))["alive"] == [lease]
 
 
 def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
@@ -432,40 +448,3 @@ def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
     )
     assert {lease, "L1-9"} <= {view["lease_id"] for view in again.status()["leases"]}
     assert again.gpu()["pressure_bytes"] > 0, "what was never approved is pressure"
-
-
-def flat(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """A spec as version 0.1 wrote it."""
-    old = {**spec, **spec["footprint"], "exclusive": False, "deny_on_deadline": False}
-    del old["footprint"]
-    return old
-
-
-def test_records_of_sub_leases_come_back_as_plain_leases() -> None:
-    """Version 0.1 carved leases out of others. Each is charged its own bytes until it reattaches,
-    or is measured gone."""
-    driver = CoreDriver(8 * GIB)
-    runner, root, _ = held_with_token(driver, "runner", 1, exclusive=False)
-    policy, leaf, token = held_with_token(driver, "policy", 4)
-    parent, child = f"lease:{root}", f"lease:{leaf}"
-    estate = {
-        "booked_bytes": 5 * GIB,
-        "approved_bytes": 5 * GIB,
-        "shares": {leaf: [4 * GIB, 4 * GIB, 0]},
-        "borne": [],
-    }
-    reserved = {**flat(driver.journal[parent]["spec"]), "ttl_s": 2.0, "exclusive": True}
-    carved = {**flat(driver.journal[child]["spec"]), "parent": [root, 1, 2]}
-    old = {"said_ready": True, "parent": None, "estate": None}
-    driver.journal[parent] = {**driver.journal[parent], **old, "estate": estate, "spec": reserved}
-    driver.journal[child] = {**driver.journal[child], **old, "parent": root, "spec": carved}
-    driver.restart()
-    assert driver.gpu()["charged_bytes"] == 5 * GIB
-    policy.connect()
-    assert answer(policy.reattach(leaf, token))["leases"][0]["kept"]
-    waiter = driver.consumer("vlm").acquire(2 * GIB)
-    runner.hold(0)
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=60.0)
-    assert (driver.state(root), driver.state(leaf)) == ("over", "held")
-    charge = {view["lease_id"]: view["charge_bytes"] for view in driver.status()["leases"]}
-    assert charge[leaf] == 4 * GIB
