@@ -50,6 +50,8 @@ class HostWeights:
 
     def drop(self) -> None:
         """Free the weights; they are to be loaded again before their use."""
+        if self._memory is None:
+            return
         import torch
 
         for tensor in self._tensors():

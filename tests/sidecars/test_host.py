@@ -13,6 +13,7 @@ from time import monotonic
 
 import pytest
 
+from tests.sidecars.conftest import children, server_of_imports
 from tests.support.paths import SUPPORT
 from tests.support.wire import WireClient
 
@@ -426,9 +427,13 @@ def test_a_model_dies_with_its_host(box):
     from_outside(lambda: box.used() == 0)
 
 
-def test_the_loop_of_the_host_never_imports_torch(box):
-    """The host answers `ping` and `revoke` whatever the model does, and costs no gigabyte."""
+def test_torch_is_not_imported_where_no_tensor_is(box):
+    """The host answers `ping` and `revoke` whatever the model does, and costs no gigabyte.
+    Regression: the keeper of a model without networks imported torch: 2 s of a core."""
     sidecar = box.start("detector")
     sidecar.detect()
-    maps = Path(f"/proc/{sidecar.process.pid}/maps").read_text()
-    assert "libtorch" not in maps
+    assert sidecar.ask("unload")["ok"]
+    sidecar.detect()
+    server = server_of_imports(sidecar.process.pid)
+    for pid in (sidecar.process.pid, server, *children(server)):
+        assert "libtorch" not in Path(f"/proc/{pid}/maps").read_text()
