@@ -8,6 +8,7 @@ come from the same fields; `check` is asked again for each call.
 """
 
 import dataclasses
+import re
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 
@@ -40,6 +41,8 @@ EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
 WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
 ASKED = ("locate_in_view", "query_scene", "look", "query_task_progress")
 OPERATOR = "/operator"
+OPEN = "open-vocabulary"  # in `objects` of a manifest: any word
+ARTICLES = frozenset({"a", "an", "the"})
 
 _USED_AS = {
     "detector": "it is asked through locate_in_view",
@@ -64,6 +67,15 @@ class Skill:
     """Why it must not be used although its kind could be; empty: it may."""
     longest_s: float = 0.0
     """Of its motion, as its manifest says; 0: it does not."""
+    vocabulary: frozenset[str] = frozenset()
+    """Words that a detector's manifest names, lower case; empty: any word may be known."""
+
+    def unknown_words(self, query: str) -> list[str]:
+        """Return the words of a query that the manifest does not name."""
+        if not self.vocabulary:
+            return []
+        named = self.vocabulary | ARTICLES
+        return [word for word in words_of(query) if word not in named]
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,6 +327,7 @@ def palette_of(
                 manifest.goal_params_schema,
                 _barred(manifest, allow_noncommercial) or body.misfit(manifest),
                 manifest.latency_budget.max_execution_s or 0.0,
+                _vocabulary(manifest),
             )
             for manifest in sorted(manifests, key=lambda manifest: manifest.name)
         )
@@ -330,6 +343,19 @@ def palette_of(
         managed=frozenset(managed),
         topics=frozenset(topics),
     )
+
+
+def words_of(text: str) -> list[str]:
+    """Return the words of a text, in lower case."""
+    return re.findall(r"[^\W_]+", text.lower())
+
+
+def _vocabulary(manifest: RSkillManifest) -> frozenset[str]:
+    """Return the words of a detector that says which objects and labels it is for."""
+    labels = manifest.detector.labels if manifest.detector is not None else ()
+    if not labels or not manifest.objects or any(OPEN in name for name in manifest.objects):
+        return frozenset()
+    return frozenset(word for name in (*labels, *manifest.objects) for word in words_of(name))
 
 
 def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:

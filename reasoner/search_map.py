@@ -1,4 +1,5 @@
-"""Map of places where the object may stand, from several looks at different poses.
+"""Map of a search: places where the object may stand, from several looks at different poses, and
+places to look from that are left.
 
 A detector takes one thing for another now and then, mostly from one side only. Two looks that are
 joined by the base's odometry tell them apart better than either does: scores of a place add up, and
@@ -8,6 +9,7 @@ the best place wins. Pure: no sockets, no clock.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from vram_arbiter.schemas.plain import JsonMap
@@ -15,6 +17,13 @@ from vram_arbiter.schemas.plain import JsonMap
 # two looks at one thing differ by less; the arm's gripper needs more room between two things
 SAME_M = 0.05
 UNMOVED = (0.0, 0.0, 0.0)
+# places to look from, in the frame of the search's first look: a step back widens the view, then to
+# the left and to the right of it
+VIEWPOINTS_M = ((-0.35, 0.0), (-0.35, 0.45), (-0.35, -0.45), (-0.2, 0.9), (-0.2, -0.9))
+SAME_VIEW_M, SAME_VIEW_RAD = 0.2, 0.2
+
+type Pose = tuple[float, float, float]
+"""x, y in meters and yaw in radians, in the odometry's frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +58,7 @@ class Places:
     """
 
     known: list[Place] = field(default_factory=list)
-    base_pose: tuple[float, float, float] = UNMOVED
+    base_pose: Pose = UNMOVED
     joined: bool = False
     """Whether odometry joins the newest look to the ones before."""
 
@@ -94,6 +103,45 @@ class Places:
             -math.sin(yaw) * dx + math.cos(yaw) * dy,
             place.z,
         )
+
+
+@dataclass(slots=True)
+class Search:
+    """Poses that were looked from, and the next that is worth a drive.
+
+    Without odometry there is none: a place that was seen cannot be told from another.
+    """
+
+    began: bool = False
+    _views: list[Pose] = field(default_factory=list)
+    _given: int = 0
+
+    def looked(self, pose: Sequence[float] | None) -> None:
+        self.began = True
+        if pose is not None:
+            self._views.append((pose[0], pose[1], pose[2]))
+
+    def next(self) -> Pose | None:
+        """Return the next pose from which nothing was looked at; None: there is none left."""
+        if not self._views:
+            return None
+        x0, y0, yaw = self._views[0]
+        while self._given < len(VIEWPOINTS_M):
+            ahead, left = VIEWPOINTS_M[self._given]
+            self._given += 1
+            pose = (
+                x0 + math.cos(yaw) * ahead - math.sin(yaw) * left,
+                y0 + math.sin(yaw) * ahead + math.cos(yaw) * left,
+                yaw,
+            )
+            if not any(_same_view(pose, view) for view in self._views):
+                return pose
+        return None
+
+
+def _same_view(a: Pose, b: Pose) -> bool:
+    turned = math.remainder(a[2] - b[2], math.tau)
+    return math.dist(a[:2], b[:2]) < SAME_VIEW_M and abs(turned) < SAME_VIEW_RAD
 
 
 def _apart_m(a: Place, b: Place) -> float:

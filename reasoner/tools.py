@@ -160,15 +160,19 @@ class Tools:
         )
         if (refusal := await self._not_permitted(self._detector)) is not None:
             return refusal  # it was replaced meanwhile
+        where: JsonObject = {"camera": frame["camera"]}
+        if (pose := frame.get("camera_model", {}).get("base_pose")) is not None:
+            where["base_pose"] = list(pose)
+        unnamed = ""
+        if unknown := self._unknown_words(self._detector, call.query):
+            where["unknown_words"] = unknown
+            unnamed = f"; the detector's manifest does not name {', '.join(unknown)}"
         if not detections:
             return Outcome(
-                "not_seen",
-                f"{call.query} is not in view of {frame['camera']}",
-                data={"camera": frame["camera"]},
+                "not_seen", f"{call.query} is not in view of {frame['camera']}{unnamed}", data=where
             )
         best, *others = sorted(detections, key=lambda detection: -detection.score)
-        data: JsonObject = {
-            "camera": frame["camera"],
+        data: JsonObject = where | {
             "box": list(best.box),
             "score": best.score,
             "label": best.label,
@@ -183,8 +187,6 @@ class Tools:
             )
         data["point_base_m"] = point
         data["seen"] = seen = _things(frame, [best, *others])
-        if (pose := frame.get("camera_model", {}).get("base_pose")) is not None:
-            data["base_pose"] = list(pose)
         places = [
             "({:.3f}, {:.3f}, {:.3f}) m from the base, score {:.2f}".format(
                 *one["point_base_m"], one["score"]
@@ -192,7 +194,14 @@ class Tools:
             for one in seen
         ]
         also = f"; less likely at {', or at '.join(places[1:])}" if len(places) > 1 else ""
-        return Outcome("found", f"{call.query} at {places[0]}{also}", data=data)
+        return Outcome("found", f"{call.query} at {places[0]}{also}{unnamed}", data=data)
+
+    def _unknown_words(self, detector: DetectorClient, query: str) -> list[str]:
+        """Return the words that the manifest of the served detector does not name."""
+        served = str(detector.identity.get("rskill", "")) if detector.identity else ""
+        skills = self._palette.skills if self._palette is not None else ()
+        known = next((skill for skill in skills if skill.id == served), None)
+        return [] if known is None else known.unknown_words(query)
 
     async def _query(self, call: QueryScene) -> Outcome:
         if self._scene_vlm is None:

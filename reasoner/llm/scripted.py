@@ -5,14 +5,23 @@ outcome. It does not mention VRAM: the arbiter decides which model is resident.
 """
 
 import json
+import math
 import re
 from collections.abc import Generator
+from dataclasses import dataclass
 
-from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.palette import OPERATOR, Palette
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome, says_yes
-from vram_arbiter.reasoner.search_map import Places, Point
+from vram_arbiter.reasoner.search_map import Places, Point, Pose, Search
 from vram_arbiter.schemas.errors import BadRequest, UnknownSkill
-from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall, Wait
+from vram_arbiter.schemas.tools import (
+    EmitPrompt,
+    ExecuteRskill,
+    LocateInView,
+    QueryScene,
+    ToolCall,
+    Wait,
+)
 
 ATTEMPTS_MAX = 3
 LOOKS_MAX = 3  # repeats of a locate that gave no answer about the scene
@@ -22,7 +31,11 @@ NAVIGATE_DEADLINE_S = 60.0
 GRAB_DEADLINE_S = 120.0  # counts from acceptance: waiting for the GPU and loading are in it
 GRASP_CAMERA = "wrist"  # looks at the fingers: what they hold cannot hide behind the arm
 
+HOLDING = "What is the gripper holding?"
+ANYTHING = "Is the gripper holding anything?"
 NO_ANSWER = "the scene VLM gave no answer"
+# outcomes of a grab that moved the arm: something may be held, whatever the skill says of itself
+MOVED = frozenset({"succeeded", "failed", "canceled"})
 
 _HOLDS = re.compile(
     r"(?<!\bnot )(?<!n't )\bhold(?:s|ing)?\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE
@@ -53,13 +66,7 @@ class ScriptedPlanner:
     """
 
     def __init__(self, task: str, palette: Palette) -> None:
-        self._script = _script(
-            object_of(task),
-            palette.first("navigate").id,
-            palette.first("grasp").id,
-            place=_optional(palette, "place"),
-            can_query=palette.can_query,
-        )
+        self._script = _script(object_of(task), _Robot.of(palette))
         self._decided_after = -1  # steps: a decision that was thrown away is given again
         self._decision: ToolCall | Finish = Finish(False, "nothing was decided")
 
@@ -80,73 +87,134 @@ class ScriptedPlanner:
         return self._decision
 
 
-def _optional(palette: Palette, action: str) -> str | None:
-    try:
-        return palette.first(action).id
-    except UnknownSkill:
-        return None
+@dataclass(frozen=True, slots=True)
+class _Robot:
+    """Skills and tools that the script has."""
 
+    navigate: str
+    grab: str
+    place: str | None
+    takes_pose: bool
+    """Whether navigation drives to a pose, and not only to what was seen."""
+    can_query: bool
+    can_say: bool
 
-def _script(thing: str, navigate: str, grab: str, *, place: str | None, can_query: bool) -> Script:
-    if can_query:
-        yield QueryScene(
-            question="What is the gripper holding?",
-            camera=GRASP_CAMERA,
-            rationale="know the hand before moving",
+    @classmethod
+    def of(cls, palette: Palette) -> "_Robot":
+        """Raises UnknownSkill when navigation or a grasp is missing."""
+        navigate = palette.first("navigate")
+        schema = navigate.goal_params_schema or {}
+        try:
+            place = palette.first("place").id
+        except UnknownSkill:
+            place = None
+        return cls(
+            navigate.id,
+            palette.first("grasp").id,
+            place,
+            "pose" in (schema.get("properties") or {}),
+            palette.can_query,
+            OPERATOR in palette.topics,
         )
+
+
+def _script(thing: str, robot: _Robot) -> Script:
+    ended = (yield from _empty_hand(thing, robot)) if robot.can_query else None
+    if ended is not None:
+        return ended
     reason = ""
+    search = Search()
     for attempt in range(1, ATTEMPTS_MAX + 1):
         if attempt > 1:
-            yield _turn(navigate, 0.0, "fold the arm, which hides the table after a grab")
+            yield _turn(robot, 0.0, "fold the arm, which hides the table after a grab")
         places = Places()
-        lost = yield from _find(thing, navigate, places)
+        lost = yield from _find(thing, robot, places, search)
         if lost:
             return Finish(False, lost)
-        stuck = yield from _approach(thing, navigate, places)
+        stuck = yield from _approach(thing, robot, places, search)
         if stuck:
             reason = stuck
             continue
         outcome = yield ExecuteRskill(
-            rskill_id=grab,
+            rskill_id=robot.grab,
             prompt=f"grab the {thing}",
             deadline_s=GRAB_DEADLINE_S,
             rationale=f"attempt {attempt} of {ATTEMPTS_MAX}",
         )
-        if outcome.status != "succeeded":
-            reason = f"the grab failed: {outcome.text}"
+        failed = "" if outcome.status == "succeeded" else f"the grab failed: {outcome.text}"
+        if outcome.status not in MOVED or (failed and not robot.can_query):
+            reason = failed
             continue
-        if not can_query:
+        if not robot.can_query:
             return Finish(True, "the grab ended; there is no scene VLM to confirm it")
         held, answer = yield from _confirm(thing)
         if held:
             return Finish(True, f"the scene VLM confirms: {answer}")
-        reason = f"not grasped after attempt {attempt}: {answer}"
-        if place is not None and attempt < ATTEMPTS_MAX and _HOLDS.search(answer):
-            yield ExecuteRskill(
-                rskill_id=place,
-                deadline_s=NAVIGATE_DEADLINE_S,
-                rationale="a held thing would be looked at, and dropped before the next grasp",
+        reason = f"not grasped after attempt {attempt}: {failed + '; ' if failed else ''}{answer}"
+        if robot.place is not None and attempt < ATTEMPTS_MAX and _HOLDS.search(answer):
+            yield _put_down(
+                robot.place, "a held thing would be looked at, and dropped before the next grasp"
             )
     return Finish(False, reason)
 
 
-def _find(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outcome, str]:
-    """Look; where a detector that really looked does not see it, turn and look again.
+def _empty_hand(thing: str, robot: _Robot) -> Generator[ToolCall, Outcome, Finish | None]:
+    """Ask what the gripper holds before anything moves.
+
+    Returns the end where the named thing is held already, or where another one cannot be put down.
+    Two answers have to agree: one that is wrong would move the arm, or end the task.
+    """
+    answer = (yield from _ask(HOLDING, "know the hand before moving")) or ""
+    if thing in answer.lower():
+        held, confirmed = yield from _confirm(thing)
+        return Finish(True, f"it is held already: {confirmed}") if held else None
+    if not _HOLDS.search(answer):
+        return None
+    again = (yield from _ask(ANYTHING, f"make sure: {answer}")) or ""
+    if not says_yes(again):
+        return None
+    if robot.place is None:
+        return Finish(False, f"{answer} No installed skill can put it down")
+    outcome = yield _put_down(robot.place, f"{answer} The gripper has to be empty for a grasp")
+    if outcome.status != "succeeded":
+        return Finish(False, f"{answer} It could not be put down: {outcome.text}")
+    return None
+
+
+def _find(
+    thing: str, robot: _Robot, places: Places, search: Search
+) -> Generator[ToolCall, Outcome, str]:
+    """Look; where a detector that really looked does not see it, turn and look again, and then
+    drive to where nothing was looked at from yet.
 
     Returns: why no place is known; empty: one is.
     """
     for turn in (*TURNS_RAD, None):
-        looked = yield from _locate(thing, places)
-        if looked.status == "found":
-            return ""
+        looked = yield from _locate(thing, robot, places, search)
         if looked.status != "not_seen":
-            return f"could not look for the {thing}: {looked.text}"
+            return _unanswered(thing, looked)
+        if unknown := looked.data.get("unknown_words"):
+            return f"the {thing} was not seen, and the detector does not know {', '.join(unknown)}"
         if turn is not None:
-            yield _turn(navigate, turn, f"the {thing} is not in view: look around")
+            yield _turn(robot, turn, f"the {thing} is not in view: look around")
+    while robot.takes_pose and (pose := search.next()) is not None:
+        arrived = yield _stand(robot, pose, f"look for the {thing} from another place")
+        if arrived.status != "succeeded":
+            continue  # something stands there: the next place
+        looked = yield from _locate(thing, robot, places, search)
+        if looked.status != "not_seen":
+            return _unanswered(thing, looked)
     return f"the {thing} was not seen"
 
 
-def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, Outcome, str]:
+def _unanswered(thing: str, looked: Outcome) -> str:
+    """Return why a look gave no place; empty: it gave one."""
+    return "" if looked.status == "found" else f"could not look for the {thing}: {looked.text}"
+
+
+def _approach(
+    thing: str, robot: _Robot, places: Places, search: Search
+) -> Generator[ToolCall, Outcome, str]:
     """Stand before the likeliest place, at most `PLACES_MAX` places in all.
 
     Looks from there may favor another place: then it goes there. Returns: why it does not stand
@@ -156,16 +224,16 @@ def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, 
     why = f"stand in front of the {thing}"
     for _ in range(PLACES_MAX):
         assert place is not None, "only called when something was found"
-        arrived = yield _drive(navigate, places.from_base(place), why)
+        arrived = yield _drive(robot, places.from_base(place), why)
         if arrived.status != "succeeded":
             return f"could not drive to the {thing}: {arrived.text}"
-        looked = yield from _locate(thing, places)
+        looked = yield from _locate(thing, robot, places, search)
         if looked.status != "found":
             return ""  # what was seen from afar has to do
         best = places.best()
         if best is place or best is None or not places.joined:
             yield _drive(
-                navigate,
+                robot,
                 places.from_base(best or place),
                 "correct what the view from afar got wrong",
             )
@@ -174,10 +242,13 @@ def _approach(thing: str, navigate: str, places: Places) -> Generator[ToolCall, 
     return ""
 
 
-def _locate(thing: str, places: Places) -> Generator[ToolCall, Outcome, Outcome]:
+def _locate(
+    thing: str, robot: _Robot, places: Places, search: Search
+) -> Generator[ToolCall, Outcome, Outcome]:
     """Note possible places and return the last outcome.
 
-    Only `not_seen` says something about the scene, everything else is tried again.
+    Only `not_seen` says something about the scene, everything else is tried again. A word that the
+    detector's manifest does not name is said once, before the robot drives.
     """
     outcome = Outcome("error", "never looked")
     for _ in range(LOOKS_MAX):
@@ -185,6 +256,11 @@ def _locate(thing: str, places: Places) -> Generator[ToolCall, Outcome, Outcome]
         if outcome.status == "found":
             places.add(outcome.data)
         if outcome.status in ("found", "not_seen"):
+            unknown = outcome.data.get("unknown_words")
+            if unknown and robot.can_say and not search.began:
+                text = f"the detector's manifest does not name {', '.join(unknown)}"
+                yield EmitPrompt(target_topic=OPERATOR, text=f"{text}: it may take another thing")
+            search.looked(outcome.data.get("base_pose"))
             break
     return outcome
 
@@ -196,31 +272,43 @@ def _confirm(thing: str) -> Generator[ToolCall, Outcome, tuple[bool, str]]:
     """
     answer = yield from _ask(f"Has the robot gripper grasped the {thing}?")
     if answer is not None and says_yes(answer) and thing not in answer.lower():
-        answer = yield from _ask("What is the gripper holding?")
+        answer = yield from _ask(HOLDING)
         return answer is not None and thing in answer.lower(), answer or NO_ANSWER
     return answer is not None and says_yes(answer), answer or NO_ANSWER
 
 
-def _ask(question: str) -> Generator[ToolCall, Outcome, str | None]:
+def _ask(question: str, why: str = "") -> Generator[ToolCall, Outcome, str | None]:
     for _ in range(LOOKS_MAX):
-        outcome = yield QueryScene(question=question, camera=GRASP_CAMERA)
+        outcome = yield QueryScene(question=question, camera=GRASP_CAMERA, rationale=why)
         if outcome.status == "answered":
             return outcome.text
     return None
 
 
-def _turn(navigate: str, angle_rad: float, why: str) -> ExecuteRskill:
-    params = json.dumps({"turn_rad": angle_rad})
-    return ExecuteRskill(
-        rskill_id=navigate, deadline_s=NAVIGATE_DEADLINE_S, rationale=why, goal_params_json=params
-    )
+def _put_down(place: str, why: str) -> ExecuteRskill:
+    return ExecuteRskill(rskill_id=place, deadline_s=NAVIGATE_DEADLINE_S, rationale=why)
 
 
-def _drive(navigate: str, point: Point, why: str) -> ExecuteRskill:
+def _turn(robot: _Robot, angle_rad: float, why: str) -> ExecuteRskill:
+    return _go(robot, json.dumps({"turn_rad": angle_rad}), why)
+
+
+def _drive(robot: _Robot, point: Point, why: str) -> ExecuteRskill:
     target = {"target_point": {"x": point.x, "y": point.y, "z": point.z}}
+    return _go(robot, json.dumps(target), why)
+
+
+def _stand(robot: _Robot, pose: Pose, why: str) -> ExecuteRskill:
+    x, y, yaw = pose
+    orientation = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    stand = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": orientation}
+    return _go(robot, json.dumps({"pose": {"header": {"frame_id": "odom"}, "pose": stand}}), why)
+
+
+def _go(robot: _Robot, params: str, why: str) -> ExecuteRskill:
     return ExecuteRskill(
-        rskill_id=navigate,
+        rskill_id=robot.navigate,
         deadline_s=NAVIGATE_DEADLINE_S,
         rationale=why,
-        goal_params_json=json.dumps(target),
+        goal_params_json=params,
     )

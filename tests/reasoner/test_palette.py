@@ -319,3 +319,17 @@ def test_the_order_of_the_palette_is_that_of_the_names() -> None:
     offered = [function["function"]["name"] for function in palette(*skills).functions()]
     assert offered[:3] == [f"execute_rskill__lab__{letter}" for letter in "abc"]
     assert palette(*skills) == palette(*reversed(skills))
+
+
+def test_a_detector_that_says_what_it_is_for_says_which_words_it_knows() -> None:
+    objects = "objects: [cube]\n"
+    body = WEIGHTS + "detector: {labels: [red cube, a blue one]}\nactions: [detect]\n"
+    head = 'name: "lab/eye"\nlicense: "mit"\nrole: "s1"\nkind: "detector"\n'
+
+    def unknown(more: str) -> list[str]:
+        (skill,) = palette(parse_manifest(head + BASE + body + more)).skills
+        return skill.unknown_words("The pink, RED cube")
+
+    assert unknown(objects) == ["pink"]
+    assert unknown("objects: [cube, open-vocabulary object]\n") == []
+    assert unknown("") == [], "labels alone are what it looks for when it is asked for nothing"

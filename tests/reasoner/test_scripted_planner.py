@@ -1,14 +1,17 @@
 """The script's decisions, driven by hand: no sockets, no clock."""
 
 import asyncio
+import dataclasses
+import math
 from collections.abc import Callable
 
 import pytest
 
 from vram_arbiter.reasoner.llm.scripted import PLACES_MAX, ScriptedPlanner, object_of
 from vram_arbiter.reasoner.loop import REPEATS_MAX, Result, run_episode
-from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.palette import OPERATOR, Palette, Skill
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.reasoner.search_map import VIEWPOINTS_M
 from vram_arbiter.schemas.errors import BadRequest, LlmError, UnknownSkill
 from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
 
@@ -19,22 +22,23 @@ PALETTE = Palette((NAVIGATE, GRAB, DETECTOR))
 
 FOUND = Outcome("found", "there", data={"point_base_m": [0.4, 0.1, 0.2]})
 DONE = Outcome("succeeded", "")
+EMPTY = Outcome("answered", "The gripper is empty.")
 YES = Outcome("answered", "Yes, the gripper holds the red cube.")
 NO = Outcome("answered", "No, the gripper is empty.")
 
 
 def run_script(
-    world: Callable[[ToolCall, int], Outcome], palette: Palette = PALETTE
+    world: Callable[[ToolCall, int], Outcome], palette: Palette = PALETTE, hand: str | None = None
 ) -> tuple[Result, list[ToolCall]]:
     """Run the script against a world that answers (call, how many calls of this tool came
-    before).
+    before). The hand is empty at first; with `hand` the world says what is in it.
     """
     calls: list[ToolCall] = []
 
     async def dispatch(call: ToolCall) -> Outcome:
         before = sum(other.tool == call.tool for other in calls)
         calls.append(call)
-        return world(call, before)
+        return EMPTY if len(calls) == 1 and hand is None else world(call, before)
 
     planner = ScriptedPlanner("grab the red cube", palette)
     return asyncio.run(run_episode("grab the red cube", planner, palette, dispatch)), calls
@@ -151,10 +155,33 @@ def test_a_failed_drive_or_grab_is_a_retry_with_its_reason() -> None:
             case _:
                 return DONE
 
-    result, _ = run_script(world)
+    result, calls = run_script(world)
     assert result["status"] == "failure"
     assert result["attempts"] == 3
     assert "out of memory" in result["reason"]
+    asked = [call for call in calls if isinstance(call, QueryScene)]
+    assert len(asked) == 4, "a grab that failed may hold the thing all the same"
+
+
+def test_a_grab_that_says_it_failed_and_holds_the_thing_is_a_success() -> None:
+    """Regression: a grab that ran into its deadline with the cube in the hand was repeated, and
+    the next one dropped it.
+    """
+
+    def world(call: ToolCall, _: int) -> Outcome:
+        match call:
+            case ExecuteRskill(rskill_id=GRAB.id):
+                return Outcome("failed", "the time is over", "deadline")
+            case LocateInView():
+                return FOUND
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    result, _ = run_script(world)
+    assert (result["status"], result["attempts"]) == ("success", 1)
+    assert result["vlm_confirmed"]
 
 
 def test_an_unclear_answer_is_not_a_yes() -> None:
@@ -343,3 +370,141 @@ def test_a_hand_of_which_nobody_says_that_it_holds_something_puts_nothing_down(
 ) -> None:
     """It would press on what it has missed, which stands there."""
     assert grabs_and_places(answer) == [GRAB.id] * 3
+
+
+# -- what it hears before it begins
+def hears(*answers: str, palette: Palette = PALETTE) -> tuple[Result, list[ToolCall]]:
+    """Run the script in a world whose scene VLM gives these answers, the last one from then on."""
+
+    def world(call: ToolCall, before: int) -> Outcome:
+        match call:
+            case QueryScene():
+                return Outcome("answered", answers[min(before, len(answers) - 1)])
+            case LocateInView():
+                return FOUND
+            case _:
+                return DONE
+
+    return run_script(world, palette, hand=answers[0])
+
+
+def test_a_target_that_is_held_already_is_confirmed_and_nothing_moves() -> None:
+    """Regression: it drove to the table and grabbed what it had in its hand."""
+    held = "The gripper holds the red cube."
+    result, calls = hears(held, f"Yes, {held}")
+    assert (result["status"], result["attempts"], result["vlm_confirmed"]) == ("success", 0, True)
+    assert [call.tool for call in calls] == ["query_scene", "query_scene"]
+    _, calls = hears(held, "No, the gripper is empty.")
+    assert any(isinstance(call, ExecuteRskill) for call in calls), "one wrong answer ends no task"
+
+
+WITH_PLACE = Palette((NAVIGATE, GRAB, PLACE))
+
+
+def test_another_thing_in_the_hand_is_put_down_first() -> None:
+    """Regression: a second task drove off with the first one's object, and dropped it on the way
+    to the grasp.
+    """
+    held = "The gripper holds the blue ball."
+    result, calls = hears(held, f"Yes, {held}", YES.text, palette=WITH_PLACE)
+    moved = [call.rskill_id for call in calls if isinstance(call, ExecuteRskill)]
+    assert moved[0] == PLACE.id
+    assert moved.count(PLACE.id) == 1
+    assert result["status"] == "success"
+    _, calls = hears(held, "No, the gripper is empty.", YES.text, palette=WITH_PLACE)
+    assert PLACE.id not in [c.rskill_id for c in calls if isinstance(c, ExecuteRskill)]
+    result, calls = hears(held, f"Yes, {held}")
+    assert "No installed skill can put it down" in result["reason"]
+    assert not any(isinstance(call, ExecuteRskill) for call in calls)
+
+
+# -- a wider search
+POSED = {"type": "object", "properties": {"pose": {}, "turn_rad": {}, "target_point": {}}}
+DRIVING = Palette((dataclasses.replace(NAVIGATE, goal_params_schema=POSED), GRAB))
+
+
+def poses(calls: list[ToolCall]) -> list[tuple[float, float]]:
+    """Where it drove in the odometry's frame."""
+    stands = [c.goal_params.get("pose") for c in calls if isinstance(c, ExecuteRskill)]
+    at = [stand["pose"]["position"] for stand in stands if stand]
+    return [(round(position["x"], 2), round(position["y"], 2)) for position in at]
+
+
+def unseen_until(looks: int, *, blocked: int = 0) -> Callable[[ToolCall, int], Outcome]:
+    """The thing is seen after so many looks; so many drives to a pose are blocked."""
+    where = [1.0, 2.0, math.pi / 2]
+    drives = 0
+
+    def world(call: ToolCall, before: int) -> Outcome:
+        nonlocal drives
+        match call:
+            case LocateInView():
+                if before >= looks:
+                    return sees(where, (0.4, 0.1, 0.9))
+                return Outcome("not_seen", "", data={"base_pose": list(where)})
+            case ExecuteRskill() if "pose" in call.goal_params:
+                drives += 1
+                if drives <= blocked:
+                    return Outcome("failed", "the base stays where it is", "goal_rejected")
+                pose = call.goal_params["pose"]["pose"]
+                where[:2] = [pose["position"]["x"], pose["position"]["y"]]
+                return DONE
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    return world
+
+
+def test_beyond_its_view_it_drives_to_where_it_has_not_looked_from() -> None:
+    """Regression: after two looks to the sides it gave up, also with room to drive."""
+    result, calls = run_script(unseen_until(5), DRIVING)
+    # it looks along y: back is smaller y, left is smaller x
+    assert poses(calls) == [(1.0, 1.65), (0.55, 1.65)]
+    assert result["status"] == "success"
+
+
+def test_a_place_that_cannot_be_reached_is_left_out_of_the_search() -> None:
+    result, calls = run_script(unseen_until(4, blocked=1), DRIVING)
+    assert poses(calls)[:2] == [(1.0, 1.65), (0.55, 1.65)]
+    assert result["status"] == "success"
+
+
+def test_a_search_has_an_end() -> None:
+    result, calls = run_script(unseen_until(999), DRIVING)
+    assert result["reason"] == "the red cube was not seen"
+    assert len(poses(calls)) == len(set(poses(calls))) == len(VIEWPOINTS_M)
+    _, calls = run_script(unseen_until(999), PALETTE)
+    assert poses(calls) == [], "navigation that takes no pose"
+
+
+# -- words that the detector does not know
+def test_an_unknown_word_is_said_before_the_robot_drives() -> None:
+    """Regression: for a thing that its detector has no word for it looked around the whole table
+    and told nobody.
+    """
+    unknown = {"unknown_words": ["cube"]}
+    said = dataclasses.replace(PALETTE, topics=frozenset({OPERATOR}))
+
+    def finds_nothing(call: ToolCall, _: int) -> Outcome:
+        return Outcome("not_seen", "", data=unknown) if isinstance(call, LocateInView) else DONE
+
+    result, calls = run_script(finds_nothing, said)
+    assert "does not know cube" in result["reason"]
+    assert [call.tool for call in calls] == ["query_scene", "locate_in_view", "emit_prompt"]
+
+    def takes_it_for_something(call: ToolCall, _: int) -> Outcome:
+        match call:
+            case LocateInView():
+                return Outcome("found", "", data=dict(FOUND.data) | unknown)
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    result, calls = run_script(takes_it_for_something, said)
+    tools = [call.tool for call in calls]
+    assert tools.count("emit_prompt") == 1
+    assert tools.index("emit_prompt") < tools.index("execute_rskill")
+    assert result["status"] == "success"
