@@ -1,22 +1,33 @@
-"""`vram-reasoner`: run one task with the present runner and sidecars, or message a running one.
+"""`vram-reasoner`: run one task with the present runner and sidecars, serve tasks one after the
+other, or message a running reasoner.
 
-Exit codes: 0 the task succeeded, 1 it failed, 2 wrong usage or configuration, 3 the runner, or the
+Exit codes: 0 the task succeeded or the service was ended, 1 the task failed, 2 wrong usage or configuration, 3 the runner, or the
 addressed reasoner, cannot be reached.
 """
 
 import argparse
 import asyncio
+import contextlib
 import json
+import logging
 import os
 import signal
 import sys
+from collections.abc import Awaitable, Callable
 from contextlib import nullcontext
 
 from vram_arbiter.reasoner.confirm import Confirmations
-from vram_arbiter.reasoner.inbox import Cancel, Inbox
 from vram_arbiter.reasoner.loop import nothing_done
-from vram_arbiter.reasoner.options import check_task, endpoint, language_model, parser
+from vram_arbiter.reasoner.options import (
+    check_files,
+    check_task,
+    endpoint,
+    language_model,
+    parser,
+)
 from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.reasoner.service import History, serve
+from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.reasoner.workplace import Workplace
 from vram_arbiter.schemas.errors import (
     BadState,
@@ -26,11 +37,12 @@ from vram_arbiter.schemas.errors import (
     SidecarUnavailable,
     VramError,
 )
-from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.reasoner import Result
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.telemetry.commands import command
+
+log = logging.getLogger(__name__)
 
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 
@@ -39,33 +51,38 @@ EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 def main() -> int:
     arguments = parser(__doc__).parse_args()
     logs.set_up("vram-reasoner", "info", arguments.log_format, "%(asctime)s %(name)s %(message)s")
+    name = _command(arguments)
     try:
-        with command("vram-reasoner", _command(arguments)):
-            _main(arguments)
+        with command("vram-reasoner", name, serves=name == "serve"):
+            _main(arguments, name)
     except ConfigError as error:  # of the telemetry: everything else is said within
         return _complain(error, EXIT_USAGE)
     return 0
 
 
 def _command(arguments: argparse.Namespace) -> str:
-    if arguments.task is not None:
-        return "task"
-    if arguments.say is not None:
-        return "say"
-    return "cancel" if arguments.cancel is not None else "confirm"
+    if arguments.command is not None:
+        return str(arguments.command)
+    for name in ("task", "say", "cancel", "submit"):
+        if getattr(arguments, name) is not None:
+            return name
+    return "tasks" if arguments.tasks else "confirm"
 
 
-def _main(arguments: argparse.Namespace) -> None:
+def _main(arguments: argparse.Namespace, name: str) -> None:
     """Exits with the code, unless that is 0."""
     try:
-        if arguments.task is None:
-            asyncio.run(_speak(arguments))
+        if name not in ("task", "serve"):
+            asyncio.run(_speak(arguments, name))
             return
-        result = asyncio.run(_one_task(arguments))
+        check_files(arguments)
+        result = asyncio.run(_serve(arguments) if name == "serve" else _one_task(arguments))
     except (RunnerUnreachable, SidecarUnavailable, ReasonerUnreachable) as error:
         sys.exit(_complain(error, EXIT_UNREACHABLE))
     except VramError as error:
         sys.exit(_complain(error, EXIT_USAGE))
+    if result is None:
+        return
     if arguments.result is not None:
         arguments.result.write_text(json.dumps(result, indent=2) + "\n")
     sys.exit(0 if result["status"] == "success" else EXIT_FAILED)
@@ -76,50 +93,93 @@ def _complain(error: VramError, code: int) -> int:
     return code
 
 
-async def _speak(arguments: argparse.Namespace) -> None:
+async def _speak(arguments: argparse.Namespace, name: str) -> None:
     """Send one message to a running reasoner."""
     at = endpoint(arguments.listen, "reasoner")
-    request: Message
-    if arguments.say is not None:
-        request = {"op": "say", "text": arguments.say}
-    elif arguments.cancel is not None:
-        request = {"op": "cancel", "reason": arguments.cancel}
-    else:
-        motion = (await send(at, {"op": "state"}))["motion"]
-        if motion is None:
-            raise BadState("no motion waits for a confirmation")
-        yes, reason = arguments.confirm, arguments.deny or ""
-        request = {"op": "confirm", "motion": motion["number"], "yes": yes, "reason": reason}
-        print(f"{'confirmed' if yes else 'denied'}: {motion['text']}")
-    await send(at, request)
+    match name:
+        case "say":
+            await send(at, {"op": "say", "text": arguments.say})
+        case "cancel":
+            number = {} if arguments.number is None else {"task": arguments.number}
+            await send(at, {"op": "cancel", "reason": arguments.cancel} | number)
+        case "submit":
+            reply = await send(at, {"op": "submit", "text": arguments.submit})
+            print(f"task {reply['task']}, {reply['ahead']} before it")
+        case "tasks":
+            for task in (await send(at, {"op": "tasks"}))["tasks"]:
+                print(json.dumps(task))
+        case _:
+            await _answer_motion(at, yes=arguments.confirm, reason=arguments.deny or "")
+
+
+async def _answer_motion(at: str, *, yes: bool, reason: str) -> None:
+    motion = (await send(at, {"op": "state"}))["motion"]
+    if motion is None:
+        raise BadState("no motion waits for a confirmation")
+    number = motion["number"]
+    await send(at, {"op": "confirm", "motion": number, "yes": yes, "reason": reason})
+    print(f"{'confirmed' if yes else 'denied'}: {motion['text']}")
 
 
 async def _one_task(arguments: argparse.Namespace) -> Result:
     """Run a task; a signal ends it like an operator's cancel, so that there is a result."""
-    check_task(arguments.task)
+    check_task(arguments.task, arguments.planner)
+    queue = TaskQueue.of_one(arguments.task)
+    task = queue.running
+    assert task is not None, "it begins at once"
+    result: Result | None = None
+
+    async def perform(workplace: Workplace) -> None:
+        nonlocal result
+        result = await workplace.perform(task.text, task.inbox)
+
+    ended_by = await _work(arguments, queue, perform)
+    return result or nothing_done(task.text, f"canceled: {ended_by}")
+
+
+async def _serve(arguments: argparse.Namespace) -> None:
+    """Serve tasks until a signal comes, which ends the running one like an operator's cancel."""
+    history = History(arguments.history)
+    queue = TaskQueue(lambda text: check_task(text, arguments.planner), history.add)
+
+    async def perform(workplace: Workplace) -> None:
+        log.info("serving tasks on %s", endpoint(arguments.listen, "reasoner"))
+        await serve(queue, workplace)
+
+    try:
+        await _work(arguments, queue, perform)
+    finally:
+        history.close()
+
+
+async def _work(
+    arguments: argparse.Namespace,
+    queue: TaskQueue,
+    perform: Callable[[Workplace], Awaitable[None]],
+) -> str:
+    """Work with connections and the operator's socket until done or signaled. Returns the signals
+    that came.
+    """
     llm, playbook = language_model(arguments, os.environ)
-    inbox = Inbox()
     confirmations = Confirmations() if arguments.require_confirmation else None
     workplace = Workplace(arguments, llm, playbook, confirmations)
     here, heard = asyncio.current_task(), list[str]()
     assert here is not None, "inside asyncio.run there is a current task"
 
     def stop(number: signal.Signals) -> None:
-        heard.append(number.name)
-        if workplace.began and len(heard) == 1:
-            inbox.put(Cancel(f"by {number.name}"))
-        else:  # nothing moves yet, or the goal's end takes too long for somebody
+        heard.append(f"by {number.name}")
+        queue.stop(heard[-1])
+        if not workplace.busy or len(heard) > 1:  # a second signal does not wait for a goal's end
             here.cancel()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop, number)
     at = endpoint(arguments.listen, "reasoner")
-    try:
-        async with workplace, OperatorServer(at, arguments.task, inbox, confirmations):
+    with contextlib.suppress(asyncio.CancelledError):
+        async with workplace, OperatorServer(at, queue, confirmations):
             with confirmations.on_terminal(sys.stdin) if confirmations else nullcontext():
-                return await workplace.perform(arguments.task, inbox)
-    except asyncio.CancelledError:
-        return nothing_done(arguments.task, f"canceled: by {' and '.join(heard)}")
+                await perform(workplace)
+    return " and ".join(heard)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
 from vram_arbiter.reasoner.llm.base import LlmPlanner
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
+from vram_arbiter.reasoner.llm.scripted import object_of
 from vram_arbiter.reasoner.playbooks import Playbook, load_playbook
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
 from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP
@@ -30,6 +31,12 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     )
     add_version(parser)
     what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "command",
+        nargs="?",
+        choices=("serve",),
+        help="serve tasks one after the other, from --submit",
+    )
     what.add_argument("--task", help='what to do, e.g. "grab the red cube"')
     what.add_argument(
         "--say", metavar="TEXT", help="tell the planner of a running reasoner something, and end"
@@ -37,7 +44,13 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     what.add_argument(
         "--cancel",
         metavar="REASON",
-        help="end the episode of a running reasoner and its goal, and end",
+        help="end the task that a reasoner runs and its goal, and end",
+    )
+    parser.add_argument(
+        "--number",
+        type=int,
+        metavar="N",
+        help="with --cancel: the task to end, also one that waits (default: the one that runs)",
     )
     parser.add_argument(
         "--planner",
@@ -45,6 +58,14 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         default="scripted",
         help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS,"
         "BUSY_S} configure them",
+    )
+    what.add_argument(
+        "--submit", metavar="TASK", help="queue a task at a serving reasoner, and end"
+    )
+    what.add_argument(
+        "--tasks",
+        action="store_true",
+        help="list the tasks of a serving reasoner, as lines of JSON, and end",
     )
     what.add_argument(
         "--confirm",
@@ -118,6 +139,12 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "--reward-camera", default="wrist", help="which camera it looks at (default: %(default)s)"
     )
     parser.add_argument("--result", type=Path, help="write the result as JSON into this file")
+    parser.add_argument(
+        "--history",
+        type=Path,
+        metavar="FILE",
+        help="with serve: append each task that ended and its result, as lines of JSON",
+    )
     return parser
 
 
@@ -126,8 +153,8 @@ def endpoint(given: str | None, name: str) -> str:
     return given or program_endpoint(name, os.environ, os.getuid())
 
 
-def check_task(task: str) -> None:
-    """Raise BadRequest for a task that no planner could work with."""
+def check_task(task: str, planner: str) -> None:
+    """Raise BadRequest for a task that no planner, or not this one, could work with."""
     if not task.strip():
         raise BadRequest("the task says nothing", hint='e.g. "grab the red cube"')
     if len(task) > TASK_MAX_CHARS:
@@ -138,6 +165,17 @@ def check_task(task: str) -> None:
         task.encode()
     except UnicodeEncodeError:
         raise BadRequest("the task has bytes that are not UTF-8") from None
+    if planner not in LLM_PLANNERS:
+        object_of(task)
+
+
+def check_files(arguments: argparse.Namespace) -> None:
+    """Raise ConfigError for a file of the other form: one task has a result, a service a history."""
+    serves = arguments.command == "serve"
+    if serves and arguments.result is not None:
+        raise ConfigError("--result is for one task", hint="serve writes --history FILE")
+    if not serves and arguments.history is not None:
+        raise ConfigError("--history is for `vram-reasoner serve`", hint="use --result FILE")
 
 
 def language_model(
@@ -149,6 +187,7 @@ def language_model(
     and the playbook raise.
     """
     check_output("--result", arguments.result)
+    check_output("--history", arguments.history)
     check_output("--transcript", arguments.transcript)
     kind = LLM_PLANNERS.get(arguments.planner)
     if kind is not None:

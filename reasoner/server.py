@@ -1,7 +1,8 @@
-"""Operator's access to a running episode: a small socket whose messages bypass the planner.
+"""Operator's access to a reasoner: a small socket for tasks, and for messages to the running one
+that bypass the planner.
 
-Speaks `schemas.reasoner`. Both ends are here: the server beside the loop, and `send` for
-`vram-reasoner --say` and `--cancel`.
+Speaks `schemas.reasoner`. Both ends are here: the server beside the loop, and `send` for the
+command line.
 """
 
 import asyncio
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, reason_of
 from vram_arbiter.reasoner.confirm import Confirmations
-from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
+from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
     BadRequest,
@@ -31,8 +32,14 @@ from vram_arbiter.schemas.reasoner import (
     CancelEpisode,
     ConfirmMotion,
     GetEpisode,
+    GetTaskResult,
+    ListTasks,
+    ResultReply,
     Say,
     StateReply,
+    SubmitReply,
+    SubmitTask,
+    TasksReply,
 )
 
 log = logging.getLogger(__name__)
@@ -41,20 +48,15 @@ SEND_S = 5.0
 
 
 class OperatorServer:
-    """`async with OperatorServer(endpoint, task, inbox)`: serve until the block ends.
+    """`async with OperatorServer(endpoint, queue)`: serve until the block ends.
 
     Raises AlreadyRunning when another reasoner serves there.
     """
 
     def __init__(
-        self,
-        endpoint: str,
-        task: str,
-        inbox: Inbox,
-        confirmations: Confirmations | None = None,
+        self, endpoint: str, queue: TaskQueue, confirmations: Confirmations | None = None
     ) -> None:
-        self._task_text = task
-        self._inbox = inbox
+        self._queue = queue
         self._confirmations = confirmations
         self._server = RouterServer(
             endpoint, lambda error: _refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
@@ -83,11 +85,22 @@ class OperatorServer:
             await self._server.send(peer, {"re": request_id, "ok": True, **reply})
 
     def _answer(self, message: Message) -> Message:
+        queue = self._queue
         match _parse(message):
             case Say(text=text):
-                self._inbox.put(Said(text))
-            case CancelEpisode(reason=reason):
-                self._inbox.put(Cancel(reason or "by an operator"))
+                queue.say(text)
+            case CancelEpisode(reason=reason, task=number):
+                queue.cancel(number, reason or "by an operator")
+            case SubmitTask(text=text):
+                task = queue.submit(text)
+                return dict(SubmitReply(task=task.number, ahead=queue.ahead_of(task)))
+            case ListTasks():
+                return dict(TasksReply(tasks=[task.view() for task in queue.tasks()]))
+            case GetTaskResult(task=number):
+                task = queue.find(number)
+                if task.result is None:
+                    raise BadState(f"task {number} is not over: {task.state}")
+                return dict(ResultReply(result=task.result))
             case ConfirmMotion(motion=number, yes=yes, reason=reason):
                 if self._confirmations is None:
                     raise BadState(
@@ -101,7 +114,14 @@ class OperatorServer:
 
     def _state(self) -> StateReply:
         motion = None if self._confirmations is None else self._confirmations.pending
-        return {"task": self._task_text, "pid": os.getpid(), "motion": motion}
+        running = self._queue.running
+        queued = sum(task.state == "queued" for task in self._queue.tasks())
+        return {
+            "task": running.text if running is not None else "",
+            "pid": os.getpid(),
+            "motion": motion,
+            "queued": queued,
+        }
 
 
 def _parse(message: Message) -> Any:
@@ -112,7 +132,11 @@ def _parse(message: Message) -> Any:
             details={"known": [*OPS]},
         )
     if message["op"] == "cancel":  # a cancel is never refused for a long reason
-        return CancelEpisode(op="cancel", id=0, reason=reason_of(message))
+        number = message.get("task")
+        valid = isinstance(number, int) and not isinstance(number, bool) and number > 0
+        if number is not None and not valid:  # it would end the wrong task
+            raise BadRequest("cancel: task: expected the number of a task", hint="see `tasks`")
+        return CancelEpisode(op="cancel", id=0, reason=reason_of(message), task=number)
     try:
         return REASONER_REQUEST.validate_python(message)
     except ValidationError as error:

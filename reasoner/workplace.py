@@ -51,8 +51,8 @@ class Workplace:
         self._vlm = _given(SceneVlmClient, arguments.scene_vlm, "scene-vlm")
         reward = "none" if arguments.reward is None else arguments.reward
         self._reward = _given(RewardClient, reward, "reward")
-        self.began = False
-        """Whether an episode began: from then on its inbox takes a cancel."""
+        self.busy = False
+        """Whether an episode runs: its inbox takes a cancel."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -107,16 +107,19 @@ class Workplace:
                 components=components,
             )
             confirm = self._confirmations
-            self.began = True
-            result = await run_episode(
-                task,
-                planner,
-                palette,
-                tools if confirm is None else confirm.before(tools),
-                inbox=inbox,
-                steps_max=_steps_max(self._playbook),
-                think_max_s=_think_max_s(self._llm),
-            )
+            self.busy = True
+            try:
+                result = await run_episode(
+                    task,
+                    planner,
+                    palette,
+                    tools if confirm is None else confirm.before(tools),
+                    inbox=inbox,
+                    steps_max=_steps_max(self._playbook),
+                    think_max_s=_think_max_s(self._llm),
+                )
+            finally:
+                self.busy = False
         if isinstance(planner, LlmPlanner):
             result["llm"] = planner.tally.as_result(planner.config.model)
         return result

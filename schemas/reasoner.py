@@ -1,4 +1,5 @@
-"""The reasoner's wire: what a person says to a running episode, on one ZeroMQ ROUTER socket.
+"""The reasoner's wire: tasks, and what a person says to a running one, on one ZeroMQ ROUTER socket;
+and the files that tasks leave behind.
 
 Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": n, "ok": false, "error":
 {…}}. Nothing here moves anything: words reach the planner, a cancel ends the episode and its goal.
@@ -7,6 +8,9 @@ Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": 
 from typing import Annotated, Literal, NotRequired, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, TypeAdapter
+
+TaskNumber = Annotated[int, Field(ge=1, lt=1 << 53)]
+TaskState = Literal["queued", "running", "success", "failure", "canceled"]
 
 
 class _Call(BaseModel):
@@ -22,10 +26,32 @@ class Say(_Call):
 
 
 class CancelEpisode(_Call):
-    """End the episode: its goal is cancelled, the planner is not asked."""
+    """End the running task, its goal is canceled and the planner is not asked; or the task with
+    this number, also one that waits."""
 
     op: Literal["cancel"]
     reason: Annotated[str, Field(max_length=500)] = ""
+    task: TaskNumber | None = None
+
+
+class SubmitTask(_Call):
+    """Queue a task (`vram-reasoner serve`). Reply: its number, and how many come before it."""
+
+    op: Literal["submit"]
+    text: Annotated[str, Field(min_length=1, max_length=4000)]
+
+
+class ListTasks(_Call):
+    """The tasks that wait, run, or ended (the last 64), the oldest first."""
+
+    op: Literal["tasks"]
+
+
+class GetTaskResult(_Call):
+    """The result of a task that ended."""
+
+    op: Literal["result"]
+    task: TaskNumber
 
 
 class ConfirmMotion(_Call):
@@ -48,10 +74,18 @@ class PingReasoner(_Call):
 
 
 ReasonerRequest = Annotated[
-    Say | CancelEpisode | ConfirmMotion | GetEpisode | PingReasoner, Field(discriminator="op")
+    Say
+    | CancelEpisode
+    | SubmitTask
+    | ListTasks
+    | GetTaskResult
+    | ConfirmMotion
+    | GetEpisode
+    | PingReasoner,
+    Field(discriminator="op"),
 ]
 REASONER_REQUEST: TypeAdapter[ReasonerRequest] = TypeAdapter(ReasonerRequest)
-OPS = ("say", "cancel", "confirm", "state", "ping")
+OPS = ("say", "cancel", "submit", "tasks", "result", "confirm", "state", "ping")
 
 
 class Motion(TypedDict):
@@ -62,9 +96,33 @@ class Motion(TypedDict):
 
 
 class StateReply(TypedDict):
+    """`task` is the running one's text, or empty."""
+
     task: str
     pid: int
     motion: Motion | None
+    queued: int
+
+
+class SubmitReply(TypedDict):
+    task: int
+    ahead: int
+
+
+class TaskView(TypedDict):
+    """One task of a reasoner. Times are ISO 8601 in UTC; `reason` is its result's."""
+
+    task: int
+    text: str
+    state: TaskState
+    reason: str
+    submitted_at: str
+    started_at: str | None
+    ended_at: str | None
+
+
+class TasksReply(TypedDict):
+    tasks: list[TaskView]
 
 
 # -- what a task came to: the result file, and the history
@@ -108,6 +166,18 @@ class Result(TypedDict):
     steps: list[StepRecord]
     notes: list[NoteRecord]
     llm: NotRequired[LlmUsage]
+
+
+class ResultReply(TypedDict):
+    result: Result
+
+
+class HistoryLine(BaseModel):
+    """A line of a serving reasoner's history: a task that ended, and its result."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    task: TaskView
+    result: Result
 
 
 class TranscriptLine(BaseModel):

@@ -11,11 +11,12 @@ import pytest
 
 from tests.support.waiting import play
 from vram_arbiter.reasoner.confirm import Confirmations
-from vram_arbiter.reasoner.inbox import Cancel, Inbox
+from vram_arbiter.reasoner.inbox import Cancel
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
 from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.schemas.errors import BadState
 from vram_arbiter.schemas.reasoner import Result
 from vram_arbiter.schemas.tools import ExecuteRskill, QueryScene, ToolCall
@@ -37,7 +38,9 @@ class Story:
     def __init__(self, folder: Path) -> None:
         self.endpoint = f"ipc://{folder}/reasoner.sock"
         self.confirmations = Confirmations()
-        self.inbox = Inbox()
+        self.queue = TaskQueue.of_one("x")
+        assert self.queue.running is not None
+        self.inbox = self.queue.running.inbox
         self.done: list[ToolCall] = []
 
     async def dispatch(self, call: ToolCall) -> Outcome:
@@ -50,7 +53,7 @@ class Story:
         return motion
 
     async def play(self, operator: Callable[[], Any]) -> Result:
-        async with OperatorServer(self.endpoint, "x", self.inbox, self.confirmations):
+        async with OperatorServer(self.endpoint, self.queue, self.confirmations):
             dispatch = self.confirmations.before(self.dispatch)
             episode = asyncio.create_task(
                 run_episode("x", TwoGrabs(), PALETTE, dispatch, inbox=self.inbox)
@@ -123,7 +126,7 @@ def test_a_reasoner_without_the_flag_takes_no_confirmation(tmp_path: Path) -> No
     endpoint = f"ipc://{tmp_path}/reasoner.sock"
 
     async def story() -> None:
-        async with OperatorServer(endpoint, "x", Inbox()):
+        async with OperatorServer(endpoint, TaskQueue.of_one("x")):
             assert (await send(endpoint, {"op": "state"}))["motion"] is None
             with pytest.raises(BadState, match="asks for no confirmation"):
                 await send(endpoint, {"op": "confirm", "motion": 1, "yes": True})

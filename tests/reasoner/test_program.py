@@ -61,20 +61,21 @@ def test_usage(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (["--task", " "], "the task says nothing"),
+        (["serve", "--result", "r.json"], "serve writes --history FILE"),
         (
-            ["--task", "x", "--result", "/proc/none/result.json"],
+            ["--task", "grab it", "--result", "/proc/none/result.json"],
             "--result /proc/none/result.json cannot be written",
         ),
         (
-            ["--task", "x", "--planner", "openai"],
+            ["--task", "grab it", "--planner", "openai"],
             "VRAM_REASONER_LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set",
         ),
         (
-            ["--task", "x", "--look"],
+            ["--task", "grab it", "--look"],
             "--look is for a language model (--planner openai or anthropic",
         ),
-        (["--task", "x", "--runner", "runner.sock"], "'runner.sock' is not an endpoint"),
-        (["--task", "x", "--listen", "tcp://127.0.0.1:7"], "any user of the machine"),
+        (["--task", "grab it", "--runner", "runner.sock"], "'runner.sock' is not an endpoint"),
+        (["--task", "grab it", "--listen", "tcp://127.0.0.1:7"], "any user of the machine"),
         (["--say", "x", "--listen", "reasoner.sock"], "'reasoner.sock' is not an endpoint"),
     ],
 )

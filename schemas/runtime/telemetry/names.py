@@ -28,6 +28,7 @@ SPAN_SAFETY = "safety.check"
 SPAN_SEND = "hal.send_action"
 SPAN_EPISODE = "sim.episode"
 
+SPAN_TASK = "reasoner.task"  # of a reasoner that serves tasks; otherwise cli.command is above
 SPAN_REASONER_TICK = "reasoner.tick"
 SPAN_PLAN = "reasoner.plan"
 SPAN_TOOL = "reasoner.tool"
