@@ -31,8 +31,9 @@ from vram_arbiter.runner.cli.common import (
     unlicensed,
     warm_up,
 )
-from vram_arbiter.runner.sim.config import CONTROL_HZ
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, VramError
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import ModelFamily
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
@@ -44,6 +45,20 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("runner")
 
+WITHOUT_MEMORY = frozenset(
+    {
+        ModelFamily.ACT,
+        ModelFamily.SMOLVLA,
+        ModelFamily.PI0,
+        ModelFamily.PI05,
+        ModelFamily.PI0_FAST,
+        ModelFamily.EO1,
+        ModelFamily.EVO1,
+        ModelFamily.XVLA,
+    }
+)
+"""Families whose sidecar answers from one observation alone."""
+MAX_STEPS = 600  # of an episode where neither the world nor --max-steps says
 REPORT = "benchmark.json"
 COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "reward", "errors")
 
@@ -59,7 +74,7 @@ def add_parser(
         "--env",
         action="append",
         default=[],
-        help="so101 (default) or gym:ID; may be given several times",
+        help="so101 (default), pusht, aloha-insertion, aloha-transfer-cube or gym:ID; repeatable",
     )
     bench.add_argument(
         "--scene",
@@ -92,9 +107,12 @@ def add_parser(
     bench.add_argument(
         "--max-steps",
         type=positive_int,
-        default=600,
-        help="of an episode; default 600, 20 s of the SO-101",
+        help="of an episode; default 600, 20 s of the SO-101, or a known environment's own",
     )
+    bench.add_argument(
+        "--parallel", type=positive_int, default=1, metavar="N",
+        help="play N episodes of a cell at once, each in a world of its own; default 1",
+    )  # fmt: skip
     bench.add_argument(
         "--episode-seconds",
         type=positive,
@@ -144,7 +162,8 @@ async def run(args: argparse.Namespace) -> int:
             arbiter = await connect_arbiter(args.arbiter, stack)
             gpu = rendering_gpu(os.environ)
             await stack.enter_async_context(gpu_lease(arbiter, gpu, RENDERING, RENDERER_BYTES))
-        entries = entries_of(args, arbiter)
+        lanes = [entries_of(args, arbiter) for _ in range(args.parallel)]
+        entries = lanes[0]
         check_output("--out", args.out / REPORT)
         if args.videos:
             check_output("--out", args.out / "videos" / "any")
@@ -153,31 +172,46 @@ async def run(args: argparse.Namespace) -> int:
         stopping = asyncio.Event()
         install_signals(stopping)
         cells: list[Cell] = []
-        for entry in entries:
+        for cell in zip(*lanes, strict=True):
             if stopping.is_set():
                 break
-            cells.append(await _play(entry, args, stopping))
-            _write(args, cells, complete=False)
+            cells.append(await _play(cell, args, stopping))
+            _write(args, entries, cells, complete=False)
     complete = len(cells) == len(entries) and all(cell.complete for cell in cells)
-    _write(args, cells, complete=complete)
+    _write(args, entries, cells, complete=complete)
     print(printable_lines(table([cell.summary() for cell in cells])))
     print(f"{args.out / REPORT}")
     return 0 if complete and not any(cell.errors for cell in cells) else 1
 
 
-async def _play(entry: Entry, args: argparse.Namespace, stopping: asyncio.Event) -> Cell:
-    bench = _benchmark(entry, args)
-    watching = asyncio.create_task(_stop_with(stopping, bench))
+async def _play(lanes: Sequence[Entry], args: argparse.Namespace, stopping: asyncio.Event) -> Cell:
+    """Play one cell, its seeds dealt out to the lanes: each has its own world and contestant."""
+    from vram_arbiter.runner.sim.benchmark import merged, release
+
+    benches = [_benchmark(entry, args) for entry in lanes]
+    contestants = [entry.contestant() for entry in lanes]
+    watching = asyncio.create_task(_stop_with(stopping, benches))
+    seeds = range(args.seed, args.seed + args.episodes)
     try:
-        return await bench.run(entry.contestant(), range(args.seed, args.seed + args.episodes))
+        async with asyncio.TaskGroup() as group:
+            played = [
+                group.create_task(bench.play(contestant, seeds[lane :: len(lanes)]))
+                for lane, (bench, contestant) in enumerate(zip(benches, contestants, strict=True))
+            ]
+        return merged([task.result() for task in played])
+    except* VramError as errors:
+        raise errors.exceptions[0] from None
     finally:
+        for contestant in contestants:  # not before all lanes are done: they share its sidecar
+            await release(contestant)
         watching.cancel()
         await asyncio.gather(watching, return_exceptions=True)
 
 
-async def _stop_with(stopping: asyncio.Event, bench: Benchmark) -> None:
+async def _stop_with(stopping: asyncio.Event, benches: Sequence[Benchmark]) -> None:
     await stopping.wait()
-    bench.stop()
+    for bench in benches:
+        bench.stop()
 
 
 def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
@@ -187,7 +221,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
     world, task, arm = entry.world, entry.task, entry.world.arm
 
     def told() -> Told:
-        return ("", {}) if arm is None or task is None else task.told(arm)
+        return (world.instruction, {}) if arm is None or task is None else task.told(arm)
 
     if arm is not None and task is not None and world.environment is not None:
         prepare = task.prepare
@@ -200,7 +234,7 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
         world.make,
         cameras=world.cameras,
         rate_hz=0,
-        max_steps=args.max_steps,
+        max_steps=longest_of(world, args),
         ends_with_skill=True,
         video_camera=world.video_camera,
         video_every=world.video_every,
@@ -216,6 +250,12 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
         video_every=world.video_every,
         episode_s=args.episode_seconds,
     )
+
+
+def longest_of(world: World, args: argparse.Namespace) -> int:
+    """Return the steps of an episode: as asked for, else the world's own."""
+    asked: int | None = args.max_steps
+    return asked or world.max_steps or MAX_STEPS
 
 
 # -- what is to be played
@@ -282,10 +322,18 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     entries = []
     for world in worlds_of(args):
         arm, environment = world.arm, world.environment
-        makers = makers_of(world, given, arbiter, period_s=1.0 / CONTROL_HZ, wait_s=LOCKSTEP_WAIT_S)
+        makers = makers_of(
+            world, given, arbiter, period_s=1.0 / world.control_hz, wait_s=LOCKSTEP_WAIT_S
+        )
         catalogue = Catalogue(manifests, makers, refused=refused, body=world.body)
         for name in dict.fromkeys(args.skill):
             _, make, manifest = catalogue.find(name)
+            if args.parallel > 1 and remembers(manifest):
+                raise ConfigError(
+                    f"--parallel {args.parallel}: {name} may keep observations of one episode in"
+                    " its sidecar, and episodes at once would mix them",
+                    hint="play it without --parallel",
+                )
             task = None if arm is None else given_task or task_of(manifest)
             entries.append(Entry(world, name, task, functools.partial(skilled, make)))
         for name in dict.fromkeys(args.policy):
@@ -299,6 +347,14 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
             entries.append(Entry(world, name, task, functools.partial(PolicyContestant, policy)))
     _check_names(entries)
     return entries
+
+
+def remembers(manifest: RSkillManifest) -> bool:
+    """Return whether a policy's answer may depend on more than the request: on a history, or, with
+    one action a request, on an ensemble of earlier answers."""
+    if manifest.kind is not Kind.VLA:
+        return False
+    return manifest.model_family not in WITHOUT_MEMORY or manifest.n_action_steps == 1
 
 
 def _check_names(entries: Sequence[Entry]) -> None:
@@ -317,16 +373,22 @@ def _check_names(entries: Sequence[Entry]) -> None:
 
 
 # -- what comes of it
-def _write(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -> None:
+def _write(
+    args: argparse.Namespace, entries: Sequence[Entry], cells: Sequence[Cell], *, complete: bool
+) -> None:
     """After every cell, whole or not at all: a run that is killed leaves the cells before."""
     report = {
         "format": "vram-benchmark/1",
         "complete": complete,
         "seeds": [args.seed, args.seed + args.episodes - 1],
-        "max_steps": args.max_steps,
+        "parallel": args.parallel,
         "cells": [
-            cell.summary() | {"episodes": [dataclasses.asdict(played) for played in cell.episodes]}
-            for cell in cells
+            {
+                **cell.summary(),
+                "max_steps": longest_of(entry.world, args),
+                "episodes": [dataclasses.asdict(played) for played in cell.episodes],
+            }
+            for entry, cell in zip(entries, cells, strict=False)
         ],
     }
     target = args.out / REPORT

@@ -12,7 +12,7 @@ import logging
 import math
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -167,6 +167,17 @@ class Cell:
         }
 
 
+def merged(cells: Sequence[Cell]) -> Cell:
+    """Return the cells of one contestant in worlds of one kind as one, its episodes by seed."""
+    first = cells[0]
+    whole = Cell(first.world, first.contestant, first.task, first.revision)
+    for played in sorted((one for cell in cells for one in cell.episodes), key=lambda o: o.seed):
+        whole.add(played)
+    whole.complete = all(cell.complete for cell in cells)
+    whole.why = next((cell.why for cell in cells if cell.why), "")
+    return whole
+
+
 class Contestant(Protocol):
     """A player. `begin` on the event loop, before each episode; `player` on the worker thread."""
 
@@ -251,6 +262,13 @@ class Benchmark:
         self.runner.request_stop()
 
     async def run(self, contestant: Contestant, seeds: Iterable[int]) -> Cell:
+        """Play the seeds, then release the contestant. Raises as `play`."""
+        try:
+            return await self.play(contestant, seeds)
+        finally:
+            await release(contestant)
+
+    async def play(self, contestant: Contestant, seeds: Iterable[int]) -> Cell:
         """Play the seeds. Raises what making the world raises; later errors are an episode's."""
         cell = Cell(self._world, contestant.name, self._task, contestant.revision)
         with ThreadPoolExecutor(1, thread_name_prefix="benchmark") as worker:
@@ -258,7 +276,7 @@ class Benchmark:
             try:
                 for seed in seeds:
                     stopped = self._stopping.is_set()
-                    played = None if stopped else await self._play(worker, contestant, seed)
+                    played = None if stopped else await self._episode_of(worker, contestant, seed)
                     if played is None:
                         cell.why = "stopped"
                         return cell
@@ -274,9 +292,8 @@ class Benchmark:
                 return cell
             finally:
                 await self._on(worker, self.runner.deactivate)
-                await _quietly(contestant.release())
 
-    async def _play(
+    async def _episode_of(
         self, worker: ThreadPoolExecutor, contestant: Contestant, seed: int
     ) -> Played | None:
         """None: stopped in its middle."""
@@ -402,6 +419,11 @@ def _verdict(played: Played) -> str:
         played.success
     ]
     return f"{word} after {played.steps} steps" + (f" ({played.message})" if played.message else "")
+
+
+async def release(contestant: Contestant) -> None:
+    """Release a contestant; a failure is logged, and its verdict is what it is."""
+    await _quietly(contestant.release())
 
 
 async def _quietly(work: Any) -> None:

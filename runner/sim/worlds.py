@@ -1,6 +1,6 @@
 """Worlds that the runner can simulate (`--env`), with their cameras, joints and skills.
 
-`so101` is our own scene, `gym:ID` any gymnasium environment. Nothing is simulated here:
+`so101` is our own scene, `gym:ID` any gymnasium environment, a preset one of the field's. Nothing is simulated here:
 `World.make` does that, on the control thread.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,11 +18,12 @@ from vram_arbiter.runner.robots.body import SIMULATED
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
-from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.config import ARM_JOINTS, CONTROL_HZ, REST_POSE, SceneConfig
 from vram_arbiter.runner.sim.env import MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, SimEnv
 from vram_arbiter.runner.sim.environment import Environment
 from vram_arbiter.runner.sim.gym_config import RENDER, GymConfig
 from vram_arbiter.runner.sim.gym_env import GymEnv
+from vram_arbiter.runner.sim.presets import PRESETS, preset_of
 from vram_arbiter.runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns
 from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.control import ControlMode
@@ -57,6 +58,9 @@ class World:
     arm: SimEnv | None = None
     environment: ArmEnvironment | None = None
     robot: RobotDescription | None = None
+    control_hz: float = float(CONTROL_HZ)  # its steps a second
+    max_steps: int | None = None  # of an episode of a benchmark; None: as it is asked for
+    instruction: str = ""  # what a benchmark tells its policies
 
 
 def so101_world(scene_file: Path | None) -> World:
@@ -117,14 +121,28 @@ def world_of(
                 "--env-config and --success are for --env gym:ID; the scene file is --scene"
             )
         return so101_world(scene)
-    if not env.startswith(GYM) or env == GYM:
-        raise ConfigError(f"unknown --env {env}", hint="so101, or gym:ID, e.g. gym:CartPole-v1")
+    preset = preset_of(env)
+    if preset is None and (not env.startswith(GYM) or env == GYM):
+        known = ", ".join(PRESETS)
+        raise ConfigError(
+            f"unknown --env {env}", hint=f"so101, {known}, or gym:ID, e.g. gym:CartPole-v1"
+        )
     if scene is not None:
         raise ConfigError(f"--scene is for --env {SO101}; a gymnasium environment has --env-config")
-    config = GymConfig() if env_config is None else GymConfig.load(env_config)
+    config = GymConfig() if preset is None else preset.config
+    if env_config is not None:
+        config = GymConfig.load(env_config)
     if success is not None:
         config = config.with_success(success)
-    return gym_world(env.removeprefix(GYM), config, render=render)
+    if preset is None:
+        return gym_world(env.removeprefix(GYM), config, render=render)
+    return replace(
+        gym_world(preset.env_id, config, render=render),
+        name=env,
+        control_hz=preset.control_hz,
+        max_steps=preset.max_steps,
+        instruction=preset.instruction,
+    )
 
 
 def makers_of(

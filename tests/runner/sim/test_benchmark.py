@@ -4,6 +4,7 @@ verdicts, videos, and a report whatever happens.
 
 import argparse
 import asyncio
+import importlib.util
 import json
 import os
 import signal
@@ -18,13 +19,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vram_arbiter.runner.__main__ import main
-from vram_arbiter.runner.cli.benchmark import add_parser, entries_of, worlds_of
+from vram_arbiter.runner.cli.benchmark import add_parser, entries_of, remembers, worlds_of
 from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant, file_name, wilson
 from vram_arbiter.runner.sim.gym_config import GymConfig
 from vram_arbiter.runner.sim.gym_env import GymEnv
 from vram_arbiter.runner.sim.policies import Policy, policy_of
+from vram_arbiter.runner.sim.presets import PRESETS, preset_of
 from vram_arbiter.runner.sim.robot import sim_runner
-from vram_arbiter.schemas.errors import SidecarUnavailable, UnknownSkill
+from vram_arbiter.runner.sim.worlds import world_of
+from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable, UnknownSkill
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.manifest.vocabulary import ModelFamily
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 HERE = Path(__file__).parents[1]
@@ -337,6 +342,58 @@ def test_mistakes_are_said_in_one_line(
     told = capsys.readouterr().err
     assert said in told
     assert len(told.splitlines()) == 1
+
+
+@pytest.mark.heavy
+def test_episodes_at_once_are_those_of_one_after_another(tmp_path: Path) -> None:
+    """Five seeds in two worlds, both contestants; a policy that gives up keeps its own error."""
+
+    def cells(*flags: str) -> list[list[tuple[Any, ...]]]:
+        out = tmp_path / "-".join(["out", *flags])
+        common = ["benchmark", "--env", POINT, "--max-steps", "9", "--no-videos", "--seed", "11"]
+        policies = ["--policy", SEEK, "--policy", "random", "--episodes", "5", "--out", str(out)]
+        assert main([*common, *policies, *flags]) == 0
+        told = report(out)
+        assert told["complete"]
+        names = ("seed", "success", "steps", "total_reward", "error")
+        return [[tuple(e[n] for n in names) for e in c["episodes"]] for c in told["cells"]]
+
+    together = cells("--parallel", "2")
+    assert together == cells()
+    assert [seed for seed, *_ in together[0]] == [11, 12, 13, 14, 15]
+
+
+def test_a_policy_with_a_memory_is_not_played_at_once() -> None:
+    grab = load_manifest(ROOT / "configs/rskills/so101-grab/rskill.yaml")
+    assert not remembers(grab)
+    assert remembers(grab.model_copy(update={"model_family": ModelFamily.DIFFUSION}))
+    assert remembers(grab.model_copy(update={"n_action_steps": 1}))  # it may be an ensemble's
+    navigate = load_manifest(ROOT / "configs/rskills/so101-navigate/rskill.yaml")
+    assert not remembers(navigate)  # it has no sidecar
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_benchmark_of_the_field_plays_or_names_its_package(name: str, tmp_path: Path) -> None:
+    preset = PRESETS[name]
+    flags = ["--policy", "random", "--episodes", "1", "--max-steps", "2", "--no-videos"]
+    argv = ["benchmark", "--env", name, *flags, "--out", str(tmp_path)]
+    if importlib.util.find_spec(preset.module) is None:
+        with pytest.raises(ConfigError, match=f"pip install {preset.package}"):
+            preset_of(name)
+        assert main(argv) == 2
+        return
+    assert main(argv) == 0
+    (cell,) = report(tmp_path)["cells"]
+    assert (cell["world"], cell["judged"], cell["max_steps"]) == (name, 1, 2)
+    world = world_of(name)
+    assert (world.max_steps, world.control_hz) == (preset.max_steps, preset.control_hz)
+    assert world.joints == preset.config.actions
+
+
+def test_libero_is_refused_with_its_package_and_a_way() -> None:
+    with pytest.raises(ConfigError, match=r"package hf-libero.*lerobot-eval"):
+        preset_of("libero:libero_10")
 
 
 @pytest.mark.heavy
