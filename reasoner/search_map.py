@@ -9,7 +9,7 @@ the best place wins. Pure: no sockets, no clock.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from vram_arbiter.schemas.plain import JsonMap
@@ -62,31 +62,40 @@ class Places:
     joined: bool = False
     """Whether odometry joins the newest look to the ones before."""
 
-    def add(self, data: JsonMap) -> None:
+    def add(self, data: JsonMap, others: Iterable[Place] = ()) -> bool:
         """Add `data` of a locate that found something: `point_base_m`, optionally `seen` and
-        `base_pose`.
+        `base_pose`. Leave out what stands where one of the `others` was seen with a better score.
+
+        Returns: whether anything was added.
         """
         pose = data.get("base_pose")
         self.joined = pose is not None
         if not self.joined:
             self.known.clear()
         self.base_pose = UNMOVED if pose is None else (pose[0], pose[1], pose[2])
+        things = data.get("seen") or [{"point_base_m": data["point_base_m"], "score": 1.0}]
+        seen = [self._place(Point(*thing["point_base_m"]), thing["score"]) for thing in things]
+        if self.joined:
+            seen = [place for place in seen if not _is_other(place, others)]
         before = list(self.known)
-        for thing in data.get("seen") or [{"point_base_m": data["point_base_m"], "score": 1.0}]:
-            self._see(Point(*thing["point_base_m"]), thing["score"], before)
+        for place in seen:
+            self._see(place, before)
+        return bool(seen)
 
-    def _see(self, point: Point, score: float, before: list[Place]) -> None:
-        """Add one thing of a look. `before`: places that are not matched in this look yet."""
+    def _place(self, point: Point, score: float) -> Place:
         x0, y0, yaw = self.base_pose
         x = x0 + math.cos(yaw) * point.x - math.sin(yaw) * point.y
         y = y0 + math.sin(yaw) * point.x + math.cos(yaw) * point.y
-        seen = Place(x, y, point.z, score, math.hypot(point.x, point.y))
+        return Place(x, y, point.z, score, math.hypot(point.x, point.y))
+
+    def _see(self, seen: Place, before: list[Place]) -> None:
+        """Add one place of a look. `before`: places that are not matched in this look yet."""
         same = min(before, key=lambda place: _apart_m(place, seen), default=None)
         if same is None or _apart_m(same, seen) > SAME_M:
             self.known.append(seen)
             return
         before.remove(same)
-        same.score += score
+        same.score += seen.score
         if seen.seen_from_m <= same.seen_from_m:
             same.x, same.y, same.z, same.seen_from_m = seen.x, seen.y, seen.z, seen.seen_from_m
 
@@ -112,6 +121,8 @@ class Search:
     Without odometry there is none: a place that was seen cannot be told from another.
     """
 
+    others: dict[str, Place] = field(default_factory=dict)
+    """Things that were in the hand and are not wanted, by name, where they were put down."""
     began: bool = False
     _views: list[Pose] = field(default_factory=list)
     _given: int = 0
@@ -137,6 +148,10 @@ class Search:
             if not any(_same_view(pose, view) for view in self._views):
                 return pose
         return None
+
+
+def _is_other(place: Place, others: Iterable[Place]) -> bool:
+    return any(_apart_m(place, other) <= SAME_M and other.score >= place.score for other in others)
 
 
 def _same_view(a: Pose, b: Pose) -> bool:

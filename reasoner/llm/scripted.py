@@ -40,6 +40,7 @@ MOVED = frozenset({"succeeded", "failed", "canceled"})
 _HOLDS = re.compile(
     r"(?<!\bnot )(?<!n't )\bhold(?:s|ing)?\s+(?!nothing\b|anything\b|no\b)", re.IGNORECASE
 )
+_NAMED = re.compile(r"\bhold(?:s|ing)?\s+(?:the|an?)\s+([^.,;]+)", re.IGNORECASE)
 _TASK = re.compile(
     r"\s*(?:grab|grasp|pick up|pick|fetch|take|lift)\s+(?:the\s+|a\s+|an\s+)?(.+?)\s*\.?\s*",
     re.IGNORECASE,
@@ -119,11 +120,11 @@ class _Robot:
 
 
 def _script(thing: str, robot: _Robot) -> Script:
-    ended = (yield from _empty_hand(thing, robot)) if robot.can_query else None
-    if ended is not None:
-        return ended
     reason = ""
     search = Search()
+    ended = (yield from _empty_hand(thing, robot, search)) if robot.can_query else None
+    if ended is not None:
+        return ended
     for attempt in range(1, ATTEMPTS_MAX + 1):
         if attempt > 1:
             yield _turn(robot, 0.0, "fold the arm, which hides the table after a grab")
@@ -152,13 +153,14 @@ def _script(thing: str, robot: _Robot) -> Script:
             return Finish(True, f"the scene VLM confirms: {answer}")
         reason = f"not grasped after attempt {attempt}: {failed + '; ' if failed else ''}{answer}"
         if robot.place is not None and attempt < ATTEMPTS_MAX and _HOLDS.search(answer):
-            yield _put_down(
-                robot.place, "a held thing would be looked at, and dropped before the next grasp"
-            )
+            why = "a held thing would be looked at, and dropped before the next grasp"
+            yield from _put_down(robot.place, answer, why, search)
     return Finish(False, reason)
 
 
-def _empty_hand(thing: str, robot: _Robot) -> Generator[ToolCall, Outcome, Finish | None]:
+def _empty_hand(
+    thing: str, robot: _Robot, search: Search
+) -> Generator[ToolCall, Outcome, Finish | None]:
     """Ask what the gripper holds before anything moves.
 
     Returns the end where the named thing is held already, or where another one cannot be put down.
@@ -175,7 +177,8 @@ def _empty_hand(thing: str, robot: _Robot) -> Generator[ToolCall, Outcome, Finis
         return None
     if robot.place is None:
         return Finish(False, f"{answer} No installed skill can put it down")
-    outcome = yield _put_down(robot.place, f"{answer} The gripper has to be empty for a grasp")
+    why = f"{answer} The gripper has to be empty for a grasp"
+    outcome = yield from _put_down(robot.place, answer, why, search)
     if outcome.status != "succeeded":
         return Finish(False, f"{answer} It could not be put down: {outcome.text}")
     return None
@@ -253,8 +256,8 @@ def _locate(
     outcome = Outcome("error", "never looked")
     for _ in range(LOOKS_MAX):
         outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
-        if outcome.status == "found":
-            places.add(outcome.data)
+        if outcome.status == "found" and not places.add(outcome.data, search.others.values()):
+            outcome = Outcome("not_seen", "what is seen was put down here", data=outcome.data)
         if outcome.status in ("found", "not_seen"):
             unknown = outcome.data.get("unknown_words")
             if unknown and robot.can_say and not search.began:
@@ -285,8 +288,22 @@ def _ask(question: str, why: str = "") -> Generator[ToolCall, Outcome, str | Non
     return None
 
 
-def _put_down(place: str, why: str) -> ExecuteRskill:
-    return ExecuteRskill(rskill_id=place, deadline_s=NAVIGATE_DEADLINE_S, rationale=why)
+def _put_down(
+    place: str, answer: str, why: str, search: Search
+) -> Generator[ToolCall, Outcome, Outcome]:
+    """Put down what the scene VLM says is held, and note where it stands by its own name: a detector
+    may take it for the wanted thing.
+    """
+    outcome = yield ExecuteRskill(rskill_id=place, deadline_s=NAVIGATE_DEADLINE_S, rationale=why)
+    named = _NAMED.search(answer)
+    if outcome.status == "succeeded" and named is not None:
+        name = named[1].lower()
+        looked = yield LocateInView(query=name, rationale=f"where does the {name} stand now?")
+        there = Places()
+        if looked.status == "found" and there.add(looked.data) and there.joined:
+            # the nearest: it stands before the arm, and another one of its kind may be better seen
+            search.others[name] = min(there.known, key=lambda place: place.seen_from_m)
+    return outcome
 
 
 def _turn(robot: _Robot, angle_rad: float, why: str) -> ExecuteRskill:

@@ -418,6 +418,30 @@ def test_another_thing_in_the_hand_is_put_down_first() -> None:
     assert not any(isinstance(call, ExecuteRskill) for call in calls)
 
 
+def test_what_was_put_down_is_not_taken_for_the_target() -> None:
+    """Regression: in the demo's world of seed 3 the second task took the red ball, which it had just
+    put down, for the red cube, and grabbed it three times.
+    """
+    here = [0.4, 0.2, 0.0]
+
+    def world(call: ToolCall, before: int) -> Outcome:
+        match call:
+            case LocateInView(query="red ball"):
+                return sees(here, (0.33, 0.0, 0.73), (0.7, 0.4, 0.8))
+            case LocateInView():
+                return sees(here, (0.33, 0.0, 0.43), *([(0.34, -0.3, 0.4)] if before > 2 else []))
+            case QueryScene(question="What is the gripper holding?"):
+                return Outcome("answered", "The gripper holds the red ball.")
+            case QueryScene():
+                return YES
+            case _:
+                return DONE
+
+    result, calls = run_script(world, WITH_PLACE, hand="red ball")
+    assert result["status"] == "success"
+    assert drives([c for c in calls if "target_point" in c.model_dump_json()])[0] == (0.34, -0.3)
+
+
 # -- a wider search
 POSED = {"type": "object", "properties": {"pose": {}, "turn_rad": {}, "target_point": {}}}
 DRIVING = Palette((dataclasses.replace(NAVIGATE, goal_params_schema=POSED), GRAB))
