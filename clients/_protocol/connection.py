@@ -10,7 +10,7 @@ the pushes. The owner (`clients._session`) feeds `receive`, takes what it finds 
 idempotent. Each request has a deadline.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Protocol
 
 from vram_arbiter.clients._protocol.records import (
@@ -177,12 +177,24 @@ class Connection:
         """Return whether the reply is missing; then the request is sent again after a reconnect."""
         return request_id in self._pending
 
-    def drop_unsent(self, matches: Callable[[Message], bool]) -> None:
-        """Drop requests that were not sent yet and have no meaning any more."""
-        for request_id in [
-            i for i, r in self._pending.items() if r.sent_at is None and matches(r.message)
-        ]:
+    def drop_unsent(self, lease_id: str, ops: frozenset[str]) -> None:
+        """Drop requests on a lease that were not sent yet and have no meaning any more."""
+        for request_id in self._unsent(lease_id, ops):
             del self._pending[request_id]
+
+    def fail_unsent(self, lease_id: str, ops: frozenset[str], error: VramError, now: float) -> None:
+        """End requests on a lease that were not sent yet: the lease is over."""
+        for request_id in self._unsent(lease_id, ops):
+            self._fail(request_id, error, now)
+
+    def _unsent(self, lease_id: str, ops: frozenset[str]) -> list[int]:
+        return [
+            request_id
+            for request_id, request in self._pending.items()
+            if request.sent_at is None
+            and request.message["op"] in ops
+            and request.message.get("lease_id") == lease_id
+        ]
 
     # -- time --------------------------------------------------------------------------------------
     def deadlines(self, expects_grants: bool) -> Iterator[float]:

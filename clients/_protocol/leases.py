@@ -46,6 +46,10 @@ from vram_arbiter.schemas.wire.views import LeaseView
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
 """Codes of replies to a request on a lease that this client no longer holds."""
 AWAY = ("standby", "parked")
+_MEANINGLESS = frozenset({"revoke_ack", "use_end"})
+"""Requests that are dropped with their lease."""
+_AWAITED = frozenset({"ready", "use_begin", "yield", "resize", "oom"})
+"""Requests whose caller waits for the arbiter while it holds the lease, and not longer."""
 
 
 class Holdings:
@@ -255,6 +259,7 @@ class Holdings:
                 details={"lease_id": record.lease_id, "silent_s": silent_s},
             )
             self._gone(record, error, fenced=True)
+            self._connection.fail_unsent(record.lease_id, _AWAITED, error, now)
 
     def end_overdue(self, now: float) -> None:
         """End waits for a return that are over while the arbiter cannot be reached."""
@@ -422,9 +427,7 @@ class Holdings:
         if not (self.held.pop(record.lease_id, None) or self._wake(record)):
             return
         record.uses.clear()
-        self._connection.drop_unsent(
-            lambda m: m.get("lease_id") == record.lease_id and m["op"] in ("revoke_ack", "use_end")
-        )
+        self._connection.drop_unsent(record.lease_id, _MEANINGLESS)
         self._connection.events.append(Gone(record, error, fenced))
 
 

@@ -59,6 +59,23 @@ def test_fenced_after_ttl_and_grace_without_a_word(link: Wire) -> None:
     assert isinstance(gone.error, LeaseLost)
 
 
+def test_a_use_that_waits_for_the_arbiter_ends_with_its_lease(link: Wire) -> None:
+    """Regression: after a kill of the arbiter the lease was fenced at TTL + grace, and `use_begin`
+    went on waiting for its own 30 s."""
+    record = link.hold()
+    link.connection.contact_lost("test")
+    begun = link.holdings.use_begin(record, "u1", "", link.now)
+    link.told()
+    link.tick(14.0)
+    gone, failed = link.told()
+    assert isinstance(gone, r.Gone)
+    assert isinstance(failed, r.Failed)
+    assert failed.request_id == begun
+    assert failed.error is gone.error
+    link.greet()
+    assert link.sent() == [], "nothing of it is said again"
+
+
 def test_a_server_that_answers_pings_but_no_renewals_does_not_keep_leases_alive(link: Wire) -> None:
     link.hold()
     for _ in range(14):
