@@ -244,17 +244,12 @@ class LeaseTelemetry:
         acquirer's trace: it only points there."""
         if (found := self._acquires.get(lease_id)) is not None:
             return found
-        parent = _W3C.extract({"traceparent": traceparent}, Context()) if traceparent else Context()
-        links: list[trace.Link] = []
-        if by_itself:
-            links, parent = _links(parent), Context()
+        asked = _context(traceparent)
+        parent, links = (Context(), _links(asked)) if by_itself else (asked, ())
+        labels = {names.ATTR_LEASE: lease_id, names.ATTR_CONSUMER: consumer}
+        kind = trace.SpanKind.SERVER
         span = self._tracer.start_span(
-            names.SPAN_ACQUIRE,
-            context=parent,
-            kind=trace.SpanKind.SERVER,
-            links=links,
-            start_time=at_ns,
-            attributes={names.ATTR_LEASE: lease_id, names.ATTR_CONSUMER: consumer},
+            names.SPAN_ACQUIRE, parent, kind, labels, links=links, start_time=at_ns
         )
         while len(self._acquires) >= OPEN_MAX:
             self._end_acquire(next(iter(self._acquires)), at_ns, failed="too many spans are open")
@@ -292,17 +287,9 @@ class LeaseTelemetry:
             acquire = self._acquire(wanted_by, asked.wanted_by, traceparent, at_ns)
             acquire.asked_ns = acquire.asked_ns or at_ns
             parent = trace.set_span_in_context(acquire.span, parent)
+        why = {names.ATTR_WANTED_BY: asked.wanted_by, names.ATTR_REASON: asked.cause}
         span = self._tracer.start_span(
-            names.SPAN_EVICT,
-            context=parent,
-            start_time=at_ns,
-            attributes={
-                names.ATTR_LEASE: lease_id,
-                names.ATTR_CONSUMER: about.consumer,
-                names.ATTR_GPU: str(about.gpu),
-                names.ATTR_WANTED_BY: asked.wanted_by,
-                names.ATTR_REASON: asked.cause,
-            },
+            names.SPAN_EVICT, parent, attributes=_labels(about) | why, start_time=at_ns
         )
         # it was never measured: asked again, the earlier way out has no end of its own
         self._end_leaving(lease_id, at_ns)
@@ -343,22 +330,13 @@ class LeaseTelemetry:
 
     def _verifying(self, leaving: _Leaving, about: About, at_ns: int) -> trace.Span:
         if leaving.verify is None:
-            links: list[trace.Link] = []
-            parent = Context()
-            if leaving.evict is not None:
-                parent = trace.set_span_in_context(leaving.evict, parent)
-            elif about.traceparent:  # came back by itself: not part of its acquirer's trace
-                links = _links(_W3C.extract({"traceparent": about.traceparent}, Context()))
+            parent, links = Context(), _links(_context(about.traceparent))
+            if (
+                leaving.evict is not None
+            ):  # else it left by itself: not part of its acquirer's trace
+                parent, links = trace.set_span_in_context(leaving.evict, parent), ()
             leaving.verify = self._tracer.start_span(
-                names.SPAN_VERIFY,
-                context=parent,
-                links=links,
-                start_time=at_ns,
-                attributes={
-                    names.ATTR_LEASE: str(about.lease_id),
-                    names.ATTR_CONSUMER: about.consumer,
-                    names.ATTR_GPU: str(about.gpu),
-                },
+                names.SPAN_VERIFY, parent, attributes=_labels(about), links=links, start_time=at_ns
             )
         return leaving.verify
 
@@ -422,9 +400,22 @@ def _bytes(count: int | None) -> dict[str, int]:
     return {} if count is None else {names.ATTR_BYTES: count}
 
 
-def _links(context: Context) -> list[trace.Link]:
+def _labels(about: About) -> dict[str, str]:
+    return {
+        names.ATTR_LEASE: str(about.lease_id),
+        names.ATTR_CONSUMER: about.consumer,
+        names.ATTR_GPU: str(about.gpu),
+    }
+
+
+def _context(traceparent: str | None) -> Context:
+    """The span that a W3C traceparent names, as the parent of others."""
+    return _W3C.extract({"traceparent": traceparent}, Context()) if traceparent else Context()
+
+
+def _links(context: Context) -> Sequence[trace.Link]:
     earlier = trace.get_current_span(context).get_span_context()
-    return [trace.Link(earlier)] if earlier.is_valid else []
+    return [trace.Link(earlier)] if earlier.is_valid else ()
 
 
 def _ids(span: trace.Span) -> Mapping[str, str]:
@@ -436,7 +427,4 @@ def _ids(span: trace.Span) -> Mapping[str, str]:
 
 def _named_by(about: About) -> Mapping[str, str]:
     """The acquirer's own span, as it was told us."""
-    if about.traceparent is None:
-        return _NONE
-    parent = _W3C.extract({"traceparent": about.traceparent}, Context())
-    return _ids(trace.get_current_span(parent))
+    return _ids(trace.get_current_span(_context(about.traceparent)))
