@@ -14,7 +14,7 @@ import os
 import signal
 import sys
 from collections.abc import Awaitable, Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.loop import nothing_done
@@ -109,10 +109,11 @@ async def _speak(arguments: argparse.Namespace, name: str) -> None:
             for task in (await send(at, {"op": "tasks"}))["tasks"]:
                 print(json.dumps(task))
         case _:
-            await _answer_motion(at, yes=arguments.confirm, reason=arguments.deny or "")
+            await answer_motion(at, yes=arguments.confirm, reason=arguments.deny or "")
 
 
-async def _answer_motion(at: str, *, yes: bool, reason: str) -> None:
+async def answer_motion(at: str, *, yes: bool, reason: str) -> None:
+    """Confirm or deny the motion that waits there. Raises BadState if none does."""
     motion = (await send(at, {"op": "state"}))["motion"]
     if motion is None:
         raise BadState("no motion waits for a confirmation")
@@ -177,9 +178,15 @@ async def _work(
     at = endpoint(arguments.listen, "reasoner")
     with contextlib.suppress(asyncio.CancelledError):
         async with workplace, OperatorServer(at, queue, confirmations):
-            with confirmations.on_terminal(sys.stdin) if confirmations else nullcontext():
+            with terminal_answers(confirmations):
                 await perform(workplace)
     return " and ".join(heard)
+
+
+def terminal_answers(confirmations: Confirmations | None) -> AbstractContextManager[None]:
+    if confirmations is None or sys.stdin is None:  # a program may be started without it
+        return nullcontext()
+    return confirmations.on_terminal(sys.stdin)
 
 
 if __name__ == "__main__":

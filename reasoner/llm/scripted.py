@@ -99,6 +99,7 @@ class _Robot:
     """Whether navigation drives to a pose, and not only to what was seen."""
     can_query: bool
     can_say: bool
+    grasp_camera: str
 
     @classmethod
     def of(cls, palette: Palette) -> "_Robot":
@@ -116,6 +117,7 @@ class _Robot:
             "pose" in (schema.get("properties") or {}),
             palette.can_query,
             OPERATOR in palette.topics,
+            GRASP_CAMERA if GRASP_CAMERA in (palette.cameras or (GRASP_CAMERA,)) else "",
         )
 
 
@@ -148,7 +150,7 @@ def _script(thing: str, robot: _Robot) -> Script:
             continue
         if not robot.can_query:
             return Finish(True, "the grab ended; there is no scene VLM to confirm it")
-        held, answer = yield from _confirm(thing)
+        held, answer = yield from _confirm(thing, robot)
         if held:
             return Finish(True, f"the scene VLM confirms: {answer}")
         reason = f"not grasped after attempt {attempt}: {failed + '; ' if failed else ''}{answer}"
@@ -166,13 +168,13 @@ def _empty_hand(
     Returns the end where the named thing is held already, or where another one cannot be put down.
     Two answers have to agree: one that is wrong would move the arm, or end the task.
     """
-    answer = (yield from _ask(HOLDING, "know the hand before moving")) or ""
+    answer = (yield from _ask(robot, HOLDING, "know the hand before moving")) or ""
     if thing in answer.lower():
-        held, confirmed = yield from _confirm(thing)
+        held, confirmed = yield from _confirm(thing, robot)
         return Finish(True, f"it is held already: {confirmed}") if held else None
     if not _HOLDS.search(answer):
         return None
-    again = (yield from _ask(ANYTHING, f"make sure: {answer}")) or ""
+    again = (yield from _ask(robot, ANYTHING, f"make sure: {answer}")) or ""
     if not says_yes(again):
         return None
     if robot.place is None:
@@ -268,21 +270,21 @@ def _locate(
     return outcome
 
 
-def _confirm(thing: str) -> Generator[ToolCall, Outcome, tuple[bool, str]]:
+def _confirm(thing: str, robot: _Robot) -> Generator[ToolCall, Outcome, tuple[bool, str]]:
     """Return whether the scene VLM confirms that the named thing is held, and its answer.
 
     A yes that names something else, or nothing, is not enough.
     """
-    answer = yield from _ask(f"Has the robot gripper grasped the {thing}?")
+    answer = yield from _ask(robot, f"Has the robot gripper grasped the {thing}?")
     if answer is not None and says_yes(answer) and thing not in answer.lower():
-        answer = yield from _ask(HOLDING)
+        answer = yield from _ask(robot, HOLDING)
         return answer is not None and thing in answer.lower(), answer or NO_ANSWER
     return answer is not None and says_yes(answer), answer or NO_ANSWER
 
 
-def _ask(question: str, why: str = "") -> Generator[ToolCall, Outcome, str | None]:
+def _ask(robot: _Robot, question: str, why: str = "") -> Generator[ToolCall, Outcome, str | None]:
     for _ in range(LOOKS_MAX):
-        outcome = yield QueryScene(question=question, camera=GRASP_CAMERA, rationale=why)
+        outcome = yield QueryScene(question=question, camera=robot.grasp_camera, rationale=why)
         if outcome.status == "answered":
             return outcome.text
     return None

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from tests.support.waiting import play
+from vram_arbiter.reasoner.__main__ import answer_motion
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.inbox import Cancel
 from vram_arbiter.reasoner.loop import run_episode
@@ -73,7 +74,7 @@ def test_a_motion_begins_when_it_is_confirmed_and_not_when_it_is_denied(tmp_path
         assert "lab/grab" in told["text"]
         with pytest.raises(BadState, match="motion 1 waits"):
             await send(story.endpoint, {"op": "confirm", "motion": 2, "yes": True})
-        await send(story.endpoint, {"op": "confirm", "motion": 1, "yes": True})
+        await answer_motion(story.endpoint, yes=True, reason="")  # as `--confirm` does
         await story.waits(2)
         with pytest.raises(BadState, match="motion 2 waits"):
             await send(story.endpoint, {"op": "confirm", "motion": 1, "yes": True})

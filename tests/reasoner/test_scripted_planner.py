@@ -442,6 +442,15 @@ def test_what_was_put_down_is_not_taken_for_the_target() -> None:
     assert drives([c for c in calls if "target_point" in c.model_dump_json()])[0] == (0.34, -0.3)
 
 
+def test_a_robot_without_a_wrist_camera_is_asked_about_with_its_default_one() -> None:
+    held = "The gripper holds the red cube."
+    for cameras, asked in ((("front", "wrist"), "wrist"), (("front",), ""), ((), "wrist")):
+        _, calls = hears(
+            held, f"Yes, {held}", palette=dataclasses.replace(PALETTE, cameras=cameras)
+        )
+        assert [call.camera for call in calls if isinstance(call, QueryScene)] == [asked] * 2
+
+
 # -- a wider search
 POSED = {"type": "object", "properties": {"pose": {}, "turn_rad": {}, "target_point": {}}}
 DRIVING = Palette((dataclasses.replace(NAVIGATE, goal_params_schema=POSED), GRAB))
