@@ -88,6 +88,7 @@ class Session:
         self.protocol = ClientProtocol(
             name=name, instance=f"{os.getpid()}-{uuid.uuid4().hex[:8]}", role=role
         )
+        self.on_prepare: Callable[[str], object] | None = None
         self._waits: dict[str, _Wait] = {}
         self._leases: dict[str, AsyncLease] = {}
         self._foreign_uses: dict[str, AsyncForeignUse] = {}
@@ -432,6 +433,9 @@ class Session:
             case r.HistoryEvent():
                 for subscriber in self._subscribers:
                     subscriber.put(event.event)
+            case r.PrepareAsked():
+                if self.on_prepare is not None:
+                    self.on_prepare(event.by)
 
     def _note_lost_contact(self, reason: str) -> None:
         """Log it once, however often a reconnect fails. Before the first contact, entering

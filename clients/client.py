@@ -36,7 +36,7 @@ from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.explained import WhyReply
-from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
+from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, PrepareReply, StatusReply
 from vram_arbiter.schemas.wire.spec import Gang, LeaseSpec
 
 CONNECT_TIMEOUT_S: Final = 5.0
@@ -287,6 +287,16 @@ class AsyncClient:
         """Return events after sequence number `after`, oldest first."""
         fields = {"after": after, "limit": limit, "kinds": list(kinds)}
         return await self._asked(HistoryReply, "history", fields)
+
+    async def prepare(self, consumer: str) -> PrepareReply:
+        """Tell a consumer that its model is wanted soon; it may read its weights into host RAM.
+        Nothing is granted, and nothing evicted, for a hint."""
+        return await self._asked(PrepareReply, "prepare", {"consumer": consumer})
+
+    def on_prepare(self, hinted: Callable[[str], object]) -> None:
+        """Call `hinted` with the name of a client that says that this consumer's model is wanted
+        soon."""
+        self._session.on_prepare = hinted
 
     async def ping(self, *, timeout_s: float = 2.0) -> PingReply:
         """Wait for a sign of life."""

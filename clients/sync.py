@@ -33,7 +33,7 @@ from vram_arbiter.schemas.errors import BadState, VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.explained import WhyReply
-from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
+from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, PrepareReply, StatusReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 
@@ -409,6 +409,14 @@ class Client:
     def history(self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()) -> HistoryReply:
         """Return events after sequence number `after`, oldest first."""
         return self._portal.call(self._client.history, after, limit, kinds)
+
+    def prepare(self, consumer: str) -> PrepareReply:
+        """Tell a consumer that its model is wanted soon; see `AsyncClient.prepare`."""
+        return self._portal.call(self._client.prepare, consumer)
+
+    def on_prepare(self, hinted: Callable[[str], object]) -> None:
+        """Call `hinted`, on the client's own thread, when this consumer's model is wanted soon."""
+        self._client.on_prepare(hinted)
 
     def ping(self, *, timeout_s: float = 2.0) -> PingReply:
         """Wait for a sign of life."""

@@ -38,12 +38,13 @@ from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
-from vram_arbiter.schemas.wire.pushes import AnyPush, EventPush
+from vram_arbiter.schemas.wire.pushes import AnyPush, EventPush, PreparePush
 from vram_arbiter.schemas.wire.replies import (
     AnyReply,
     DoneReply,
     HistoryReply,
     PingReply,
+    PrepareReply,
     WelcomeReply,
 )
 
@@ -176,7 +177,7 @@ class SessionTable:
                 # the peer by the kernel's word; the name is what the connection calls itself
                 peer = session.peer
                 operator = f"{session.name} (uid {peer.uid}, pid {peer.process.pid})"
-            if op in _READS:  # 5
+            if op in _READS or isinstance(request, w.Prepare):  # 5
                 self._answer(session, request)
                 return True
             if op in _HOLDING and not session.leased:
@@ -274,7 +275,7 @@ class SessionTable:
         self.reply(session.client, RequestId(hello.id), welcome)
 
     def _answer(self, session: Session, request: w.Request) -> None:
-        """Answer what changes nothing."""
+        """Answer what changes nothing in the engine."""
         client, re, decisions = session.client, RequestId(request.id), self._decisions
         match request:
             case w.Hello():
@@ -303,6 +304,15 @@ class SessionTable:
             case w.Subscribe():
                 self._subscribe(session)
                 self.reply(client, re, DoneReply())
+            case w.Prepare():
+                told = [
+                    other
+                    for other in self._sessions.values()
+                    if other.name == request.consumer and other.role == "client"
+                ]
+                for other in told:
+                    self.push(other.client, PreparePush(session.name))
+                self.reply(client, re, PrepareReply(len(told)))
             case w.Bye():
                 self.reply(client, re, DoneReply())
                 self._registry.leave(session, ev.BYE)

@@ -14,7 +14,7 @@ from itertools import chain
 from vram_arbiter.clients._protocol.connection import Connection
 from vram_arbiter.clients._protocol.foreign_uses import ForeignUses
 from vram_arbiter.clients._protocol.leases import Holdings
-from vram_arbiter.clients._protocol.records import HistoryEvent, error_of
+from vram_arbiter.clients._protocol.records import HistoryEvent, PrepareAsked, error_of
 from vram_arbiter.clients._protocol.waits import Waits
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.wire.decode import AnyReply
@@ -24,6 +24,7 @@ from vram_arbiter.schemas.wire.pushes import (
     EventPush,
     GrantedPush,
     LostPush,
+    PreparePush,
     ResizedPush,
     RevokePush,
 )
@@ -104,3 +105,5 @@ class ClientProtocol:
                 self.holdings.lost(push)
             case EventPush():
                 self.connection.events.append(HistoryEvent(push.event))
+            case PreparePush():
+                self.connection.events.append(PrepareAsked(push.by))

@@ -144,6 +144,13 @@ class HistoryEvent:
     event: JsonMap
 
 
+@dataclass(frozen=True, slots=True)
+class PrepareAsked:
+    """A hint: this consumer's model is wanted soon. `by`: the client that said so."""
+
+    by: str
+
+
 Event = (
     Up
     | ContactLost
@@ -158,6 +165,7 @@ Event = (
     | Resized
     | UseLost
     | HistoryEvent
+    | PrepareAsked
 )
 
 

@@ -20,6 +20,7 @@ REPLIES: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {
         "hello": r.WelcomeReply,
         "ping": r.PingReply,
+        "prepare": r.PrepareReply,
         "bye": r.DoneReply,
         "subscribe": r.DoneReply,
         "acquire": r.AcquireReply,

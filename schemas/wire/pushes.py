@@ -84,4 +84,15 @@ class EventPush:
     event: JsonMap
 
 
-type AnyPush = RevokePush | GrantedPush | DeniedPush | ResizedPush | LostPush | EventPush
+@dataclass(frozen=True, slots=True)
+class PreparePush:
+    """The consumer's model is wanted soon. `by`: the client that said so."""
+
+    TAG: ClassVar = ("push", "prepare")
+
+    by: str
+
+
+type AnyPush = (
+    RevokePush | GrantedPush | DeniedPush | ResizedPush | LostPush | EventPush | PreparePush
+)

@@ -147,6 +147,13 @@ class DrainReply:
     drained: str
 
 
+@dataclass(frozen=True, slots=True)
+class PrepareReply:
+    """`told`: sessions of the consumer that the hint went to."""
+
+    told: int
+
+
 type AnyReply = (
     DoneReply
     | WelcomeReply
@@ -163,5 +170,6 @@ type AnyReply = (
     | HistoryReply
     | OperatorReply
     | DrainReply
+    | PrepareReply
     | WhyReply
 )

@@ -251,6 +251,14 @@ class Resume(_ByHand):
     op: Literal["resume"]
 
 
+class Prepare(_Request):
+    """A hint: the consumer's model is wanted soon. It is passed on to the consumer, which may read
+    its weights into host RAM; it grants nothing and evicts nothing."""
+
+    op: Literal["prepare"]
+    consumer: Name
+
+
 class Ping(_Request):
     op: Literal["ping"]
 
@@ -288,6 +296,7 @@ Request = Annotated[
     | ReleaseDead
     | Drain
     | Resume
+    | Prepare
     | Ping
     | Bye,
     Field(discriminator="op"),

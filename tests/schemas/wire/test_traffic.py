@@ -109,6 +109,8 @@ def everything(connect: Callable[..., RecordedClient]) -> list[RecordedClient]:
     for op in ("status", "ping"):
         other.ask(op)
     other.ask("history", after=0, limit=100)
+    other.ask("prepare", consumer="client-1")
+    holder.push("prepare")
     for action in ("pin", "unpin"):
         operator.ask(action, target=lease["lease_id"], reason="test")
     operator.ask("release_dead", target=lease["lease_id"], reason="test")
