@@ -81,6 +81,8 @@ class SidecarHost:
                 await stack.enter_async_context(on_port(settings.port, path_of(settings.endpoint)))
             self._processes.preload(self._adapter.modules)
             residency = self._residency = Residency(settings, self._processes, client)
+            if client is not None:
+                client.on_prepare(residency.announce)
             background = [
                 asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")
             ]

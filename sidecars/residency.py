@@ -58,6 +58,8 @@ TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
 }
 """State → states that may follow."""
 Token = tuple[int, int]
+FORESEEN_S: Final = 120.0
+"""How long weights that were read ahead wait for a request: longer than a drive."""
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
 _LEAVING = ("revoking", "unloading")
 _AWAY = ("standby", "parked")
@@ -83,6 +85,8 @@ class Residency:
         self._model: Model | None = None
         self._prepared: asyncio.Task[None] | None = None
         self._weights: asyncio.Task[int] | None = None  # on their way into host RAM, or there
+        self._foreseen: asyncio.Task[None] | None = None  # reads weights ahead of a request
+        self._expiry: asyncio.TimerHandle | None = None  # drops them where none comes
         self._weights_bytes: int | None = None  # in host RAM, when they were there the last time
         self._left = asyncio.Event()  # the unload or parking in progress is over
         self._called_off = asyncio.Event()  # the load in progress is not wanted any more
@@ -107,6 +111,40 @@ class Residency:
         after a failure, or where the process has died since."""
         if self._prepared is None or self._prepared.done():
             self._prepared = asyncio.create_task(self._models.prepare(), name="prepare")
+
+    def announce(self, by: str) -> None:
+        """Read the weights into host RAM ahead of a request that `by` foresees.
+
+        Only where the arbiter's budget of host RAM has room for them beside what is parked. They
+        are dropped where no request comes within `FORESEEN_S`. No lease is asked for.
+        """
+        if self._client is None or self._ending or self.state != "unloaded":
+            return  # else they are in host RAM already, or on their way
+        if self._foreseen is None or self._foreseen.done():
+            _log.info("%s says that the model is wanted soon", by)
+            if self._expiry is not None:
+                self._expiry.cancel()
+            ahead = self._read_ahead(self._client)
+            self._foreseen = asyncio.create_task(ahead, name="read ahead")
+
+    async def _read_ahead(self, client: AsyncClient) -> None:
+        try:
+            await self.prepared()
+            ram = (await client.status()).host_ram
+            size, room = self._settings.footprint.steady_bytes, ram.budget_bytes - ram.parked_bytes
+            if (size := self._weights_bytes or size) > room:
+                _log.info("%d bytes of weights, room for %d: they are not read ahead", size, room)
+                return
+            self._weights_bytes = await asyncio.shield(self._fetch())
+        except VramError as error:
+            _log.info("the weights are not read ahead: %s", error)
+            return
+        self._expiry = asyncio.get_running_loop().call_later(FORESEEN_S, self._unforeseen)
+
+    def _unforeseen(self) -> None:
+        if self.state == "unloaded" and not self.wanted:
+            _log.info("no request came for it: dropping the weights")
+            self._drop()
 
     def _fetch(self) -> asyncio.Task[int]:
         """Begin to read the weights into host RAM, if they are not there."""
@@ -224,8 +262,11 @@ class Residency:
     async def leave(self) -> None:
         """End of the program: after the op in progress, free everything."""
         self._ending = True
+        if self._expiry is not None:
+            self._expiry.cancel()
         lease = self.lease
-        under_way = {task for task in (self._prepared, self._weights) if task and not task.done()}
+        tasks = (self._prepared, self._foreseen, self._weights)
+        under_way = {task for task in tasks if task and not task.done()}
         for task in under_way:
             task.cancel()
         if under_way:

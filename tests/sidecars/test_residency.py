@@ -6,7 +6,7 @@ import asyncio
 import pytest
 
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.schemas.errors import Evicted, ModelError, NotResident
+from vram_arbiter.schemas.errors import Evicted, ModelError, NotPermitted, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
 from vram_arbiter.sidecars.residency import TRANSITIONS, Residency
@@ -164,6 +164,54 @@ async def test_each_residency_has_a_model_of_its_own(arbiter_daemon):
             assert not models.started[1].ended.is_set()
             await residency.leave()
             assert models.started[1].ended.is_set()
+
+
+async def test_a_model_that_is_wanted_soon_is_read_ahead_and_nothing_else(
+    arbiter_daemon, monkeypatch
+):
+    """The hint reaches the consumer by its name. It asks for no lease, and weights for which no
+    request comes, or no host RAM is left, do not stay."""
+    models = Models(weights_bytes=GB)
+    endpoint = arbiter_daemon.endpoint
+    async with (
+        AsyncClient("eye", endpoint=endpoint) as client,
+        AsyncClient("reasoner", endpoint=endpoint) as reasoner,
+        AsyncClient("watcher", endpoint=endpoint, role="observer") as watcher,
+        asyncio.timeout(WAIT_S),
+    ):
+        residency = Residency(settings(arbiter_daemon), models, client)
+        client.on_prepare(residency.announce)
+        with pytest.raises(NotPermitted):
+            await watcher.prepare("eye")
+        assert (await reasoner.prepare("nobody")).told == 0
+        for _ in range(2):
+            assert (await reasoner.prepare("eye")).told == 1
+        while not models.in_host_ram:
+            await asyncio.sleep(0.01)
+        assert (models.reads, models.loads, (await client.status()).leases) == (1, 0, ())
+        await residency.load()
+        assert (models.reads, residency.state) == (1, "resident"), "it was there already"
+        await residency.unload()
+        while models.in_host_ram:
+            await asyncio.sleep(0.01)
+        await reasoner.prepare("eye")
+        while not models.in_host_ram:  # regression: the second hint in two minutes was ignored
+            await asyncio.sleep(0.01)
+        await residency.leave()
+
+        monkeypatch.setattr("vram_arbiter.sidecars.residency.FORESEEN_S", 0.0)
+        again = Residency(settings(arbiter_daemon), models, client)
+        again.announce("reasoner")
+        while models.reads < 3 or models.in_host_ram:
+            await asyncio.sleep(0.01)
+        scarce = Models(weights_bytes=GB)
+        crowded = Residency(settings(arbiter_daemon), scarce, client)
+        crowded._weights_bytes = (await client.status()).host_ram.budget_bytes + 1
+        crowded.announce("reasoner")
+        await crowded._foreseen
+        assert scarce.reads == 0
+        for residency in (again, crowded):
+            await residency.leave()
 
 
 async def test_weights_stay_in_host_ram_while_the_arbiter_has_room_for_them(arbiter_daemon):
