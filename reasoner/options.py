@@ -119,6 +119,10 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)"
     )
     parser.add_argument(
+        "--arbiter",
+        help='endpoint of the arbiter, which is told what model follows; "none": it is not told',
+    )
+    parser.add_argument(
         "--detector", help='endpoint of the detector sidecar; "none": there is none'
     )
     parser.add_argument(

@@ -25,6 +25,7 @@ from vram_arbiter.clients.sidecar.perception import (
     RewardClient,
     SceneVlmClient,
 )
+from vram_arbiter.reasoner.hints import Hints
 from vram_arbiter.reasoner.history import Past, Taken
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Outcome
@@ -109,6 +110,7 @@ class Tools:
         judge: Judge | None = None,
         palette: Palette | None = None,
         components: Mapping[str, SidecarClient] | None = None,
+        hints: Hints | None = None,
         goal_grace_s: float = GOAL_GRACE_S,
     ) -> None:
         self._runner = runner
@@ -117,6 +119,7 @@ class Tools:
         self._judge = judge
         self._palette = palette
         self._components = dict(components or {})
+        self._hints = hints
         self._goal_grace_s = goal_grace_s
 
     async def __call__(self, call: ToolCall) -> Outcome:
@@ -259,6 +262,11 @@ class Tools:
             asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
         )
         waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
+        hint = (
+            asyncio.create_task(self._hints.follows(call.next_rskill_id))
+            if call.next_rskill_id and self._hints is not None
+            else None
+        )
         try:
             either: set[asyncio.Task[Any]] = {waiting} if patience is None else {waiting, patience}
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
@@ -284,7 +292,7 @@ class Tools:
             await _called_off(goal)
             raise
         finally:
-            for task in (waiting, patience):
+            for task in (waiting, patience, hint):
                 if task is not None:
                     task.cancel()
                     task.add_done_callback(_retrieve)

@@ -3,12 +3,14 @@
 import argparse
 import asyncio
 import contextlib
+import os
 from typing import Self
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from vram_arbiter.reasoner.confirm import Confirmations
+from vram_arbiter.reasoner.hints import Hints
 from vram_arbiter.reasoner.history import RATE_HZ, Past
 from vram_arbiter.reasoner.inbox import Inbox
 from vram_arbiter.reasoner.llm.base import LlmPlanner
@@ -25,6 +27,7 @@ from vram_arbiter.reasoner.watch import watch
 from vram_arbiter.schemas.body import read_body
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.reasoner import Result
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 
 
 class Workplace:
@@ -47,6 +50,8 @@ class Workplace:
         self._transcript = Transcript(arguments.transcript)
         at = endpoint(arguments.runner, "runner")
         self._runner, self._watching, self._eyes = (RunnerClient(at) for _ in range(3))
+        arbiter = arguments.arbiter or arbiter_endpoint(os.environ, os.getuid())
+        self._hints = None if arbiter == "none" else Hints(arbiter)
         self._detector = _given(DetectorClient, arguments.detector, "detector")
         self._vlm = _given(SceneVlmClient, arguments.scene_vlm, "scene-vlm")
         reward = "none" if arguments.reward is None else arguments.reward
@@ -105,6 +110,7 @@ class Workplace:
                 judge=judge,
                 palette=palette,
                 components=components,
+                hints=self._hints,
             )
             confirm = self._confirmations
             self.busy = True

@@ -88,6 +88,14 @@ class ExecuteRskill(_Tool):
         ),
     ] = None
 
+    next_rskill_id: Annotated[
+        str,
+        Field(
+            max_length=256,
+            description="The skill that follows, so that its model is made ready meanwhile.",
+        ),
+    ] = ""
+
     @field_validator("goal_params_json")
     @classmethod
     def _is_json_object(cls, text: str) -> str:

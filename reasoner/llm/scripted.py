@@ -327,6 +327,7 @@ def _stand(robot: _Robot, pose: Pose, why: str) -> ExecuteRskill:
 def _go(robot: _Robot, params: str, why: str) -> ExecuteRskill:
     return ExecuteRskill(
         rskill_id=robot.navigate,
+        next_rskill_id=robot.grab,
         deadline_s=NAVIGATE_DEADLINE_S,
         rationale=why,
         goal_params_json=params,

@@ -15,7 +15,7 @@ from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.errors import ManifestInvalid, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.runtime.endpoints import program_endpoint
+from vram_arbiter.schemas.runtime.endpoints import program_endpoint, sidecar_name
 
 EXECUTABLE = frozenset({Kind.VLA, Kind.ROS_ACTION, Kind.ROS_SERVICE})
 NOT_EXECUTED = {
@@ -175,11 +175,5 @@ def _why_not(kind: Kind) -> str:
 
 
 def sidecar_endpoint(rskill_id: str, given: Mapping[str, str], environ: Mapping[str, str]) -> str:
-    """Return the address of a policy's sidecar: as given, else by name (`OWNER/so101-grab` →
-    `grab`).
-    """
-    repository = rskill_id.rpartition("/")[2]
-    _, dash, rest = repository.partition("-")
-    return given.get(rskill_id) or program_endpoint(
-        rest if dash else repository, environ, os.getuid()
-    )
+    """Return the address of a policy's sidecar: as given, else by its name."""
+    return given.get(rskill_id) or program_endpoint(sidecar_name(rskill_id), environ, os.getuid())

@@ -54,6 +54,13 @@ def arbiter_endpoint(environ: Mapping[str, str], uid: int) -> str:
     return environ.get(ENDPOINT_VARIABLE) or program_endpoint("arbiter", environ, uid)
 
 
+def sidecar_name(rskill_id: str) -> str:
+    """Name of a skill's sidecar where none is given: `OWNER/so101-grab` → `grab`."""
+    repository = rskill_id.rpartition("/")[2]
+    _, dash, rest = repository.partition("-")
+    return rest if dash else repository
+
+
 def program_endpoint(name: str, environ: Mapping[str, str], uid: int) -> str:
     """Endpoint of a sidecar or of the runner, by its name: `ipc://<runtime>/<name>.sock`. Raises
     ConfigError."""

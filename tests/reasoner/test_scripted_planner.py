@@ -66,6 +66,7 @@ def test_finds_drives_corrects_grabs_and_asks() -> None:
     ]
     drive, correct, grab = (call for call in calls if isinstance(call, ExecuteRskill))
     assert drive.rskill_id == correct.rskill_id == NAVIGATE.id
+    assert drive.next_rskill_id == correct.next_rskill_id == GRAB.id
     assert drive.goal_params == {"target_point": {"x": 0.4, "y": 0.1, "z": 0.2}}
     assert (grab.rskill_id, grab.prompt) == (GRAB.id, "grab the red cube")
     assert result["status"] == "success"

@@ -14,6 +14,7 @@ from tests.support.field_server import FieldServer
 from tests.support.waiting import play
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
+from vram_arbiter.reasoner.hints import Hints
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
@@ -82,6 +83,27 @@ def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
         ("canceled", ""),
         ("failed", "deadline"),
     ]
+
+
+def test_what_follows_a_goal_is_said_while_it_runs(a_runner: Any) -> None:
+    class Said(Hints):
+        def __init__(self) -> None:
+            self.follow = asyncio.Queue[str]()
+
+        async def follows(self, rskill_id: str) -> None:
+            await self.follow.put(rskill_id)
+
+    async def story() -> tuple[str, str]:
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            said = Said()
+            drive = GRAB.model_copy(update={"next_rskill_id": "test/next"})
+            doing = asyncio.create_task(Tools(client, None, None, hints=said)(drive))
+            await runner.accepted.wait()
+            follows = await said.follow.get()
+            await runner.end("succeeded")
+            return follows, (await doing).status
+
+    assert play(story) == ("test/next", "succeeded")
 
 
 def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(a_runner: Any) -> None:
