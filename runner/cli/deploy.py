@@ -48,6 +48,7 @@ from vram_arbiter.runner.gpu_lease import DECODER_BYTES, DECODING, cuda_uuid, gp
 from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData, Skill
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
+from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.config.robot import RobotEnvironment
@@ -167,7 +168,7 @@ class Deploy:
             print(printable_lines(plan(self._file, parts, check, self._facts(check))))
             print("dry run: nothing was opened")
             return 0
-        for text in (*unkept(parts, check), *unused(self._file.robot)):
+        for text in (*unkept(self._file, parts, check), *unused(self._file.robot)):
             log.warning("%s is not kept", text)
         install_signals(self._stopping)
         async with contextlib.AsyncExitStack() as stack:
@@ -183,6 +184,8 @@ class Deploy:
                 gpu_lease(arbiter, gpu, DECODING, decoders * DECODER_BYTES)
             )
             runner = self._runner(parts, mark)
+            topic = listened_topic(self._file.robot)
+            stack.enter_context(estop_topic(topic, runner.request_estop))
             runner.spans.share = self._args.trace_ticks
             if (folder := self._file.robot.save_dir) is not None:
                 rate_hz, name = self._file.robot.rate_hz, self._file.robot.robot_id

@@ -18,6 +18,7 @@ from vram_arbiter.runner.recording.commit import check_folder
 from vram_arbiter.runner.recording.recorder import whole_rate
 from vram_arbiter.runner.robots.body import body_of
 from vram_arbiter.runner.safety.gate import RobotGate
+from vram_arbiter.runner.sensors.ros2_estop import listened_topic
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE
 from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
@@ -132,11 +133,14 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
     return Parts(hal, tuple(readers), gate)
 
 
-def unkept(parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
-    """Return the safety limits of the file and of all executable skills that the gate cannot
-    enforce.
+def unkept(file: DeploymentFile, parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
+    """Return the safety limits of the file and of all executable skills that neither the gate nor
+    the emergency stop's listener keeps.
     """
-    found = dict.fromkeys(parts.gate.unkept)
+    heard = "safety.e_stop_topic (" if listened_topic(file.robot) else None
+    found = dict.fromkeys(
+        text for text in parts.gate.unkept if heard is None or not text.startswith(heard)
+    )
     for manifest in catalogue.executable():
         found |= dict.fromkeys(parts.gate.for_skill(manifest, ()).unkept)
     return tuple(found)
@@ -320,7 +324,9 @@ def plan(
         lines.append(("safety", ", ".join(f"{key} {value}" for key, value in given.items())))
     else:
         lines.append(("safety", "none given: only the joints' own ranges and speeds are limits"))
-    lines += [("NOT KEPT", text) for text in unkept(parts, catalogue)]
+    if (button := listened_topic(robot)) is not None:
+        lines.append(("estop", f"also by {button} (std_msgs/Bool)"))
+    lines += [("NOT KEPT", text) for text in unkept(file, parts, catalogue)]
     lines += [("skill", text) for text in catalogue.summary()]
     lines += [("contract", text) for text in contracts(parts, catalogue)]
     if robot.task is not None and robot.vla is not None:

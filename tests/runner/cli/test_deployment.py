@@ -489,3 +489,11 @@ def test_a_continuous_detector_is_checked_against_the_installed_ones(dry_run: Dr
     assert "one detector a camera; given twice: front" in dry_run(twice, skills=skills)[2]
     blind = f"{TWIN}{cameras}detectors:\n  - {{id: a/b, sensor_id: rear}}\n"
     assert "detectors look at cameras that are not there: rear" in dry_run(blind)[2]
+
+
+def test_a_topic_that_stops_the_robot_is_named_and_not_told_as_unkept(dry_run: DryRun) -> None:
+    pytest.importorskip("cyclonedds")
+    out = dry_run(TWIN + "safety: {e_stop_topic: /cell/e_stop, deadman_required: true}\n")[1]
+    assert "estop     also by /cell/e_stop (std_msgs/Bool)" in out.splitlines()
+    assert "NOT KEPT  safety.deadman_required" in out
+    assert "NOT KEPT  safety.e_stop_topic" not in out

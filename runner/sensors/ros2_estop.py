@@ -1,0 +1,152 @@
+"""Emergency stop by a ROS 2 topic: `std_msgs/Bool`, true stops. Over DDS, without a ROS installation.
+
+Fails to the safe side: a message that cannot be read stops the robot, and so does a listener that
+breaks down. A publisher that is away stops nothing: the topic is a button, not a dead man's switch.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from vram_arbiter.runner.sensors.ros2_dds import (
+    cdr_of,
+    dds_problems,
+    dds_topic,
+    domain_of,
+    sample_of,
+)
+from vram_arbiter.schemas.config.robot import RobotEnvironment
+from vram_arbiter.schemas.errors import ConfigError
+
+log = logging.getLogger(__name__)
+
+WAIT_S = 1.0  # the longest that the thread sleeps in DDS; a message wakes it
+STOP_S = 2.0
+MESSAGES_KEPT = 64  # until the thread has come to them
+_BOOL_BYTES = 5  # four that name the encoding, and the value
+
+
+def listened_topic(robot: RobotEnvironment) -> str | None:
+    """Return the topic that a deployment is stopped by: one that its file gives, where DDS is
+    installed."""
+    safety = robot.safety
+    if safety is None or "e_stop_topic" not in safety.model_fields_set:
+        return None
+    return safety.e_stop_topic if importlib.util.find_spec("cyclonedds") is not None else None
+
+
+@contextmanager
+def estop_topic(topic: str | None, stop: Callable[[str], None]) -> Iterator[None]:
+    """While inside, call `stop(reason)` on a thread of its own when the topic says so; None: do
+    nothing.
+
+    Raises ConfigError: a wrong name or domain, or DDS cannot be started.
+    """
+    if topic is None:
+        yield
+        return
+    try:
+        name, domain = dds_topic(topic), domain_of()
+    except ValueError as error:
+        raise ConfigError(f"safety.e_stop_topic: {error}") from error
+    listener = _Listener(topic, name, domain, stop)
+    try:
+        yield
+    finally:
+        listener.close()
+
+
+class _Listener:
+    def __init__(self, topic: str, name: str, domain: int, stop: Callable[[str], None]) -> None:
+        from cyclonedds.core import (
+            DDSStatus,
+            GuardCondition,
+            InstanceState,
+            Policy,
+            Qos,
+            ReadCondition,
+            SampleState,
+            ViewState,
+            WaitSet,
+        )
+        from cyclonedds.domain import DomainParticipant
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        self._topic, self._stop = topic, stop
+        with dds_problems(domain):
+            participant = DomainParticipant(domain)
+            reader = DataReader(
+                participant,
+                Topic(participant, name, bool_type()),
+                qos=Qos(
+                    Policy.Reliability.Reliable(max_blocking_time=0),
+                    Policy.Durability.Volatile,
+                    # not the newest alone: a button that is let go at once has been pressed
+                    Policy.History.KeepLast(MESSAGES_KEPT),
+                    Policy.DataRepresentation(use_cdrv0_representation=True),
+                ),
+            )
+            reader.set_status_mask(DDSStatus.RequestedIncompatibleQos)
+            self._guard: Any = GuardCondition(participant)
+            waitset = WaitSet(participant)
+            unread = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+            for entity in (unread, reader, self._guard):
+                waitset.attach(entity)
+        self._thread = threading.Thread(
+            target=self._run, args=(waitset, reader), name="estop-topic", daemon=True
+        )
+        self._thread.start()
+        log.info("the robot stops when %s says true", topic)
+
+    def close(self) -> None:
+        self._guard.set(True)
+        self._thread.join(STOP_S)
+
+    # -- on its thread
+    def _run(self, waitset: Any, reader: Any) -> None:
+        from cyclonedds.util import duration
+
+        try:
+            while not self._guard.read():
+                waitset.wait(duration(seconds=WAIT_S))
+                self._attend(reader)
+        except Exception as error:
+            log.exception("the emergency stop's topic %s", self._topic)
+            self._stop(f"the listener on {self._topic} broke down: {type(error).__name__}")
+
+    def _attend(self, reader: Any) -> None:
+        from cyclonedds.core import DDSStatus
+
+        if reader.take_status(DDSStatus.RequestedIncompatibleQos):
+            log.error(
+                "a publisher on %s offers best effort and is not heard: it has to be reliable",
+                self._topic,
+            )
+        for sample in reader.take(N=MESSAGES_KEPT):
+            if sample.sample_info.valid_data and (reason := said(cdr_of(sample))):
+                self._stop(f"{self._topic} {reason}")
+
+
+def said(cdr: bytes) -> str:
+    """Return why a `std_msgs/Bool` as it came stops the robot; "" if it says false."""
+    if len(cdr) < _BOOL_BYTES or cdr[0] != 0 or cdr[4] > 1:
+        return "sent what cannot be read"
+    return "says stop" if cdr[4] else ""
+
+
+@functools.cache
+def bool_type() -> Any:
+    """Return the DDS type of `std_msgs/Bool`; its samples stay as bytes."""
+    from cyclonedds.idl import make_idl_struct
+
+    made = make_idl_struct("Bool_", "std_msgs.msg.dds_.Bool_", {"data": bool})
+    made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
+    made.serialize = lambda self, *_, **__: cdr_of(self)
+    return made
