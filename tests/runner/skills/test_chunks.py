@@ -84,6 +84,25 @@ def test_a_robot_that_stood_still_misses_no_row() -> None:
     assert play(player, policy, 6, delay=9) == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 3), (1, 4)]
 
 
+def standing(prefetch_at: int, delay: int) -> int:
+    """Return the steps without a row between the first and the thirtieth row."""
+    policy = Policy(12)
+    player = ChunkPlayer(policy.fetch, prefetch_at=prefetch_at, keep=6)
+    stood, waited = 0, 0
+    while player.played < 30:
+        if policy.futures and not policy.futures[-1].done():
+            waited += 1
+            if waited > delay:
+                policy.answer()
+                waited = 0
+        stood += player.next_row(None if not player.wants_observation() else "o") is None
+    return stood - (delay + 1)  # those before the first row
+
+
+def test_a_prefetch_that_covers_the_latency_never_stands_still() -> None:
+    assert [standing(prefetch_at, delay=2) for prefetch_at in (0, 1, 2, 3, 5)] == [12, 8, 4, 0, 0]
+
+
 def test_what_the_chunks_say_about_the_steps_to_come() -> None:
     """Left-over rows begin with those that are played before the new chunk, `delay` of them."""
     policy = Policy(6)
