@@ -73,7 +73,7 @@ def _main(arguments: argparse.Namespace, name: str) -> None:
     """Exits with the code, unless that is 0."""
     try:
         if name not in ("task", "serve"):
-            asyncio.run(_speak(arguments, name))
+            asyncio.run(speak(arguments, name))
             return
         check_files(arguments)
         result = asyncio.run(_serve(arguments) if name == "serve" else _one_task(arguments))
@@ -93,7 +93,7 @@ def _complain(error: VramError, code: int) -> int:
     return code
 
 
-async def _speak(arguments: argparse.Namespace, name: str) -> None:
+async def speak(arguments: argparse.Namespace, name: str) -> None:
     """Send one message to a running reasoner."""
     at = endpoint(arguments.listen, "reasoner")
     match name:

@@ -38,6 +38,7 @@ from vram_arbiter.schemas.tools import (
 )
 
 EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
+PROMPTED_KINDS = frozenset({"vla"})  # the others have their goal in its parameters
 WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
 ASKED = ("locate_in_view", "query_scene", "look", "query_task_progress")
 OPERATOR = "/operator"
@@ -257,7 +258,12 @@ class Palette:
         offered = []
         if "execute_rskill" in tools:
             offered += [
-                skill_function(skill.id, skill.description, skill.goal_params_schema)
+                skill_function(
+                    skill.id,
+                    skill.description,
+                    skill.goal_params_schema,
+                    prompted=skill.kind in PROMPTED_KINDS,
+                )
                 for skill in self.executable.values()
             ]
         asked = function_schemas(name for name in ASKED if name in tools)

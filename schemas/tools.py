@@ -303,13 +303,17 @@ class FunctionTool(TypedDict):
 
 
 def skill_function(
-    rskill_id: str, description: str, goal_params_schema: JsonMap | None
+    rskill_id: str,
+    description: str,
+    goal_params_schema: JsonMap | None,
+    *,
+    prompted: bool = True,
 ) -> FunctionTool:
     """The function description of one skill: `execute_rskill` without `rskill_id`, its parameters
     as the manifest describes them.
 
     `goal_params` takes the place of `goal_params_json` where the manifest has a schema; a skill
-    without one takes none.
+    without one takes none. Only a skill that is `prompted` reads words.
     """
     function = function_schema(ExecuteRskill)
     body = function["function"]
@@ -320,6 +324,8 @@ def skill_function(
         parameters["properties"]["goal_params_json"],
         parameters["required"],
     )
+    if not prompted:
+        del parameters["properties"]["prompt"]
     if goal_params_schema:
         parameters["properties"]["goal_params"] = copy.deepcopy(dict(goal_params_schema))
     return function

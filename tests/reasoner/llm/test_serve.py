@@ -1,6 +1,7 @@
 """`vram-reasoner serve` as a process: tasks from its socket, one after the other, until a signal."""
 
 import asyncio
+import json
 import os
 import signal
 import sys
@@ -10,6 +11,8 @@ from typing import Any
 import pytest
 
 from tests.support.llm_apis import OpenAi
+from vram_arbiter.reasoner.__main__ import speak
+from vram_arbiter.reasoner.options import parser
 from vram_arbiter.reasoner.server import send
 from vram_arbiter.schemas.errors import BadState, ReasonerUnreachable
 from vram_arbiter.schemas.reasoner import HistoryLine
@@ -17,13 +20,20 @@ from vram_arbiter.schemas.reasoner import HistoryLine
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
 
-def test_tasks_in_sequence(tmp_path: Path, a_runner: Any, stand_in: Any) -> None:
+def test_tasks_in_sequence(
+    tmp_path: Path, a_runner: Any, stand_in: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     endpoint, history = f"ipc://{tmp_path}/reasoner.sock", tmp_path / "history.jsonl"
     stand_in.json(OpenAi.says(("finish", '{"success": true, "reason": "here already"}')))
     stand_in.hangs()
 
     async def told(request: dict[str, Any]) -> Any:
         return await send(endpoint, request, timeout_s=60.0)
+
+    async def said(*argv: str) -> None:
+        """As the command line says it."""
+        arguments = parser("").parse_args([*argv, "--listen", endpoint])
+        await speak(arguments, argv[0].removeprefix("--"))
 
     async def up() -> None:
         while True:
@@ -61,12 +71,13 @@ def test_tasks_in_sequence(tmp_path: Path, a_runner: Any, stand_in: Any) -> None
             assert (await state_of(1, "success"))["reason"] == "here already"
             await told({"op": "submit", "text": "drive away"})
             await state_of(2, "running")
-            ahead = [
-                (await told({"op": "submit", "text": text}))["ahead"] for text in ("left", "right")
-            ]
-            assert ahead == [1, 2]
-            await told({"op": "cancel", "task": 3, "reason": "not that way"})
-            await state_of(3, "canceled")
+            for text in ("left", "right"):
+                await said("--submit", text)
+            assert capsys.readouterr().out == "task 3, 1 before it\ntask 4, 2 before it\n"
+            await said("--cancel", "not that way", "--number", "3")
+            await said("--tasks")
+            listed = [json.loads(line)["state"] for line in capsys.readouterr().out.splitlines()]
+            assert listed == ["success", "running", "canceled", "queued"]
             assert (await told({"op": "state"}))["queued"] == 1
             assert (await told({"op": "result", "task": 1}))["result"]["llm"]["requests"] == 1
             with pytest.raises(BadState, match="is not over: running"):

@@ -51,6 +51,8 @@ def test_cameras_are_a_choice_and_another_one_is_told_back(
     offered = api.offered(stand_in.asked[0])
     for name in ("locate_in_view", "query_scene", "look"):
         assert offered[name]["properties"]["camera"]["enum"] == ["front", "wrist"]
+    assert "prompt" in offered["execute_rskill__lab__grab"]["properties"]
+    assert "prompt" not in offered["execute_rskill__lab__navigate"]["properties"]
     assert set(offered["locate_in_view"]["properties"]) == {"query", "camera", "rationale"}
     assert "there is no camera rear" in api.told(stand_in.asked[1])[-1]
 
