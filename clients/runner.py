@@ -3,6 +3,7 @@ knows no robot and no GPU."""
 
 import asyncio
 import contextlib
+import logging
 import os
 import uuid
 from collections.abc import AsyncIterator
@@ -23,11 +24,19 @@ from vram_arbiter.schemas.goals import FeedbackPush, FrameReply, ResultPush
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 
+log = logging.getLogger(__name__)
+
 CALL_TIMEOUT_S = 10.0
 CONNECT_TIMEOUT_S = 10.0
+RESET_TIMEOUT_S = 60.0  # scenes are built, pictures rendered
+WAIT_QUIETLY_S = 2.0  # for a runner that is starting; then the log says so
+MARK_TIMEOUT_S = 90.0  # the dataset's writer may be closing an episode's files
 RESULT_POLL_S = 1.0  # while waiting for a result push: ask, in case contact was lost meanwhile
 ENDED = ("succeeded", "failed", "canceled", "deadline")
 FEEDBACK_MAX = 1000  # kept for a reader that is late; the oldest go first
+
+
+Verdict = Literal["success", "failure", "discard"]
 
 
 class Goal:
@@ -199,6 +208,19 @@ class RunnerClient:
     async def skills(self) -> Message:
         return await self.call("skills")
 
+    async def reset(self, seed: int | None = None) -> Message:
+        """Simulator only: begin the scene again, or that of `seed`; returns once it stands.
+
+        Raises BadState while a goal runs."""
+        return await self.call("reset", {"seed": seed}, timeout_s=RESET_TIMEOUT_S)
+
+    async def mark(self, verdict: Verdict, goal_id: str = "") -> Message:
+        """Mark the episode of the goal that runs, or of the last one; "discard" removes it.
+
+        Raises BadState when nothing is recorded, BadRequest for another goal."""
+        fields = {"verdict": verdict, "goal_id": goal_id}
+        return await self.call("mark", fields, timeout_s=MARK_TIMEOUT_S)
+
     async def ping(self, *, timeout_s: float = 1.0) -> Message:
         return await self._exchange("ping", {}, timeout_s)
 
@@ -223,12 +245,24 @@ class RunnerClient:
         """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer
         before anything is said."""
         if not self._rpc.proven:
-            await self._exchange("ping", {}, self._connect_timeout_s)
+            await self._await_runner()
         return await self._exchange(
             op, fields or {}, self._timeout_s if timeout_s is None else timeout_s
         )
 
     # -- steps -------------------------------------------------------------------------------------
+    async def _await_runner(self) -> None:
+        """Wait until a runner answers: one that is starting does not serve yet."""
+        quiet_s = min(WAIT_QUIETLY_S, self._connect_timeout_s)
+        try:
+            await self._exchange("ping", {}, quiet_s)
+        except RunnerUnreachable:
+            rest_s = self._connect_timeout_s - quiet_s
+            if rest_s <= 0:
+                raise
+            log.warning("waiting for a runner at %s, %.0f s more", self.endpoint, rest_s)
+            await self._exchange("ping", {}, rest_s)
+
     async def _exchange(self, op: str, fields: JsonMap, timeout_s: float) -> Message:
         try:
             reply: Message = await self._rpc.exchange({"op": op, **fields}, timeout_s)

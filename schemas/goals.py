@@ -75,6 +75,22 @@ class GetGroundTruth(_Call):
     op: Literal["ground_truth"]
 
 
+class ResetWorld(_Call):
+    """Simulator only: begin the scene again, or that of another seed. Refused while a goal runs."""
+
+    op: Literal["reset"]
+    seed: Annotated[int, Field(ge=0, lt=1 << 31)] | None = None
+
+
+class MarkEpisode(_Call):
+    """The operator's verdict on the episode of a goal: the one that runs, or the last one. ""
+    takes that goal. A discarded episode is removed from the dataset."""
+
+    op: Literal["mark"]
+    verdict: Literal["success", "failure", "discard"]
+    goal_id: Name | Literal[""] = ""
+
+
 class PingRunner(_Call):
     op: Literal["ping"]
 
@@ -91,6 +107,8 @@ RunnerRequest = Annotated[
     | GetState
     | GetSkills
     | GetGroundTruth
+    | ResetWorld
+    | MarkEpisode
     | PingRunner
     | ShutdownRunner,
     Field(discriminator="op"),

@@ -8,22 +8,18 @@ import contextlib
 import logging
 import os
 import signal
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
-from vram_arbiter.runner.control.loop import ControlLoop
-from vram_arbiter.runner.control.robot import Robot
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, Kind, RSkillManifest
-
-if TYPE_CHECKING:
-    from vram_arbiter.runner.recording.recorder import DatasetRecorder
 
 log = logging.getLogger("runner")
 
@@ -170,38 +166,6 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
         ) from error
 
 
-async def record_into[R: Robot](
-    folder: Path,
-    runner: ControlLoop[R],
-    rate_hz: float,
-    robot: str,
-    stack: contextlib.AsyncExitStack,
-) -> DatasetRecorder:
-    """Record the runner's goals, from before its control thread starts until after it has ended.
-
-    Args: `rate_hz` 0 records as fast as possible. Raises ConfigError for a folder or a rate that
-    cannot be recorded, AlreadyRunning when another program records there.
-    """
-    from vram_arbiter.runner.recording.recorder import DatasetRecorder
-
-    recorder = DatasetRecorder(
-        folder,
-        rate_hz=rate_hz or AS_FAST_AS_POSSIBLE_HZ,
-        cameras=runner.camera_names,
-        robot=robot,
-        patient=rate_hz == 0,
-    )
-    log.info("starting the dataset's writer")
-    try:
-        await asyncio.to_thread(recorder.start)
-    except asyncio.CancelledError:
-        recorder.abort()  # else the thread goes on waiting
-        raise
-    stack.push_async_callback(asyncio.to_thread, recorder.close)
-    runner.follow(recorder, save_dir=str(recorder.root))
-    return recorder
-
-
 def default_skills() -> Path:
     """Folder of the shipped manifests. Raises ConfigError where there is none."""
     folder = configs_folder(os.environ) / "rskills"
@@ -210,6 +174,11 @@ def default_skills() -> Path:
             f"no skills in {folder}", hint="name some with --skills, or set VRAM_ARBITER_CONFIGS"
         )
     return folder
+
+
+def announce(endpoint: str) -> None:
+    """Say that clients may connect, on stderr: stdout is the run's result."""
+    print(f"serving goals on {endpoint}", file=sys.stderr, flush=True)
 
 
 def install_signals(stopping: asyncio.Event) -> None:

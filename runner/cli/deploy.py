@@ -19,12 +19,12 @@ from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.cli.common import (
     add_serving_flags,
+    announce,
     check_endpoint,
     check_sidecars,
     connect_arbiter,
     default_skills,
     install_signals,
-    record_into,
     sidecars_given,
 )
 from vram_arbiter.runner.cli.deployment import (
@@ -37,6 +37,13 @@ from vram_arbiter.runner.cli.deployment import (
     skill_named,
     unkept,
     unused,
+)
+from vram_arbiter.runner.cli.recording import (
+    Recording,
+    add_push_flags,
+    check_recording,
+    conclude_recording,
+    record_into,
 )
 from vram_arbiter.runner.cli.watching import Watch, slots_of, watches, watching
 from vram_arbiter.runner.control.clock import SystemClock
@@ -53,7 +60,7 @@ from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIn
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.control import ControlMode
-from vram_arbiter.schemas.errors import RunnerUnreachable, VramError
+from vram_arbiter.schemas.errors import ConfigError, RunnerUnreachable, VramError
 from vram_arbiter.schemas.goals import ResultPush
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint, runtime_dir
@@ -87,6 +94,7 @@ def add_parser(
         action="store_true",
         help="check everything, print what would run, open nothing",
     )
+    add_push_flags(deploy)
     add_serving_flags(deploy)
     return deploy
 
@@ -157,7 +165,10 @@ class Deploy:
     async def run(self) -> int:
         """Check, then print the plan or carry it out."""
         check_endpoint(self._endpoint)
+        if self._args.push_to_hub is not None and self._file.robot.save_dir is None:
+            raise ConfigError("--push-to-hub is for a file with save_dir")
         parts = make_parts(self._file, self._clock)
+        recorder = None
         manifests = read_manifests(self._args.skills or [default_skills()])
         check = self._offered(parts, manifests, None)
         given = sidecars_given(self._args.sidecar)
@@ -187,12 +198,13 @@ class Deploy:
             topic = listened_topic(self._file.robot)
             stack.enter_context(estop_topic(topic, runner.request_estop))
             runner.spans.share = self._args.trace_ticks
-            if (folder := self._file.robot.save_dir) is not None:
-                rate_hz, name = self._file.robot.rate_hz, self._file.robot.robot_id
-                await record_into(Path(folder), runner, rate_hz, name, stack)
+            if (recording := recording_of(self._file.robot, parts)) is not None:
+                recorder = await record_into(recording, runner, self._stopping.set, stack)
             control = await self._start(runner, stack)
             if control is None:
                 return 0
+            if recorder is not None:
+                await check_recording(recorder, control, runner)
             await stack.enter_async_context(watching(self._watches, runner.robot, self._clock))
             await make_prompt(
                 control, first=self._args.realtime and leaves_room(self._file.robot.rate_hz)
@@ -205,6 +217,8 @@ class Deploy:
                 catalogue,
                 self._clock,
                 identity=self._identity(parts, arbiter),
+                on_bound=lambda: announce(self._endpoint),
+                mark=None if recorder is None else recorder.mark,
                 stopping=self._stopping,
                 realtime=self._args.realtime,
             )
@@ -212,7 +226,9 @@ class Deploy:
         failed = control.ended.exception() is not None
         if not failed:
             mark.remove()
-        return self._conclude(runner, ended, failed)
+        code = self._conclude(runner, ended, failed)
+        await conclude_recording(recorder, self._args)
+        return code
 
     # -- steps
     def _offered(
@@ -341,6 +357,15 @@ class Deploy:
         return (
             1 if runner.estop is None else 2
         )  # 2: a supervisor that restarts failed programs must not restart this one
+
+
+def recording_of(robot: RobotEnvironment, parts: Parts) -> Recording | None:
+    """Return what is to be recorded of a deployment; None: nothing."""
+    if robot.save_dir is None:
+        return None
+    lerobot = parts.lerobot_units if robot.save_format == "lerobot" else None
+    joints = parts.hal.description.joint_names
+    return Recording(Path(robot.save_dir), robot.rate_hz, robot.robot_id, joints, lerobot)
 
 
 def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:

@@ -17,6 +17,7 @@ from vram_arbiter.runner.protocols import Hal, SensorReader
 from vram_arbiter.runner.recording.commit import check_folder
 from vram_arbiter.runner.recording.recorder import whole_rate
 from vram_arbiter.runner.robots.body import body_of
+from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.sensors.ros2_estop import listened_topic
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE
@@ -82,6 +83,7 @@ class Parts:
     hal: Hal
     readers: tuple[SensorReader, ...]
     gate: RobotGate
+    lerobot_units: LerobotUnits | None = None  # None: lerobot does not know such a robot
 
 
 def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
@@ -114,6 +116,9 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
             check_folder(Path(robot.save_dir))
         except ConfigError as error:
             errors.append(file.error(("save_dir", str(error))))
+    if robot.save_format == "lerobot" and hal.lerobot_units is None:
+        said = f"lerobot has no names and units for {hal.description.name}; use full"
+        errors.append(file.error(("save_format", said)))
     try:
         gate = RobotGate(
             hal.description,
@@ -130,7 +135,7 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
         raise file.merged([*errors, file.error(("hal.adapter", text))]) from error
     if errors:
         raise file.merged(errors)
-    return Parts(hal, tuple(readers), gate)
+    return Parts(hal, tuple(readers), gate, hal.lerobot_units)
 
 
 def unkept(file: DeploymentFile, parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:

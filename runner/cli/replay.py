@@ -134,7 +134,8 @@ def as_text(recorded: Recorded, link: str | None) -> str:
 
 def _outcome(goal: RecordedGoal) -> str:
     status = str(goal.get("status", ""))
-    return f"{status}: {goal['message']}" if goal.get("message") else status
+    said = f"{status}: {goal['message']}" if goal.get("message") else status
+    return f"{said}; marked {goal['marked']}" if "marked" in goal else said
 
 
 def _index(text: str) -> int:

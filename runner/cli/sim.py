@@ -16,6 +16,7 @@ from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
+    announce,
     check_endpoint,
     check_sidecars,
     connect_arbiter,
@@ -23,10 +24,17 @@ from vram_arbiter.runner.cli.common import (
     install_signals,
     not_negative,
     positive_int,
-    record_into,
     sidecars_given,
     unlicensed,
     warm_up,
+)
+from vram_arbiter.runner.cli.recording import (
+    Recording,
+    add_push_flags,
+    check_recording,
+    conclude_recording,
+    lerobot_units_for,
+    record_into,
 )
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.schemas.errors import ConfigError, InternalError
@@ -75,6 +83,11 @@ def add_parser(
         help="write every goal, or episode of --policy, as an episode of the LeRobotDataset"
         " in this folder; a new one, or one of an earlier recording",
     )  # fmt: skip
+    sim.add_argument(
+        "--record-format", choices=("full", "lerobot"), default="full",
+        help="columns of the dataset: all, or those of lerobot-record with its names and units",
+    )  # fmt: skip
+    add_push_flags(sim)
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
         "--timings",
@@ -108,6 +121,7 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.gpu_lease import RENDERER_BYTES, RENDERING, gpu_lease, rendering_gpu
     from vram_arbiter.runner.protocols import DeadlinePolicy
     from vram_arbiter.runner.recording.video import VideoRecorder
+    from vram_arbiter.runner.robots.so101 import lerobot_units_of
     from vram_arbiter.runner.sim.policies import policy_of
     from vram_arbiter.runner.sim.robot import sim_runner
     from vram_arbiter.runner.sim.truth import truth_as_wire
@@ -123,6 +137,11 @@ async def run(args: argparse.Namespace) -> int:
     )
     if args.episodes is not None and args.policy is None:
         raise ConfigError("--episodes is for --policy; goals end their episodes themselves")
+    if args.record is None and (args.push_to_hub is not None or args.record_format != "full"):
+        raise ConfigError("--push-to-hub and --record-format are for --record DIR")
+    robot = world.robot
+    joints, units = ((), None) if robot is None else (robot.joint_names, lerobot_units_of(robot))
+    lerobot = lerobot_units_for(units, world.name) if args.record_format == "lerobot" else None
     check_output("--video", args.video)
     check_output("--timings", args.timings)
     policy = None if args.policy is None else policy_of(args.policy)
@@ -135,6 +154,7 @@ async def run(args: argparse.Namespace) -> int:
     clock = SystemClock()
 
     dataset = None
+    stopping = asyncio.Event()
     async with contextlib.AsyncExitStack() as stack:
         alone = args.no_arbiter or policy is not None  # such a policy needs no GPU memory
         arbiter = None if alone else await connect_arbiter(args.arbiter, stack)
@@ -169,14 +189,27 @@ async def run(args: argparse.Namespace) -> int:
             )
         runner.spans.share = args.trace_ticks
         if args.record is not None:
+            name = str(runner.identity["robot"])
+            strict = policy is not None  # it plays for the recording
             dataset = await record_into(
-                args.record, runner, args.rate, str(runner.identity["robot"]), stack
+                Recording(args.record, args.rate, name, joints, lerobot, strict),
+                runner,
+                runner.request_stop if strict else stopping.set,
+                stack,
             )
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)
+        if dataset is not None and robot is not None and policy is None:
+            await check_recording(dataset, control, runner)
         await make_prompt(control, first=args.realtime and leaves_room(args.rate))
         arm = world.arm
+
+        def bound() -> None:
+            # not before: a second runner must not touch the first's video
+            runner.robot.video.recorder = recorder
+            announce(endpoint)
+
         server = GoalServer(
             endpoint,
             control,
@@ -189,18 +222,19 @@ async def run(args: argparse.Namespace) -> int:
             ),
             clock,
             ground_truth=None if arm is None else lambda: truth_as_wire(arm),
-            on_bound=lambda: setattr(
-                runner.robot.video, "recorder", recorder
-            ),  # not before: a second runner must not touch the first's video
+            on_bound=bound,
+            reset=None if policy is not None else runner.robot.begin_episode_of,
             identity={
                 **runner.identity,
                 "simulated": True,
                 "seed": args.seed,
                 "arbiter": arbiter is not None,
             },
+            mark=None if dataset is None else dataset.mark,
+            stopping=stopping,
             realtime=args.realtime,
         )
-        install_signals(server.stopping)
+        install_signals(stopping)
         try:
             async with asyncio.timeout(args.max_seconds):
                 await server.serve()
@@ -221,9 +255,9 @@ async def run(args: argparse.Namespace) -> int:
             raise ConfigError(f"--timings {args.timings} cannot be written: {error}") from error
     if runner.robot.policy_error is not None:
         raise runner.robot.policy_error
-    if policy is not None and dataset is not None and dataset.error is not None:
-        # it was played for the recording; goals are served whatever becomes of theirs
-        raise dataset.error
+    if policy is not None and dataset is not None and dataset.counts.error is not None:
+        raise dataset.counts.error  # it was played for the recording
+    await conclude_recording(dataset, args)
     return 1 if control.ended.exception() is not None else 0
 
 

@@ -22,10 +22,12 @@ from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals import frames
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.one_goal import OneGoal, Performer
+from vram_arbiter.runner.recording.recorder import Marked, Verdict
 from vram_arbiter.runner.safety.estop import OBEY_S, EstopServer
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
     BadRequest,
+    BadState,
     EstopRequested,
     InternalError,
     LimitExceeded,
@@ -40,7 +42,9 @@ from vram_arbiter.schemas.goals import (
     GetResult,
     GetSkills,
     GetState,
+    MarkEpisode,
     PingRunner,
+    ResetWorld,
     ResultPush,
     SendGoal,
     ShutdownRunner,
@@ -54,7 +58,10 @@ READS_MAX = 16  # requests that wait for the control thread; a limit keeps room 
 # of the time, for the goal socket: the control thread waits for the interpreter lock meanwhile
 WORK_SHARE = 0.25
 LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
-OPS = ("goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "ping", "shutdown")
+OPS = (
+    "goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "reset", "mark",
+    "ping", "shutdown",
+)  # fmt: skip
 
 
 class ServedRunner(frames.FrameSource, Performer, Protocol):
@@ -84,7 +91,8 @@ class GoalServer:
     """`await GoalServer(...).serve()` until `shutdown` or cancellation; cancels the active goal.
 
     `estop_s`: a control loop that has not obeyed an emergency stop by then is reported as hanging.
-    `realtime` runs the emergency stop's thread before other programs.
+    `realtime` runs the emergency stop's thread before other programs. `reset` begins a
+    simulator's scene again, on the control thread, and returns its seed. `mark` is the recording's.
     """
 
     def __init__(
@@ -97,6 +105,8 @@ class GoalServer:
         *,
         ground_truth: Callable[[], Message] | None = None,
         identity: Message | None = None,
+        reset: Callable[[int | None], int] | None = None,
+        mark: Callable[[str, Verdict], Marked] | None = None,
         on_bound: Callable[[], None] | None = None,
         stopping: asyncio.Event | None = None,
         estop_s: float = OBEY_S,
@@ -109,6 +119,8 @@ class GoalServer:
         self._clock = clock
         self._ground_truth = ground_truth
         self._identity = identity or {}
+        self._reset = reset
+        self._mark = mark
         self._on_bound = on_bound
         self._estop_s = estop_s
         self._realtime = realtime
@@ -227,6 +239,24 @@ class GoalServer:
                     raise UnknownOp("only a simulator knows the truth", details={"known": [*OPS]})
                 with self._waiting_read():
                     return await self._control.call(self._ground_truth)
+            case ResetWorld():
+                if (reset := self._reset) is None:
+                    raise UnknownOp("only a simulator is reset", details={"known": [*OPS]})
+                if (goal := self._goals.goal) is not None:
+                    hint = "wait for its result or cancel it"
+                    raise BadState(f"goal {goal.goal_id} is running", hint=hint)
+                with self._waiting_read():
+                    seed = await self._control.call(lambda: reset(request.seed))
+                    await self._control.call(lambda: None)  # after the reset's tick
+                return {"seed": seed}
+            case MarkEpisode():
+                if (mark := self._mark) is None:
+                    hint = "start the runner with --record DIR, or save_dir in its file"
+                    raise BadState("this runner records nothing", hint=hint)
+                with self._waiting_read():
+                    return {
+                        **await asyncio.to_thread(lambda: mark(request.goal_id, request.verdict))
+                    }
             case PingRunner():
                 goal = self._goals.goal
                 return {

@@ -19,16 +19,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TypedDict
 
-from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
+from vram_arbiter.schemas.errors import AlreadyRunning, BadRequest, BadState, ConfigError
 
 FOLDER = ".runner"
 COMMIT = "commit.json"
+PREVIOUS = "previous.json"  # the commit before, which `undo` returns to
 OPEN = "open"
 EPISODES = "episodes.jsonl"
 LOCK = "lock"
 CACHE = "cache"  # of the libraries that write; worthless afterwards
 MUTABLE = ("meta/info.json", "meta/stats.json", "meta/tasks.parquet")
-DATA = ("data", "videos", "images", "meta/episodes")  # where files are only ever added
+TICKS = f"{FOLDER}/ticks"  # columns that a dataset of lerobot's does not have
+DATA = ("data", "videos", "images", "meta/episodes", TICKS)  # where files are only ever added
 SCRATCH = "tmp*"  # folders in which lerobot encodes videos
 LOCK_WAIT_S = 30.0  # a runner that was killed leaves a writer that still finishes its episode
 LOCK_POLL_S = 0.1
@@ -61,6 +63,7 @@ class EpisodeNote(TypedDict, total=False):
     dropped: int
     incomplete: int
     reasons: dict[str, int]
+    marked: str  # by the operator: success or failure
 
 
 def check_folder(root: Path) -> None:
@@ -146,8 +149,39 @@ def commit(root: Path, episode: EpisodeNote | None) -> None:
             if (root / name).exists()
         },
     )
+    if episode is not None:
+        _write(root / FOLDER / PREVIOUS, json.dumps(before).encode())
     _write(root / FOLDER / COMMIT, json.dumps(record).encode())
     (root / FOLDER / OPEN).unlink(missing_ok=True)
+
+
+def mark(root: Path, episode: int, verdict: str) -> None:
+    """Note the operator's verdict on a committed episode."""
+    record = last(root)
+    if record is None or not 0 <= episode < record["episodes"]:
+        raise BadRequest(f"there is no episode {episode} in {root}")
+    line = json.dumps({"episode": episode, "marked": verdict}).encode() + b"\n"
+    _note(root / FOLDER / EPISODES, record["notes_bytes"], line)
+    grown = Commit(**{**record, "notes_bytes": record["notes_bytes"] + len(line)})
+    _write(root / FOLDER / COMMIT, json.dumps(grown).encode())
+
+
+def undo(root: Path) -> None:
+    """Remove the episode that was committed last. Only once: the one before stays.
+
+    Raises BadState where there is none to remove.
+    """
+    record, previous = last(root), root / FOLDER / PREVIOUS
+    before: Commit | None = json.loads(previous.read_bytes()) if previous.exists() else None
+    if record is None or before is None or before["episodes"] != record["episodes"] - 1:
+        raise BadState(
+            "the last episode cannot be removed any more",
+            hint="lerobot-edit-dataset removes any episode",
+        )
+    begin(root)
+    _write(root / FOLDER / COMMIT, json.dumps(before).encode())
+    repair(root)
+    previous.unlink()
 
 
 def repair(root: Path) -> list[str]:
@@ -179,12 +213,16 @@ def repair(root: Path) -> list[str]:
 
 
 def notes(root: Path) -> list[EpisodeNote]:
-    """Return the notes of the committed episodes, in order."""
+    """Return the notes of the committed episodes, in order, with the operator's marks."""
     record = last(root)
     if record is None or not (root / FOLDER / EPISODES).exists():
         return []
     text = (root / FOLDER / EPISODES).read_bytes()[: record["notes_bytes"]].decode()
-    return [json.loads(line) for line in text.splitlines()]
+    found: dict[int, EpisodeNote] = {}
+    for line in text.splitlines():
+        note: EpisodeNote = json.loads(line)
+        found[note["episode"]] = {**found.get(note["episode"], {}), **note}
+    return list(found.values())
 
 
 def _clear(root: Path) -> list[str]:

@@ -7,17 +7,28 @@ for a full queue and checks the video's length at the end.
 
 from __future__ import annotations
 
+import json
 import shutil
 import threading
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 from vram_arbiter.runner.recording import commit
-from vram_arbiter.runner.recording.rows import TIMINGS, Row, RowFrame
-from vram_arbiter.runner.sensors.pictures import as_rgb
+from vram_arbiter.runner.recording.columns import (
+    ACTION,
+    PICTURES,
+    REWARD,
+    STATE,
+    SUCCESS,
+    Columns,
+    Features,
+    Frame,
+    camera_column,
+    differences,
+    own_columns,
+)
+from vram_arbiter.runner.recording.reader import TICKS_FILE
 from vram_arbiter.schemas.errors import ConfigError, InternalError
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 REPO_ID = "local/recording"  # lerobot wants a name; nothing is ever pushed or pulled
 VIDEO_CODEC = (
@@ -29,130 +40,6 @@ ENCODER_WAIT_S = 60.0
 ENCODER_POLL_S = 0.002
 LENGTH_TOLERANCE = 0.5  # frames
 
-SUCCESS = "next.success"  # only of worlds that judge: a skill that says "done" does not know
-
-Frame = dict[str, Any]
-"""One row as lerobot takes it: arrays and texts by column."""
-
-
-class Feature(TypedDict):
-    """One column of a LeRobotDataset."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    names: list[str] | None
-
-
-Features = dict[str, Feature]
-
-
-def features_of(row: Row) -> Features:
-    """Return the dataset's columns, from its first row.
-
-    Only cameras' columns may have `image` in their names: lerobot takes the statistics of all such
-    columns for those of pictures. Raises ConfigError for pictures that a video cannot hold.
-    """
-    features: Features = {"action": _vector("float32", row["action_names"])}
-    if row["state_names"]:  # a world may show nothing but pictures
-        features = {"observation.state": _vector("float32", row["state_names"])} | features
-    for frame in row["frames"]:
-        height, width = frame["height"], frame["width"]
-        if height % 2 or width % 2:
-            raise ConfigError(
-                f"camera {frame['camera']} gives {width} × {height} pixels;"
-                " a video needs even numbers",
-                hint="choose another size for it, or leave it out",
-            )
-        if _camera(frame["camera"]) in features:
-            raise ConfigError(
-                f"two cameras would have the column {_camera(frame['camera'])}",
-                hint="rename one of them",
-            )
-        features[_camera(frame["camera"])] = {
-            "dtype": "video",
-            "shape": (height, width, 3),
-            "names": ["height", "width", "channels"],
-        }
-    if row["base_pose"] is not None:
-        features["base_pose"] = _vector("float32", ["x_m", "y_m", "yaw_rad"])
-    if row["base_velocity"] is not None:
-        features["base_velocity"] = _vector("float32", ["vx", "vy", "wz"])
-    if row["reward"] is not None:
-        features["next.reward"] = _one("float32")
-    if row["success"] is not None:  # a column of booleans cannot say "not known": it is left out
-        features[SUCCESS] = _one("bool")
-    if row["frames"]:
-        features["tick.camera_ages_ms"] = _vector(
-            "float32", [frame["camera"] for frame in row["frames"]]
-        )
-    return features | {
-        "next.done": _one("bool"),
-        "tick.index": _one("int64"),
-        "tick.stamp_ns": _one("int64"),
-        "tick.timings_ms": _vector("float32", list(TIMINGS)),
-        "tick.chunk_index": _one("int64"),
-        "tick.action_applied": _one("bool"),
-        "tick.deadline_missed": _one("bool"),
-        "tick.violations": _one("string"),
-        "goal_id": _one("string"),
-        "skill": _one("string"),
-        "trace_id": _one("string"),
-        "span_id": _one("string"),
-        "trace_sampled": _one("bool"),
-    }
-
-
-def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> Frame:
-    """Return the row as lerobot takes it.
-
-    Raises ModelError and FrameStale for a picture without colors, ConfigError for one of another
-    size than the first.
-    """
-    import numpy as np
-
-    values: Frame = {
-        "observation.state": row["state"],
-        "action": row["action"],
-        "base_pose": row["base_pose"],
-        "base_velocity": row["base_velocity"],
-        "next.reward": row["reward"],
-        "next.done": False,
-        SUCCESS: False,
-        "tick.index": row["tick_idx"],
-        "tick.stamp_ns": row["stamp_ns"],
-        "tick.timings_ms": row["timings_ms"],
-        "tick.chunk_index": row["chunk_index"],
-        "tick.action_applied": row["action_applied"],
-        "tick.deadline_missed": row["deadline_missed"],
-        "tick.violations": row["violations"],
-        "tick.camera_ages_ms": row["ages_ms"],
-        "goal_id": row["goal_id"],
-        "skill": row["skill"],
-        "trace_id": row["trace_id"],
-        "span_id": row["span_id"],
-        "trace_sampled": row["sampled"],
-    }
-    frame: Frame = {"task": row["task"]}
-    for name, feature in features.items():
-        if feature["dtype"] == "video" or name not in values:
-            continue
-        value = values[name]
-        if feature["dtype"] == "string":
-            frame[name] = value
-        elif value is not None:
-            frame[name] = np.atleast_1d(np.asarray(value, dtype=feature["dtype"]))
-    for said, data in zip(row["frames"], pictures, strict=True):
-        rgb = as_rgb(_picture(said, data))
-        column = features.get(_camera(said["camera"]))
-        wanted = None if column is None else tuple(column["shape"])
-        if tuple(rgb.shape) != wanted:
-            raise ConfigError(
-                f"camera {said['camera']} gives pictures of {rgb.shape}, the dataset has {wanted}",
-                hint="record into a new folder",
-            )
-        frame[_camera(said["camera"])] = rgb
-    return frame
-
 
 class LerobotFiles:
     """`begin` → `add`… → `finish` or `abandon`, for each episode.
@@ -160,7 +47,7 @@ class LerobotFiles:
     In between the folder is committed.
     """
 
-    def __init__(self, root: Path, *, fps: int, robot: str) -> None:
+    def __init__(self, root: Path, *, fps: int, robot: str, columns: Columns = "full") -> None:
         import av
         from lerobot.configs import RGBEncoderConfig
 
@@ -168,10 +55,22 @@ class LerobotFiles:
         self._root = root
         self._fps = fps
         self._robot = robot
-        self._encoder = RGBEncoderConfig(vcodec=VIDEO_CODEC, preset="veryfast", crf=VIDEO_CRF)
+        # lerobot merges videos of one codec only: a dataset of its columns has its default one
+        self._encoder = (
+            RGBEncoderConfig()
+            if columns == "lerobot"
+            else RGBEncoderConfig(vcodec=VIDEO_CODEC, preset="veryfast", crf=VIDEO_CRF)
+        )
+        self._columns: Columns = columns
+        self._beside: Features = {}  # columns that the dataset does not have
+        self._beside_rows: list[Frame] = []
         self._dataset: Any = None
         self._rows = 0
         self._pause = threading.Event()
+
+    @property
+    def root(self) -> Path:
+        return self._root
 
     @property
     def rows(self) -> int:
@@ -185,6 +84,57 @@ class LerobotFiles:
         meta = self._meta()
         return meta.total_episodes, meta.total_frames
 
+    def check(self, units: str, joints: list[str], cameras: list[str] | None) -> None:
+        """Compare an existing dataset with a recording, as far as it is known before a robot moves.
+
+        Args: `joints` are the names of state and action. `units` and `joints` empty, `cameras`
+        None: not known yet. Raises ConfigError that says what differs.
+        """
+        if commit.last(self._root) is None:
+            return
+        meta = self._meta()
+        found = []
+        if meta.fps != self._fps:
+            found.append(f"{meta.fps} frames a second there, {self._fps} here")
+        if meta.robot_type != self._robot:
+            found.append(f"robot {meta.robot_type!r} there, {self._robot!r} here")
+        known = [note.get("units", units) for note in commit.notes(self._root)[-1:]]
+        if units and known and known[0] != units:
+            found.append(f"units {known[0]!r} there, {units!r} here")
+        if joints:
+            for name in (STATE, ACTION):
+                there = (meta.features.get(name) or {}).get("names") or []
+                if there != joints:
+                    found.append(f"{name} ({', '.join(there)} there, {', '.join(joints)} here)")
+        seen = {name for name in meta.features if name.startswith(PICTURES)}
+        if cameras is not None and seen != {camera_column(name) for name in cameras}:
+            said = ", ".join(sorted(name.removeprefix(PICTURES) for name in seen))
+            found.append(f"cameras ({said or 'none'} there, {', '.join(cameras) or 'none'} here)")
+        self._refuse(found)
+
+    def check_columns(self, features: Features) -> None:
+        """Compare an existing dataset with the columns of a first row, but for a world's verdicts.
+
+        Raises ConfigError that says what differs.
+        """
+        if commit.last(self._root) is not None:
+            self._refuse(self._misfits(self._meta(), features, REWARD, SUCCESS))
+
+    def _misfits(self, meta: Any, features: Features, *ignored: str) -> list[str]:
+        from lerobot.utils.constants import DEFAULT_FEATURES
+
+        if self._columns == "lerobot":
+            features = {name: features[name] for name in features.keys() - own_columns(features)}
+        return differences(meta.features, features, (*DEFAULT_FEATURES, *ignored))
+
+    def _refuse(self, found: list[str]) -> None:
+        if found:
+            raise ConfigError(
+                f"{self._root} was recorded with other columns: {'; '.join(found)}",
+                hint="record into a new folder",
+                details={"differences": found},
+            )
+
     def begin(self, features: Features) -> Features:
         """Open an episode and return its columns.
 
@@ -194,21 +144,17 @@ class LerobotFiles:
         from lerobot.datasets import LeRobotDataset
 
         commit.repair(self._root)  # of an episode that could not be abandoned either
+        beside = own_columns(features) if self._columns == "lerobot" else set()
         if commit.last(self._root) is None:
-            self._create(features)
+            self._create({name: features[name] for name in features if name not in beside})
         meta = self._meta()
         if meta.fps != self._fps:
-            raise ConfigError(
-                f"{self._root} has {meta.fps} frames a second, this recording {self._fps}",
-                hint="record into a new folder",
-            )
-        if SUCCESS not in meta.features:
+            self._refuse([f"{meta.fps} frames a second there, {self._fps} here"])
+        if SUCCESS not in meta.features and SUCCESS not in beside:
             features = {name: feature for name, feature in features.items() if name != SUCCESS}
-        if differences := _differences(meta.features, features):
-            raise ConfigError(
-                f"{self._root} was recorded with other columns: {differences}",
-                hint="record into a new folder",
-            )
+        self._refuse(self._misfits(meta, features))
+        self._beside = {name: features[name] for name in features if name in beside}
+        self._beside_rows = []
         commit.begin(self._root)
         self._dataset = LeRobotDataset.resume(
             REPO_ID,
@@ -227,6 +173,9 @@ class LerobotFiles:
         not fit.
         """
         self._await_encoder()
+        if self._beside:
+            self._beside_rows.append({name: frame[name] for name in self._beside})
+            frame = {name: frame[name] for name in frame if name not in self._beside}
         self._dataset.add_frame(frame)
         self._rows += 1
 
@@ -249,6 +198,7 @@ class LerobotFiles:
                 )
         dataset.finalize()
         index = int(episode["episode_index"][0])
+        self._write_beside(index)
         commit.commit(self._root, {**note, "episode": index, "frames": self._rows})
         self._rows = 0
         return index
@@ -263,6 +213,28 @@ class LerobotFiles:
                 dataset.finalize()
         finally:
             commit.repair(self._root)
+
+    def _write_beside(self, episode: int) -> None:
+        """Write the columns that the dataset does not have, with their names for the reader."""
+        if not self._beside:
+            return
+        import pyarrow
+        import pyarrow.parquet
+
+        columns = {}
+        for name, feature in self._beside.items():
+            values = [row[name] for row in self._beside_rows]
+            if feature["dtype"] != "string":
+                lists = [value.tolist() for value in values]
+                values = [value[0] for value in lists] if feature["names"] is None else lists
+            columns[name] = values
+        table = pyarrow.table(columns).replace_schema_metadata(
+            {"features": json.dumps(self._beside)}
+        )
+        path = self._root / TICKS_FILE.format(episode)
+        path.parent.mkdir(exist_ok=True)
+        pyarrow.parquet.write_table(table, path)
+        self._beside_rows = []
 
     # -- lerobot
     def _meta(self) -> Any:
@@ -305,42 +277,3 @@ class LerobotFiles:
                 )
             self._pause.wait(ENCODER_POLL_S)
             waited_s += ENCODER_POLL_S
-
-
-def _picture(said: RowFrame, data: bytes) -> SensorFrame:
-    return SensorFrame(
-        sensor_id=said["camera"],
-        stamp_monotonic_ns=0,
-        stamp_wall_ns=0,
-        encoding=FrameEncoding(said["encoding"]),
-        width=said["width"],
-        height=said["height"],
-        data=data,
-    )
-
-
-def _camera(name: str) -> str:
-    return f"observation.images.{name.replace('/', '_')}"
-
-
-def _vector(dtype: str, names: Sequence[str]) -> Feature:
-    return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
-
-
-def _one(dtype: str) -> Feature:
-    return {"dtype": dtype, "shape": (1,), "names": None}
-
-
-def _differences(there: Features, wanted: Features) -> str:
-    """Columns that are not the same, but for those that lerobot adds itself."""
-    from lerobot.utils.constants import DEFAULT_FEATURES
-
-    def essence(feature: Feature | None) -> Any:
-        if feature is None:
-            return None
-        return feature["dtype"], tuple(feature["shape"]), feature["names"]
-
-    names = sorted((set(there) | set(wanted)) - set(DEFAULT_FEATURES))
-    return ", ".join(
-        name for name in names if essence(there.get(name)) != essence(wanted.get(name))
-    )

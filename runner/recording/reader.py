@@ -7,7 +7,7 @@ refused: their rows lead to no trace.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -17,9 +17,9 @@ from vram_arbiter.runner.recording.rows import NO_CHUNK, ROBOT
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
-    from vram_arbiter.runner.recording.lerobot_files import Features
+    from vram_arbiter.runner.recording.columns import Features
 
-EPISODE_COLUMNS = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
+TICKS_FILE = commit.TICKS + "/episode-{:06}.parquet"  # of a dataset with lerobot's columns only
 
 
 ParquetRow = dict[str, Any]
@@ -45,6 +45,7 @@ class RecordedGoal(TypedDict, total=False):
     message: str
     dropped: int
     incomplete: int
+    marked: str
 
 
 class RecordedTick(TypedDict):
@@ -71,7 +72,8 @@ class RecordedPicture(TypedDict):
 class Recorded:
     """One frame.
 
-    `state` and `action` are by joint (rad), or with `units` "own" by the names of their world;
+    `state` and `action` are by joint (rad), or with `units` "own" by the names of their world, with
+    "lerobot" by lerobot's;
     `timings_ms` by part of the tick; `pictures` maps a camera to its video's path and the second in
     it.
     """
@@ -114,8 +116,80 @@ def read_frame(root: Path, frame: int, episode: int | None = None) -> Recorded:
     if len(rows) != 1:
         raise ConfigError(f"{root / path} does not have frame {index}", hint="restore the file")
     row = rows[0]
+    beside = TICKS_FILE.format(about["episode_index"])
+    if beside in record["files"]:
+        more, columns = _beside(root, beside)
+        info = {**info, "features": {**info["features"], **columns}}
+        row |= more[row["frame_index"]]
     notes = {note["episode"]: note for note in commit.notes(root)}
     return _recorded(root, info, about, row, notes.get(about["episode_index"], {}))
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRows:
+    """All rows of one episode, with the columns beside the dataset; `videos` by camera."""
+
+    index: int
+    note: commit.EpisodeNote
+    features: Features
+    rows: list[ParquetRow]
+    videos: Mapping[str, Path]
+
+    def named(self, row: ParquetRow, column: str) -> dict[str, float]:
+        """Return the values of a column by name; empty: there is no such column."""
+        return _named(self.features, row, column)
+
+
+def read_episodes(root: Path, wanted: int | None = None) -> Iterator[EpisodeRows]:
+    """Yield the committed episodes, or one of them.
+
+    Raises ConfigError for a folder that cannot be read or is not one of ours, BadRequest for an
+    episode that does not exist.
+    """
+    info, record = _open(root)
+    names = [name for name in record["files"] if name.startswith("meta/episodes/")]
+    episodes = _rows(root, names)
+    if wanted is not None:
+        episodes = [_episode(episodes, 0, wanted)]
+    notes = {note["episode"]: note for note in commit.notes(root)}
+    for about in episodes:
+        index = about["episode_index"]
+        path = info["data_path"].format(
+            chunk_index=about["data/chunk_index"], file_index=about["data/file_index"]
+        )
+        rows = _rows(root, [path], ("episode_index", "==", index))
+        features = info["features"]
+        if (beside := TICKS_FILE.format(index)) in record["files"]:
+            more, columns = _beside(root, beside)
+            features = {**features, **columns}
+            rows = [{**row, **extra} for row, extra in zip(rows, more, strict=True)]
+        yield EpisodeRows(index, notes.get(index, {}), features, rows, _videos(root, info, about))
+
+
+def _videos(root: Path, info: DatasetInfo, about: ParquetRow) -> dict[str, Path]:
+    return {
+        name.removeprefix("observation.images."): root
+        / info["video_path"].format(
+            video_key=name,
+            chunk_index=about[f"videos/{name}/chunk_index"],
+            file_index=about[f"videos/{name}/file_index"],
+        )
+        for name, feature in info["features"].items()
+        if feature["dtype"] == "video"
+    }
+
+
+def _named(features: Features, row: ParquetRow, column: str) -> dict[str, float]:
+    if column not in features:
+        return {}
+    values = row[column]  # of a single number lerobot makes a column of plain numbers
+    return dict(
+        zip(
+            features[column]["names"] or [],
+            values if isinstance(values, list) else [values],
+            strict=True,
+        )
+    )
 
 
 def _open(root: Path) -> tuple[DatasetInfo, commit.Commit]:
@@ -133,6 +207,15 @@ def _open(root: Path) -> tuple[DatasetInfo, commit.Commit]:
             hint="the next recording into the folder repairs it",
         ) from error
     return info, record
+
+
+def _beside(root: Path, name: str) -> tuple[list[ParquetRow], Features]:
+    """Return an episode's rows of the columns that the dataset does not have, and those columns."""
+    import pyarrow.parquet
+
+    rows = _rows(root, [name])
+    features: Features = json.loads(pyarrow.parquet.read_schema(root / name).metadata[b"features"])
+    return rows, features
 
 
 def _rows(
@@ -193,30 +276,12 @@ def _recorded(
     features = info["features"]
 
     def named(column: str) -> dict[str, float]:
-        if column not in features:
-            return {}
-        values = row[column]  # of a single number lerobot makes a column of plain numbers
-        return dict(
-            zip(
-                features[column]["names"] or [],
-                values if isinstance(values, list) else [values],
-                strict=True,
-            )
-        )
+        return _named(features, row, column)
 
     pictures: dict[str, RecordedPicture] = {}
-    for name, feature in features.items():
-        if feature["dtype"] == "video":
-            video = info["video_path"].format(
-                video_key=name,
-                chunk_index=about[f"videos/{name}/chunk_index"],
-                file_index=about[f"videos/{name}/file_index"],
-            )
-            at_s = about[f"videos/{name}/from_timestamp"] + row["timestamp"]
-            pictures[name.removeprefix("observation.images.")] = {
-                "path": str(root / video),
-                "at_s": at_s,
-            }
+    for camera, video in _videos(root, info, about).items():
+        begins_s = about[f"videos/observation.images.{camera}/from_timestamp"]
+        pictures[camera] = {"path": str(video), "at_s": begins_s + row["timestamp"]}
     return Recorded(
         root=str(root),
         robot=info.get("robot_type") or "",
@@ -251,7 +316,7 @@ def _recorded(
 
 def _goal(row: ParquetRow, note: commit.EpisodeNote) -> RecordedGoal:
     goal: RecordedGoal = {"goal_id": row["goal_id"], "skill": row["skill"]}
-    for key in ("status", "code", "message", "dropped", "incomplete"):
+    for key in ("status", "code", "message", "dropped", "incomplete", "marked"):
         if key in note:
             goal[key] = note[key]
     return goal

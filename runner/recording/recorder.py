@@ -1,8 +1,9 @@
 """Recorder of a runner's goals: hands ticks from the control thread to the writer process.
 
 The control thread only appends to a bounded queue. When the writer is slower than the robot, ticks
-are dropped, counted and logged; when it dies, the robot continues and the loss is logged. Must not
-import lerobot: that lives in the writer's process.
+are dropped, counted and logged. A writer that dies costs the episode in its hands, which is logged,
+and is started again; after RESTARTS_MAX times the session ends. Must not import lerobot: that lives
+in the writer's process.
 """
 
 from __future__ import annotations
@@ -10,30 +11,42 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
-import os
-import socket
 import subprocess
-import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, TypedDict
 
 from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded
 from vram_arbiter.runner.recording import commit, wire
-from vram_arbiter.runner.recording.rows import Incomplete, row_of
-from vram_arbiter.schemas.errors import Cancelled, ConfigError, InternalError, VramError, from_wire
+from vram_arbiter.runner.recording.counts import Counts
+from vram_arbiter.runner.recording.queue import TickQueue
+from vram_arbiter.runner.recording.rows import LEROBOT, ROBOT, Incomplete, row_of
+from vram_arbiter.runner.recording.writer_process import Opening, WriterProcess
+from vram_arbiter.runner.robots.units import LerobotUnits
+from vram_arbiter.schemas.errors import BadState, ConfigError, InternalError, VramError, from_wire
 
 log = logging.getLogger("vram_arbiter.runner.recording")
 
-QUEUE_TICKS = 90  # three seconds at 30 Hz
-QUEUE_BYTES = 96 << 20
 PATIENCE_S = 10.0  # without a rate nothing is late: the loop may wait so long for room
-START_S = 180.0  # the writer imports torch; a minute on a busy machine
 CLOSE_S = 120.0
+ANSWER_S = 60.0  # of a writer that may be closing an episode's files
+RESTARTS_MAX = 3
 REASONS_KEPT = 8
 PACKAGES = ("lerobot", "datasets", "pyarrow", "pandas", "av")
+
+Verdict = Literal["success", "failure", "discard"]
+
+
+class Marked(TypedDict):
+    """An operator's verdict in force. `episode` None: the goal is still being recorded."""
+
+    goal_id: str
+    episode: int | None
+    verdict: Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +54,22 @@ class _End:
     goal: Goal
     ended: SkillEnded | None
     dropped: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Ask:
+    """A message that the writer answers."""
+
+    message: wire.Header
+    answer: Future[wire.Header] = field(default_factory=Future)
+
+
+@dataclass(frozen=True, slots=True)
+class _Gone:
+    """A writer that ended by itself."""
+
+    writer: WriterProcess
+    code: int
 
 
 def whole_rate(rate_hz: float) -> int:
@@ -60,8 +89,11 @@ class DatasetRecorder:
     """`start()`, then `tick` and `goal_ended` on the control thread, then `close()`.
 
     Everything else may be read at any time. `cameras` is called for every tick, on a thread of its
-    own: some worlds know theirs only after their first reset. `patient` waits for room instead of
-    dropping; only where no tick has a deadline.
+    own: some worlds know theirs only after their first reset. `joints` are the robot's, where they
+    are known. `lerobot` records by lerobot's names and units, with its columns only. `patient`
+    waits for room instead of dropping; only where no tick has a deadline. `strict` ends the session
+    with the first episode that cannot be recorded. `on_lost` is called, on any thread, when nothing
+    more can be recorded, after the goal that runs.
     """
 
     def __init__(
@@ -71,41 +103,47 @@ class DatasetRecorder:
         rate_hz: float,
         cameras: Callable[[], Sequence[str]],
         robot: str,
+        joints: Sequence[str] = (),
+        lerobot: LerobotUnits | None = None,
         patient: bool = False,
+        strict: bool = False,
+        on_lost: Callable[[], None] = lambda: None,
     ) -> None:
         self.root = root.absolute()
         self._fps = whole_rate(rate_hz)
         self._cameras = cameras
-        self._robot = robot
+        self._robot = robot if lerobot is None else lerobot.robot_type
+        self._joints = joints
+        self._lerobot = lerobot
         self._patient = patient
-        self._room = threading.Condition()
-        self._queue: deque[GoalTick | _End | None] = deque()  # None: the end of all
-        self._queued = 0  # ticks in it
-        self._queued_bytes = 0
+        self._strict = strict
+        self._on_lost = on_lost
+        self._queue: TickQueue[_End | _Ask | _Gone | None] = TickQueue()  # None: the end
         self._dropped_now = 0  # of the goal that runs
-        self._process: subprocess.Popen[bytes] | None = None
-        self._peer: socket.socket | None = None
+        self._goal_runs = False
+        self._writer: WriterProcess | None = None
         self._feeding: threading.Thread | None = None
-        self._hearing: threading.Thread | None = None
-        self._ready = threading.Event()
-        self._closing = False
         self._aborted = False
-        self._refused: VramError | None = None
-        self.pid = 0  # of the writer
-        self.dropped = 0
-        self.incomplete: Counter[str] = Counter()  # ticks without a row, by reason
-        self.episodes = 0  # of this run
-        self.frames = 0
-        self.skipped = 0  # goals of too few ticks to be an episode
-        self.error: VramError | None = None  # the last thing that was not recorded
+        self._closing = False
+        self._restarts = 0
+        self._answers: deque[_Ask] = deque()  # asked and not answered
+        self._unfinished: dict[str, None] = {}  # goals whose rows the writer has in its hands
+        self._given_up_goal = ""  # whose rows went down with a writer
+        self.counts = Counts(self.root)
+        self.lost: VramError | None = None  # why nothing more can be recorded
+
+    @property
+    def pid(self) -> int:
+        """Process of the writer; 0 before the start."""
+        return 0 if self._writer is None else self._writer.pid
 
     # -- life
     def start(self) -> None:
         """Start the writer; return when it can take rows.
 
-        Raises ConfigError for a folder that cannot be recorded into or missing packages,
-        AlreadyRunning when another program records there, InternalError when the writer does not
-        start.
+        Raises ConfigError for missing packages, for a folder that cannot be recorded into and for
+        a dataset of another robot, other units or columns, AlreadyRunning when another program
+        records there, InternalError when the writer does not start.
         """
         if absent := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
             raise ConfigError(
@@ -113,119 +151,105 @@ class DatasetRecorder:
                 hint="pip install 'vram-arbiter[dataset]'",
             )
         commit.check_folder(self.root)
-        ours, theirs = socket.socketpair()
-        try:
-            self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    "vram_arbiter.runner.recording.writer",
-                    str(theirs.fileno()),
-                ],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                env=_environment(self.root),
-                start_new_session=True,  # a Ctrl-C for the runner must not cut the episode off
-            )
-        finally:
-            theirs.close()
-        self._peer = ours
-        self.pid = self._process.pid
-        opening = {"root": str(self.root), "fps": self._fps, "robot": self._robot}
-        wire.send(ours, opening)
-        self._hearing = threading.Thread(target=self._hear, name="dataset-hear", daemon=True)
-        self._hearing.start()
-        came_up = self._ready.wait(START_S)
-        if not came_up or self._aborted or self._refused is not None:
-            self.abort()
-            if self._refused is not None:
-                raise self._refused
-            if self._aborted and came_up:
-                raise Cancelled("the recording was to end before it had begun")
-            raise InternalError(f"the dataset's writer did not come up within {START_S:.0f} s")
+        self._writer = self._new_writer()
+        if self._aborted:
+            self._writer.abort()
+        self._writer.await_ready()
         self._feeding = threading.Thread(target=self._feed, name="dataset-feed", daemon=True)
         self._feeding.start()
+
+    def _new_writer(self) -> WriterProcess:
+        joints = dict.fromkeys(self._joints, 0.0)
+        cameras = list(self._cameras())
+        opening: Opening = {
+            "root": str(self.root),
+            "fps": self._fps,
+            "robot": self._robot,
+            "columns": "full" if self._lerobot is None else "lerobot",
+            "units": LEROBOT if self._lerobot is not None else ROBOT if self._joints else "",
+            "joints": list(joints if self._lerobot is None else self._lerobot.named(joints)),
+            "cameras": cameras if self._joints else None,
+        }
+        return WriterProcess(opening, self._heard, self._writer_gone)
 
     def abort(self) -> None:
         """End a `start` that runs, from any thread before the first row; nothing is written."""
         self._aborted = True
-        if self._peer is not None:
-            with contextlib.suppress(OSError):  # it is gone already
-                self._peer.shutdown(socket.SHUT_RDWR)
+        if self._writer is not None:
+            self._writer.abort()
 
     def close(self) -> None:
         """Finish the open episode and wait for the disk, at most CLOSE_S. Repeatable.
 
         The writer then ends by itself.
         """
-        if self._feeding is None or self._process is None or self._closing:
+        if self._feeding is None or self._writer is None or self._closing:
             return
-        with self._room:
+        with self._queue.changed:
             self._closing = True
-            self._queue.append(None)
-            self._room.notify_all()
+            self._queue.put(None)
+        self._feeding.join(CLOSE_S)
         try:
-            code = self._process.wait(CLOSE_S)
+            code = self._writer.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
             log.warning(
                 "the dataset is still being written, by process %d; it ends by itself", self.pid
             )
             return
-        self._feeding.join()
-        if self._hearing is not None:
-            self._hearing.join()
-        if self._peer is not None:
-            self._peer.close()
         if code != 0:
-            log.error("the dataset's writer ended with status %d", code)
-        log.info("%s", self.summary())
+            self.counts.lose(InternalError(f"the dataset's writer died (status {code})"))
+        log.info("%s", self.counts.summary())
 
     def facts(self) -> GoalData:
-        """Return the facts of `runner.protocols.TickSink`: `dropped` and `left_out` count ticks,
-        `skipped` goals.
-        """
-        return {
-            "episodes": self.episodes,
-            "frames": self.frames,
-            "skipped": self.skipped,
-            "dropped": self.dropped,
-            "left_out": sum(self.incomplete.values()),
-            "error": self.error.message if self.error is not None else None,
-        }
+        """See `runner.protocols.TickSink`."""
+        return self.counts.facts()
 
-    def summary(self) -> str:
-        """Describe what was recorded, and what was not, in one line."""
-        parts = [f"recorded {self.episodes} episodes, {self.frames} frames into {self.root}"]
-        if self.skipped:
-            parts.append(f"{self.skipped} goals were too short for an episode")
-        if self.dropped:
-            parts.append(f"{self.dropped} ticks were dropped: the writer was too slow")
-        parts += [f"{count} ticks left out: {reason}" for reason, count in self.incomplete.items()]
-        if self.error is not None:
-            parts.append(f"NOT ALL WAS RECORDED: {self.error}")
-        return "; ".join(parts)
+    # -- any thread
+    def check(self, sample: GoalTick) -> None:
+        """Compare a tick that is not recorded with an existing dataset. Blocks.
+
+        Raises ConfigError that says what differs, or why no tick could be recorded.
+        """
+        try:
+            row, _ = row_of(sample, self._cameras(), self._lerobot)
+        except Incomplete as error:
+            raise ConfigError(f"nothing could be recorded: {error}") from error
+        self._ask({"kind": "check", **row})
+
+    def mark(self, goal_id: str, verdict: Verdict) -> Marked:
+        """Note the operator's verdict on the goal that runs, or the last one. Blocks.
+
+        An empty `goal_id` means that goal. Raises BadRequest for another one, BadState.
+        """
+        said = self._ask({"kind": "mark", "goal_id": goal_id, "verdict": verdict})
+        if verdict == "discard" and said["episode"] is not None:
+            self.counts.discard(said["goal_id"], finished=True)
+        else:
+            log.info("goal %s is marked as %s", said["goal_id"], verdict)
+        return {"goal_id": said["goal_id"], "episode": said["episode"], "verdict": verdict}
+
+    def _ask(self, message: wire.Header) -> wire.Header:
+        ask = _Ask(message)
+        with self._queue.changed:
+            if self._closing or self.lost is not None or self._feeding is None:
+                raise BadState("nothing is recorded any more", hint="see the runner's log")
+            self._queue.put(ask)
+        try:
+            return ask.answer.result(ANSWER_S)
+        except TimeoutError:
+            raise BadState(f"the dataset's writer gave no answer for {ANSWER_S:.0f} s") from None
 
     # -- control thread
     def tick(self, tick: GoalTick) -> None:
         """See `runner.protocols.TickSink`."""
-        size = sum(len(frame.data or b"") for frame in (tick.world.image_frames or {}).values())
-        with self._room:
-            if self._patient:
-                self._room.wait_for(lambda: self._fits(size) or self._lost, PATIENCE_S)
-            if self._closing or self._lost:
-                return
-            if self._fits(size):
-                self._queue.append(tick)
-                self._queued += 1
-                self._queued_bytes += size
-                self._room.notify_all()
-                return
-            self.dropped += 1
-            self._dropped_now += 1
-            first = self._dropped_now == 1
-        if first:
+        self._goal_runs = True
+        if self._patient:
+            self._queue.wait(lambda: self._queue.fits(tick) or self.lost is not None, PATIENCE_S)
+        if self._closing or self.lost is not None or self._queue.put_tick(tick):
+            return
+        self.counts.dropped += 1
+        self._dropped_now += 1
+        if self._dropped_now == 1:
             log.warning(
                 "goal %s: the dataset's writer is too slow; ticks are dropped from now on",
                 tick.goal.goal_id,
@@ -233,57 +257,61 @@ class DatasetRecorder:
 
     def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
         """See `runner.protocols.TickSink`. Never dropped."""
-        with self._room:
-            if not self._closing:
-                self._queue.append(_End(goal, ended, self._dropped_now))
-                self._dropped_now = 0
-                self._room.notify_all()
-
-    def _fits(self, size: int) -> bool:
-        return self._queued < QUEUE_TICKS and (
-            self._queued_bytes + size <= QUEUE_BYTES or not self._queued
-        )
-
-    @property
-    def _lost(self) -> bool:
-        return self._process is not None and self._process.returncode is not None
+        with self._queue.changed:
+            self._goal_runs = False
+            lost = self.lost is not None
+            if not self._closing and not lost:
+                self._queue.put(_End(goal, ended, self._dropped_now))
+        self._dropped_now = 0
+        if lost:
+            self._on_lost()
 
     # -- the queue's other end
     def _feed(self) -> None:
-        peer = self._peer
-        assert peer is not None
         reasons: Counter[str] = Counter()
-        while (item := self._next()) is not None:
-            try:
-                if isinstance(item, GoalTick):
-                    row, pictures = row_of(item, self._cameras())
-                    wire.send(peer, {"kind": "row", **row}, pictures)
-                else:
-                    wire.send(peer, {"kind": "end", **self._note(item, reasons)})
+        while (item := self._queue.next()) is not None:
+            match item:
+                case GoalTick():
+                    self._feed_tick(item, reasons)
+                case _End():
+                    self._given_up_goal = ""
+                    self._send({"kind": "end", **self._note(item, reasons)})
                     reasons = Counter()
-            except Incomplete as error:
-                if not reasons[str(error)]:
-                    log.warning("ticks are left out of the dataset: %s", error)
-                if str(error) in reasons or len(reasons) < REASONS_KEPT:
-                    reasons[str(error)] += 1
-                    self.incomplete[str(error)] += 1
-            except (OSError, ValueError) as error:
-                self._note_loss(InternalError(f"the dataset's writer does not take rows: {error}"))
-        try:
-            wire.send(peer, {"kind": "close"})
-        except OSError:
-            log.debug("the dataset's writer is gone")
+                case _Ask():
+                    self._answers.append(item)
+                    self._send(item.message)
+                case _Gone():
+                    self._revive(item)
+        if self._writer is not None:
+            with contextlib.suppress(OSError):  # it is gone already
+                self._writer.send({"kind": "close"})
 
-    def _next(self) -> GoalTick | _End | None:
-        with self._room:
-            self._room.wait_for(lambda: bool(self._queue))
-            item = self._queue.popleft()
-            if isinstance(item, GoalTick):
-                self._queued -= 1
-                frames = (item.world.image_frames or {}).values()
-                self._queued_bytes -= sum(len(frame.data or b"") for frame in frames)
-                self._room.notify_all()
-            return item
+    def _feed_tick(self, tick: GoalTick, reasons: Counter[str]) -> None:
+        if tick.goal.goal_id == self._given_up_goal:
+            self.counts.dropped += 1
+            return
+        try:
+            row, pictures = row_of(tick, self._cameras(), self._lerobot)
+        except Incomplete as error:
+            if not reasons[str(error)]:
+                log.warning("ticks are left out of the dataset: %s", error)
+            if str(error) in reasons or len(reasons) < REASONS_KEPT:
+                reasons[str(error)] += 1
+                self.counts.incomplete[str(error)] += 1
+            return
+        self._unfinished[tick.goal.goal_id] = None
+        self._send({"kind": "row", **row}, pictures)
+
+    def _send(self, message: wire.Header, pictures: Sequence[bytes] = ()) -> None:
+        """Send a message; one that a dead writer does not take is lost with what it had."""
+        if self._writer is None or self.lost is not None:
+            return
+        try:
+            self._writer.send(message, pictures)
+        except OSError:
+            log.debug("the dataset's writer is gone")  # `_revive` accounts for it
+        except ValueError as error:
+            self.counts.lose(InternalError(f"the dataset's writer does not take rows: {error}"))
 
     @staticmethod
     def _note(end: _End, reasons: Counter[str]) -> commit.EpisodeNote:
@@ -301,24 +329,51 @@ class DatasetRecorder:
             "reasons": dict(reasons),
         }
 
-    # -- what the writer says
-    def _hear(self) -> None:
-        peer, process = self._peer, self._process
-        assert peer is not None
-        assert process is not None
-        while (message := wire.receive(peer)) is not None:
-            self._heard(message[0])
-        if self._aborted:
-            self._ready.set()
-            return
-        code = process.wait()
-        if code != 0 and self._refused is None:
-            self._note_loss(InternalError(f"the dataset's writer died (status {code})"))
-            self._refused = self.error
-        self._ready.set()
-        with self._room:
-            self._room.notify_all()
+    # -- a writer that died
+    def _writer_gone(self, writer: WriterProcess, code: int) -> None:
+        if not self._closing:
+            self._queue.put(_Gone(writer, code), first=True)
 
+    def _revive(self, gone: _Gone) -> None:
+        """Account for what a dead writer had, and start another one."""
+        lost = ", ".join(self._unfinished) or "none"
+        self.counts.lose(
+            InternalError(
+                f"the dataset's writer died (status {gone.code}); goals without an episode: {lost}"
+            )
+        )
+        self._given_up_goal = next(reversed(self._unfinished), "")
+        self._unfinished.clear()
+        while self._answers:
+            self._answers.popleft().answer.set_exception(
+                BadState("the dataset's writer died", hint="ask again")
+            )
+        error: VramError = InternalError(f"the dataset's writer died {RESTARTS_MAX + 1} times")
+        while self._restarts < RESTARTS_MAX and not self._closing:
+            self._restarts += 1
+            log.warning(
+                "the dataset's writer is started again (%d of %d)", self._restarts, RESTARTS_MAX
+            )
+            self._writer = self._new_writer()
+            try:
+                self._writer.await_ready()
+            except VramError as refused:
+                self.counts.lose(refused)
+                error = refused
+            else:
+                return
+        self._lose(error)
+
+    def _lose(self, error: VramError) -> None:
+        with self._queue.changed:
+            self.lost = error
+            runs = self._goal_runs
+            self._queue.changed.notify_all()
+        log.error("NOTHING MORE IS RECORDED: %s", error)
+        if not runs:
+            self._on_lost()
+
+    # -- what the writer says
     def _heard(self, said: wire.Header) -> None:
         match said["kind"]:
             case "ready":
@@ -331,38 +386,22 @@ class DatasetRecorder:
                         said["episodes"],
                         said["frames"],
                     )
-                self._ready.set()
-            case "refused":
-                self._refused = from_wire(said["error"])
-                self._ready.set()
             case "episode":
-                self.episodes += 1
-                self.frames += said["frames"]
-                log.info(
-                    "goal %s is episode %d, %d frames",
-                    said["goal_id"],
-                    said["episode"],
-                    said["frames"],
-                )
+                self._unfinished.pop(said["goal_id"], None)
+                self.counts.finished(said["goal_id"], said["episode"], said["frames"])
             case "skipped":
-                self.skipped += 1
-                log.warning("goal %s is not recorded: %s", said["goal_id"], said["reason"])
+                self._unfinished.pop(said["goal_id"], None)
+                self.counts.skip(said["goal_id"], said["reason"])
+            case "discarded":
+                self._unfinished.pop(said["goal_id"], None)
+                self.counts.discard(said["goal_id"], finished=False)
             case "failed":
-                self._note_loss(from_wire(said["error"]))
-
-    def _note_loss(self, error: VramError) -> None:
-        if self.error is None or self.error.message != error.message:
-            log.error("not recorded: %s", error)
-        self.error = error
-
-
-def _environment(root: Path) -> dict[str, str]:
-    """Return the writer's environment: no network look-ups, no user caches, no core of the loop."""
-    return {
-        **os.environ,
-        "HF_HUB_OFFLINE": "1",
-        "HF_DATASETS_OFFLINE": "1",
-        "HF_DATASETS_CACHE": str(root / commit.FOLDER / commit.CACHE),
-        "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
+                self._unfinished.pop(said["goal_id"], None)
+                error = from_wire(said["error"])
+                self.counts.lose(error)
+                if self._strict:
+                    self._lose(error)
+            case "fits" | "marked":
+                self._answers.popleft().answer.set_result(said)
+            case "misfit" | "unmarked":
+                self._answers.popleft().answer.set_exception(from_wire(said["error"]))

@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from typing import TypedDict
 
 from vram_arbiter.runner.protocols import GoalTick, Transition
+from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
-ROBOT, OWN = "rad", "own"  # units of state and action: a robot's, or whatever its world has
+# units of state and action: a robot's, whatever its world has, or lerobot's for this robot
+ROBOT, OWN, LEROBOT = "rad", "own", "lerobot"
 NUMBERS_MAX = 4096  # of a state; beyond that it is a picture of some kind
 LARGEST = 3.4028234663852886e38  # of the columns' float32
 NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
@@ -72,17 +74,25 @@ class Incomplete(Exception):
     """This tick cannot become a row of the dataset; the message names what it lacks."""
 
 
-def row_of(tick: GoalTick, cameras: Sequence[str]) -> tuple[Row, list[bytes]]:
-    """Return the row and its pictures, in the order of `cameras`. Raises Incomplete."""
+def row_of(
+    tick: GoalTick, cameras: Sequence[str], lerobot: LerobotUnits | None = None
+) -> tuple[Row, list[bytes]]:
+    """Return the row and its pictures, in the order of `cameras`. Raises Incomplete.
+
+    `lerobot` records a robot by lerobot's names, in its units.
+    """
     world, result, goal = tick.world, tick.result, tick.goal
     state, action = _joints(tick) if tick.transition is None else _step(tick.transition)
+    units = ROBOT if tick.transition is None else OWN
+    if lerobot is not None:
+        state, action, units = lerobot.named(state), lerobot.named(action), LEROBOT
     frames = [_colours(world.image_frames or {}, camera) for camera in cameras]
     trace_id, span_id, sampled = trace_of((result.trace_context or {}).get("traceparent"))
     row: Row = {
         "goal_id": goal.goal_id,
         "skill": f"{goal.rskill_id}@{goal.revision}" if goal.revision else goal.rskill_id,
         "task": goal.prompt or goal.rskill_id,
-        "units": ROBOT if tick.transition is None else OWN,
+        "units": units,
         "state_names": list(state),
         "state": list(state.values()),
         "action_names": list(action),

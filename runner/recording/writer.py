@@ -21,16 +21,11 @@ from pathlib import Path
 from typing import cast
 
 from vram_arbiter.runner.recording import commit, wire
-from vram_arbiter.runner.recording.lerobot_files import (
-    SUCCESS,
-    Features,
-    Frame,
-    LerobotFiles,
-    features_of,
-    frame_of,
-)
+from vram_arbiter.runner.recording.columns import SUCCESS, Features, Frame, features_of, frame_of
+from vram_arbiter.runner.recording.lerobot_files import LerobotFiles
 from vram_arbiter.runner.recording.rows import Row
 from vram_arbiter.schemas.errors import (
+    BadRequest,
     ConfigError,
     FrameStale,
     InternalError,
@@ -41,6 +36,7 @@ from vram_arbiter.schemas.runtime import logging as logs
 
 log = logging.getLogger("vram_arbiter.runner.recording")
 
+DISCARD = "discard"
 NICENESS = 10  # the control loop goes first
 ROWS_MIN = 2  # lerobot has no statistics of a single picture
 ROWS_MAX = 30 * 60 * 30  # half an hour at 30 Hz; a longer goal goes on in the next episode
@@ -59,6 +55,8 @@ class EpisodeWriter:
         self._judged: bool | None = None  # verdict of the world with the last row; None: no verdict
         self._broken = 0  # rows of it with a picture that cannot be read
         self._refused = ""  # goal whose rows cannot be recorded
+        self._mark = ""  # the operator's verdict on the goal that is being recorded
+        self._finished: list[tuple[str, int]] = []  # goals with an episode, and that episode
 
     def row(self, row: Row, pictures: list[bytes]) -> None:
         """Add one row of a goal; the first one begins its episode.
@@ -72,7 +70,7 @@ class EpisodeWriter:
             self._close({"status": "unfinished"})
         if self._goal is None:
             self._features = self._files.begin(features_of(row))
-            self._goal, self._broken = row, 0
+            self._goal, self._broken, self._mark = row, 0, ""
         try:
             frame = frame_of(row, pictures, self._features)
         except (
@@ -94,6 +92,42 @@ class EpisodeWriter:
             self._close(note)
         elif self._refused == note["goal_id"]:
             self._refused = ""
+
+    def check(self, row: Row) -> None:
+        """Compare the columns of a row that is not recorded with those of an existing dataset."""
+        try:
+            self._files.check_columns(features_of(row))
+        except VramError as error:
+            self._tell({"kind": "misfit", "error": error.to_wire()})
+        else:
+            self._tell({"kind": "fits"})
+
+    def mark(self, goal_id: str, verdict: str) -> None:
+        """Note the operator's verdict on the goal that is being recorded, or the last one.
+
+        A discarded episode is not written, or is removed. An empty `goal_id` means that goal.
+        """
+        goal = self._goal["goal_id"] if self._goal is not None else ""
+        finished, episode = self._finished[-1] if self._finished else ("", -1)
+        try:
+            if goal and goal_id in ("", goal):
+                self._mark = verdict
+                self._tell({"kind": "marked", "goal_id": goal, "episode": None})
+                return
+            if not finished or goal_id not in ("", finished):
+                what = "no goal was recorded" if not finished else f"the last one is {finished}"
+                hint = "mark a goal while it runs, or before the next one"
+                raise BadRequest(f"goal {goal_id or '?'} cannot be marked: {what}", hint=hint)
+            if verdict == DISCARD:
+                if goal:
+                    raise BadRequest(f"the next goal, {goal}, is being recorded")
+                commit.undo(self._files.root)
+                self._finished.pop()
+            else:
+                commit.mark(self._files.root, episode, verdict)
+            self._tell({"kind": "marked", "goal_id": finished, "episode": episode})
+        except VramError as error:
+            self._tell({"kind": "unmarked", "error": error.to_wire()})
 
     def close(self, status: str) -> None:
         """End everything; an open goal is finished with its rows so far. Raises like `ended`."""
@@ -126,6 +160,10 @@ class EpisodeWriter:
                 }
             )
             return
+        if self._mark == DISCARD:
+            self._forget()
+            self._tell({"kind": "discarded", "goal_id": first["goal_id"]})
+            return
         last["next.done"][0] = True
         if SUCCESS in last:
             last[SUCCESS][0] = note.get("status") == "succeeded" and self._judged is True
@@ -138,9 +176,12 @@ class EpisodeWriter:
             "units": first["units"],
             "judged": self._judged,
         }
+        if self._mark:
+            about["marked"] = self._mark
         incomplete = note.get("incomplete", 0) + self._broken
         index = self._files.finish({**about, **note, "incomplete": incomplete})
         self._goal = self._last = None
+        self._finished.append((first["goal_id"], index))
         self._tell(
             {"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows}
         )
@@ -165,8 +206,11 @@ def serve(peer: socket.socket) -> int:
             stack.enter_context(commit.locked(root))
             stack.callback(shutil.rmtree, root / commit.FOLDER / commit.CACHE, ignore_errors=True)
             repaired = commit.repair(root)
-            files = LerobotFiles(root, fps=said["fps"], robot=said["robot"])
+            files = LerobotFiles(
+                root, fps=said["fps"], robot=said["robot"], columns=said["columns"]
+            )
             episodes, frames = files.totals()
+            files.check(said["units"], said["joints"], said["cameras"])
         except (ImportError, VramError, OSError) as error:
             _answer(peer, {"kind": "refused", "error": _typed(root, error).to_wire()})
             return 2
@@ -211,6 +255,10 @@ def _take(writer: EpisodeWriter, header: wire.Header, pictures: list[bytes]) -> 
             writer.row(cast(Row, header), pictures)
         elif kind == "end":
             writer.ended(cast(commit.EpisodeNote, header))
+        elif kind == "check":
+            writer.check(cast(Row, header))
+        elif kind == "mark":
+            writer.mark(header["goal_id"], header["verdict"])
         else:
             writer.close(header["status"])
     except Exception as error:

@@ -14,6 +14,8 @@ from typing import NoReturn
 from pydantic import ValidationError
 
 from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.runner.robots.so101 import lerobot_units_of
+from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadState,
@@ -35,6 +37,11 @@ class HalBase(ABC):
         self._connected = False
         self._estop: EstopRequested | None = None
         self._sent: dict[str, float] = {}
+
+    @property
+    def lerobot_units(self) -> LerobotUnits | None:
+        """How lerobot would record this robot; None: it does not know such a robot."""
+        return lerobot_units_of(self.description)
 
     # -- what the hardware does
     @abstractmethod

@@ -21,7 +21,7 @@ from vram_arbiter.runner.protocols import (
 )
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
-from vram_arbiter.runner.robots.lerobot_robot import POSITION, LerobotHal, can_switch_off
+from vram_arbiter.runner.robots.lerobot_robot import LerobotHal, can_switch_off
 from vram_arbiter.runner.robots.models import frames_of, load_model
 from vram_arbiter.runner.robots.params import (
     JointParams,
@@ -34,7 +34,7 @@ from vram_arbiter.runner.robots.params import (
     wrong,
 )
 from vram_arbiter.runner.robots.so101 import so101
-from vram_arbiter.runner.robots.units import JointScale, JointUnit
+from vram_arbiter.runner.robots.units import POSITION, JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.yamltext import Problem, config_error, did_you_mean, dotted

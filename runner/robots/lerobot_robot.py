@@ -17,14 +17,13 @@ from typing import Any, Literal
 from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.robots.base import HalBase
-from vram_arbiter.runner.robots.units import JointScale
+from vram_arbiter.runner.robots.units import POSITION, JointScale, LerobotUnits
 from vram_arbiter.schemas.errors import RobotFault
 from vram_arbiter.schemas.world import JointState
 
 log = logging.getLogger(__name__)
 
 CONNECT_TRIES = 4  # lerobot asks each motor dozens of things and gives up when one answer is lost
-POSITION = ".pos"  # lerobot's features of joint positions: `elbow_flex.pos`
 Estop = Literal["hold", "torque_off"]
 
 
@@ -50,6 +49,10 @@ class LerobotHal(HalBase):
         self._estop_by = estop
         self._clock = clock or SystemClock()
         self._target: dict[str, float] = {}  # rad: what the robot accepted last
+
+    @property
+    def lerobot_units(self) -> LerobotUnits:
+        return LerobotUnits(str(self._robot.name), self._scales)
 
     def _open(self) -> None:
         robot = self._robot

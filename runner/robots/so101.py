@@ -7,6 +7,7 @@ servos are Feetech STS3215.
 from __future__ import annotations
 
 from vram_arbiter.runner.protocols import EndEffector, Joint, MobileBase, RobotDescription
+from vram_arbiter.runner.robots.units import JointScale, JointUnit, LerobotUnits
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
 
 NAME = "so101"
@@ -40,3 +41,12 @@ def so101(*, simulated: bool, base: MobileBase | None = None) -> RobotDescriptio
         model=NAME,
         ends=(EndEffector(GRIPPER, TOOL, GRIPPER),),
     )
+
+
+def lerobot_units_of(description: RobotDescription) -> LerobotUnits | None:
+    """Return how lerobot records an SO-101, with its default `use_degrees`; None: another robot."""
+    if description.joint_names != ARM_JOINTS:
+        return None
+    units = dict.fromkeys(ARM_JOINTS, JointUnit.DEG) | {GRIPPER: JointUnit.PERCENT}
+    scales = {name: JointScale(units[name], *RANGES_RAD[name]) for name in ARM_JOINTS}
+    return LerobotUnits("so_follower", scales)

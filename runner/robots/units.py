@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -55,3 +56,20 @@ class JointScale:
                 share = (angle_rad - self.lower_rad) / (self.upper_rad - self.lower_rad)
                 share = share if self.sign > 0 else 1.0 - share
                 return 100.0 * share if self.unit is JointUnit.PERCENT else 200.0 * share - 100.0
+
+
+POSITION = ".pos"  # lerobot's features of joint positions: `elbow_flex.pos`
+
+
+@dataclass(frozen=True, slots=True)
+class LerobotUnits:
+    """How lerobot records a robot: the type's name in its datasets, and the unit of each joint."""
+
+    robot_type: str
+    scales: Mapping[str, JointScale]
+
+    def named(self, angles_rad: Mapping[str, float]) -> dict[str, float]:
+        """Return joint angles by lerobot's names, in its units."""
+        return {
+            name + POSITION: self.scales[name].from_rad(angle) for name, angle in angles_rad.items()
+        }

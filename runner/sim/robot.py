@@ -150,6 +150,10 @@ class SimRobot:
         """First error of the policy that plays the episodes; it ended the run."""
         return None if self.player is None else self.player.error
 
+    @property
+    def _episode_seed(self) -> int:
+        return self._seed + self.episode_idx if self._next_seed is None else self._next_seed
+
     def begin_episode(self, seed: int) -> None:
         """Reset the world in the next tick and in every later reset to this seed.
 
@@ -157,6 +161,13 @@ class SimRobot:
         """
         self._next_seed = seed
         self.reset_due = True
+
+    def begin_episode_of(self, seed: int | None) -> int:
+        """Reset the world in the next tick, to `seed` or again to its own; return the seed."""
+        if seed is not None:
+            self.begin_episode(seed)
+        self.reset_due = True
+        return self._episode_seed
 
     def reset(self) -> Applied:
         """Prepare the next episode.
@@ -166,7 +177,7 @@ class SimRobot:
         self.reset_due = self._had_skill = False
         self.failure = None
         self._snapshots.clear()
-        seed = self._seed + self.episode_idx if self._next_seed is None else self._next_seed
+        seed = self._episode_seed
         self.env.reset(seed)
         if not self._cameras_given:
             self._cameras = self.env.cameras

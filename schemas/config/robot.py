@@ -172,6 +172,8 @@ class RobotEnvironment(_Section):
     max_ticks: Annotated[int, Field(gt=0)] | None = None
     save_dir: str | None = None
     """Folder of the recorded dataset; null: nothing is recorded."""
+    save_format: Literal["full", "lerobot"] = "full"
+    """Columns of the dataset: all, or those of `lerobot-record` with its names and units."""
     metadata: dict[str, JsonValue] = {}
 
     @model_validator(mode="after")

@@ -78,6 +78,8 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
             )
             async for feedback in goal.feedback():
                 if feedback["tick_idx"] >= 30 and (root / commit.FOLDER / commit.OPEN).exists():
+                    marked = await client.mark("failure")
+                    assert (marked["goal_id"], marked["episode"]) == (goal.goal_id, None)
                     process.kill()
                     return
 
@@ -86,7 +88,7 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
     with commit.locked(root, WAIT_S):  # until the writer is done
         pass
     (note,) = commit.notes(root)
-    assert note["status"] == "runner_lost"
+    assert (note["status"], note["marked"]) == ("runner_lost", "failure")
     assert note["frames"] >= 2
     last = read_frame(root, note["frames"] - 1)
     assert last.tick["done"]
@@ -122,6 +124,7 @@ def test_a_deployment_records_into_its_save_dir(start_recording: Start, tmp_path
     said = {
         "episodes": 1,
         "frames": note["frames"],
+        "discarded": 0,
         "skipped": 0,
         "dropped": 0,
         "left_out": 0,

@@ -134,6 +134,7 @@ def test_lerobot_reads_what_the_world_showed_and_was_sent(
     told = {
         "episodes": 3,
         "frames": frames,
+        "discarded": 0,
         "skipped": 0,
         "dropped": 0,
         "left_out": 0,

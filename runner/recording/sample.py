@@ -1,0 +1,44 @@
+"""A tick that is not recorded: what rows will look like, before a goal moves the robot."""
+
+from __future__ import annotations
+
+from vram_arbiter.runner.control.loop import ControlLoop
+from vram_arbiter.runner.control.robot import Robot
+from vram_arbiter.runner.protocols import Goal, GoalTick, Picture
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, TickResult
+
+MAX_AGE_S = 60.0  # its size counts, not what it shows
+
+
+def sample_of[R: Robot](runner: ControlLoop[R]) -> GoalTick | None:
+    """Return a tick with the present state and a picture of each camera; None before any state.
+
+    Control thread. Targets are where the joints are. Raises FrameStale, ModelError for a camera
+    without a picture.
+    """
+    if (world := runner.world) is None:
+        return None
+    frames = {
+        name: _frame(name, runner.snapshot(name, MAX_AGE_S)) for name in runner.camera_names()
+    }
+    joints = world.joint_state
+    return GoalTick(
+        Goal("", ""),
+        world.model_copy(update={"image_frames": frames}),
+        TickResult(stamp_ns=world.stamp_ns, tick_idx=0, tick_ms=0.0),
+        dict(zip(joints.name, joints.position, strict=True)),
+        None if world.base_pose is None else (0.0, 0.0, 0.0),
+    )
+
+
+def _frame(camera: str, picture: Picture) -> SensorFrame:
+    height, width = picture.rgb.shape[:2]
+    return SensorFrame(
+        sensor_id=camera,
+        stamp_monotonic_ns=picture.stamp_ns,
+        stamp_wall_ns=0,
+        encoding=FrameEncoding.RGB8,
+        width=int(width),
+        height=int(height),
+        data=picture.rgb.tobytes(),
+    )
