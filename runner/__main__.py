@@ -20,7 +20,10 @@ from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.telemetry.commands import Command, command
 from vram_arbiter.schemas.runtime.version import add_version
 
-COMMANDS = ("sim", "benchmark", "deploy", "estop", "replay")
+COMMANDS = (
+    "sim", "benchmark", "deploy", "estop", "goal", "state", "frame", "reset", "mark", "episodes",
+    "replay",
+)  # fmt: skip
 URGENT = "estop"  # it imports nothing of the others: a second of imports is a second of motion
 
 
