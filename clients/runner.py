@@ -182,8 +182,16 @@ class RunnerClient:
 
         Raises RunnerUnreachable at once where no process serves the socket any more.
         """
-        if not self._rpc.proven and not somebody_listens(self.endpoint):
-            raise self._lost("it has ended")
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + self._connect_timeout_s
+        while not self._rpc.proven:  # in slices: a socket may vanish while its runner ends
+            if not somebody_listens(self.endpoint):
+                raise self._lost("it has ended")
+            try:
+                await self._exchange("ping", {}, RESULT_POLL_S)
+            except RunnerUnreachable:
+                if loop.time() > deadline_s:
+                    raise
         return await self.call(op, {"goal_id": goal.goal_id})
 
     # -- reads -------------------------------------------------------------------------------------
