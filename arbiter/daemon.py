@@ -340,7 +340,7 @@ class Daemon:
 
     def _say(self, kind: str, facts: JsonMap) -> None:
         """A fact of the daemon itself, in its history and its log."""
-        telemetry.log_event(self._history.append(kind, partial(dict, facts)))
+        telemetry.log_event(self._history.append(kind, facts))
 
     def _keep_learnt(self) -> None:
         """So that a kill loses no more than the last few seconds of learning."""

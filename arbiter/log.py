@@ -10,7 +10,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.logging import Form, PrintableFormatter, set_up
@@ -115,35 +114,20 @@ def write_in_thread() -> Callable[[], None]:
     return close
 
 
-@dataclass(slots=True)
-class Fact:
-    """One fact as history, log and subscribers tell it. Its words are made where they are first
-    read: by the thread of the log or of the history, or for a subscriber."""
-
-    seq: int
-    at_wall_s: float
-    kind: str
-    facts: Callable[[], JsonMap]
-    """Gives its other keys."""
-    _plain: JsonMap | None = None
-
-    def plain(self) -> JsonMap:
-        """Return its map. Several threads may ask."""
-        if self._plain is None:
-            known = {"seq": self.seq, "at_wall_s": self.at_wall_s, "kind": self.kind}
-            self._plain = {**known, **self.facts()}
-        return self._plain
+class _Event(dict[str, object]):
+    """An event of the history, in words where its line is written."""
 
     def __str__(self) -> str:
-        return sentence(self.plain())
+        return sentence(self)
 
 
-def log_event(event: Fact, trace: Mapping[str, str] | None = None) -> None:
+def log_event(event: JsonMap, trace: Mapping[str, str] | None = None) -> None:
     """One event of the history as one line of the log; as JSON with `trace_id` and `span_id` of its
     span, if it has one."""
-    level = _LEVELS.get(event.kind, logging.INFO)
+    level = _LEVELS.get(event["kind"], logging.INFO)
     if events_log.isEnabledFor(level):
-        events_log.log(level, "%s", event, extra={"event": event.plain, "trace": trace})
+        said = _Event(event)
+        events_log.log(level, "%s", said, extra={"event": said, "trace": trace})
 
 
 def sentence(event: JsonMap) -> str:

@@ -9,12 +9,10 @@ are behind the protocols below.
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.log import Fact
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
@@ -38,7 +36,7 @@ class Outbox(Protocol):
 
     def push(self, client: ClientId, body: AnyPush) -> None: ...
 
-    def broadcast(self, event: Fact) -> None: ...
+    def broadcast(self, event: JsonMap) -> None: ...
 
 
 class Records(Protocol):
@@ -50,7 +48,7 @@ class Records(Protocol):
 class Chronicle(Protocol):
     """The history: gives a fact its number and time, and keeps it."""
 
-    def append(self, kind: str, facts: Callable[[], JsonMap]) -> Fact: ...
+    def append(self, kind: str, data: JsonMap) -> JsonMap: ...
 
 
 class Traces(Protocol):
@@ -83,7 +81,7 @@ class Executor:
         history: Chronicle,
         sample: Callable[[GpuId], None],
         post: Callable[[ev.Event], None],
-        log_event: Callable[[Fact, Mapping[str, str] | None], None],
+        log_event: Callable[[JsonMap, Mapping[str, str] | None], None],
         signal: Callable[[ProcessKey, str], None],
         words: Words,
         traces: Traces | None = None,
@@ -134,8 +132,8 @@ class Executor:
                 case fx.Signal():
                     self._signal(effect.process, effect.kind)
         for note in notes:
-            event = self._history.append(note.body.TAG[1], partial(self._words.event, note))
-            span = None if self._traces is None else self._traces.observe(note, event.plain())
+            event = self._history.append(note.body.TAG[1], self._words.event(note))
+            span = None if self._traces is None else self._traces.observe(note, event)
             self._log_event(event, span)
             self._outbox.broadcast(event)
         for sample in samples:

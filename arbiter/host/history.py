@@ -1,7 +1,7 @@
 """History: every fact of the engine as an event with a number and a wall time.
 
-The newest events are in memory, all of them in SQLite. `append` costs the loop one object; a thread
-words and writes them, and answers questions about events that memory no longer holds. A crash loses the last
+The newest events are in memory, all of them in SQLite. `append` costs the loop one dict; a thread
+writes them and answers questions about events that memory no longer holds. A crash loses the last
 moment, which loses explanations, never leases. A broken database is put aside and reported; without
 a writable one the history lives in memory only. Must not know what the events mean.
 """
@@ -20,7 +20,6 @@ from typing import Self
 
 from vram_arbiter.arbiter.host.disk_writer import DiskBehind, DiskFailed, DiskWriter
 from vram_arbiter.arbiter.host.journal_files import is_corruption, put_aside
-from vram_arbiter.arbiter.log import Fact
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.replies import HistoryReply
@@ -46,6 +45,7 @@ CLEAN_END = "stopped"
 """Kind of the last event of an orderly stop."""
 
 Done = Callable[[HistoryReply], None]
+Event = JsonMap
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS events
@@ -71,8 +71,8 @@ class History:
         self._store = store
         self._wall = wall
         self._last_seq = last_seq
-        self._ring: deque[Fact] = deque(maxlen=RING_EVENTS)
-        self._disk: DiskWriter[Fact] | None = None
+        self._ring: deque[Event] = deque(maxlen=RING_EVENTS)
+        self._disk: DiskWriter[Event] | None = None
         self.problem = "history is kept in memory only: its file cannot be used"
         if store is not None:
             self.problem = ""
@@ -111,11 +111,10 @@ class History:
     def last_seq(self) -> int:
         return self._last_seq
 
-    def append(self, kind: str, facts: Callable[[], JsonMap]) -> Fact:
-        """Give a fact its number and wall time, keep it, and return the event. `facts` is asked for
-        its other keys where they are read, perhaps by another thread."""
+    def append(self, kind: str, data: JsonMap) -> Event:
+        """Give a fact its number and wall time, keep it, and return the event."""
         self._last_seq += 1
-        event = Fact(self._last_seq, self._wall(), kind, facts)
+        event = {"seq": self._last_seq, "at_wall_s": self._wall(), "kind": kind, **data}
         self._ring.append(event)
         if self._disk is not None:
             self._disk.put(event)
@@ -128,15 +127,17 @@ class History:
 
         Calls `done({"events", "last_seq"})` at once, or later on the loop's thread.
         """
-        first = self._ring[0].seq if self._ring else self._last_seq + 1
+        first = self._ring[0]["seq"] if self._ring else self._last_seq + 1
         store, disk = self._store, self._disk
         if store is None or disk is None or not disk.running or after + 1 >= first:
             wanted = frozenset(kinds)
-            found = [e for e in self._ring if e.seq > after and (not wanted or e.kind in wanted)]
-            done(HistoryReply(tuple(e.plain() for e in found[:limit]), self._last_seq))
+            found = [
+                e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)
+            ]
+            done(HistoryReply(tuple(found[:limit]), self._last_seq))
             return
 
-        def answer(found: list[JsonMap] | DiskFailed) -> None:
+        def answer(found: list[Event] | DiskFailed) -> None:
             if isinstance(found, DiskFailed):
                 done(HistoryReply((), self._last_seq, str(found)))
             else:
@@ -165,7 +166,7 @@ class History:
             self.problem = f"history cannot be written ({failure}): events are in memory only"
 
 
-def _event(seq: int, at_wall_s: object, text: str) -> JsonMap:
+def _event(seq: int, at_wall_s: object, text: str) -> Event:
     """Return the event of one row; a damaged one keeps its number, so that paging goes on."""
     with contextlib.suppress(ValueError, TypeError):
         event = strictjson.loads(text, max_chars=EVENT_MAX_CHARS)
@@ -199,7 +200,7 @@ class _Store:
         self._max_events = max_events
         self._days = days
         self._since_prune = 0
-        self._owed: deque[Fact] = deque(maxlen=BUFFER_MAX)
+        self._owed: deque[Event] = deque(maxlen=BUFFER_MAX)
         self._earlier = 0  # the last number of earlier runs
         self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
         try:
@@ -234,10 +235,10 @@ class _Store:
             self._earlier = int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
         return self._earlier
 
-    def write(self, items: Sequence[Fact]) -> None:
+    def write(self, items: Sequence[Event]) -> None:
         self._owed.extend(items)
         rows = [
-            (e.seq, e.at_wall_s, e.kind, json.dumps(e.plain(), separators=(",", ":"), default=str))
+            (e["seq"], e["at_wall_s"], e["kind"], json.dumps(e, separators=(",", ":"), default=str))
             for e in self._owed
         ]
         with self._db:
@@ -264,7 +265,7 @@ class _Store:
             "DELETE FROM events WHERE at_wall_s < ? AND seq <= ?", (wall_s - age_s, up_to)
         )
 
-    def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[JsonMap]:
+    def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Event]:
         wanted = json.dumps(list(kinds))
         return [_event(*row) for row in self._db.execute(_QUESTION, (after, wanted, wanted, limit))]
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.log import Fact, RefusalLog
+from vram_arbiter.arbiter.log import RefusalLog
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.arbiter.rpc.registry import (
     Decisions,
@@ -33,6 +33,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.connection import Connection
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
@@ -220,11 +221,11 @@ class SessionTable:
             session.seq += 1
             session.connection.send(codec.push(session.seq, self._epoch, body))
 
-    def broadcast(self, event: Fact) -> None:
+    def broadcast(self, event: JsonMap) -> None:
         """One history event to every subscriber. One that does not read loses events and can fetch
         them by `history`."""
         for client in list(self._registry.subscribers):
-            self.push(client, EventPush(event.plain()))
+            self.push(client, EventPush(event))
 
     # -- steps
     def _charge(

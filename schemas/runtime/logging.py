@@ -50,8 +50,7 @@ def set_up(program: str | None, level: str, form: Form, human: str | logging.For
 def _json(program: str | None) -> logging.Formatter:
     """Return a formatter of one JSON object per line, with the ids of the span where there is one.
 
-    Keys: at_wall_s, level, logger, message, program, event, trace_id, span_id, exception. An
-    `event` may be a function that gives it: then it is made here, where the line is written.
+    Keys: at_wall_s, level, logger, message, program, event, trace_id, span_id, exception.
     """
     from pythonjsonlogger.json import JsonFormatter
 
@@ -69,7 +68,7 @@ def _json(program: str | None) -> logging.Formatter:
             if program is not None:
                 log_data["program"] = program
             if (event := getattr(record, "event", None)) is not None:
-                log_data["event"] = event() if callable(event) else event
+                log_data["event"] = event
             log_data.update(getattr(record, "trace", None) or _span_ids())
             if record.exc_info:
                 log_data["exception"] = self.formatException(record.exc_info)

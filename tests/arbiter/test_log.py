@@ -5,21 +5,15 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 
 from vram_arbiter.arbiter import log as telemetry
-from vram_arbiter.arbiter.log import LINES_MAX, REFUSALS_BURST, REFUSED_USERS_MAX, Fact, RefusalLog
+from vram_arbiter.arbiter.log import LINES_MAX, REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
 
 EVENT = {"seq": 4, "at_wall_s": 1.0, "kind": "granted", "lease_id": "L1-4", "consumer": "detector",
          "charge_bytes": 5 << 30, "waited_s": 1.25, "reason": "fits"}  # fmt: skip
-
-
-def said(event: Mapping[str, Any]) -> Fact:
-    """An event as the history numbers it."""
-    return Fact(event["seq"], event["at_wall_s"], event["kind"], lambda: event)
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +30,7 @@ def _root_logger() -> Iterator[None]:
 
 def test_an_event_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("human", "info")
-    telemetry.log_event(said(EVENT))
+    telemetry.log_event(EVENT)
     line = capsys.readouterr().err
     assert line.endswith(
         'info     granted L1-4 (detector): charge=5 GiB, waited_s=1.25, reason="fits"\n'
@@ -45,7 +39,7 @@ def test_an_event_for_people(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_an_event_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("json", "info")
-    telemetry.log_event(said(EVENT))
+    telemetry.log_event(EVENT)
     line = json.loads(capsys.readouterr().err)
     assert line["event"] == EVENT
     assert line["level"] == "info"
@@ -53,16 +47,16 @@ def test_an_event_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_for_programs_names_its_span(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("json", "info")
-    telemetry.log_event(said(EVENT), {"trace_id": "a" * 32, "span_id": "b" * 16})
+    telemetry.log_event(EVENT, {"trace_id": "a" * 32, "span_id": "b" * 16})
     line = json.loads(capsys.readouterr().err)
     assert (line["event"], line["trace_id"], line["span_id"]) == (EVENT, "a" * 32, "b" * 16)
 
 
 def test_frequent_events_are_quiet_and_trouble_is_loud(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("human", "info")
-    telemetry.log_event(said({**EVENT, "kind": "use_began"}))
+    telemetry.log_event({**EVENT, "kind": "use_began"})
     assert capsys.readouterr().err == ""
-    telemetry.log_event(said({**EVENT, "kind": "lost"}))
+    telemetry.log_event({**EVENT, "kind": "lost"})
     assert " warning  lost L1-4" in capsys.readouterr().err
 
 
@@ -89,11 +83,11 @@ def test_a_log_that_is_not_read_holds_up_nothing_and_loses_lines_in_words() -> N
     root.handlers, root.level = [Slow()], logging.INFO
     close = telemetry.write_in_thread()
     for _ in range(LINES_MAX + 10):
-        telemetry.log_event(said(EVENT))
+        telemetry.log_event(EVENT)
     read.set()
     while len(lines) < LINES_MAX:
         time.sleep(0.001)
-    telemetry.log_event(said(EVENT))
+    telemetry.log_event(EVENT)
     close()
     logging.getLogger("x").warning("after the end")
     assert re.fullmatch(r"(9|10) lines are left out: the log was not read", lines[-3])

@@ -1,7 +1,7 @@
 """Effects are performed in order, and nothing is said about a grant that could not be
 written down."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,6 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.model.records import DrainRecord
 from vram_arbiter.arbiter.core.model.refusals import LeaseOver
 from vram_arbiter.arbiter.host.executor import Executor
-from vram_arbiter.arbiter.log import Fact
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
@@ -50,17 +49,17 @@ class Recorder:
     def push(self, client: ClientId, body: object) -> None:
         self.done.append(("push", client, body))
 
-    def broadcast(self, event: Fact) -> None:
-        self.done.append(("broadcast", event.kind))
+    def broadcast(self, event: Mapping[str, Any]) -> None:
+        self.done.append(("broadcast", event["kind"]))
 
     def apply(self, changes: Sequence[tuple[str, Mapping[str, Any] | None]]) -> None:
         if self.disk_full:
             raise JournalUnavailable("disk full")
         self.done.append(("journal", *changes))
 
-    def append(self, kind: str, facts: Callable[[], Mapping[str, Any]]) -> Fact:
+    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]:
         self.done.append(("history", kind))
-        return Fact(1, 1.0, kind, facts)
+        return {"kind": kind, **data}
 
     def sample(self, gpu: GpuId) -> None:
         self.done.append(("sample", gpu))
@@ -71,8 +70,8 @@ class Recorder:
     def post(self, event: ev.Event) -> None:
         self.done.append(("post", event))
 
-    def log_event(self, event: Fact, trace: object) -> None:
-        self.done.append(("log", event.kind))
+    def log_event(self, event: Mapping[str, Any], trace: object) -> None:
+        self.done.append(("log", event["kind"]))
 
 
 def test_a_signal_goes_to_whoever_watches_the_process() -> None:

@@ -6,7 +6,6 @@ import sqlite3
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +20,6 @@ from vram_arbiter.arbiter.host.history import (
     SKIPPED_AFTER_CRASH,
     History,
 )
-from vram_arbiter.arbiter.log import Fact
 from vram_arbiter.schemas.wire.replies import HistoryReply
 
 PATIENCE_S = 60.0
@@ -55,13 +53,11 @@ async def read(
 
 def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
     async def test(history: History) -> None:
-        event = history.append("granted", lambda: {"lease_id": "L1-1"})
-        assert event.plain() == {
-            "seq": 1, "at_wall_s": event.at_wall_s, "kind": "granted", "lease_id": "L1-1",
-        }  # fmt: skip
-        assert abs(event.at_wall_s - time.time()) < PATIENCE_S
-        history.append("ready", dict)
-        history.append("granted", lambda: {"lease_id": "L1-2"})
+        event = history.append("granted", {"lease_id": "L1-1"})
+        assert event["seq"] == 1
+        assert abs(event["at_wall_s"] - time.time()) < PATIENCE_S
+        history.append("ready", {})
+        history.append("granted", {"lease_id": "L1-2"})
         assert [e["seq"] for e in (await read(history)).events] == [1, 2, 3]
         assert [e["seq"] for e in (await read(history, after=1)).events] == [2, 3]
         assert [e["seq"] for e in (await read(history, limit=1)).events] == [1]
@@ -76,11 +72,11 @@ def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
 
 def test_numbering_goes_on_after_an_orderly_stop(tmp_path: Path) -> None:
     async def first(history: History) -> None:
-        history.append("granted", lambda: {"lease_id": "L1-1"})
-        history.append(CLEAN_END, dict)
+        history.append("granted", {"lease_id": "L1-1"})
+        history.append(CLEAN_END, {})
 
     async def second(history: History) -> None:
-        assert history.append("ready", dict).seq == 3
+        assert history.append("ready", {})["seq"] == 3
         events = (await read(history)).events
         assert [(e["seq"], e["kind"]) for e in events] == [
             (1, "granted"),
@@ -98,10 +94,10 @@ def test_numbering_goes_on_after_an_orderly_stop(tmp_path: Path) -> None:
 
 def test_after_a_crash_no_number_is_given_twice(tmp_path: Path) -> None:
     async def crash(history: History) -> None:
-        history.append("granted", dict)
+        history.append("granted", {})
 
     async def after(history: History) -> None:
-        assert history.append("ready", dict).seq == 2 + SKIPPED_AFTER_CRASH
+        assert history.append("ready", {})["seq"] == 2 + SKIPPED_AFTER_CRASH
 
     with_history(tmp_path, crash)
     with_history(tmp_path, after)
@@ -110,7 +106,7 @@ def test_after_a_crash_no_number_is_given_twice(tmp_path: Path) -> None:
 def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
     async def test(history: History) -> None:
         for number in range(RING_EVENTS + 50):
-            history.append("odd" if number % 2 else "even", partial(dict, number=number))
+            history.append("odd" if number % 2 else "even", {"number": number})
         old = (await read(history, after=10, limit=3)).events
         assert [e["seq"] for e in old] == [11, 12, 13]
         assert [e["number"] for e in (await read(history, kinds=("odd",), limit=2)).events] == [
@@ -125,7 +121,7 @@ def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
 def test_number_and_age_are_bounded(tmp_path: Path) -> None:
     async def many(history: History) -> None:
         for _ in range(module.PRUNE_EVERY_EVENTS + 10):
-            history.append("x", dict)
+            history.append("x", {})
 
     async def look(history: History) -> None:
         assert (await read(history)).events[0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
@@ -151,7 +147,7 @@ def test_a_wild_wall_clock_only_dates_events(tmp_path: Path) -> None:
         history = History.open(tmp_path, 100_000, 7.0, lambda: next(clock))
         history.start(asyncio.get_running_loop())
         for number in range(len(WILD)):
-            history.append("x", partial(dict, number=number))
+            history.append("x", {"number": number})
         found = (await read(history)).events
         assert [(e["seq"], e["number"], e["at_wall_s"]) for e in found] == [
             (number + 1, number, at) for number, at in enumerate(WILD)
@@ -171,7 +167,9 @@ def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(
     as older than a week."""
     store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
     assert store.last_seq() == 0
-    store.write([Fact(number, 60.0 * number, "x", dict) for number in range(1, 6)])
+    store.write(
+        [{"seq": number, "at_wall_s": 60.0 * number, "kind": "x"} for number in range(1, 6)]
+    )
     store.prune(1.8e9)
     assert [event["seq"] for event in store.find(0, 100, ())] == [1, 2, 3, 4, 5]
     store.close()
@@ -186,7 +184,7 @@ def test_a_broken_database_is_put_aside(tmp_path: Path) -> None:
     (tmp_path / "history.sqlite").write_bytes(b"junk" * 1000)
 
     async def test(history: History) -> None:
-        assert history.append("x", dict).seq == 1
+        assert history.append("x", {})["seq"] == 1
 
     with_history(tmp_path, test)
     assert list(tmp_path.glob("history.sqlite.corrupt-*"))
@@ -202,7 +200,7 @@ def test_without_a_disk_it_lives_in_memory(tmp_path: Path) -> None:
 
     async def test(history: History) -> None:
         for _ in range(RING_EVENTS + 5):
-            history.append("x", dict)
+            history.append("x", {})
         assert (await read(history)).events[0]["seq"] == 6
 
     with_history(tmp_path, test)
@@ -216,10 +214,10 @@ class HangingDisk:
         self.hangs, self.goes_on = threading.Event(), threading.Event()
         self.written: list[int] = []
 
-    def write(self, events: Sequence[Fact]) -> None:
+    def write(self, events: Sequence[Mapping[str, Any]]) -> None:
         self.hangs.set()
         assert self.goes_on.wait(PATIENCE_S)
-        self.written += [event.seq for event in events]
+        self.written += [event["seq"] for event in events]
 
     def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Mapping[str, Any]]:
         return [{"seq": after + 1}]
@@ -236,10 +234,10 @@ def test_a_disk_that_hangs_lets_no_more_pile_up_than_the_bound() -> None:
     async def run() -> None:
         history = History(cast(Any, disk), 0)
         history.start(asyncio.get_running_loop())
-        history.append("operator", dict)
+        history.append("operator", {})
         assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
         for _ in range(4 * BUFFER_MAX):
-            history.append("operator", dict)  # each asks to be written at once
+            history.append("operator", {})  # each asks to be written at once
         assert "does not answer" in history.problem
         disk.goes_on.set()
         newest = history.last_seq
@@ -261,7 +259,7 @@ def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:
         history = History(cast(Any, disk), 0)
         history.start(asyncio.get_running_loop())
         for _ in range(RING_EVENTS + 2):
-            history.append("operator", dict)
+            history.append("operator", {})
         assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
         for _ in range(QUESTIONS_MAX + 1):
             history.read(0, 1, (), answers.append)
@@ -287,7 +285,7 @@ def spoiled(folder: Path, statement: str, *values: object) -> None:
 
 
 async def nothing(history: History) -> None:
-    history.append("first", dict)
+    history.append("first", {})
 
 
 EVENT = "INSERT INTO events VALUES (?, 9e9, 'x', ?)"  # young enough to be kept
@@ -307,7 +305,7 @@ def test_an_event_that_cannot_be_read_does_not_hide_the_others(
 
     async def test(history: History) -> None:
         for _ in range(RING_EVENTS + 5):
-            history.append("x", dict)
+            history.append("x", {})
         found = (await read(history, limit=3)).events
         assert [event["seq"] for event in found] == [1, 3, SKIPPED_AFTER_CRASH + 4]
         assert (found[1]["kind"], found[1]["at_wall_s"]) == ("unreadable", 9e9)
@@ -328,7 +326,7 @@ def test_a_history_that_cannot_be_continued_is_put_aside(tmp_path: Path, stateme
 
     async def test(history: History) -> None:
         assert history.problem == ""
-        assert history.append("x", dict).seq == 1
+        assert history.append("x", {})["seq"] == 1
 
     with_history(tmp_path, test)
     assert list(tmp_path.glob("history.sqlite.corrupt-*"))

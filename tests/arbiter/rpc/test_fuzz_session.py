@@ -26,7 +26,6 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.executor import Executor
-from vram_arbiter.arbiter.log import Fact
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
@@ -129,10 +128,9 @@ class RealCore:
             else:
                 self.journal[key] = record
 
-    def append(self, kind: str, facts: Callable[[], Mapping[str, Any]]) -> Fact:
-        event = Fact(len(self.history) + 1, self.plant.now, kind, facts)
-        self.history.append(event.plain())
-        return event
+    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        self.history.append({"seq": len(self.history) + 1, "kind": kind, **data})
+        return self.history[-1]
 
     def _sample(self, gpu: GpuId) -> None:
         self.plant.now += 0.001
@@ -189,7 +187,7 @@ class Plant:
     def push(self, *arguments: Any) -> None:
         self.table.push(*arguments)
 
-    def broadcast(self, event: Fact) -> None:
+    def broadcast(self, event: Mapping[str, Any]) -> None:
         self.table.broadcast(event)
 
     def _read(

@@ -26,7 +26,6 @@ from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.records import record_of, records_of
 from vram_arbiter.arbiter.inbox import Inbox
-from vram_arbiter.arbiter.log import Fact
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
@@ -303,7 +302,7 @@ class _Outbox:
         self._sessions.push(client, body)
         self._daemon.crash_point("after a push")
 
-    def broadcast(self, event: Fact) -> None:
+    def broadcast(self, event: Mapping[str, Any]) -> None:
         self._sessions.broadcast(event)
 
 
@@ -338,11 +337,11 @@ class _Chronicle:
     def __init__(self, machine: Machine, epoch: int) -> None:
         self._machine, self._epoch = machine, epoch
 
-    def append(self, kind: str, facts: Callable[[], Mapping[str, Any]]) -> Fact:
-        history, data = self._machine.history, facts()
+    def append(self, kind: str, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        history = self._machine.history
         history.append(Happening(self._machine.clock.now, self._epoch, kind, data))
         self._machine.clock.say(f"note {kind} {data.get('lease_id', '')} {data.get('reason', '')}")
-        return Fact(len(history), self._machine.clock.now, kind, lambda: data)
+        return {"seq": len(history), "at_wall_s": self._machine.clock.now, "kind": kind, **data}
 
 
 def _asked(payload: bytes) -> str:
