@@ -38,6 +38,7 @@ from vram_arbiter.runner.cli.deployment import (
     unkept,
     unused,
 )
+from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
 from vram_arbiter.runner.cli.recording import (
     Recording,
     add_push_flags,
@@ -95,6 +96,7 @@ def add_parser(
         help="check everything, print what would run, open nothing",
     )
     add_push_flags(deploy)
+    add_display_flag(deploy)
     add_serving_flags(deploy)
     return deploy
 
@@ -167,6 +169,7 @@ class Deploy:
         check_endpoint(self._endpoint)
         if self._args.push_to_hub is not None and self._file.robot.save_dir is None:
             raise ConfigError("--push-to-hub is for a file with save_dir")
+        check_display_flag(self._args)
         parts = make_parts(self._file, self._clock)
         recorder = None
         manifests = read_manifests(self._args.skills or [default_skills()])
@@ -200,6 +203,7 @@ class Deploy:
             runner.spans.share = self._args.trace_ticks
             if (recording := recording_of(self._file.robot, parts)) is not None:
                 recorder = await record_into(recording, runner, self._stopping.set, stack)
+            display_runner(self._args, runner, arbiter, stack)
             control = await self._start(runner, stack)
             if control is None:
                 return 0

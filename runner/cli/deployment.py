@@ -339,7 +339,9 @@ def plan(
         skill = skill_named(robot.vla, catalogue.executable())
         lines.append(("task", f"{robot.task.id}: {skill} {robot.task.instruction!r}{limit}"))
     if robot.save_dir is not None:
-        lines.append(("record", f"every goal, as an episode of the dataset in {robot.save_dir}"))
+        columns = ", as lerobot-record writes it" if robot.save_format == "lerobot" else ""
+        said = f"every goal, as an episode of the dataset in {robot.save_dir}{columns}"
+        lines.append(("record", said))
     if robot.max_ticks is not None:
         lines.append(("end", f"after {robot.max_ticks} ticks"))
     lines += facts

@@ -28,6 +28,7 @@ from vram_arbiter.runner.cli.common import (
     unlicensed,
     warm_up,
 )
+from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
 from vram_arbiter.runner.cli.recording import (
     Recording,
     add_push_flags,
@@ -88,6 +89,7 @@ def add_parser(
         help="columns of the dataset: all, or those of lerobot-record with its names and units",
     )  # fmt: skip
     add_push_flags(sim)
+    add_display_flag(sim)
     sim.add_argument("--video", type=Path, help="write the episode as H.264 video to this file")
     sim.add_argument(
         "--timings",
@@ -142,6 +144,7 @@ async def run(args: argparse.Namespace) -> int:
     robot = world.robot
     joints, units = ((), None) if robot is None else (robot.joint_names, lerobot_units_of(robot))
     lerobot = lerobot_units_for(units, world.name) if args.record_format == "lerobot" else None
+    check_display_flag(args)
     check_output("--video", args.video)
     check_output("--timings", args.timings)
     policy = None if args.policy is None else policy_of(args.policy)
@@ -197,6 +200,7 @@ async def run(args: argparse.Namespace) -> int:
                 runner.request_stop if strict else stopping.set,
                 stack,
             )
+        display_runner(args, runner, arbiter, stack)
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)

@@ -390,6 +390,7 @@ class ControlLoop[R: Robot]:
 
     def _metadata(self) -> GoalData:
         late_ms, sink = self.timings.late_ms, self.slot.follower.sink
+        recorded = {} if sink is None else dict(sink.facts())  # a mere view has none
         return {
             **self.identity,
             "rate_hz": self.rate_hz,
@@ -399,7 +400,7 @@ class ControlLoop[R: Robot]:
             "start_late_ms": spread(late_ms),
             **self.slot.total.as_data(),
             "goals_by_skill": dict(self.slot.goals_by_skill),
-            **({} if sink is None else {"recorded": dict(sink.facts())}),
+            **({"recorded": recorded} if recorded else {}),
             **self.robot.facts(),
         }
 

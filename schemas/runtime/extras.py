@@ -30,6 +30,7 @@ EXTRA_OF: Mapping[str, str] = {
     "pandas": "dataset",
     "av": "dataset",
     "cyclonedds": "ros2",
+    "rerun": "viz",
 }
 
 

@@ -16,6 +16,8 @@ from typing import Any, ClassVar
 import pytest
 
 from tests.runner.recording.ticks import HEIGHT, TRACE, WIDTH, goal, span_of, tick
+from tests.support.rerun_files import rows_of
+from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.protocols import GoalTick
 from vram_arbiter.runner.recording import commit
 from vram_arbiter.runner.recording.columns import features_of, frame_of
@@ -245,3 +247,17 @@ def test_the_committed_dataset_is_pushed_whole(
         push(root, "me/set", private=True)  # the hub is gone
     with pytest.raises(ConfigError, match="has no episode to push"):
         push(tmp_path / "none", "me/set", private=True)
+
+
+def test_a_recording_is_exported_for_the_rerun_viewer(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rerun", reason="needs the viz extra")
+    out = tmp_path / "set.rrd"
+    assert main(["export", "--dataset", str(root), "--out", str(out)]) == 0
+    assert f"{FRAMES} frames in {out}" in capsys.readouterr().out
+    rows = rows_of(out)
+    wanted = ("/camera/front", "/state/elbow_flex.pos", "/action/gripper.pos", "/tick/withheld")
+    assert [rows[name] for name in wanted] == [FRAMES] * 4
+    assert main(["export", "--dataset", str(root), "--out", str(out), "--episode", "7"]) == 1
+    assert "there is no episode 7" in capsys.readouterr().err

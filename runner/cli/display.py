@@ -1,0 +1,70 @@
+"""`--display` of a serving command: ticks, the state between goals and the arbiter's leases."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+from collections import Counter
+from typing import Protocol
+
+from vram_arbiter.runner.control.loop import ControlLoop
+from vram_arbiter.runner.control.robot import Robot
+from vram_arbiter.runner.display.display import Display, Tee
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.wire.replies import StatusReply
+
+LEASES_PERIOD_S = 1.0
+
+
+class Leases(Protocol):
+    """What is needed of `clients.client.AsyncClient`."""
+
+    async def status(self) -> StatusReply: ...
+
+
+def add_display_flag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--display", metavar="rerun",
+        help="show cameras, state, actions, leases and goal: rerun starts the viewer,"
+        " rerun+http://HOST:PORT/proxy connects to one, FILE.rrd is written",
+    )  # fmt: skip
+
+
+def check_display_flag(args: argparse.Namespace) -> None:
+    """Raise ConfigError for an unknown target or missing packages, before anything is opened."""
+    if args.display is not None:
+        from vram_arbiter.runner.display.stream import check_display
+
+        check_display(args.display)
+
+
+def display_runner[R: Robot](
+    args: argparse.Namespace,
+    runner: ControlLoop[R],
+    arbiter: Leases | None,
+    stack: contextlib.AsyncExitStack,
+) -> None:
+    """Show the runner until the stack is left, beside its recorder; call it after `record_into`."""
+    if args.display is None:
+        return
+    from vram_arbiter.runner.display.stream import RerunStream
+
+    name = str(runner.identity.get("robot", "runner"))
+    display = Display(lambda: RerunStream(args.display, name), lambda: runner.world)
+    stack.push_async_callback(asyncio.to_thread, display.close)
+    follower = runner.slot.follower
+    follower.sink = display if follower.sink is None else Tee((follower.sink, display))
+    if arbiter is not None:
+        polling = asyncio.create_task(_show_leases(arbiter, display), name="leases' display")
+        stack.callback(polling.cancel)
+
+
+async def _show_leases(arbiter: Leases, display: Display) -> None:
+    while True:
+        with contextlib.suppress(VramError):  # a daemon that restarts is asked again
+            charged: Counter[str] = Counter()
+            for lease in (await arbiter.status()).leases:
+                charged[lease.consumer] += lease.charge_bytes
+            display.leases(charged)
+        await asyncio.sleep(LEASES_PERIOD_S)

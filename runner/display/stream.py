@@ -1,0 +1,136 @@
+"""What a runner sees and does as a Rerun recording: for a viewer, or in a file.
+
+`rerun` is imported when a stream is made; it is lerobot's visualizer (extra `viz`). Entities:
+`camera/NAME`, `state/JOINT`, `action/JOINT`, `base/…`, `tick/…`, `leases/NAME`, `goal` and `events`,
+on the timelines `time` and `tick`. Must not know threads, robots or sockets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from vram_arbiter.runner.protocols import GoalTick
+from vram_arbiter.runner.recording.rows import COLOURS
+from vram_arbiter.runner.sensors.pictures import as_rgb
+from vram_arbiter.schemas.errors import ConfigError, FrameStale, ModelError
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, WorldState
+
+APPLICATION = "vram-runner"
+RERUN = "rerun"
+JPEG_QUALITY = 85
+GIB = 1 << 30
+
+
+def check_display(target: str) -> None:
+    """Raise ConfigError for a target that is not one, or without the packages."""
+    if target != RERUN and not target.startswith(f"{RERUN}+http") and not target.endswith(".rrd"):
+        raise ConfigError(
+            f"--display {target}: expected rerun, rerun+http://HOST:PORT/proxy or FILE.rrd"
+        )
+    need("--display", "rerun", "cv2", extra="viz")
+
+
+class RerunStream:
+    """One recording. `target`: `rerun` starts a viewer, `rerun+http://…/proxy` connects to one, a
+    path ending in `.rrd` is written. Calls on one thread.
+    """
+
+    def __init__(self, target: str, name: str) -> None:
+        import rerun
+
+        self._rerun = rerun
+        self._stream = rerun.RecordingStream(APPLICATION, recording_id=None)
+        self._stream.send_recording_name(name)
+        if target == RERUN:
+            self._stream.spawn(memory_limit="10%", hide_welcome_screen=True)
+        elif target.endswith(".rrd"):
+            self._stream.save(target)
+        else:
+            self._stream.connect_grpc(target)
+
+    def close(self) -> None:
+        """Finish the file, or send the rest to the viewer."""
+        self._stream.flush(timeout_sec=5.0)
+        self._stream.disconnect()
+
+    # -- what is shown
+    def at(self, time_s: float, tick: int | None = None) -> None:
+        """Set the time of what is shown next."""
+        self._stream.set_time("time", duration=time_s)
+        if tick is not None:
+            self._stream.set_time("tick", sequence=tick)
+
+    def numbers(self, group: str, values: Mapping[str, float]) -> None:
+        """Show one number by name each."""
+        for name, value in values.items():
+            self._stream.log(f"{group}/{name}", self._rerun.Scalars([value]))
+
+    def event(self, text: str, level: str = "INFO") -> None:
+        """Show a line of the log."""
+        self._stream.log("events", self._rerun.TextLog(text, level=level))
+
+    def goal(self, text: str) -> None:
+        """Show what the robot is doing, in place of what it did before."""
+        self._stream.log("goal", self._rerun.TextDocument(text))
+
+    def picture(self, camera: str, rgb: Any) -> None:
+        """Show a picture: uint8, height × width × 3."""
+        import cv2
+
+        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if done:
+            self._encoded(camera, bytes(data))
+
+    def _encoded(self, camera: str, jpeg: bytes) -> None:
+        image = self._rerun.EncodedImage(contents=jpeg, media_type="image/jpeg")
+        self._stream.log(f"camera/{camera}", image)
+
+    def frames(self, frames: Mapping[str, SensorFrame]) -> None:
+        """Show the cameras' pictures; those without colors are left out."""
+        for camera, frame in frames.items():
+            if frame.data is None or frame.encoding not in COLOURS:
+                continue
+            if frame.encoding is FrameEncoding.JPEG:
+                self._encoded(camera, frame.data)
+                continue
+            try:
+                self.picture(camera, as_rgb(frame))
+            except (FrameStale, ModelError) as error:
+                self.event(f"camera {camera}: {error.message}", "WARN")
+
+    def world(self, world: WorldState, *, pictures: bool) -> None:
+        """Show a state of the world."""
+        joints = world.joint_state
+        self.numbers("state", dict(zip(joints.name, joints.position, strict=True)))
+        if world.base_pose is not None:
+            self.numbers("base", dict(zip("xyz", world.base_pose.xyz, strict=True)))
+        if pictures:
+            self.frames(world.image_frames or {})
+
+    def tick(self, tick: GoalTick, *, pictures: bool) -> None:
+        """Show a tick of a goal: what was seen, what the motors were told, what was withheld."""
+        result = tick.result
+        self.at(tick.world.stamp_ns / 1e9, result.tick_idx)
+        self.world(tick.world, pictures=pictures)
+        self.numbers("action", tick.targets)
+        if tick.base_velocity is not None:
+            self.numbers(
+                "action/base", dict(zip(("vx", "vy", "wz"), tick.base_velocity, strict=True))
+            )
+        if tick.transition is not None:
+            self.numbers("state", tick.transition.shown)
+            self.numbers("action", tick.transition.sent)
+        withheld = bool(result.safety_violations) and not result.action_applied
+        timings = {"ms": result.tick_ms, "inference_ms": result.inference_ms}
+        self.numbers("tick", {**timings, "withheld": float(withheld)})
+        if result.reward is not None:
+            self.numbers("tick", {"reward": result.reward})
+        for text in result.safety_violations:
+            self.event(f"withheld: {text}" if withheld else text, "WARN")
+
+    def leases(self, charged: Mapping[str, float]) -> None:
+        """Show the bytes that leases are charged, by holder, as GiB."""
+        self.numbers("leases", {name: size / GIB for name, size in charged.items()})

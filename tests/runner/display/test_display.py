@@ -1,0 +1,108 @@
+"""The live view: it never holds the control thread up, and a Rerun file has everything it shows."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.runner.recording.ticks import DONE, FAILED, goal, tick
+from tests.support.rerun_files import rows_of
+from tests.support.waiting import until
+from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.display.display import PICTURES_UNTIL, QUEUE_TICKS, Display, Tee
+from vram_arbiter.runner.protocols import GoalTick
+
+
+class Slow:
+    """A viewer that starts when the test says so."""
+
+    def __init__(self) -> None:
+        self.may_start = threading.Event()
+        self.shown: list[bool] = []
+
+    def make(self) -> Any:
+        assert self.may_start.wait(60)
+        return self
+
+    def tick(self, shown: GoalTick, *, pictures: bool) -> None:
+        assert (shown.world.image_frames is not None) is pictures
+        self.shown.append(pictures)
+
+    def at(self, *_: object) -> None: ...
+
+    goal = event = leases = at
+
+    def close(self) -> None: ...
+
+
+def test_a_viewer_that_hangs_costs_pictures_first_and_never_time() -> None:
+    viewer = Slow()
+    display = Display(viewer.make, lambda: None)
+    for index in range(QUEUE_TICKS + 5):
+        display.tick(tick(index))
+    display.goal_ended(goal(), DONE)
+    assert (display.dropped_pictures, display.dropped_ticks) == (QUEUE_TICKS - PICTURES_UNTIL, 5)
+    viewer.may_start.set()
+    display.close()
+    assert viewer.shown == [True] * PICTURES_UNTIL + [False] * (QUEUE_TICKS - PICTURES_UNTIL)
+
+
+def test_a_viewer_that_breaks_is_said_once_and_the_robot_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def make() -> Any:
+        raise OSError("no display")
+
+    display = Display(make, lambda: None)
+    until(lambda: "nothing more is displayed" in caplog.text)
+    for index in range(2 * QUEUE_TICKS):
+        display.tick(tick(index))
+    display.close()
+    assert display.dropped_ticks == 0
+
+
+def test_one_runner_is_recorded_and_displayed() -> None:
+    viewer, other = Slow(), Slow()
+    viewer.may_start.set()
+    other.may_start.set()
+    both = [Display(each.make, lambda: None) for each in (viewer, other)]
+    tee = Tee(tuple(both))
+    tee.tick(tick(0))
+    tee.goal_ended(goal(), None)
+    for display in both:
+        display.close()
+    assert (viewer.shown, other.shown, tee.facts()) == ([True], [True], {})
+
+
+@pytest.mark.heavy
+def test_a_rerun_file_has_cameras_states_actions_withheld_actions_leases_and_the_goal(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("rerun", reason="needs the viz extra")
+    from vram_arbiter.runner.display.stream import RerunStream
+
+    out = tmp_path / "run.rrd"
+    idle = tick(0).world
+    display = Display(lambda: RerunStream(str(out), "bench"), lambda: idle)
+    for index in range(3):
+        display.tick(tick(index, safety_violations=("too fast",), action_applied=index > 0))
+    display.goal_ended(goal(), FAILED)
+    display.leases({"grab": 3 << 30})
+    display.leases({})
+    display.close()
+    rows = rows_of(out)
+    assert rows["/camera/front"] == 3
+    assert rows["/state/pan"] == rows["/action/grip"] == rows["/tick/withheld"] == 3
+    assert rows["/base/x"] == rows["/action/base/wz"] == 3
+    assert rows["/leases/grab"] == 2
+    assert rows["/goal"] == 2  # it begins and ends
+    assert rows["/events"] == 3 + 2 + 2  # violations, the goal's ends, the lease's
+
+
+@pytest.mark.heavy
+def test_a_display_that_is_none_is_refused_before_a_world_begins(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["sim", "--no-arbiter", "--display", "foxglove"]) == 2
+    assert "expected rerun, rerun+http://HOST:PORT/proxy or FILE.rrd" in capsys.readouterr().err
