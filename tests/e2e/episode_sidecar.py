@@ -64,13 +64,13 @@ class StillModel:
         return {"action": np.tile(call.data["observation"]["observation.state"], (10, 1))}
 
 
-def adapter_for(folder: Path, manifest: RSkillManifest, weights: Weights) -> Any:
+def still_for(folder: Path, manifest: RSkillManifest, weights: Weights) -> Any:
     return StillModel(manifest, folder)
 
 
 def main() -> int:
     folder = Path(sys.argv.pop(1))
-    return serve(adapter_for=functools.partial(adapter_for, folder))
+    return serve(adapter_for=functools.partial(still_for, folder))
 
 
 if __name__ == "__main__":

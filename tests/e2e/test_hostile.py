@@ -51,7 +51,7 @@ def attack(arbiter: ArbiterProcess, script: str, **words: Any) -> "subprocess.Po
     )
 
 
-def findings(attacker: "subprocess.Popen[str]") -> dict[str, Any]:
+def report_of(attacker: "subprocess.Popen[str]") -> dict[str, Any]:
     out, _ = attacker.communicate(timeout=PATIENCE_S)
     assert attacker.returncode == 0, out
     found: dict[str, Any] = json.loads(out.splitlines()[-1])
@@ -152,7 +152,7 @@ done()
 os._exit(0)
 """,
     )
-    findings(hasty)
+    report_of(hasty)
     honest.is_alone()
 
 
@@ -225,7 +225,7 @@ done(**codes)
 """,
         on=honest.on,
     )
-    found = findings(thief)
+    found = report_of(thief)
     assert {found.pop(op) for op in ("ready", "revoke_ack", "unloading", "release", "oom", "cancel",
     "renew",
                                      "reattach")} == {"not_permitted"}  # fmt: skip
@@ -247,7 +247,7 @@ clients = client.ask("status")["clients"]
 done(clients=clients, left=client.ask("bye")["ok"])
 """,
     )
-    assert findings(forger) == {"clients": 3, "left": True}, "it is a client of its own"
+    assert report_of(forger) == {"clients": 3, "left": True}, "it is a client of its own"
     assert mine.ask("ping")["ok"]
     assert mine.ask("bye")["ok"]
     honest.is_alone()
@@ -264,7 +264,7 @@ done(code=answer["error"]["code"])
 """,
         pid=os.getpid(),
     )
-    assert findings(liar)["code"] == "bad_request"
+    assert report_of(liar)["code"] == "bad_request"
     honest.is_alone()
 
 
@@ -281,5 +281,5 @@ with WireClient(endpoint) as client:
     done(clients=client.hello("again", instance="one").ask("status")["clients"])
 """,
     )
-    assert findings(storm)["clients"] == 2
+    assert report_of(storm)["clients"] == 2
     honest.is_alone()

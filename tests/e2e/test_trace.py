@@ -138,7 +138,7 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
         programs = Programs(arbiter, collector.environ() | llm)
         stack.callback(programs.close)
         try:
-            codes = played(arbiter, programs, collector, tmp_path)
+            codes = run_programs(arbiter, programs, collector, tmp_path)
         except (AssertionError, VramError, subprocess.TimeoutExpired):
             print(programs.log.read_text(errors="replace")[-6000:])
             raise
@@ -149,7 +149,7 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
     judge(Trace(collector.spans()), collector)
 
 
-def played(
+def run_programs(
     arbiter: ArbiterProcess, programs: Programs, collector: Collector, folder: Path
 ) -> list[int]:
     """Start the programs, let the arm move, end them. Their exit codes, the last started first."""

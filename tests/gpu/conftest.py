@@ -14,6 +14,7 @@ import pytest
 
 from tests.gpu import weights_model
 from tests.support.process import ArbiterProcess
+from tests.support.processes import children, server_of_imports
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.clients.calibration.gpu import FakeGpu, Gpu, NvmlGpu
@@ -89,7 +90,7 @@ class Model:
     @property
     def forks(self) -> tuple[int, int]:
         """Pids of the server of imports and of the keeper of the weights."""
-        (server,) = [pid for pid in children(self.process.pid) if "forkserver" in command(pid)]
+        server = server_of_imports(self.process.pid)
         (keeper,) = children(server)
         return server, keeper
 
@@ -195,19 +196,6 @@ def machine(kind: str, make_arbiter: Callable[..., ArbiterProcess]) -> Iterator[
         made = Machine(kind, make_arbiter(gpu="nvml").start(), NvmlGpu(0), 512 * MIB)
     yield made
     made.close()
-
-
-def children(pid: int) -> list[int]:
-    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(child) for child in listed.split()]
-
-
-def command(pid: int) -> str:
-    return Path(f"/proc/{pid}/cmdline").read_text()
-
-
-def threads(pid: int) -> int:
-    return len(os.listdir(f"/proc/{pid}/task"))
 
 
 def back(machine: Machine, used_bytes: int) -> bool:

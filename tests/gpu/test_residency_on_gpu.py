@@ -6,9 +6,10 @@ import signal
 
 import pytest
 
-from tests.gpu.conftest import GIB, NF4, Machine, Model, back, threads
+from tests.gpu.conftest import GIB, NF4, Machine, Model, back
 from tests.gpu.weights_model import LAYER_BYTES
 from tests.support.process import vramctl
+from tests.support.processes import threads
 from tests.support.waiting import until
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.nightly]

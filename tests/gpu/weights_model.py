@@ -124,13 +124,13 @@ class WeightsModel:
         return time.perf_counter() - began_s
 
 
-def adapter_for(weights_bytes: int, manifest: RSkillManifest, weights: Any) -> WeightsModel:
+def weights_for(weights_bytes: int, manifest: RSkillManifest, weights: Any) -> WeightsModel:
     return WeightsModel(weights_bytes, manifest)
 
 
 def main() -> int:
     weights_bytes = int(sys.argv.pop(1))
-    return serve(adapter_for=functools.partial(adapter_for, weights_bytes))
+    return serve(adapter_for=functools.partial(weights_for, weights_bytes))
 
 
 if __name__ == "__main__":

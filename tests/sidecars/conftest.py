@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.fakegpu_check import check_log
 from tests.support.prepared import start
+from tests.support.processes import children, server_of_imports
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
@@ -74,21 +75,6 @@ class Sidecar:
     @property
     def log(self):
         return (self.folder / "log").read_text()
-
-
-def children(pid):
-    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(child) for child in listed.split()]
-
-
-def server_of_imports(sidecar):
-    """Return the pid of the sidecar's child from which its keeper is forked."""
-    (server,) = [
-        pid
-        for pid in children(sidecar)
-        if "resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_text()
-    ]
-    return server
 
 
 class Box:

@@ -66,13 +66,13 @@ class EchoAdapter:
         return {"ok": True, "answer": query, "norm": 1000, "detections": []}
 
 
-def adapter_for(folder: Path, manifest, weights) -> EchoAdapter:
+def echo_for(folder: Path, manifest, weights) -> EchoAdapter:
     return EchoAdapter(folder)
 
 
 def main() -> int:
     folder = Path(sys.argv.pop(1))
-    return serve(adapter_for=functools.partial(adapter_for, folder))
+    return serve(adapter_for=functools.partial(echo_for, folder))
 
 
 if __name__ == "__main__":

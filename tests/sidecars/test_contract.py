@@ -18,10 +18,11 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.sidecars.conftest import children, server_of_imports
 from tests.support.fakegpu_check import check_log
+from tests.support.pictures import encoded
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
+from tests.support.processes import children, server_of_imports
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe
@@ -37,14 +38,8 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 type Message = dict[str, Any]
 
 
-def picture() -> bytes:
-    import io
-
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.new("RGB", (96, 96), (200, 30, 30)).save(stream, "PNG")
-    return stream.getvalue()
+def red() -> bytes:
+    return encoded(size=(96, 96), color=(200, 30, 30))
 
 
 def observation(cameras: tuple[str, ...]) -> Message:
@@ -71,13 +66,13 @@ class Kind:
 KINDS = (
     Kind(
         "detector", "rskills/so101-detector",
-        lambda: {"op": "detect", "image": picture(), "query": "red cube"},
+        lambda: {"op": "detect", "image": red(), "query": "red cube"},
         lambda: {"op": "detect", "image": b"\x89PNG no picture", "query": "red cube"},
     ),
     Kind(
         "scene-vlm", "rskills/so101-scene-vlm",
-        lambda: {"op": "query", "image": picture(), "question": "is the red cube held?"},
-        lambda: {"op": "query", "image": picture(), "question": "held?", "max_new_tokens": -1},
+        lambda: {"op": "query", "image": red(), "question": "is the red cube held?"},
+        lambda: {"op": "query", "image": red(), "question": "held?", "max_new_tokens": -1},
         slow=True,
     ),
     Kind(
@@ -86,7 +81,7 @@ KINDS = (
     ),
     Kind(
         "reward", "rskills/so101-progress",
-        lambda: {"op": "score", "task": "grab the red cube", "images": [picture()]},
+        lambda: {"op": "score", "task": "grab the red cube", "images": [red()]},
         lambda: {"op": "score", "task": "grab the red cube", "images": []},
         slow=True,
     ),

@@ -13,8 +13,8 @@ from time import monotonic
 
 import pytest
 
-from tests.sidecars.conftest import children, server_of_imports
 from tests.support.paths import SUPPORT
+from tests.support.processes import children, server_of_imports
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.sidecars.conftest import PNG
-from tests.sidecars.echo_sidecar import adapter_for
+from tests.sidecars.echo_sidecar import echo_for
 from tests.support.matrix_model import matrix_for
 from tests.support.waiting import until
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
@@ -60,7 +60,7 @@ class Place:
             "eye", parse_manifest(MANIFEST), Weights("test/eye"), footprint,
             f"ipc://{self.folder}/eye.sock", f"fake:{self.card}", None
         )  # fmt: skip
-        echo = functools.partial(adapter_for, self.folder)
+        echo = functools.partial(echo_for, self.folder)
         made = ModelProcesses(settings, adapter or echo, no_log)
         self.made.append(made)
         return made

@@ -36,20 +36,20 @@ FIELD = {
 }
 
 
-def manifest(dtype: str, **fields: Any) -> RSkillManifest:
+def grab_manifest(dtype: str, **fields: Any) -> RSkillManifest:
     found = load_manifest(configs_folder({}) / "rskills/so101-grab/rskill.yaml")
     asked = Quantization.model_validate({"dtype": dtype, **fields})
     return found.model_copy(update={"quantization": asked})
 
 
 def int4(**extra: Any) -> RSkillManifest:
-    return manifest("int4", extra={"min_params_to_quantize": 0, **extra})
+    return grab_manifest("int4", extra={"min_params_to_quantize": 0, **extra})
 
 
 def test_what_the_field_writes_about_nf4_is_read() -> None:
-    assert nf4_of(manifest("int4", extra=FIELD)) == Nf4(min_params=4_000_000)
-    assert nf4_of(manifest("int4")) == Nf4()
-    assert nf4_of(manifest("bf16")) is None
+    assert nf4_of(grab_manifest("int4", extra=FIELD)) == Nf4(min_params=4_000_000)
+    assert nf4_of(grab_manifest("int4")) == Nf4()
+    assert nf4_of(grab_manifest("bf16")) is None
     assert nf4_of(int4(skip_modules=["visual"], compute_dtype="float16")) == Nf4(
         quantization.Dtype.FP16, ("visual",), 0
     )
@@ -69,7 +69,7 @@ def test_what_cannot_be_honored_is_refused(extra: dict[str, Any], told: str) -> 
     """A bare text as skip_modules was taken apart into its letters; unknown keys were ignored."""
     for dtype in ("int4", "bf16"):
         with pytest.raises(ConfigError, match=told):
-            nf4_of(manifest(dtype, extra=extra))
+            nf4_of(grab_manifest(dtype, extra=extra))
 
 
 @pytest.mark.parametrize("dtype", ["int8", "fp8", "fp4_nvfp4"])
@@ -77,7 +77,7 @@ def test_a_number_format_that_is_not_served_is_refused_on_every_device(dtype: st
     """Regression: such a model ran in bf16 on a GPU and in float32 on the CPU."""
     for device in ("cpu", "cuda:0", "none"):
         with pytest.raises(UnsupportedQuantization, match="supported: fp32, fp16, bf16, int4") as e:
-            check_precision(manifest(dtype), device)
+            check_precision(grab_manifest(dtype), device)
     assert e.value.details["dtype"] == dtype
     assert CODES["unsupported_quantization"] is UnsupportedQuantization
 
@@ -86,7 +86,7 @@ def test_int4_without_bitsandbytes_is_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(quantization.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UnsupportedQuantization, match="needs bitsandbytes"):
         nf4_of(int4())
-    assert nf4_of(manifest("fp16")) is None
+    assert nf4_of(grab_manifest("fp16")) is None
 
 
 class TestQuantizedLinear:
@@ -144,12 +144,12 @@ class TestQuantizedLinear:
         self, model: Any
     ) -> None:
         """Regression: a reward model ran in its code's number format, whatever its manifest."""
-        check_weights(model, manifest("fp32"))
+        check_weights(model, grab_manifest("fp32"))
         with pytest.raises(UnsupportedQuantization, match=r"weights in fp32 \(write dtype: fp32"):
-            check_weights(model, manifest("bf16"))
+            check_weights(model, grab_manifest("bf16"))
         model.bfloat16()
         model.embed.float()
-        check_weights(model, manifest("bf16"))
+        check_weights(model, grab_manifest("bf16"))
 
     def test_skipped_modules_and_small_layers_stay(self, model: Any) -> None:
         from bitsandbytes.nn import Linear4bit
@@ -164,8 +164,8 @@ class TestQuantizedLinear:
         with pytest.raises(ConfigError, match="'vision_tower', and Model has no such module"):
             quantize_linear(model, int4(skip_modules=["vision_tower"]))
         with pytest.raises(UnsupportedQuantization, match="no linear layer to quantize"):
-            quantize_linear(model, manifest("int4"))
-        quantize_linear(model, manifest("fp32"))
+            quantize_linear(model, grab_manifest("int4"))
+        quantize_linear(model, grab_manifest("fp32"))
         assert type(model.layers[0]).__name__ == "Linear"
 
 
@@ -182,14 +182,14 @@ def test_a_gpu_that_cannot_compute_in_the_number_format_is_refused(
     monkeypatch: pytest.MonkeyPatch, dtype: str, extra: dict[str, Any], needs: tuple[int, int]
 ) -> None:
     """Regression: torch emulates bf16 on such a GPU, many times slower."""
-    asked = manifest(dtype, extra=extra)
+    asked = grab_manifest(dtype, extra=extra)
     has = [(5, 2)]
     monkeypatch.setattr(quantization, "capabilities", lambda device: has)
     for device in ("cuda", "cuda:1"):
         with pytest.raises(UnsupportedQuantization, match=f"capability {needs[0]}.{needs[1]}"):
             check_precision(asked, device)
     check_precision(asked, "cpu")
-    check_precision(manifest("fp32"), "cuda")
+    check_precision(grab_manifest("fp32"), "cuda")
     has.append(needs)
     check_precision(asked, "cuda")
 

@@ -9,6 +9,7 @@ import msgpack
 import pytest
 import zmq
 
+from tests.support.pictures import encoded
 from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
 from vram_arbiter.schemas.sidecar import PICTURES_MAX, DetectOp, EndpointCall, ScoreOp
@@ -255,21 +256,13 @@ def test_clients_of_the_field_get_their_familys_shapes():
 
 
 # -- pictures
-def picture(kind, size=(8, 6), mode="RGB"):
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.new(mode, size).save(stream, kind)
-    return stream.getvalue()
-
-
 def test_pictures_of_any_mode_become_rgb():
     pytest.importorskip("PIL")
     for data in (
-        picture("PNG", mode="RGBA"),
-        picture("PNG", mode="L"),
-        picture("PNG", mode="P"),
-        picture("JPEG"),
+        encoded("PNG", mode="RGBA"),
+        encoded("PNG", mode="L"),
+        encoded("PNG", mode="P"),
+        encoded("JPEG"),
     ):
         found = decode(data)
         assert (found.mode, found.size) == ("RGB", (8, 6))
@@ -277,11 +270,11 @@ def test_pictures_of_any_mode_become_rgb():
 
 def test_what_is_no_picture_or_too_large_is_refused():
     pytest.importorskip("PIL")
-    whole = picture("PNG", size=(64, 64))
+    whole = encoded("PNG", size=(64, 64))
     for data, told in (
         (b"no picture", "cannot be decoded"), (whole[: len(whole) // 2], "cannot be decoded"),
-        (picture("GIF"), "cannot be decoded"),
-        (picture("PNG", size=(4200, 4200), mode="1"), "4200 x 4200"),
+        (encoded("GIF"), "cannot be decoded"),
+        (encoded("PNG", size=(4200, 4200), mode="1"), "4200 x 4200"),
     ):  # fmt: skip
         with pytest.raises(BadRequest, match=told):
             decode(data)

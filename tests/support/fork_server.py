@@ -37,7 +37,7 @@ def lend() -> None:
     pid = os.fork()
     if pid == 0:
         orders.close()
-        _become(ordered)
+        _run_server(ordered)
     ordered.close()
     start = util.spawnv_passfds  # type: ignore[attr-defined]
 
@@ -53,7 +53,7 @@ def lend() -> None:
     util.spawnv_passfds = spawn  # type: ignore[attr-defined]
 
 
-def _become(ordered: socket.socket) -> NoReturn:
+def _run_server(ordered: socket.socket) -> NoReturn:
     """Run the server; end with the program where it starts none."""
     code = 1
     try:

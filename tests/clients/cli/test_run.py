@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
@@ -23,7 +24,6 @@ from vram_arbiter.clients.foreign.program import ForeignProgram
 from vram_arbiter.clients.foreign.supervisor import RunSpec, Supervisor
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.spec import LeaseSpec
-from vram_arbiter.schemas.wire.views import LeaseView
 
 Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
@@ -79,12 +79,7 @@ def running(
         process.communicate(timeout=PATIENCE_S)
 
 
-def view(client: Client, consumer: str) -> LeaseView:
-    (found,) = [lease for lease in client.status().leases if lease.consumer == consumer]
-    return found
-
-
-def said(process: "subprocess.Popen[str]") -> str:
+def error_line(process: "subprocess.Popen[str]") -> str:
     assert process.stderr is not None
     return process.stderr.readline()
 
@@ -236,10 +231,10 @@ def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
             command("--name", "next", "--wait", "60", program="raise SystemExit(4)"),
             env=arbiter_daemon.environ, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert "waiting: " in said(second)
+        assert "waiting: " in error_line(second)
         if not options:
-            assert "next waits for its room (priority 40)" in said(first)
-        assert (view(client, "job").uses, first.poll()) == (1, None)
+            assert "next waits for its room (priority 40)" in error_line(first)
+        assert (view_of(client, "job").uses, first.poll()) == (1, None)
         first.terminate()
         assert first.wait(PATIENCE_S) == 5
     assert second.wait(PATIENCE_S) == 4
@@ -266,10 +261,10 @@ def test_a_higher_priority_behind_an_equal_one_ends_the_program(
         equal = subprocess.Popen(
             command("--name", "next", program="pass"), env=arbiter_daemon.environ
         )
-        assert "next waits" in said(process)
+        assert "next waits" in error_line(process)
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert process.wait(PATIENCE_S) == 5
-        assert "b needs the room; sending SIGTERM" in said(process)
+        assert "b needs the room; sending SIGTERM" in error_line(process)
     lease.release()
     assert equal.wait(PATIENCE_S) == 0
 
@@ -281,10 +276,10 @@ def test_an_operator_ends_the_program_although_it_keeps_another_waiting(
     environ = arbiter_daemon.environ
     with running(environ) as process:
         equal = subprocess.Popen(command("--name", "next", program="pass"), env=environ)
-        assert "next waits" in said(process)
+        assert "next waits" in error_line(process)
         assert vramctl("evict", "job", "--reason", "lunch", environ=environ).returncode == 0
         assert process.wait(PATIENCE_S) == 5
-        assert "lunch; sending SIGTERM" in said(process)
+        assert "lunch; sending SIGTERM" in error_line(process)
     assert equal.wait(PATIENCE_S) == 0
 
 
@@ -303,9 +298,9 @@ def test_run_is_pinned_only_on_request(
     client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     with running(arbiter_daemon.environ, "--pin"):
-        assert view(client, "job").evictable is False
+        assert view_of(client, "job").evictable is False
     with running(arbiter_daemon.environ, "--priority", "60", "--on-revoke", "term") as process:
-        assert view(client, "job").evictable is True
+        assert view_of(client, "job").evictable is True
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert process.wait(PATIENCE_S) == 5
     lease.release()

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.leases import view_of
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.cli.run import check_gpus
@@ -21,7 +22,7 @@ from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.wire.spec import LeaseSpec
-from vram_arbiter.schemas.wire.views import GpuView, LeaseView
+from vram_arbiter.schemas.wire.views import GpuView
 
 pytestmark = pytest.mark.e2e
 Spec = Callable[..., LeaseSpec]
@@ -96,11 +97,6 @@ def server(
         yield run, int(run.line())
 
 
-def view(client: Client, consumer: str = "job") -> LeaseView:
-    (found,) = [lease for lease in client.status().leases if lease.consumer == consumer]
-    return found
-
-
 def until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
@@ -133,11 +129,11 @@ def test_a_stopped_program_is_started_again(
         run.said("ended 1 of its processes")
         assert not alive(first)
         assert not alive(orphan)
-        assert view(client).state == "standby"
+        assert view_of(client, "job").state == "standby"
         lease.release()
         second, _ = map(int, run.line().split())
         assert second != first
-        until(lambda: view(client).state == "held")
+        until(lambda: view_of(client, "job").state == "held")
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert not alive(second)
         run.process.send_signal(signal.SIGTERM)  # nothing runs that could take it
@@ -172,12 +168,15 @@ def test_a_server_frees_its_memory_and_takes_it_back(
     with server(arbiter_daemon, "vllm", "--url", "URL", "--priority", "60") as (run, pid):
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         run.said("freeing by vllm")
-        assert (view(client).state, view(client).parked_bytes) == ("parked", 5 << 30)
+        assert (view_of(client, "job").state, view_of(client, "job").parked_bytes) == (
+            "parked",
+            5 << 30,
+        )
         assert used_bytes(client) < 1 << 30
         lease.release()
         run.said("restored")
         until(lambda: used_bytes(client) > 4 << 30)
-        assert view(client).state == "held"
+        assert view_of(client, "job").state == "held"
         order = ("evict", "job", "-r", "lunch")
         assert vramctl(*order, environ=arbiter_daemon.environ).returncode == 0
         assert "lunch" in run.said("freeing by vllm")

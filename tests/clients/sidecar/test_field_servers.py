@@ -2,14 +2,13 @@
 in their own shapes. None of their operations worked."""
 
 import asyncio
-import io
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.support.field_server import PNG, FieldServer
+from tests.support.pictures import encoded
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar.field import grounded
 from vram_arbiter.clients.sidecar.perception import (
@@ -37,24 +36,16 @@ pytestmark = pytest.mark.anyio
 GROUNDED = "<ref>red cube</ref><box><100><200><300><600></box>"
 
 
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="fs") as name:  # short: a socket path holds 107 bytes
-        yield Path(name)
-
-
 @pytest.fixture(params=["ipc", "tcp"])
-def server(request: pytest.FixtureRequest, folder: Path) -> Iterator[FieldServer]:
-    where = f"ipc://{folder}/s" if request.param == "ipc" else "tcp://127.0.0.1:*"
+def server(request: pytest.FixtureRequest, short_folder: Path) -> Iterator[FieldServer]:
+    where = f"ipc://{short_folder}/s" if request.param == "ipc" else "tcp://127.0.0.1:*"
     with FieldServer(where, GROUNDED) as started:
         yield started
 
 
-def picture(blue: int, size: tuple[int, int] = (4, 3)) -> bytes:
-    image = pytest.importorskip("PIL.Image")
-    stream = io.BytesIO()
-    image.new("RGB", size, (7, 8, blue)).save(stream, "PNG")
-    return stream.getvalue()
+def shade(blue: int, size: tuple[int, int] = (4, 3)) -> bytes:
+    pytest.importorskip("PIL")
+    return encoded(size=size, color=(7, 8, blue))
 
 
 async def test_every_operation_of_the_op_family(server: FieldServer) -> None:
@@ -73,14 +64,14 @@ async def test_every_operation_of_the_op_family(server: FieldServer) -> None:
     async with SceneVlmClient(server.endpoint) as vlm:
         assert await vlm.query(PNG, "held?", fresh_s=60.0) == f"held? {len(PNG)}"
     async with RewardClient(server.endpoint) as reward:
-        judged = await reward.score([picture(blue) for blue in range(0, 200, 10)], "grab")
+        judged = await reward.score([shade(blue) for blue in range(0, 200, 10)], "grab")
         assert len(judged.progress) == len(judged.success) == 8
         assert judged.progress[0] == 0.0, "the oldest"
         assert judged.progress[-1] == 190 / 255, "the newest: blue comes first"
         assert judged.success_threshold == 0.5
-        assert (await reward.score([picture(255)], "grab")).progress == (1.0,)
+        assert (await reward.score([shade(255)], "grab")).progress == (1.0,)
         with pytest.raises(BadRequest, match="several sizes"):
-            await reward.score([picture(1), picture(1, (3, 4))], "grab")
+            await reward.score([shade(1), shade(1, (3, 4))], "grab")
         with pytest.raises(BadRequest, match="cannot be decoded"):
             await reward.score([PNG], "grab")
         await reward.shutdown()
@@ -175,8 +166,8 @@ async def test_requests_take_turns_and_a_picture_that_waited_is_not_looked_at(
     assert "old" not in [request.get("question") for request in server.heard]
 
 
-async def test_what_it_would_answer_wrongly_is_refused(folder: Path) -> None:
-    with FieldServer(f"ipc://{folder}/s") as server:
+async def test_what_it_would_answer_wrongly_is_refused(short_folder: Path) -> None:
+    with FieldServer(f"ipc://{short_folder}/s") as server:
         async with DetectorClient(server.endpoint) as client:
             assert await client.detect(PNG, "nothing there") == []
             with pytest.raises(BadRequest, match="knows no tokens"):
@@ -202,8 +193,8 @@ async def test_what_it_would_answer_wrongly_is_refused(folder: Path) -> None:
                 await policy.get_action({}, rtc=rtc)
 
 
-async def test_a_server_may_be_replaced_by_one_of_the_other_kind(folder: Path) -> None:
-    endpoint = f"ipc://{folder}/s"
+async def test_a_server_may_be_replaced_by_one_of_the_other_kind(short_folder: Path) -> None:
+    endpoint = f"ipc://{short_folder}/s"
 
     async def ours(client: SceneVlmClient) -> str:
         async with RouterServer(endpoint, lambda error: {"ok": False}) as server:

@@ -41,7 +41,7 @@ def endpoint() -> Iterator[str]:
         yield f"ipc://{folder}/s.sock"
 
 
-def command(endpoint: str, mode: str = "") -> list[str]:
+def server_command(endpoint: str, mode: str = "") -> list[str]:
     return [sys.executable, str(SERVER), endpoint, mode]
 
 
@@ -51,7 +51,7 @@ def foreign(endpoint: str) -> Iterator[Callable[[], subprocess.Popen[bytes]]]:
     started: list[subprocess.Popen[bytes]] = []
 
     def start() -> subprocess.Popen[bytes]:
-        started.append(subprocess.Popen(command(endpoint)))
+        started.append(subprocess.Popen(server_command(endpoint)))
         return started[-1]
 
     yield start
@@ -63,7 +63,7 @@ def foreign(endpoint: str) -> Iterator[Callable[[], subprocess.Popen[bytes]]]:
 @pytest.fixture
 async def detector(endpoint: str) -> AsyncIterator[DetectorClient]:
     async with DetectorClient(
-        endpoint, spawn=SpawnSpec(command(endpoint)), timeout_s=60.0
+        endpoint, spawn=SpawnSpec(server_command(endpoint)), timeout_s=60.0
     ) as client:
         yield client
 
@@ -78,7 +78,7 @@ def alive(pid: int) -> bool:
 
 # -- life of a child
 async def test_the_first_call_starts_the_sidecar_and_close_ends_it(endpoint: str) -> None:
-    client = DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint)))
+    client = DetectorClient(endpoint, spawn=SpawnSpec(server_command(endpoint)))
     assert client.child is None
     found = await client.detect(PNG, "red cube")
     assert found == [Detection("b", 0.9, (1, 1, 3, 3)), Detection("a", 0.2, (0, 0, 2, 4))]
@@ -100,7 +100,7 @@ async def test_an_adopted_sidecar_is_used_and_left_running(
         endpoint, connect_timeout_s=60.0
     ) as waiting:  # without a spawn spec it waits for the start
         await waiting.call("load")
-    async with DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
+    async with DetectorClient(endpoint, spawn=SpawnSpec(server_command(endpoint))) as client:
         await client.detect(PNG, "x")
         assert client.child is None
     assert process.poll() is None
@@ -145,7 +145,7 @@ async def test_a_replaced_child_leaves_no_log(
 ) -> None:
     """The log of a child that died between two looks at it stayed in the temporary folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    async with DyingInBetween(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
+    async with DyingInBetween(endpoint, spawn=SpawnSpec(server_command(endpoint))) as client:
         await client.detect(PNG, "x")
         first = client.child
         client._drop("a broken connection")
@@ -171,7 +171,7 @@ async def test_a_child_that_takes_its_time_to_die_is_replaced_all_the_same(
 
 
 async def test_a_boot_that_fails_says_why(endpoint: str) -> None:
-    client = DetectorClient(endpoint, spawn=SpawnSpec(command(endpoint, "crash")))
+    client = DetectorClient(endpoint, spawn=SpawnSpec(server_command(endpoint, "crash")))
     with pytest.raises(SidecarUnavailable, match="exit code 3: cannot find the weights") as failed:
         await client.detect(PNG, "x")
     assert failed.value.details["exit_code"] == 3
@@ -181,7 +181,7 @@ async def test_a_boot_that_fails_says_why(endpoint: str) -> None:
 
 async def test_a_boot_that_takes_too_long(endpoint: str, tmp_path: Path) -> None:
     spec = SpawnSpec(
-        command(endpoint, "silent"), boot_timeout_s=0.5, log=tmp_path / "logs" / "s.log"
+        server_command(endpoint, "silent"), boot_timeout_s=0.5, log=tmp_path / "logs" / "s.log"
     )
     async with DetectorClient(endpoint, spawn=spec) as client:
         with pytest.raises(SidecarUnavailable, match=r"within 0\.5 s"):
@@ -205,7 +205,7 @@ async def test_a_command_that_does_not_exist(
 
 
 async def test_two_clients_starting_one_sidecar_end_up_with_one(endpoint: str) -> None:
-    spec = SpawnSpec(command(endpoint))
+    spec = SpawnSpec(server_command(endpoint))
     async with (
         DetectorClient(endpoint, spawn=spec) as one,
         DetectorClient(endpoint, spawn=spec) as two,
@@ -228,7 +228,7 @@ async def test_a_sidecar_that_owns_the_endpoint_and_is_slow_is_waited_for(
         await waiting.load()
     owner.send_signal(signal.SIGSTOP)
     try:
-        spec = SpawnSpec(command(endpoint))
+        spec = SpawnSpec(server_command(endpoint))
         async with DetectorClient(endpoint, spawn=spec, connect_timeout_s=60.0) as client:
             found = asyncio.create_task(client.detect(PNG, "x"))
             async with asyncio.timeout(60.0):
@@ -281,7 +281,7 @@ async def test_a_failure_without_a_code_is_a_model_error(detector: DetectorClien
 
 
 async def test_the_token_travels_with_the_call(endpoint: str) -> None:
-    async with SceneVlmClient(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
+    async with SceneVlmClient(endpoint, spawn=SpawnSpec(server_command(endpoint))) as client:
         assert await client.query(PNG, "held?", token=(3, 7)) == "held? [3, 7]"
         loaded = await client.load(timeout_s=60.0)
         assert (loaded["lease_id"], loaded["token"]) == ("L1-1", [1, 2])
@@ -312,7 +312,7 @@ async def test_pictures_and_a_video_travel_in_one_query(
 async def test_arrays_there_and_back(endpoint: str) -> None:
     import numpy
 
-    async with PolicyClient(endpoint, spawn=SpawnSpec(command(endpoint))) as client:
+    async with PolicyClient(endpoint, spawn=SpawnSpec(server_command(endpoint))) as client:
         assert (await client.reset({"seed": 3}))["seed"] == 3
         state = numpy.arange(6, dtype=numpy.float32).reshape(2, 3)
         actions = await client.get_action({"state": state, "task": "grab"}, token=(1, 2))

@@ -45,7 +45,7 @@ REASON = {
 }
 
 
-def manifest_of(kind: Kind, tag: str = "any") -> RSkillManifest:
+def lab_skill(kind: Kind, tag: str = "any") -> RSkillManifest:
     return RSkillManifest.model_validate(
         {
             "name": f"lab/{kind}",
@@ -73,8 +73,8 @@ EVERY_MAKER: dict[Kind, Maker] = dict.fromkeys(Kind, make_skill)
 def test_every_kind_runs_or_is_refused_with_the_way_to_use_it(kind: Kind) -> None:
     """A maker for a kind that moves nothing changes nothing: the kind decides, whoever asks."""
     with_makers, without = (
-        Catalogue([manifest_of(kind)], EVERY_MAKER),
-        Catalogue([manifest_of(kind)], {}),
+        Catalogue([lab_skill(kind)], EVERY_MAKER),
+        Catalogue([lab_skill(kind)], {}),
     )
     if kind in EXECUTABLE:
         assert with_makers.find(f"lab/{kind}")[2].kind is kind
@@ -94,7 +94,7 @@ def test_every_kind_runs_or_is_refused_with_the_way_to_use_it(kind: Kind) -> Non
 
 def test_a_goal_for_another_robot_is_refused_whoever_asks() -> None:
     found = Catalogue(
-        [manifest_of(Kind.VLA, "go2"), manifest_of(Kind.ROS_ACTION, "mobile_base")],
+        [lab_skill(Kind.VLA, "go2"), lab_skill(Kind.ROS_ACTION, "mobile_base")],
         EVERY_MAKER,
         body=SIMULATED,
     )

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -70,19 +69,13 @@ class Model:
 
 
 @pytest.fixture
-def folder() -> Iterator[Path]:
-    with TemporaryDirectory(prefix="cd") as path:
-        yield Path(path)
-
-
-@pytest.fixture
 def model(clock: ManualClock) -> Model:
     return Model(clock)
 
 
 @pytest.fixture
-async def client(folder: Path, model: Any) -> AsyncIterator[DetectorClient]:
-    endpoint = f"ipc://{folder}/d.sock"
+async def client(short_folder: Path, model: Any) -> AsyncIterator[DetectorClient]:
+    endpoint = f"ipc://{short_folder}/d.sock"
     async with RouterServer(endpoint, unread_reply(model.model_ops)) as server:
         serving = asyncio.create_task(server.serve(Wire(model, server.send).handle))
         async with DetectorClient(endpoint) as client:

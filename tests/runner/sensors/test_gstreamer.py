@@ -41,7 +41,7 @@ SIZE = (96, 64)
 """Width and height of the file's pictures."""
 
 
-def camera(max_age_ms: float = 60_000.0, **params: Any) -> SensorReaderConfig:
+def wrist(max_age_ms: float = 60_000.0, **params: Any) -> SensorReaderConfig:
     return SensorReaderConfig(
         sensor_id="wrist",
         backend=SensorBackend.GSTREAMER,
@@ -56,7 +56,7 @@ def reader() -> Iterator[Callable[..., SlotReader]]:
     made: list[SlotReader] = []
 
     def start(max_age_ms: float = 60_000.0, tee: Any = None, **params: Any) -> SlotReader:
-        made.append(make(camera(max_age_ms, **params), CLOCK, tee))
+        made.append(make(wrist(max_age_ms, **params), CLOCK, tee))
         made[-1].start()
         return made[-1]
 
@@ -295,7 +295,7 @@ def test_a_csi_pipeline_negotiates_and_is_refused_where_argus_is_not() -> None:
     assert (frame.width, frame.height, frame.encoding) == (64, 48, "bgr8")
     if gst.ElementFactory.find("nvarguscamerasrc") is None:
         with pytest.raises(ConfigError, match="only a Jetson has it"):
-            make(camera(source="csi", sensor_index=0), CLOCK, None)
+            make(wrist(source="csi", sensor_index=0), CLOCK, None)
 
 
 # -- ends
@@ -315,7 +315,7 @@ def test_formats_that_do_not_meet_end_it_with_a_reason(reader: Callable[..., Slo
     own = (
         "videotestsrc is-live=true ! video/x-raw,format=I420,width=16,height=16 ! appsink name=sink"
     )
-    source = make(camera(pipeline=own), CLOCK, None)
+    source = make(wrist(pipeline=own), CLOCK, None)
     with contextlib.suppress(FrameStale):  # said at once, or a moment later
         source.start()
     assert "not-negotiated" in end_of(source)
@@ -376,7 +376,7 @@ def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(
 )
 def test_mistakes_are_named(params: dict[str, Any], problem: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        make(camera(**params), CLOCK, None)
+        make(wrist(**params), CLOCK, None)
     assert problem in caught.value.message
     assert caught.value.message.startswith("sensor wrist")
 

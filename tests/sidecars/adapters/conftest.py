@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vram_arbiter.schemas.manifest import parse_manifest
-from vram_arbiter.sidecars.weights import resolve
+from vram_arbiter.sidecars.weights import Weights, resolve
 
 CHAT = (
     "{%- for message in messages -%}<|im_start|>{{ message.role }}\n{%- for part in "
@@ -184,6 +184,29 @@ def weights(configs):
         return resolve(f"local://models/{name}", configs)
 
     return weights
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """Saves a family's checkpoint in float32, once, and returns its weights."""
+    root = tmp_path_factory.mktemp("saved")
+
+    def saved(family, save):
+        folder = root / family
+        if not folder.exists():
+            folder.mkdir()
+            save(folder)
+        return Weights(str(folder), local=True)
+
+    return saved
+
+
+def placed(adapter):
+    """Load an adapter's weights and place them on the CPU."""
+    adapter.prepare()
+    adapter.load("cpu")
+    adapter.place("cpu")
+    return adapter
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from tests.sidecars.adapters import tiny_vision
+from tests.sidecars.adapters.conftest import placed
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.sidecar import DetectOp
 from vram_arbiter.sidecars.adapters.detector import DetectorAdapter
@@ -19,22 +20,14 @@ LABELS = ["red cube", "ball"]
 WIDTH, HEIGHT = 80, 60
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    """Loads a family's checkpoint, saved in float32, in the manifest's precision."""
-    root = tmp_path_factory.mktemp("detectors")
+@pytest.fixture
+def loaded(saved, manifest):
+    """Loads a family's checkpoint in the manifest's precision."""
 
-    def loaded(family, manifest, dtype="fp32", save=None):
-        folder = root / family
-        if not folder.exists():
-            folder.mkdir()
-            (save or tiny_vision.DETECTORS[family])(folder)
+    def loaded(family, dtype="fp32", save=None):
         described = manifest("detector", BLOCK + f"quantization: {{dtype: {dtype}}}\n")
-        adapter = DetectorAdapter(described, Weights(str(folder), local=True))
-        adapter.prepare()
-        adapter.load("cpu")
-        adapter.place("cpu")
-        return adapter
+        weights = saved(family, save or tiny_vision.DETECTORS[family])
+        return placed(DetectorAdapter(described, weights))
 
     return loaded
 
@@ -54,7 +47,7 @@ def detect(adapter, picture):
 @pytest.mark.parametrize("family", tiny_vision.DETECTORS)
 def test_each_family_detects_in_each_precision(family, dtype, loaded, manifest, png):
     """Grounding DINO raised in 16 bits: its inputs and its own tables are float32."""
-    adapter = loaded(family, manifest, dtype)
+    adapter = loaded(family, dtype)
     kept = {"fp32": "torch.float32", "bf16": "torch.bfloat16", "fp16": "torch.float16"}[dtype]
     (network,) = adapter.networks
     assert {str(one.dtype) for one in network.parameters()} == {kept}
@@ -67,7 +60,7 @@ def test_each_family_detects_in_each_precision(family, dtype, loaded, manifest, 
 
 def test_omdet_turbo_with_a_backbone_of_timm(loaded, manifest, png):
     pytest.importorskip("timm", reason="OmDet-Turbo's published backbone comes from timm")
-    adapter = loaded("omdet_timm", manifest, "fp16", tiny_vision.save_omdet_turbo_timm)
+    adapter = loaded("omdet_timm", "fp16", tiny_vision.save_omdet_turbo_timm)
     assert detect(adapter, png(WIDTH, HEIGHT))
 
 
@@ -95,7 +88,7 @@ def test_the_name_of_a_backbone_is_not_looked_up_on_the_hub(manifest, monkeypatc
 def test_numbers_that_overflow_are_not_nothing_found(family, loaded, manifest, png):
     """A score that is not a number is above no threshold: the answer was an empty list, which
     means that the object is not in view."""
-    adapter = loaded(family, manifest)
+    adapter = loaded(family)
     (network,) = adapter.networks
     for parameter in network.parameters():
         parameter.data.fill_(math.nan)
@@ -105,7 +98,7 @@ def test_numbers_that_overflow_are_not_nothing_found(family, loaded, manifest, p
 
 def test_grounding_dino_answers_with_whole_texts(loaded, manifest, png):
     """The library's reading joins the tokens above 0.25: half a text, or an empty one."""
-    adapter = loaded("grounding_dino", manifest)
+    adapter = loaded("grounding_dino")
     tokens = adapter._processor(images=None, text=[LABELS])["input_ids"][0]
     spans = adapter._spans(tokens, LABELS)
     decode = adapter._processor.tokenizer.decode
@@ -119,7 +112,7 @@ def test_grounding_dino_answers_with_whole_texts(loaded, manifest, png):
 @pytest.mark.parametrize("family", ["owlvit", "grounding_dino"])
 def test_a_query_that_would_be_cut_off_is_refused(family, loaded, manifest, png):
     """Objects beyond the model's tokens were dropped, and answered as not in view."""
-    adapter = loaded(family, manifest)
+    adapter = loaded(family)
     query = ["a small red cube with rounded edges", "a green ball on the left"]
     query.append("a mug without a handle")
     with pytest.raises(BadRequest, match="tokens; this model reads"):

@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from tests.sidecars.adapters import tiny_vision
+from tests.sidecars.adapters.conftest import placed
 from vram_arbiter.schemas.errors import BadRequest, LimitExceeded, ModelError
 from vram_arbiter.schemas.sidecar import PICTURES_MAX, QueryOp
 from vram_arbiter.sidecars.adapters import scene_vlm
@@ -25,24 +26,15 @@ FAMILIES = [
 ]
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    """Loads a family's checkpoint, saved in float32, in the manifest's precision."""
-    root = tmp_path_factory.mktemp("vlms")
+@pytest.fixture
+def loaded(saved, manifest):
+    """Loads a family's checkpoint in the manifest's precision."""
 
-    def loaded(family, manifest, dtype="fp32"):
-        folder = root / family
-        if not folder.exists():
-            folder.mkdir()
-            tiny_vision.VLMS[family](folder)
+    def loaded(family, dtype="fp32"):
         described = manifest(
             "vlm", f"role: s2\nactions: [query]\nquantization: {{dtype: {dtype}}}\n"
         )
-        adapter = SceneVlmAdapter(described, Weights(str(folder), local=True))
-        adapter.prepare()
-        adapter.load("cpu")
-        adapter.place("cpu")
-        return adapter
+        return placed(SceneVlmAdapter(described, saved(family, tiny_vision.VLMS[family])))
 
     return loaded
 
@@ -77,7 +69,7 @@ def by_transformers(adapter, pictures):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_each_family_answers_about_several_pictures(family, loaded, manifest, png):
     """In 16 bits; LLaVA-OneVision took two pictures for those of two prompts."""
-    adapter = loaded(family, manifest, dtype := "fp16" if family == "qwen3_5" else "bf16")
+    adapter = loaded(family, dtype := "fp16" if family == "qwen3_5" else "bf16")
     (network,) = adapter.networks
     assert str(network.dtype) == {"fp16": "torch.float16", "bf16": "torch.bfloat16"}[dtype]
     pictures = [png(colour=RED), png(colour=BLUE)]
@@ -96,7 +88,7 @@ def test_each_family_answers_about_several_pictures(family, loaded, manifest, pn
 def test_each_family_looks_at_all_frames_of_a_video(family, loaded, manifest, png):
     import torch
 
-    adapter = loaded(family, manifest)
+    adapter = loaded(family)
     red, blue = decode(png(colour=RED)), decode(png(colour=BLUE))
     inputs, _ = adapter._inputs([], [red, red, red], 2.0, "Is it held?")
     changed, _ = adapter._inputs([], [red, red, blue], 2.0, "Is it held?")
@@ -123,7 +115,7 @@ def test_each_family_looks_at_all_frames_of_a_video(family, loaded, manifest, pn
 
 @pytest.mark.heavy
 def test_what_the_model_cannot_read_is_refused(loaded, manifest, png, monkeypatch):
-    adapter = loaded("qwen3_5", manifest)
+    adapter = loaded("qwen3_5")
     with pytest.raises(LimitExceeded, match="send fewer pictures") as refused:
         adapter.run(asked(image=png()).model_copy(update={"max_new_tokens": 4096 - 20}))
     assert refused.value.details["tokens_max"] == 20
@@ -152,7 +144,7 @@ def test_what_the_model_cannot_read_is_refused(loaded, manifest, png, monkeypatc
 def test_a_checkpoint_without_chat_template_is_refused_before_it_is_loaded(
     loaded, manifest, tmp_path
 ):
-    adapter = loaded("qwen3_5", manifest)
+    adapter = loaded("qwen3_5")
     adapter._processor.save_pretrained(tmp_path)
     (tmp_path / "chat_template.jinja").unlink()
     adapter.networks[0].config.save_pretrained(tmp_path)

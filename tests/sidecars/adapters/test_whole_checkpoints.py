@@ -380,7 +380,7 @@ def test_a_quantized_policy_is_loaded_as_it_is(
         packed |= {f"{name}.{key}": part for key, part in state.as_dict(packed=True).items()}
     file = tmp_path / WHOLE
     save_file(packed, file)
-    assert "absmax" in refused(load, None).message, "the manifest has to say int4"
+    assert "absmax" in refused_load(load, None).message, "the manifest has to say int4"
     model = load()
     assert {tensor.device.type for tensor in model.parameters()} == {device}
     if device == "cpu":
@@ -400,7 +400,7 @@ def test_a_quantized_policy_is_loaded_as_it_is(
 
     def damaged(content: dict[str, Any]) -> ModelError:
         save_file(content, file)
-        return refused(load, nf4)
+        return refused_load(load, nf4)
 
     name = names[0]
     error = damaged({key: part for key, part in packed.items() if key != f"{name}.absmax"})
@@ -410,7 +410,7 @@ def test_a_quantized_policy_is_loaded_as_it_is(
     assert damaged(packed | {name: packed[name][1:]}).details["misshapen"] == 1
 
 
-def refused(load: Callable[[Nf4 | None], Any], nf4: Nf4 | None) -> ModelError:
+def refused_load(load: Callable[[Nf4 | None], Any], nf4: Nf4 | None) -> ModelError:
     with pytest.raises(ModelError) as caught:
         load(nf4)
     return caught.value

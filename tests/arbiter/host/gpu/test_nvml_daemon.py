@@ -47,11 +47,11 @@ def held_here(client: WireClient, nvml: NvmlStub, size: int) -> dict[str, Any]:
     nvml.card(size)
     nvml.write(f"process 0 compute {ME} {size}")
     assert client.ask("ready", **on, measured_bytes=size)["ok"]
-    seen(client, size)
+    until_read(client, size)
     return on
 
 
-def seen(client: WireClient, used: int) -> None:
+def until_read(client: WireClient, used: int) -> None:
     """Until the daemon has read so much: what a release is compared with."""
     deadline = time.monotonic() + PATIENCE_S
     while client.ask("status")["gpus"][0]["measured_used_bytes"] != used:
@@ -164,7 +164,7 @@ def test_where_bytes_per_process_are_na_the_total_decides(
     nvml.card(5 * GIB)
     nvml.write(f"process 0 compute {ME} na")
     assert client.ask("ready", **on)["ok"]
-    seen(client, 5 * GIB)
+    until_read(client, 5 * GIB)
     let_go(client, nvml, on, left, f"process 0 compute {ME} na")
     said = event(client, "verified")
     assert (said["verdict"], said["culprits"]) == (verdict, [])
