@@ -156,6 +156,11 @@ def _compared(cls: Any, weights: Weights, options: Mapping[str, Any]) -> Any:
     )
     try:
         _differences(account).refuse(weights.source)
+        if getattr(model, "_hf_peft_config_loaded", False):  # transformers follows it unasked
+            raise ModelError(
+                f"{weights.source} holds a PEFT adapter beside a model",
+                hint="merge it into its base model and save that",
+            )
     except ModelError:
         del model  # the error is kept for `ping`, and this frame with it
         raise
@@ -300,7 +305,7 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
 
     class Recording(cls):  # type: ignore[misc]
         def __init__(self, *arguments: Any, **options: Any) -> None:
-            with torch.device(META) if without_bytes else contextlib.nullcontext():
+            with torch.device(META) if without_bytes else contextlib.nullcontext(), _silence():
                 super().__init__(*arguments, **options)
             record.built = True
 

@@ -1,15 +1,10 @@
-"""lerobot's policies for the server of imports, without diffusers.
+"""lerobot's policies for the server of imports, without diffusers and PEFT.
 
-lerobot imports the code of all its policies, and GR00T's imports diffusers where that is installed:
-4 s of a core, and bitsandbytes with it, whose import initializes CUDA before the fork. A family
-that needs diffusers takes `preload_diffusers` instead.
+lerobot imports the code of all its policies, and with it diffusers and PEFT where these are
+installed: 4 s of a core, and bitsandbytes, whose import initializes CUDA before the fork. A family
+that needs one of them takes `preload_diffusers` or `preload_peft` instead.
 """
 
-from lerobot.utils import import_utils
+from vram_arbiter.sidecars.lerobot_packages import import_policies
 
-_known = import_utils._diffusers_available
-import_utils._diffusers_available = False
-try:
-    import lerobot.policies.factory  # noqa: F401  reason: for every model process
-finally:
-    import_utils._diffusers_available = _known
+import_policies(without=("diffusers", "peft"))

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 LEROBOT = "vram_arbiter.sidecars.preload_lerobot"
 DIFFUSERS = "vram_arbiter.sidecars.preload_diffusers"
+PEFT = "vram_arbiter.sidecars.preload_peft"
 """Modules of lerobot's policies, for `ModelAdapter.modules`."""
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 

@@ -2,13 +2,15 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
-from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, ModelCall
+from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, ModelCall
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
     family_of,
@@ -44,6 +46,8 @@ _OURS: Final = {
 }
 """Fields of configurations that the sidecar decides."""
 _ACTION: Final = "action"
+_LAZY: Final = "proc"
+"""GR00T's processor of pictures and texts, read when this property of its step is first asked."""
 
 
 class Guidance(TypedDict, total=False):
@@ -99,7 +103,8 @@ class PolicyAdapter:
     def modules(self) -> tuple[str, ...]:
         kind = model_type(self._weights, "type")
         own = f"lerobot.policies.{kind}.modeling_{kind}"
-        first = DIFFUSERS if "diffusers" in self._family.packages else LEROBOT
+        packages = self._family.packages
+        first = PEFT if "peft" in packages else DIFFUSERS if "diffusers" in packages else LEROBOT
         return ("torch", first, own, *_OWN_POLICIES)
 
     def prepare(self) -> None:
@@ -116,26 +121,30 @@ class PolicyAdapter:
         for field, value in _OURS.items():
             if hasattr(self._config, field):
                 setattr(self._config, field, value)
-        if self._has_own_dtype:
-            self._config.dtype = TORCH_NAMES[self._dtype]
+        if hasattr(self._config, "use_bf16"):  # GR00T's own autocast
+            self._config.use_bf16 = self._dtype is Dtype.BF16
+        if self._family.dtype_field is not None:
+            setattr(self._config, self._family.dtype_field, TORCH_NAMES[self._dtype])
 
     @property
     def _has_own_dtype(self) -> bool:
         """Return whether the policy's own code casts: some of its layers then stay float32."""
-        return hasattr(self._config, "dtype")
+        return self._family.casts or self._family.dtype_field is not None
 
     def load(self, device: str) -> None:
         self._config.device = device
         self._config.pretrained_path = self._weights.source
+        _need_weights(self._weights.source)
         policy = load_lerobot(
             self._policy_class, self._weights, self._config, nf4_of(self._manifest)
         )
         if device != META:
             _need_trained(policy, self._weights.source)
         self._guided = False
-        self._policy = policy if self._has_own_dtype else policy.to(torch_type(self._dtype))
+        self._policy = policy if self._has_own_dtype else _cast(policy, torch_type(self._dtype))
         self._quantize(device)
         self._make_processors()
+        _need_absolute(self._after, self._weights.source)
         need_statistics(self._before, self._config.input_features, self._weights.source)
         need_statistics(self._after, self._config.output_features, self._weights.source)
         self._observations = Observations(
@@ -165,6 +174,8 @@ class PolicyAdapter:
             if isinstance(step, DeviceProcessorStep):
                 step.device = device
                 step.__post_init__()
+            elif hasattr(step, _LAZY):
+                step.device = device
 
     def _make_processors(self) -> None:
         """Read the processors, for the CPU. Raises ModelError."""
@@ -186,6 +197,8 @@ class PolicyAdapter:
                 postprocessor_config_filename=files.postprocessor,
                 preprocessor_overrides={"device_processor": {"device": "cpu"}},
             )
+            for step in self._before.steps:
+                getattr(step, _LAZY, None)  # no residency reads files, and none the hub
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
                 f"{files.source}: its processors cannot be read: {type(error).__name__}: {error}",
@@ -290,6 +303,31 @@ class PolicyAdapter:
         return self._family.queues or ensembles
 
 
+def _cast(policy: Any, dtype: Any) -> Any:
+    """Return the policy with its weights in `dtype`.
+
+    Buffers that no checkpoint holds keep their precision: rotary frequencies in bfloat16 would
+    turn far positions into others.
+    """
+    for module in policy.modules():
+        for parameter in module.parameters(recurse=False):
+            if parameter.is_floating_point():
+                parameter.data = parameter.data.to(dtype)
+        for name, buffer in module.named_buffers(recurse=False):
+            if buffer.is_floating_point() and name not in module._non_persistent_buffers_set:
+                module._buffers[name] = buffer.to(dtype)
+    return policy
+
+
+def _need_weights(source: str) -> None:
+    """Raise ModelError for a folder without weights: GR00T's loader takes that for another format
+    and builds a model of 3 billion random numbers."""
+    if not (Path(source) / "model.safetensors").is_file():
+        raise ModelError(
+            f"{source} has no model.safetensors", hint="check that the checkpoint is complete"
+        )
+
+
 def _need_trained(policy: Any, source: str) -> None:
     """Raise ModelError for a VQ-BeT whose codes were never trained; lerobot only warns."""
     vqbet = getattr(policy, "vqbet", None)
@@ -297,6 +335,15 @@ def _need_trained(policy: Any, source: str) -> None:
         raise ModelError(
             f"{source}: the quantizer of its actions is not trained: `discretized` is false",
             hint="train past n_vqvae_training_steps",
+        )
+
+
+def _need_absolute(after: Any, source: str) -> None:
+    """Raise ModelError for a GR00T whose postprocessor decodes actions relative to the state."""
+    if any(getattr(step, "use_relative_action", False) for step in after.steps):
+        raise ModelError(
+            f"{source}: its postprocessor decodes relative actions, which are not served",
+            hint="use a checkpoint with absolute actions",
         )
 
 

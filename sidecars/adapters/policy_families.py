@@ -15,14 +15,29 @@ from typing import Any, Final
 from vram_arbiter.schemas.errors import ConfigError, ModelError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
-from vram_arbiter.schemas.runtime.extras import not_installed
+from vram_arbiter.schemas.runtime.extras import EXTRA_OF, not_installed
 from vram_arbiter.sidecars.quantization import nf4_of
 from vram_arbiter.sidecars.weights import ProcessorFiles
 
 _FLOATS: Final = frozenset({Dtype.FP32, Dtype.BF16, Dtype.FP16})
 _OWN_FLOATS: Final = frozenset({Dtype.FP32, Dtype.BF16})
+_BF16: Final = frozenset({Dtype.BF16})  # its code computes in nothing else
 _CONSENT_HINT: Final = "read that code, then write trust_remote_code: true in quantization.extra"
 _OWN_STEPS: Final = ("lerobot.", "vram_arbiter.")
+
+_NOT_COMPARED: Final[Mapping[str, Mapping[str, object]]] = {
+    "groot": {"use_relative_actions": True},  # each row needs the state that its chunk began with
+    "wall_x": {"prediction_mode": "fast"},  # its tokenizer of actions is Python code of the hub
+}
+"""Settings of a type's configuration that are refused."""
+_WHY_NOT: Final[Mapping[ModelFamily | None, str]] = {
+    ModelFamily.FASTWAM: "its image encoder is in no checkpoint: lerobot reads it, in whatever "
+    "revision, from a hub repository whose name is fixed in its code",
+    ModelFamily.LINGBOT_VA: "its image and text encoders are in no checkpoint: lerobot reads them, "
+    "in whatever revision, at the first action",
+    ModelFamily.MOLMOACT2: "its actions were not compared with lerobot's",
+}
+"""lerobot's types that are not in `FAMILIES`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +48,9 @@ class Family:
     beyond torch, transformers and lerobot. `queues` marks a policy that keeps observations between
     calls or gives one action a call: it answers through `select_action`, never through
     `predict_action_chunk`. `precisions` are the number formats that its code runs in. `camera` is
-    the only name of an image that its code finds. `remote_code`: its code runs Python files of a
-    hub repository.
+    the only name of an image that its code finds. `remote_code`: what of it is Python files of a
+    hub repository. `dtype_field` is the field of its configuration that names the number format, if
+    it has one, and `casts` marks code that casts unasked; layers of either may stay float32.
     """
 
     types: tuple[str, ...]
@@ -42,7 +58,9 @@ class Family:
     queues: bool = False
     precisions: frozenset[Dtype] = _FLOATS
     camera: str | None = None
-    remote_code: bool = False
+    remote_code: str | None = None
+    dtype_field: str | None = None
+    casts: bool = False
 
 
 FAMILIES: Final[Mapping[ModelFamily, Family]] = {
@@ -53,14 +71,27 @@ FAMILIES: Final[Mapping[ModelFamily, Family]] = {
     ModelFamily.MULTI_TASK_DIT: Family(("multi_task_dit",), ("diffusers",), queues=True),
     ModelFamily.GAUSSIAN_ACTOR: Family(("gaussian_actor",), queues=True),
     ModelFamily.SMOLVLA: Family(("smolvla",), ("num2words",)),
-    ModelFamily.PI0: Family(("pi0",), precisions=_OWN_FLOATS),
-    ModelFamily.PI05: Family(("pi05",), precisions=_OWN_FLOATS),
+    ModelFamily.PI0: Family(("pi0",), precisions=_OWN_FLOATS, dtype_field="dtype"),
+    ModelFamily.PI05: Family(("pi05",), precisions=_OWN_FLOATS, dtype_field="dtype"),
     ModelFamily.PI0_FAST: Family(
-        ("pi0_fast",), ("scipy",), precisions=_OWN_FLOATS, remote_code=True
+        ("pi0_fast",),
+        ("scipy",),
+        precisions=_OWN_FLOATS,
+        remote_code="action tokenizer",
+        dtype_field="dtype",
     ),
-    ModelFamily.EO1: Family(("eo1",), precisions=_OWN_FLOATS),
+    ModelFamily.EO1: Family(("eo1",), precisions=_OWN_FLOATS, dtype_field="dtype"),
     ModelFamily.EVO1: Family(("evo1",)),
-    ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS),
+    ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS, dtype_field="dtype"),
+    ModelFamily.VLA_JEPA: Family(
+        ("vla_jepa",), ("diffusers",), precisions=_BF16, dtype_field="torch_dtype"
+    ),
+    ModelFamily.GR00T: Family(
+        ("groot",), ("diffusers", "tree"), precisions=_OWN_FLOATS, remote_code="backbone"
+    ),
+    ModelFamily.WALL_X: Family(
+        ("wall_x",), ("peft", "torchdiffeq", "qwen_vl_utils"), precisions=_BF16, casts=True
+    ),
 }
 
 
@@ -74,13 +105,14 @@ def family_of(manifest: RSkillManifest) -> Family:
     family = FAMILIES.get(name) if name is not None else None
     if name is None or family is None:
         raise ConfigError(
-            f"{manifest.name}: model_family {name.value if name else None!r} is not served",
+            f"{manifest.name}: model_family {name.value if name else None!r} is not served"
+            + (f": {why}" if (why := _WHY_NOT.get(name)) else ""),
             hint=f"sidecars serve {', '.join(sorted(FAMILIES))}",
         )
     if family.remote_code and not _consents(manifest):
         raise ConfigError(
-            f"{manifest.name}: the action tokenizer of model_family {name} is Python code of the "
-            "hub",
+            f"{manifest.name}: the {family.remote_code} of model_family {name} is Python code of "
+            "the hub",
             hint=_CONSENT_HINT,
         )
     return family
@@ -99,7 +131,8 @@ def need_packages(manifest: RSkillManifest) -> None:
         if importlib.util.find_spec(name) is None
     ]
     if missing:
-        raise not_installed(f"a policy of family {manifest.model_family}", missing, "sidecars")
+        extra = EXTRA_OF[missing[0]]
+        raise not_installed(f"a policy of family {manifest.model_family}", missing, extra)
 
 
 def computing_type(manifest: RSkillManifest, family: Family) -> Dtype:
@@ -140,6 +173,12 @@ def need_type(manifest: RSkillManifest, family: Family, config: Any, source: str
             f"{source}: its image encoder {config.vision_encoder_name} is Python code of the hub",
             hint=_CONSENT_HINT,
         )
+    for field, value in _NOT_COMPARED.get(config.type, {}).items():
+        if getattr(config, field) == value:
+            raise ModelError(
+                f"{source}: a {config.type} with {field}: {value} is not served",
+                hint="its actions were not compared with lerobot's",
+            )
     cameras = sorted(config.image_features)
     if family.camera and cameras and cameras != [family.camera]:
         raise ModelError(

@@ -1,0 +1,25 @@
+"""Optional packages of lerobot, kept out of imports that do not need them."""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Final, Literal
+
+_FLAGS: Final[Mapping[str, tuple[str, ...]]] = {
+    "diffusers": ("_diffusers_available",),
+    "peft": ("_peft_available", "_wallx_deps_available"),
+}
+"""lerobot's record of what is installed, by package."""
+
+
+def import_policies(without: Sequence[Literal["diffusers", "peft"]]) -> None:
+    """Import the code of all of lerobot's policies, as if some packages were not installed."""
+    from lerobot.utils import import_utils
+
+    known = {flag: getattr(import_utils, flag) for name in without for flag in _FLAGS[name]}
+    for flag in known:
+        setattr(import_utils, flag, False)
+    try:
+        importlib.import_module("lerobot.policies.factory")
+    finally:
+        for flag, value in known.items():
+            setattr(import_utils, flag, value)
