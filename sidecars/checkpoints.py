@@ -11,6 +11,7 @@ import copy
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import ModelError
@@ -151,16 +152,17 @@ def _loaded_as(name: str, model: Any) -> str:
 
 def _compared(cls: Any, weights: Weights, options: Mapping[str, Any]) -> Any:
     """Load, and raise ModelError for what transformers filled, dropped or cut."""
+    if weights.local and (Path(weights.source) / "adapter_config.json").is_file():
+        # transformers adds it unasked, but only where PEFT is installed
+        raise ModelError(
+            f"{weights.source} holds a PEFT adapter beside a model",
+            hint="merge it into its base model and save that",
+        )
     model, account = from_pretrained(
         cls, weights, output_loading_info=True, ignore_mismatched_sizes=True, **options
     )
     try:
         _differences(account).refuse(weights.source)
-        if getattr(model, "_hf_peft_config_loaded", False):  # transformers follows it unasked
-            raise ModelError(
-                f"{weights.source} holds a PEFT adapter beside a model",
-                hint="merge it into its base model and save that",
-            )
     except ModelError:
         del model  # the error is kept for `ping`, and this frame with it
         raise

@@ -252,7 +252,8 @@ class PolicyAdapter:
         """
         import torch
 
-        if self._selects or not self._policy.supports_rtc():
+        compared = self._config.type != "groot"  # its own chunking counts rows otherwise
+        if self._selects or not compared or not self._policy.supports_rtc():
             raise BadRequest(
                 f"a policy of type {self._config.type} takes no left-over chunk",
                 hint="leave rtc out of policy_extras in the skill's manifest",

@@ -2,6 +2,7 @@
 several pictures, a video, limits."""
 
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
@@ -172,3 +173,17 @@ PNG = bytes(8)
 def test_pictures_are_counted_before_any_is_looked_at(fields, reason):
     with pytest.raises(ValidationError, match=reason):
         asked(**fields)
+
+
+@pytest.mark.heavy
+def test_an_adapter_beside_a_model_is_refused(loaded, manifest):
+    """Regression: transformers adds an adapter unasked where PEFT is installed, and ignores it
+    where it is not."""
+    adapter = loaded("qwen2_5_vl", manifest)
+    config = Path(adapter._weights.source) / "adapter_config.json"
+    config.write_text('{"peft_type": "LORA", "base_model_name_or_path": "other/model"}')
+    try:
+        with pytest.raises(ModelError, match="holds a PEFT adapter beside a model"):
+            adapter.load("cpu")
+    finally:
+        config.unlink()
