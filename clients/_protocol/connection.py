@@ -11,6 +11,7 @@ idempotent. Each request has a deadline.
 """
 
 from collections.abc import Iterator
+from itertools import count
 from typing import Protocol
 
 from vram_arbiter.clients._protocol.records import (
@@ -86,7 +87,7 @@ class Connection:
             "instance": instance,
             "role": role,
         }
-        self._next_id = 1
+        self._ids = count(1)
         self.outgoing: list[Message] = []
         self.events: list[Event] = []
         self._pending: dict[int, Pending] = {}
@@ -160,7 +161,7 @@ class Connection:
     ) -> int:
         """Queue a request. Its end (also its deadline) goes to `on_reply` or `on_error`, then to
         the owner unless `quiet`."""
-        request_id = self._new_id()
+        request_id = next(self._ids)
         request = Pending(
             {**message, "id": request_id},
             now + timeout_s,
@@ -243,7 +244,7 @@ class Connection:
     # -- steps: greeting ---------------------------------------------------------------------------
     def _send_handshake(self, message: Message, now: float) -> None:
         """Send hello or the reattachment, which come before any request."""
-        self._handshake_id, self._handshake_at = self._new_id(), now
+        self._handshake_id, self._handshake_at = next(self._ids), now
         self._phase_deadline = now + HELLO_TIMEOUT_S
         self.outgoing.append({**message, "id": self._handshake_id})
 
@@ -319,10 +320,6 @@ class Connection:
     def _send(self, request: Pending, now: float) -> None:
         request.sent_at = now
         self.outgoing.append(request.message)
-
-    def _new_id(self) -> int:
-        self._next_id += 1
-        return self._next_id - 1
 
 
 def _unreachable(op: str) -> ArbiterUnreachable:
