@@ -65,6 +65,7 @@ from vram_arbiter.schemas.errors import ConfigError, RunnerUnreachable, VramErro
 from vram_arbiter.schemas.goals import ResultPush
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint, runtime_dir
+from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.folders import LockFile, private_folder
 from vram_arbiter.schemas.runtime.printable import printable_lines
 from vram_arbiter.schemas.world import RunResult
@@ -143,10 +144,30 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             )
 
         follow = StandIn(make_trajectory, frozenset({ControlMode.JOINT_POSITION}))
-        stand_ins = StandIns({TRAJECTORY: follow}, parts.hal.description.joint_names)
+        known = {TRAJECTORY: follow, **ros_servers(file.robot)}
+        stand_ins = StandIns(known, parts.hal.description.joint_names)
         return {Kind.VLA: make_policy, Kind.ROS_ACTION: stand_ins}
 
     return make_makers
+
+
+def ros_servers(robot: RobotEnvironment) -> dict[str, StandIn]:
+    """Return the actions that ROS 2 servers execute, by interface. Raises ConfigError."""
+    if not robot.ros_actions:
+        return {}
+    need("ros_actions", "cyclonedds", extra="ros2")
+    from vram_arbiter.runner.ros2.action_skill import RosAction
+    from vram_arbiter.runner.sensors.ros2_dds import domain_of
+
+    try:
+        domain = domain_of()
+    except ValueError as error:
+        raise ConfigError(f"ros_actions: {error}") from error
+    served = StandIn(
+        lambda manifest: RosAction(manifest, domain),
+        frozenset({ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST}),
+    )
+    return dict.fromkeys(robot.ros_actions, served)
 
 
 class Deploy:

@@ -331,6 +331,9 @@ def plan(
         lines.append(("safety", "none given: only the joints' own ranges and speeds are limits"))
     if (button := listened_topic(robot)) is not None:
         lines.append(("estop", f"also by {button} (std_msgs/Bool)"))
+    if robot.ros_actions:
+        names = ", ".join(robot.ros_actions)
+        lines.append(("actions", f"by ROS 2 servers, past this runner's gate and motors: {names}"))
     lines += [("NOT KEPT", text) for text in unkept(file, parts, catalogue)]
     lines += [("skill", text) for text in catalogue.summary()]
     lines += [("contract", text) for text in contracts(parts, catalogue)]

@@ -28,7 +28,7 @@ NOT_EXECUTED = {
 }
 UNMADE = {
     Kind.VLA: "nothing here makes learned policies",
-    Kind.ROS_ACTION: "this runner has no ROS 2 action client and no stand-in for this one",
+    Kind.ROS_ACTION: "this runner neither stands in for it nor asks a ROS 2 server",
     Kind.ROS_SERVICE: "this runner has no ROS 2 service client",
 }
 MOTION_S = 45.0  # of a goal when neither it nor its manifest says how long

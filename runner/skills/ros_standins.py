@@ -1,7 +1,7 @@
 """Skills that this runner performs itself in place of a ROS 2 server, by interface type.
 
-It has no ROS 2 action client. A `ros_action` without a stand-in is refused before a goal could ask
-for it, with a list of the known ones.
+A `ros_action` without a stand-in is refused before a goal could ask for it, with a list of the known
+ones. `runner.ros2` asks ROS 2 servers, where a deployment names the interface.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class StandIns:
         if stand_in is None:
             known = " and ".join(sorted(self._known)) or "none"
             return (
-                f"this runner has no ROS 2 action client;"
-                f" it stands in for {known}, not for {wanted}"
+                f"this runner stands in for {known}, not for {wanted};"
+                " a deployment's `ros_actions` names what ROS 2 servers execute"
             )
         for actuator in manifest.actuators_required:
             if actuator.kind not in stand_in.drives:

@@ -162,6 +162,11 @@ class RobotEnvironment(_Section):
     """Cameras that are read together; null: each by itself."""
     detectors: tuple[DetectorConfig, ...] = ()
     """Detectors that look all the time, for the world state's `detected_objects`."""
+    ros_actions: tuple[
+        Literal["nav2_msgs/NavigateToPose", "control_msgs/FollowJointTrajectory"], ...
+    ] = ()
+    """Interfaces of `ros_action` skills that ROS 2 servers execute. Their motion passes neither
+    this runner's safety gate nor its emergency stop, which only cancels their goals."""
     task: TaskSpec | None = None
     vla: VlaSpec | None = None
     safety: SafetyEnvelope | None = None

@@ -497,3 +497,18 @@ def test_a_topic_that_stops_the_robot_is_named_and_not_told_as_unkept(dry_run: D
     assert "estop     also by /cell/e_stop (std_msgs/Bool)" in out.splitlines()
     assert "NOT KEPT  safety.deadman_required" in out
     assert "NOT KEPT  safety.e_stop_topic" not in out
+
+
+def test_an_action_that_a_ros_server_executes_is_offered_only_if_the_file_says_so(
+    dry_run: DryRun,
+) -> None:
+    pytest.importorskip("cyclonedds")
+    driving = TWIN + "embodiment_tags: [so101_follower, mobile_base]\n"
+    here = "so101-navigate is not offered: this runner stands in for control_msgs/FollowJoint"
+    assert here in dry_run(driving)[1]
+    served = driving + "ros_actions: [nav2_msgs/NavigateToPose]\n"
+    code, out, _ = dry_run(served)
+    assert code == 0
+    assert "by ROS 2 servers, past this runner's gate and motors: nav2_msgs/NavigateToPose" in out
+    assert here not in out
+    assert "not offered" not in out

@@ -40,7 +40,7 @@ REASON = {
     Kind.REWARD: "it judges progress and moves nothing",
     Kind.PLAYBOOK: "it is a text for planners",
     Kind.VLA: "nothing here makes learned policies",
-    Kind.ROS_ACTION: "no ROS 2 action client",
+    Kind.ROS_ACTION: "nor asks a ROS 2 server",
     Kind.ROS_SERVICE: "no ROS 2 service client",
 }
 

@@ -247,7 +247,7 @@ def test_a_ros_action_without_a_stand_in_is_refused_with_what_there_is() -> None
     assert both.refuses(MOVE) == both.refuses(DRIVE) == arm.refuses(MOVE) == ""
     said = arm.refuses(DRIVE)
     assert (
-        "has no ROS 2 action client; it stands in for control_msgs/FollowJointTrajectory, not for"
+        "this runner stands in for control_msgs/FollowJointTrajectory, not for"
         " nav2_msgs/NavigateToPose" in said
     )
     assert isinstance(arm(MOVE), FollowJointTrajectory)

@@ -1,0 +1,189 @@
+"""Client of one ROS 2 action over DDS, as rmw_cyclonedds speaks it. Needs no ROS installation.
+
+An action is three services (`send_goal`, `get_result`, `cancel_goal`) below `NAME/_action`; a
+service is a topic of requests and one of replies, which name the client and the request. Feedback
+and status topics are not read. A thread of its own waits for replies; calls are awaited on the
+event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import threading
+from typing import Any, Self
+
+from vram_arbiter.runner.ros2 import messages
+from vram_arbiter.runner.sensors.ros2_dds import cdr_of, dds_problems, full_topic, sample_of
+from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
+
+log = logging.getLogger(__name__)
+
+WAIT_S = 1.0  # the longest that the thread sleeps in DDS; a reply wakes it
+STOP_S = 2.0
+REPLIES_KEPT = 16
+SERVICES = ("send_goal", "get_result", "cancel_goal")
+CANCEL = "action_msgs/CancelGoal"
+
+
+class ActionClient:
+    """`async with ActionClient("nav2_msgs/NavigateToPose", "/navigate_to_pose", 0) as client:`
+
+    Entering raises ConfigError: a wrong name, or DDS cannot be started.
+    """
+
+    def __init__(self, interface: str, name: str, domain: int) -> None:
+        try:
+            self.name = full_topic(name)
+        except ValueError as error:
+            raise ConfigError(f"the action's name: {error}") from error
+        kinds = (f"{interface}_SendGoal", f"{interface}_GetResult", CANCEL)
+        self._kinds = dict(zip(SERVICES, kinds, strict=True))
+        self._domain = domain
+        self._guid = secrets.randbits(63)
+        self._sent = 0
+        self._waiting: dict[tuple[str, int], asyncio.Future[JsonObject]] = {}
+        self._writers: dict[str, Any] = {}
+        self._readers: dict[str, Any] = {}
+        self._served = asyncio.Event()
+        self._thread: threading.Thread | None = None
+
+    async def __aenter__(self) -> Self:
+        self._loop = asyncio.get_running_loop()
+        with dds_problems(self._domain):
+            waitset = self._open()
+        self._thread = threading.Thread(
+            target=self._run, args=(waitset,), name="ros2-action", daemon=True
+        )
+        self._thread.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._guard.set(True)
+        if self._thread is not None:
+            await asyncio.to_thread(self._thread.join, STOP_S)
+        self._writers.clear()
+        self._readers.clear()
+
+    async def served(self, timeout_s: float) -> None:
+        """Wait for a server. Raises SidecarUnavailable."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._served.wait()
+        except TimeoutError:
+            raise SidecarUnavailable(
+                f"no server of the action {self.name} within {timeout_s:g} s",
+                hint="is it running, on this ROS_DOMAIN_ID and network (CYCLONEDDS_URI)?",
+            ) from None
+
+    async def call(self, service: str, fields: JsonMap) -> JsonObject:
+        """Send a request and wait for its reply, without a limit. Raises ValueError for fields that
+        the request does not have."""
+        self._sent += 1
+        number = self._sent
+        kind = self._kinds[service] + "_Request"
+        cdr = messages.write(kind, {"guid": self._guid, "seq": number, **fields})
+        reply = self._waiting[service, number] = self._loop.create_future()
+        try:
+            self._writers[service].write(sample_of(messages.dds_type(kind), cdr))
+            answer: JsonObject = await reply
+            return answer
+        finally:
+            del self._waiting[service, number]
+
+    # -- DDS
+    def _open(self) -> Any:
+        from cyclonedds.core import (
+            DDSStatus,
+            GuardCondition,
+            InstanceState,
+            Policy,
+            Qos,
+            ReadCondition,
+            SampleState,
+            ViewState,
+            WaitSet,
+        )
+        from cyclonedds.domain import DomainParticipant
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+        from cyclonedds.util import duration
+
+        quality = Qos(
+            Policy.Reliability.Reliable(duration(seconds=1)),
+            Policy.Durability.Volatile,
+            Policy.History.KeepLast(REPLIES_KEPT),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.WriterDataLifecycle(autodispose=False),  # ROS disposes of nothing
+        )
+        participant = DomainParticipant(self._domain)
+        self._guard: Any = GuardCondition(participant)
+        waitset = WaitSet(participant)
+        waitset.attach(self._guard)
+        for service, kind in self._kinds.items():
+            path = f"{self.name}/_action/{service}"
+            asked = Topic(participant, f"rq{path}Request", messages.dds_type(kind + "_Request"))
+            told = Topic(participant, f"rr{path}Reply", messages.dds_type(kind + "_Response"))
+            writer = self._writers[service] = DataWriter(participant, asked, qos=quality)
+            reader = self._readers[service] = DataReader(participant, told, qos=quality)
+            writer.set_status_mask(DDSStatus.PublicationMatched)
+            reader.set_status_mask(DDSStatus.SubscriptionMatched)
+            waitset.attach(writer)
+            waitset.attach(reader)
+            state = SampleState.Any | ViewState.Any | InstanceState.Any
+            waitset.attach(ReadCondition(reader, state))
+        return waitset
+
+    # -- on its thread
+    def _run(self, waitset: Any) -> None:
+        from cyclonedds.core import DDSException
+        from cyclonedds.util import duration
+
+        try:
+            while not self._guard.read():
+                waitset.wait(duration(seconds=WAIT_S))
+                self._loop.call_soon_threadsafe(self._found, self._matched())
+                for service, reader in self._readers.items():
+                    for sample in reader.take(N=REPLIES_KEPT):
+                        if sample.sample_info.valid_data:
+                            self._took(service, cdr_of(sample))
+        except DDSException as error:
+            log.error("the client of %s failed: %s", self.name, error)
+            self._loop.call_soon_threadsafe(self._fail, str(error))
+
+    def _matched(self) -> bool:
+        """Return whether a server has all three services."""
+        counts = [w.get_publication_matched_status().current_count for w in self._writers.values()]
+        counts += [
+            r.get_subscription_matched_status().current_count for r in self._readers.values()
+        ]
+        return all(counts)
+
+    def _took(self, service: str, cdr: bytes) -> None:
+        try:
+            reply = messages.read(self._kinds[service] + "_Response", cdr)
+        except ValueError as error:
+            log.warning("a reply of %s/%s cannot be read: %s", self.name, service, error)
+            return
+        if reply["guid"] == self._guid:  # else it is another client's
+            self._loop.call_soon_threadsafe(self._settle, service, reply)
+
+    # -- on the event loop
+    def _found(self, matched: bool) -> None:
+        if matched:
+            self._served.set()
+        else:
+            self._served.clear()
+
+    def _settle(self, service: str, reply: JsonObject) -> None:
+        waiting = self._waiting.get((service, reply["seq"]))
+        if waiting is not None and not waiting.done():
+            waiting.set_result(reply)
+
+    def _fail(self, problem: str) -> None:
+        for waiting in self._waiting.values():
+            if not waiting.done():
+                waiting.set_exception(SidecarUnavailable(f"{self.name}: DDS failed: {problem}"))

@@ -1,0 +1,263 @@
+"""ROS 2 messages of the actions that this runner asks for: their fields, CDR and DDS types.
+
+A message is a map, as in a goal's `goal_params`: missing fields have ROS's defaults, unknown ones
+are refused. Pure but for `dds_type`, which imports Cyclone DDS.
+"""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from vram_arbiter.runner.sensors.ros2_dds import cdr_of, sample_of
+
+type Fields = tuple[tuple[str, str], ...]
+
+_XYZ: Final[Fields] = (("x", "float64"), ("y", "float64"), ("z", "float64"))
+_TOLERANCE: Final[Fields] = (
+    ("position", "float64"),
+    ("velocity", "float64"),
+    ("acceleration", "float64"),
+)
+_CALL: Final[Fields] = (("guid", "uint64"), ("seq", "int64"))
+"""What rmw_cyclonedds writes before each request and reply: the client, and its number."""
+
+MESSAGES: Final[Mapping[str, Fields]] = {
+    "builtin_interfaces/Time": (("sec", "int32"), ("nanosec", "uint32")),
+    "builtin_interfaces/Duration": (("sec", "int32"), ("nanosec", "uint32")),
+    "std_msgs/Header": (("stamp", "builtin_interfaces/Time"), ("frame_id", "string")),
+    "unique_identifier_msgs/UUID": (("uuid", "uint8[16]"),),
+    "geometry_msgs/Point": _XYZ,
+    "geometry_msgs/Vector3": _XYZ,
+    "geometry_msgs/Quaternion": (*_XYZ, ("w", "float64=1")),
+    "geometry_msgs/Pose": (
+        ("position", "geometry_msgs/Point"),
+        ("orientation", "geometry_msgs/Quaternion"),
+    ),
+    "geometry_msgs/PoseStamped": (("header", "std_msgs/Header"), ("pose", "geometry_msgs/Pose")),
+    "geometry_msgs/Transform": (
+        ("translation", "geometry_msgs/Vector3"),
+        ("rotation", "geometry_msgs/Quaternion"),
+    ),
+    "geometry_msgs/Twist": (
+        ("linear", "geometry_msgs/Vector3"),
+        ("angular", "geometry_msgs/Vector3"),
+    ),
+    "trajectory_msgs/JointTrajectoryPoint": (
+        ("positions", "float64[]"),
+        ("velocities", "float64[]"),
+        ("accelerations", "float64[]"),
+        ("effort", "float64[]"),
+        ("time_from_start", "builtin_interfaces/Duration"),
+    ),
+    "trajectory_msgs/JointTrajectory": (
+        ("header", "std_msgs/Header"),
+        ("joint_names", "string[]"),
+        ("points", "trajectory_msgs/JointTrajectoryPoint[]"),
+    ),
+    "trajectory_msgs/MultiDOFJointTrajectoryPoint": (
+        ("transforms", "geometry_msgs/Transform[]"),
+        ("velocities", "geometry_msgs/Twist[]"),
+        ("accelerations", "geometry_msgs/Twist[]"),
+        ("time_from_start", "builtin_interfaces/Duration"),
+    ),
+    "trajectory_msgs/MultiDOFJointTrajectory": (
+        ("header", "std_msgs/Header"),
+        ("joint_names", "string[]"),
+        ("points", "trajectory_msgs/MultiDOFJointTrajectoryPoint[]"),
+    ),
+    "control_msgs/JointTolerance": (("name", "string"), *_TOLERANCE),
+    "control_msgs/JointComponentTolerance": (
+        ("joint_name", "string"),
+        ("component", "uint16"),
+        *_TOLERANCE,
+    ),
+    "control_msgs/FollowJointTrajectory_Goal": (
+        ("trajectory", "trajectory_msgs/JointTrajectory"),
+        ("multi_dof_trajectory", "trajectory_msgs/MultiDOFJointTrajectory"),
+        ("path_tolerance", "control_msgs/JointTolerance[]"),
+        ("component_path_tolerance", "control_msgs/JointComponentTolerance[]"),
+        ("goal_tolerance", "control_msgs/JointTolerance[]"),
+        ("component_goal_tolerance", "control_msgs/JointComponentTolerance[]"),
+        ("goal_time_tolerance", "builtin_interfaces/Duration"),
+    ),
+    "control_msgs/FollowJointTrajectory_Result": (
+        ("error_code", "int32"),
+        ("error_string", "string"),
+    ),
+    "nav2_msgs/NavigateToPose_Goal": (
+        ("pose", "geometry_msgs/PoseStamped"),
+        ("behavior_tree", "string"),
+    ),
+    "nav2_msgs/NavigateToPose_Result": (("error_code", "uint16"), ("error_msg", "string")),
+    "action_msgs/GoalInfo": (
+        ("goal_id", "unique_identifier_msgs/UUID"),
+        ("stamp", "builtin_interfaces/Time"),
+    ),
+    "action_msgs/CancelGoal_Request": (*_CALL, ("goal_info", "action_msgs/GoalInfo")),
+    "action_msgs/CancelGoal_Response": (
+        *_CALL,
+        ("return_code", "int8"),
+        ("goals_canceling", "action_msgs/GoalInfo[]"),
+    ),
+}
+_NUMBERS: Final[Mapping[str, str]] = {
+    "bool": "?", "int8": "b", "uint8": "B", "uint16": "H", "int32": "i", "uint32": "I",
+    "int64": "q", "uint64": "Q", "float64": "d",
+}  # fmt: skip
+ITEMS_MAX: Final = 100_000  # of one sequence
+
+
+def fields_of(kind: str) -> Fields:
+    """Return the fields of a message, or of a service that an action consists of."""
+    if kind in MESSAGES:
+        return MESSAGES[kind]
+    package, _, name = kind.partition("/")
+    action, _, part = name.partition("_")
+    action = f"{package}/{action}"
+    goal_id = ("goal_id", "unique_identifier_msgs/UUID")
+    return {
+        "SendGoal_Request": (*_CALL, goal_id, ("goal", f"{action}_Goal")),
+        "SendGoal_Response": (
+            *_CALL,
+            ("accepted", "bool"),
+            ("stamp", "builtin_interfaces/Time"),
+        ),
+        "GetResult_Request": (*_CALL, goal_id),
+        "GetResult_Response": (*_CALL, ("status", "int8"), ("result", f"{action}_Result")),
+    }[part]
+
+
+# -- CDR
+def write(kind: str, message: Mapping[str, Any]) -> bytes:
+    """Return a message as plain CDR. Raises ValueError with the field that does not fit."""
+    out = bytearray()
+    _put(out, kind, message, "")
+    return b"\x00\x01\x00\x00" + bytes(out)
+
+
+def read(kind: str, cdr: bytes) -> dict[str, Any]:
+    """Read a message from plain CDR. Raises ValueError."""
+    if len(cdr) < 4 or cdr[0] != 0 or cdr[1] not in (0, 1, 6, 7):
+        raise ValueError("the message is in an encoding other than plain CDR")
+    found, _ = _take(memoryview(cdr)[4:], 0, kind, "<" if cdr[1] & 1 else ">")
+    assert isinstance(found, dict)
+    return found
+
+
+def _split(kind: str) -> tuple[str, int | None, float]:
+    """Return the type of an entry, its count (None: one, 0: any number), and its default."""
+    kind, _, default = kind.partition("=")
+    base, bracket, count = kind.rstrip("]").partition("[")
+    return base, (int(count or 0) if bracket else None), float(default or 0)
+
+
+def _put(out: bytearray, kind: str, value: Any, at: str) -> None:
+    base, count, default = _split(kind)
+    if count is not None:
+        items = [] if value is None else value
+        if not isinstance(items, Sequence) or isinstance(items, str) or len(items) > ITEMS_MAX:
+            raise ValueError(f"{at}: expected a list, got {type(items).__name__}")
+        if count == 0:
+            _number(out, "I", len(items), at)
+        elif len(items) != count:
+            raise ValueError(f"{at}: expected {count} numbers, got {len(items)}")
+        for index, item in enumerate(items):
+            _put(out, base, item, f"{at}[{index}]")
+    elif base == "string":
+        text = "" if value is None else value
+        if not isinstance(text, str) or "\x00" in text:
+            raise ValueError(f"{at}: expected a text, got {value!r:.40}")
+        raw = text.encode() + b"\x00"
+        _number(out, "I", len(raw), at)
+        out += raw
+    elif base in _NUMBERS:
+        missing: float | bool = default if base != "bool" else False
+        _number(out, _NUMBERS[base], missing if value is None else value, at)
+    else:
+        given = {} if value is None else value
+        if not isinstance(given, Mapping):
+            raise ValueError(f"{at or base}: expected a map, got {type(value).__name__}")
+        fields = fields_of(base)
+        if unknown := sorted(set(given) - {name for name, _ in fields}):
+            raise ValueError(f"{at or base}: unknown field {unknown[0]}")
+        for name, entry in fields:
+            _put(out, entry, given.get(name), f"{at}.{name}" if at else name)
+
+
+def _number(out: bytearray, code: str, value: Any, at: str) -> None:
+    out += b"\x00" * (-len(out) % struct.calcsize(code))
+    try:
+        whole = value if code in "d?" else int(value)
+        if isinstance(value, bool) != (code == "?") or whole != value:
+            raise ValueError
+        out += struct.pack("<" + code, whole)
+    except (struct.error, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{at}: expected a number of this field, got {value!r:.40}") from error
+
+
+def _take(data: memoryview, at: int, kind: str, order: str) -> tuple[Any, int]:
+    base, count, _ = _split(kind)
+    if count is not None:
+        if count == 0:
+            count, at = _unpack(data, at, "I", order)
+        if count > ITEMS_MAX:
+            raise ValueError(f"a list of {count} items")
+        items = []
+        for _ in range(count):
+            item, at = _take(data, at, base, order)
+            items.append(item)
+        return items, at
+    if base == "string":
+        size, at = _unpack(data, at, "I", order)
+        if at + size > len(data):
+            raise ValueError("the message ends too early")
+        return bytes(data[at : at + size]).rstrip(b"\x00").decode("utf-8", "replace"), at + size
+    if base in _NUMBERS:
+        return _unpack(data, at, _NUMBERS[base], order)
+    found = {}
+    for name, entry in fields_of(base):
+        found[name], at = _take(data, at, entry, order)
+    return found, at
+
+
+def _unpack(data: memoryview, at: int, code: str, order: str) -> tuple[Any, int]:
+    width = struct.calcsize(code)
+    at += -at % width
+    if at + width > len(data):
+        raise ValueError("the message ends too early")
+    return struct.unpack_from(order + code, data, at)[0], at + width
+
+
+# -- DDS
+def dds_name(kind: str) -> str:
+    """Return the name of the DDS type: `nav2_msgs::action::dds_::NavigateToPose_Goal_`."""
+    package, _, name = kind.partition("/")
+    folder = "msg"
+    if name.endswith(("_Goal", "_Result")) or "_SendGoal_" in name or "_GetResult_" in name:
+        folder = "action"
+    elif name.startswith("CancelGoal_"):
+        folder = "srv"
+    return f"{package}.{folder}.dds_.{name}_"
+
+
+@functools.cache
+def dds_type(kind: str) -> Any:
+    """Return the DDS type of a message under its ROS name; its samples stay as bytes."""
+    from cyclonedds.idl import make_idl_struct, types
+
+    def of(entry: str) -> Any:
+        base, count, _ = _split(entry)
+        plain = {"string": str, "bool": bool}.get(base)
+        one = plain or (getattr(types, base) if base in _NUMBERS else dds_type(base))
+        if count is None:
+            return one
+        return types.array[one, count] if count else types.sequence[one]
+
+    members = {name: of(entry) for name, entry in fields_of(kind)}
+    made = make_idl_struct(kind.partition("/")[2] + "_", dds_name(kind), members)
+    made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
+    made.serialize = lambda self, *_, **__: cdr_of(self)
+    return made

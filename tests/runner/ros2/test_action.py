@@ -1,0 +1,343 @@
+"""Actions that a ROS 2 server executes: an independent participant, with types and codec of
+Cyclone DDS alone, accepts, rejects, succeeds, aborts and is canceled.
+"""
+
+import asyncio
+import threading
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from tests.runner.sensors.test_gstreamer_to_ros import NETWORK
+from vram_arbiter.runner.protocols import Done, Goal, Hold
+from vram_arbiter.runner.ros2.action_skill import RosAction
+from vram_arbiter.runner.ros2.messages import read, write
+from vram_arbiter.schemas.errors import BadRequest, Cancelled, GoalRejected, ModelError
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.world import JointState, WorldState
+
+pytestmark = [pytest.mark.heavy, pytest.mark.anyio]
+pytest.importorskip("cyclonedds")
+
+from cyclonedds.core import Policy, Qos  # noqa: E402
+from cyclonedds.domain import DomainParticipant  # noqa: E402
+from cyclonedds.idl import IdlStruct  # noqa: E402
+from cyclonedds.idl.annotations import final  # noqa: E402
+from cyclonedds.idl.types import (  # noqa: E402
+    array,
+    float64,
+    int8,
+    int32,
+    int64,
+    sequence,
+    uint8,
+    uint16,
+    uint32,
+    uint64,
+)
+from cyclonedds.pub import DataWriter  # noqa: E402
+from cyclonedds.sub import DataReader  # noqa: E402
+from cyclonedds.topic import Topic  # noqa: E402
+from cyclonedds.util import duration  # noqa: E402
+
+DOMAIN = 80
+WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
+PATIENCE_S = 60.0
+
+
+@dataclass
+@final
+class Time_(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+@final
+class UUID_(IdlStruct, typename="unique_identifier_msgs.msg.dds_.UUID_"):
+    uuid: array[uint8, 16]
+
+
+@dataclass
+@final
+class Header_(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    stamp: Time_
+    frame_id: str
+
+
+@dataclass
+@final
+class Point_(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+@final
+class Quaternion_(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+@final
+class Pose_(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
+    position: Point_
+    orientation: Quaternion_
+
+
+@dataclass
+@final
+class PoseStamped_(IdlStruct, typename="geometry_msgs.msg.dds_.PoseStamped_"):
+    header: Header_
+    pose: Pose_
+
+
+@dataclass
+@final
+class Goal_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_Goal_"):
+    pose: PoseStamped_
+    behavior_tree: str
+
+
+@dataclass
+@final
+class Result_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_Result_"):
+    error_code: uint16
+    error_msg: str
+
+
+@dataclass
+@final
+class SendRequest_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_SendGoal_Request_"):
+    guid: uint64
+    seq: int64
+    goal_id: UUID_
+    goal: Goal_
+
+
+@dataclass
+@final
+class SendResponse_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_SendGoal_Response_"):
+    guid: uint64
+    seq: int64
+    accepted: bool
+    stamp: Time_
+
+
+@dataclass
+@final
+class ResultRequest_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_GetResult_Request_"):
+    guid: uint64
+    seq: int64
+    goal_id: UUID_
+
+
+@dataclass
+@final
+class ResultResponse_(
+    IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_GetResult_Response_"
+):
+    guid: uint64
+    seq: int64
+    status: int8
+    result: Result_
+
+
+@dataclass
+@final
+class GoalInfo_(IdlStruct, typename="action_msgs.msg.dds_.GoalInfo_"):
+    goal_id: UUID_
+    stamp: Time_
+
+
+@dataclass
+@final
+class CancelRequest_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Request_"):
+    guid: uint64
+    seq: int64
+    goal_info: GoalInfo_
+
+
+@dataclass
+@final
+class CancelResponse_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Response_"):
+    guid: uint64
+    seq: int64
+    return_code: int8
+    goals_canceling: sequence[GoalInfo_]
+
+
+@dataclass
+class Navigator:
+    """Accepts goals ahead of the robot (x >= 0); x = 1 succeeds, x = 2 aborts, others drive on
+    until they are canceled."""
+
+    name: str
+    goals: list[Any] = field(default_factory=list)
+    canceled: list[bytes] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._participant = DomainParticipant(DOMAIN)
+        self._send = self._service("send_goal", SendRequest_, SendResponse_)
+        self._result = self._service("get_result", ResultRequest_, ResultResponse_)
+        self._cancel = self._service("cancel_goal", CancelRequest_, CancelResponse_)
+        self._pending: dict[bytes, Any] = {}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _service(self, name: str, request: type, response: type) -> tuple[Any, Any]:
+        qos = Qos(
+            Policy.Reliability.Reliable(duration(seconds=10)),
+            Policy.History.KeepLast(10),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        path = f"{self.name}/_action/{name}"
+        asked = Topic(self._participant, f"rq{path}Request", request)
+        told = Topic(self._participant, f"rr{path}Reply", response)
+        return (
+            DataReader(self._participant, asked, qos=qos),
+            DataWriter(self._participant, told, qos=qos),
+        )
+
+    def _run(self) -> None:
+        while not self._over.wait(0.01):
+            for asked in valid(self._send[0]):
+                x = asked.goal.pose.pose.position.x
+                self.goals.append(asked.goal)
+                told = SendResponse_(asked.guid, asked.seq, x >= 0, Time_(0, 0))
+                self._send[1].write(SendResponse_(asked.guid + 1, asked.seq, False, Time_(0, 0)))
+                self._send[1].write(told)  # after another client's
+            for asked in valid(self._result[0]):
+                self._pending[bytes(asked.goal_id.uuid)] = asked
+                x = self.goals[-1].pose.pose.position.x
+                if x in (1.0, 2.0):
+                    self._answer(
+                        asked, 4 if x == 1.0 else 6, Result_(int(x) - 1, "no way" * (x > 1))
+                    )
+            for asked in valid(self._cancel[0]):
+                goal_id = bytes(asked.goal_info.goal_id.uuid)
+                self.canceled.append(goal_id)
+                self._cancel[1].write(CancelResponse_(asked.guid, asked.seq, 0, [asked.goal_info]))
+                if (waiting := self._pending.pop(goal_id, None)) is not None:
+                    self._answer(waiting, 5, Result_(0, ""))
+
+    def _answer(self, asked: Any, status: int, result: Result_) -> None:
+        self._result[1].write(ResultResponse_(asked.guid, asked.seq, status, result))
+
+
+def valid(reader: Any) -> list[Any]:
+    return [sample for sample in reader.take(N=10) if sample.sample_info.valid_data]
+
+
+@pytest.fixture
+def navigator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Navigator]:
+    monkeypatch.setenv("CYCLONEDDS_URI", NETWORK)
+    server = Navigator(f"/n{uuid.uuid4().hex}/navigate_to_pose")
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def skill(navigator: Navigator, navigate_manifest: Any) -> RosAction:
+    manifest = load_manifest(navigate_manifest)
+    assert manifest.ros_integration is not None
+    ros = {
+        "interface_name": navigator.name,
+        "package": "nav2_msgs",
+        "interface_type": "NavigateToPose",
+        "default_goal_json": '{"pose": {"header": {"frame_id": "map"}}}',
+    }
+    return RosAction(
+        manifest.model_copy(
+            update={"ros_integration": manifest.ros_integration.model_copy(update=ros)}
+        ),
+        DOMAIN,
+    )
+
+
+def goal(x: Any, **more: Any) -> Goal:
+    params = {"pose": {"pose": {"position": {"x": x}}}, **more}
+    return Goal("g", "a/nav", params=params)
+
+
+async def ended(skill: RosAction) -> Any:
+    async with asyncio.timeout(PATIENCE_S):
+        while isinstance(step := skill.step(WORLD), Hold):
+            await asyncio.sleep(0.01)
+    return step
+
+
+async def test_goals_succeed_abort_are_rejected_and_are_canceled(
+    skill: RosAction, navigator: Navigator
+) -> None:
+    try:
+        await skill.start(goal(1.0))
+        assert await ended(skill) == Done({"result": {"error_code": 0, "error_msg": ""}})
+        seen = navigator.goals[0].pose
+        assert (seen.header.frame_id, seen.pose.orientation.w) == ("map", 1.0)  # ROS's default
+        await skill.finish()
+
+        await skill.start(goal(2.0))
+        with pytest.raises(ModelError, match=r"status 6, error code 1: no way"):
+            await ended(skill)
+        await skill.finish()
+
+        with pytest.raises(GoalRejected):
+            await skill.start(goal(-1.0))
+        with pytest.raises(
+            BadRequest, match=r"goal_params: pose\.pose\.position\.x: expected a nu"
+        ):
+            await skill.start(goal("far"))
+        with pytest.raises(BadRequest, match="goal_params: unknown field tree"):
+            await skill.start(goal(1.0, tree="x"))
+
+        await skill.start(goal(5.0))
+        assert isinstance(skill.step(WORLD), Hold)
+        await skill.finish()  # canceled by a person, the deadline or the emergency stop
+        assert len(navigator.canceled) == 1
+    finally:
+        await skill.release()
+
+
+async def test_a_goal_that_the_server_itself_cancels_is_not_a_success(
+    skill: RosAction, navigator: Navigator
+) -> None:
+    try:
+        await skill.start(goal(5.0))
+        assert skill._client is not None
+        await skill._client.call("cancel_goal", {"goal_info": {"goal_id": skill._goal_id}})
+        with pytest.raises(Cancelled, match="status 5"):
+            await ended(skill)
+    finally:
+        await skill.release()
+
+
+def test_a_trajectory_goal_round_trips_and_is_never_read_in_part() -> None:
+    kind = "control_msgs/FollowJointTrajectory_Goal"
+    sent = {
+        "trajectory": {
+            "joint_names": ["a", "bc"],
+            "points": [{"positions": [0.5, -1.0], "time_from_start": {"sec": 1, "nanosec": 5}}],
+        },
+        "goal_tolerance": [{"name": "a", "position": 0.01}],
+        "goal_time_tolerance": {"sec": 2},
+    }
+    cdr = write(kind, sent)
+    back = read(kind, cdr)
+    assert back["trajectory"]["points"][0]["positions"] == [0.5, -1.0]
+    assert (back["goal_tolerance"][0]["position"], back["goal_time_tolerance"]["sec"]) == (0.01, 2)
+    for cut in range(4, len(cdr) - 1, 7):
+        with pytest.raises(ValueError, match="ends too early"):
+            read(kind, cdr[:cut])
