@@ -7,19 +7,38 @@ refuse another. A tool's result is text; a picture follows it as a message of th
 
 import base64
 import json
+import logging
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
 from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner, tokens
+from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.tools import FunctionTool
+
+log = logging.getLogger(__name__)
+
+REFUSABLE = ("parallel_tool_calls", "max_completion_tokens")
+"""Parameters that some servers refuse: o1, o3 and o4-mini the first, strict older ones the second."""
 
 
 class OpenAiPlanner(LlmPlanner):
     """`BASE_URL` ends where the API begins, usually in `/v1`."""
 
     provider: ClassVar[str] = "openai"
+    _refused: frozenset[str] = frozenset()
+
+    async def _ask(self, turns: Sequence[Turn], functions: Sequence[FunctionTool]) -> Answer:
+        try:
+            return await super()._ask(turns, functions)
+        except LlmError as error:
+            named = {name for name in REFUSABLE if f"'{name}'" in str(error)} - self._refused
+            if not named:
+                raise
+            log.warning("%s: asking without it from now on", error.message)
+            self._refused |= named
+        return await self._ask(turns, functions)
 
     def _headers(self) -> dict[str, str]:
         return {"authorization": f"Bearer {self.config.api_key}"} if self.config.api_key else {}
@@ -30,14 +49,17 @@ class OpenAiPlanner(LlmPlanner):
         messages = [{"role": "system", "content": self._system}]
         for turn in turns:
             messages += _messages(turn)
-        return f"{self.config.base_url}/chat/completions", {
+        limit = "max_completion_tokens"
+        body: JsonObject = {
             "model": self.config.model,
             "messages": messages,
             "tools": list(functions),
             "tool_choice": "auto",
-            "parallel_tool_calls": False,
-            "max_completion_tokens": self.config.max_tokens,
+            "max_tokens" if limit in self._refused else limit: self.config.max_tokens,
         }
+        if "parallel_tool_calls" not in self._refused:
+            body["parallel_tool_calls"] = False
+        return f"{self.config.base_url}/chat/completions", body
 
     def _read(self, body: JsonObject) -> Answer:
         choice = body["choices"][0]

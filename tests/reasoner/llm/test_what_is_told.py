@@ -11,6 +11,7 @@ import pytest
 
 from tests.support.llm_apis import KEY, PALETTE, OpenAi
 from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
 from vram_arbiter.reasoner.llm.prompt import instructions
 from vram_arbiter.reasoner.llm.transcript import Transcript
 from vram_arbiter.reasoner.palette import Palette, Skill
@@ -40,6 +41,31 @@ def test_current_parameters(api: Any, stand_in: Any, decide: Any) -> None:
     else:
         assert body["max_tokens"] == 4096
         assert body["tool_choice"]["disable_parallel_tool_use"] is True
+
+
+def test_a_parameter_that_a_model_refuses_is_left_out_from_then_on(stand_in: Any) -> None:
+    """o1, o3 and o4-mini refuse `parallel_tool_calls`, which other models have to be told."""
+    for name in ("parallel_tool_calls", "max_completion_tokens"):
+        text = f"Unsupported parameter: '{name}' is not supported with this model."
+        stand_in.json({"error": {"message": text}}, 400)
+    for _ in range(2):
+        stand_in.json(OpenAi.says(("query_scene", '{"question": "?"}')))
+    stand_in.json({"error": {"message": "Unsupported parameter: 'tools'"}}, 400)
+
+    async def thrice() -> None:
+        async with OpenAiPlanner(LlmConfig(stand_in.url, "m", KEY), PALETTE) as planner:
+            for _ in range(2):
+                await planner.decide(Episode("x"))
+            with pytest.raises(LlmError, match="'tools'"):
+                await planner.decide(Episode("x"))
+
+    asyncio.run(thrice())
+    assert len(stand_in.asked) == 5
+    assert "parallel_tool_calls" not in stand_in.asked[1]
+    for body in stand_in.asked[2:]:
+        assert "parallel_tool_calls" not in body
+        assert "max_completion_tokens" not in body
+        assert body["max_tokens"] == 4096
 
 
 def test_cameras_are_a_choice_and_another_one_is_told_back(
