@@ -209,9 +209,8 @@ def test_a_policys_vectors_are_told_where_it_fits(dry_run: DryRun) -> None:
         (
             TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: "
             "vram-arbiter/so101-navigate\n",
-            r"robot\.yaml:6: vla\.id: .* is not offered here: this runner has no ROS 2 action "
-            r"client; it stands in for control_msgs/FollowJointTrajectory, not for "
-            r"nav2_msgs/NavigateToPose",
+            r"robot\.yaml:6: vla\.id: .* is not offered here: this runner stands in for "
+            r"control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose",
         ),
         (
             TWIN + "embodiment_tags: [any]\n",
