@@ -1,5 +1,5 @@
-"""`kill -9` of a holder, of a waiter and of the daemon in the middle of a switch: real processes,
-sockets and files.
+"""`kill -9` of a waiter, of the daemon and of both sides in the middle of a switch: real processes,
+sockets and files. `test_steps` kills each side at each step.
 
 Every test ends with the independent checker over the card's own allocation log: no instant with
 more bytes than the card has.
@@ -174,42 +174,6 @@ def bytes_of(log: str, name: str, before_first_alloc_of: str) -> int:
         if line["name"] == name:
             held = line["process_bytes"]
     pytest.fail(f"{before_first_alloc_of} never allocated")
-
-
-def test_the_waiter_is_granted_after_a_killed_holders_bytes_are_measured_gone() -> None:
-    async def test(box: Box) -> None:
-        await box.arbiter()
-        holder = await box.consumer("holder", 5)
-        await holder.until("ready")
-        holder.tell("use")  # in use: nobody may make it leave, but it can die
-        await holder.until("in_use")
-        waiter = await box.consumer("waiter", 5)
-        await box.status(lambda status: consumers(status).get("waiter") == "queued")
-        await holder.kill()
-        await waiter.until("ready")
-        assert bytes_of(box.log(), "holder", "waiter") == 0
-
-    in_box(test)
-
-
-@pytest.mark.parametrize("step", ["loading", "unloading"])
-def test_a_holder_killed_in_the_middle_of_a_switch(step: str) -> None:
-    async def test(box: Box) -> None:
-        await box.arbiter()
-        first = await box.consumer("first", 5, pause=step)
-        if step == "loading":
-            await first.until("loading")
-            second = await box.consumer("second", 5)
-            await box.status(lambda status: consumers(status).get("second") == "queued")
-        else:
-            await first.until("ready")
-            second = await box.consumer("second", 5)
-            await first.until("unloading")
-        await first.kill()
-        await second.until("ready")
-        assert bytes_of(box.log(), "first", "second") == 0
-
-    in_box(test)
 
 
 def test_a_killed_waiter_leaves_the_queue_and_its_place_to_the_next() -> None:
