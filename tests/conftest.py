@@ -36,11 +36,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 LONGEST = (
     "tests/e2e/test_demo.py",
-    "tests/bench/",
+    "tests/sidecars/test_",
+    "tests/packaging/test_readme.py",
+    "tests/runner/recording/",
     "tests/e2e/",
     "tests/sidecars/",
-    "tests/runner/recording/",
+    "tests/packaging/",
     "tests/runner/cli/",
+    "tests/bench/",
     "tests/arbiter/test_",
 )
 """Where the longest tests are: begun last, one worker would end minutes after the other."""

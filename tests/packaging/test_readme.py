@@ -17,12 +17,15 @@ import pytest
 
 from tests.packaging.installed import TREE, install_into
 from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.sync import Client
+from vram_arbiter.schemas.manifest import load_manifest
 
 pytestmark = pytest.mark.e2e
 PAGE = (TREE / "README.md").read_text(encoding="utf-8")
 LIMIT_S = 240.0
 INSTALLS = "^(make|pip) "
+OTHER_SIDECARS = "^vram-sidecar --name (detector|scene-vlm) "
 LONG = "^vram-(reasoner|runner (benchmark|sim --policy|replay)) ?"
 
 
@@ -93,9 +96,18 @@ def test_the_commands_of_the_tutorial_work(reader: Reader) -> None:
     assert "Traceback" not in printed
 
 
+def test_each_sidecar_of_the_page_has_a_shipped_model() -> None:
+    names = re.findall(r"^vram-sidecar --name \S+ --rskill (\S+) &", PAGE, re.MULTILINE)
+    assert len(names) == 3
+    for name in names:
+        load_manifest(shipped(Path(name), "rskills", configs_folder({})))
+
+
 @pytest.mark.heavy
 def test_the_commands_with_a_robot_work(reader: Reader) -> None:
-    printed = reader.types("On your machine", "With a robot", skip=f"{INSTALLS}|{LONG}|^vramctl ")
+    """One sidecar is started: each imports for 8 s of a core."""
+    skip = f"{INSTALLS}|{LONG}|{OTHER_SIDECARS}|^vramctl "
+    printed = reader.types("On your machine", "With a robot", skip=skip)
     assert "vram-sidecar --name grab" in printed
     assert "dry run: nothing was opened" in printed
     assert "Traceback" not in printed

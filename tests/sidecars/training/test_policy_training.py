@@ -1,15 +1,13 @@
 """The policy trainer's code path in seconds: recorded arrays in, a checkpoint that lerobot's own
 factory loads out."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("lerobot")
-import numpy as np
-import torch
 
 from vram_arbiter.sidecars.training.policy import (
     BadDemonstrations,
@@ -20,6 +18,9 @@ from vram_arbiter.sidecars.training.policy import (
 )
 from vram_arbiter.sidecars.weights import Weights, read_config
 
+if TYPE_CHECKING:
+    import numpy as np
+
 pytestmark = pytest.mark.heavy
 
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
@@ -28,6 +29,8 @@ CHECKPOINT = Path(__file__).parents[3] / "configs" / "models" / "so101-grab"
 
 def write_demonstrations(folder: Path, episodes: int = 4, length: int = 25) -> None:
     """Episodes in which a bright spot stands where the first joint has to go."""
+    import numpy as np
+
     rng = np.random.default_rng(0)
     sizes = {"front": (96, 96), "wrist": (96, 80)}
     steps = episodes * length
@@ -68,6 +71,7 @@ def write_demonstrations(folder: Path, episodes: int = 4, length: int = 25) -> N
 
 def act(folder: Path, chunk_of: int) -> np.ndarray:
     """One chunk from a checkpoint, loaded as any lerobot checkpoint is."""
+    import torch
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -107,6 +111,8 @@ def test_smoke_training_writes_a_checkpoint_that_the_factory_loads(tmp_path: Pat
 
 
 def test_the_loss_falls_and_the_seed_decides(tmp_path: Path) -> None:
+    import torch
+
     write_demonstrations(tmp_path)
     torch.set_num_threads(1)
     data = load_demonstrations(tmp_path)
@@ -122,6 +128,9 @@ def test_the_loss_falls_and_the_seed_decides(tmp_path: Path) -> None:
 
 
 def test_going_on_from_a_checkpoint_keeps_its_normalisation(tmp_path: Path) -> None:
+    import numpy as np
+    import torch
+
     first, second, started, went_on = (
         tmp_path / name for name in ("first", "second", "started", "went_on")
     )
@@ -141,6 +150,8 @@ def test_going_on_from_a_checkpoint_keeps_its_normalisation(tmp_path: Path) -> N
 def test_a_folder_without_demonstrations_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    import numpy as np
+
     assert main(["--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "info.json is missing" in capsys.readouterr().err
     write_demonstrations(tmp_path)
@@ -150,5 +161,7 @@ def test_a_folder_without_demonstrations_is_refused(
 
 
 def test_the_shipped_checkpoint_is_small_and_loads() -> None:
+    import numpy as np
+
     assert sum(p.stat().st_size for p in CHECKPOINT.iterdir()) < 5_000_000
     assert np.abs(act(CHECKPOINT, 12)).max() < 3.5
