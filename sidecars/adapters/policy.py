@@ -43,9 +43,13 @@ _OURS: Final = {
     "use_amp": False,
     "use_flash_attn": False,  # it does not compute in float32
     "enable_gradient_checkpointing": False,
+    "enable_inference_cuda_graph": False,  # its graphs keep memory that no footprint counts
+    "inference_action_mode": "continuous",  # unset in most checkpoints; discrete is refused
 }
 """Fields of configurations that the sidecar decides."""
 _ACTION: Final = "action"
+_OWN_CHUNKING: Final = ("groot", "molmoact2")
+"""Types whose real-time chunking is not lerobot's, and was not compared with it."""
 _LAZY: Final = "proc"
 """GR00T's processor of pictures and texts, read when this property of its step is first asked."""
 
@@ -252,7 +256,7 @@ class PolicyAdapter:
         """
         import torch
 
-        compared = self._config.type != "groot"  # its own chunking counts rows otherwise
+        compared = self._config.type not in _OWN_CHUNKING
         if self._selects or not compared or not self._policy.supports_rtc():
             raise BadRequest(
                 f"a policy of type {self._config.type} takes no left-over chunk",

@@ -27,6 +27,7 @@ _OWN_STEPS: Final = ("lerobot.", "vram_arbiter.")
 
 _NOT_COMPARED: Final[Mapping[str, Mapping[str, object]]] = {
     "groot": {"use_relative_actions": True},  # each row needs the state that its chunk began with
+    "molmoact2": {"inference_action_mode": "discrete", "enable_lora_vlm": True},
     "wall_x": {"prediction_mode": "fast"},  # its tokenizer of actions is Python code of the hub
 }
 """Settings of a type's configuration that are refused."""
@@ -35,7 +36,6 @@ _WHY_NOT: Final[Mapping[ModelFamily | None, str]] = {
     "revision, from a hub repository whose name is fixed in its code",
     ModelFamily.LINGBOT_VA: "its image and text encoders are in no checkpoint: lerobot reads them, "
     "in whatever revision, at the first action",
-    ModelFamily.MOLMOACT2: "its actions were not compared with lerobot's",
 }
 """lerobot's types that are not in `FAMILIES`."""
 
@@ -85,6 +85,9 @@ FAMILIES: Final[Mapping[ModelFamily, Family]] = {
     ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS, dtype_field="dtype"),
     ModelFamily.VLA_JEPA: Family(
         ("vla_jepa",), ("diffusers",), precisions=_BF16, dtype_field="torch_dtype"
+    ),
+    ModelFamily.MOLMOACT2: Family(
+        ("molmoact2",), ("scipy",), precisions=_OWN_FLOATS, dtype_field="model_dtype"
     ),
     ModelFamily.GR00T: Family(
         ("groot",), ("diffusers", "tree"), precisions=_OWN_FLOATS, remote_code="backbone"

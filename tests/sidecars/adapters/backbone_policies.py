@@ -179,8 +179,67 @@ def save_groot(folder: Path) -> None:
     pipeline.write_text(json.dumps(steps))
 
 
+def save_molmoact2(folder: Path) -> None:
+    """A whole model of the published format lies beside it, with weights that the checkpoint
+    replaces."""
+    from lerobot.policies.molmoact2.configuration_molmoact2 import MolmoAct2Config
+    from lerobot.policies.molmoact2.molmoact2_hf_model import configuration_molmoact2 as parts
+    from lerobot.policies.molmoact2.molmoact2_hf_model.modeling_molmoact2 import (
+        MolmoAct2ForConditionalGeneration,
+    )
+    from lerobot.policies.molmoact2.molmoact2_hf_model.processing_molmoact2 import IMAGE_TOKENS
+    from tokenizers.pre_tokenizers import ByteLevel
+    from transformers import Qwen2Tokenizer
+
+    base = folder / "base"
+    tokenizer = Qwen2Tokenizer(
+        vocab={sign: place for place, sign in enumerate(sorted(ByteLevel.alphabet()))}, merges=[]
+    )
+    names = ("action", "state", "setup", "control")
+    spoken = [f"<{name}_{end}>" for name in names for end in ("start", "end")]
+    spoken += [f"<state_{place}>" for place in range(16)] + ["<action_output>", "<|image|>"]
+    tokenizer.add_tokens(
+        [*IMAGE_TOKENS, *spoken, "<|im_start|>", "<|im_end|>"], special_tokens=True
+    )
+    tokenizer.save_pretrained(base)
+    ids = tokenizer.convert_tokens_to_ids
+    small = {
+        "hidden_size": 16, "intermediate_size": 16, "num_attention_heads": 2,
+        "num_key_value_heads": 2, "head_dim": 8,
+    }  # fmt: skip
+    config = parts.MolmoAct2Config(
+        vit_config=small | {
+            "num_hidden_layers": 2, "image_default_input_size": [32, 32], "image_patch_size": 8,
+            "image_num_pos": 16,
+        },
+        adapter_config=small | {"vit_layers": [-1], "text_hidden_size": 16},
+        text_config=small | {
+            "vocab_size": len(tokenizer), "additional_vocab_size": 1, "num_hidden_layers": 2,
+        },
+        action_expert_config={
+            "hidden_size": 16, "num_layers": 2, "num_heads": 2, "timestep_embed_dim": 16,
+            "ffn_multiple_of": 8,
+        },
+        image_start_token_id=ids("<im_start>"), image_end_token_id=ids("<im_end>"),
+        low_res_image_start_token_id=ids("<low_res_im_start>"), image_col_id=ids("<im_col>"),
+        image_low_res_id=ids("<im_low>"), image_patch_id=ids("<im_patch>"),
+        frame_start_token_id=ids("<frame_start>"), frame_end_token_id=ids("<frame_end>"),
+        max_action_horizon=5, action_mode="continuous", flow_matching_num_steps=2,
+    )  # fmt: skip
+    MolmoAct2ForConditionalGeneration(config).save_pretrained(base)
+    pictures = {"size": {"height": 32, "width": 32}, "patch_size": 8, "max_crops": 1}
+    (base / "processor_config.json").write_text(json.dumps({"image_processor": pictures}))
+    policy = MolmoAct2Config(
+        **features(FRONT), checkpoint_path=str(base), action_mode="continuous", chunk_size=5,
+        n_action_steps=3, model_dtype="float32", num_state_tokens=16,
+        inference_action_mode="continuous",
+    )  # fmt: skip
+    save(folder, policy, FRONT)
+
+
 SAVERS: dict[str, Callable[[Path], None]] = {
     "vla_jepa": save_vla_jepa,
     "wall_x": save_wall_x,
     "gr00t": save_groot,
+    "molmoact2": save_molmoact2,
 }

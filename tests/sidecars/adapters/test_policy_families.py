@@ -36,12 +36,13 @@ ROWS = {  # actions in one answer
     "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
     "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5,
     "evo1": 5, "vla_jepa": 5, "wall_x": 5, "gr00t": 3,
+    "molmoact2": 3,
 }  # fmt: skip
 CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
 SEED = 2  # most policies draw their actions
 NOT_SERVED = {
     "openvla": "", "fastwam": "hub repository whose name is fixed in its code",
-    "lingbot_va": "at the first action", "molmoact2": "not compared with lerobot",
+    "lingbot_va": "at the first action",
 }  # fmt: skip
 
 
