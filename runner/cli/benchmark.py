@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
-import json
 import logging
 import os
 from collections.abc import Callable, Sequence
@@ -39,7 +38,7 @@ from vram_arbiter.schemas.runtime.printable import printable_lines
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.protocols import Skill
-    from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, CellSummary, Contestant, Told
+    from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, Contestant, Told
     from vram_arbiter.runner.sim.tasks import Task
     from vram_arbiter.runner.sim.worlds import World
 
@@ -58,9 +57,8 @@ WITHOUT_MEMORY = frozenset(
     }
 )
 """Families whose sidecar answers from one observation alone."""
-MAX_STEPS = 600  # of an episode where neither the world nor --max-steps says
 REPORT = "benchmark.json"
-COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "reward", "errors")
+MAX_STEPS = 600  # of an episode where neither the world nor --max-steps says
 
 
 def add_parser(
@@ -179,6 +177,8 @@ async def run(args: argparse.Namespace) -> int:
             _write(args, entries, cells, complete=False)
     complete = len(cells) == len(entries) and all(cell.complete for cell in cells)
     _write(args, entries, cells, complete=complete)
+    from vram_arbiter.runner.cli.benchmark_report import table
+
     print(printable_lines(table([cell.summary() for cell in cells])))
     print(f"{args.out / REPORT}")
     return 0 if complete and not any(cell.errors for cell in cells) else 1
@@ -372,54 +372,19 @@ def _check_names(entries: Sequence[Entry]) -> None:
             )
 
 
-# -- what comes of it
 def _write(
     args: argparse.Namespace, entries: Sequence[Entry], cells: Sequence[Cell], *, complete: bool
 ) -> None:
-    """After every cell, whole or not at all: a run that is killed leaves the cells before."""
-    report = {
-        "format": "vram-benchmark/1",
-        "complete": complete,
-        "seeds": [args.seed, args.seed + args.episodes - 1],
-        "parallel": args.parallel,
-        "cells": [
-            {
-                **cell.summary(),
-                "max_steps": longest_of(entry.world, args),
-                "episodes": [dataclasses.asdict(played) for played in cell.episodes],
-            }
+    """After every cell: a run that is killed leaves the cells before."""
+    from vram_arbiter.runner.cli.benchmark_report import write_report
+
+    write_report(
+        args.out / REPORT,
+        [
+            (cell, longest_of(entry.world, args))
             for entry, cell in zip(entries, cells, strict=False)
         ],
-    }
-    target = args.out / REPORT
-    beside = target.with_suffix(".new")
-    try:
-        beside.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        os.replace(beside, target)
-    except OSError as error:
-        raise ConfigError(f"{target} cannot be written: {error}") from error
-
-
-def table(rows: Sequence[CellSummary]) -> str:
-    """Format the cells as a table."""
-    lines = [COLUMNS, *(_row(row) for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
-    return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
-
-
-def _row(row: CellSummary) -> tuple[str, ...]:
-    interval = row["interval_95"]
-    rate = row["success_rate"]
-    task = f" ({row['task']})" if row["task"] else ""
-    return (
-        row["world"] + task,
-        row["contestant"],
-        "not judged" if rate is None else f"{row['successes']}/{row['judged']} = {rate:.0%}",
-        "" if interval is None else f"{interval[0]:.0%} to {interval[1]:.0%}",
-        "" if row["mean_steps"] is None else f"{row['mean_steps']:.1f}",
-        "" if row["mean_reward"] is None else f"{row['mean_reward']:.2f}",
-        f"{row['errors']}" + ("" if row["complete"] else f"; not complete: {row['why']}"),
+        seeds=(args.seed, args.seed + args.episodes - 1),
+        parallel=args.parallel,
+        complete=complete,
     )

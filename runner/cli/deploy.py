@@ -12,7 +12,7 @@ import contextlib
 import logging
 import os
 import re
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 from vram_arbiter.clients.configs import configs_folder, shipped
@@ -39,6 +39,7 @@ from vram_arbiter.runner.cli.deployment import (
     unused,
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
+from vram_arbiter.runner.cli.makers import MakeMakers, policy_makers
 from vram_arbiter.runner.cli.recording import (
     Recording,
     add_push_flags,
@@ -50,22 +51,19 @@ from vram_arbiter.runner.cli.watching import Watch, slots_of, watches, watching
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.control.thread import ControlThread
-from vram_arbiter.runner.goals.catalogue import Catalogue, Maker, read_manifests, sidecar_endpoint
+from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests, sidecar_endpoint
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.gpu_lease import DECODER_BYTES, DECODING, cuda_uuid, gpu_lease
-from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData, Skill
+from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic
-from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.config.robot import RobotEnvironment
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ConfigError, RunnerUnreachable, VramError
 from vram_arbiter.schemas.goals import ResultPush
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint, runtime_dir
-from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.folders import LockFile, private_folder
 from vram_arbiter.schemas.runtime.printable import printable_lines
 from vram_arbiter.schemas.world import RunResult
@@ -74,9 +72,6 @@ log = logging.getLogger("runner")
 
 SERVES = True
 OWN_GOAL = "task"  # goal id of the file's own task
-
-MakeMakers = Callable[[Parts, Arbiter | None], Mapping[Kind, Maker]]
-"""How skills of each kind are made for this robot, with or without an arbiter."""
 
 
 def add_parser(
@@ -110,64 +105,6 @@ async def run(args: argparse.Namespace) -> int:
     """
     file = read_deployment(shipped(args.config, "robots", configs_folder(os.environ)))
     return await Deploy(args, file, policy_makers(args, file)).run()
-
-
-def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
-    """Learnt policies, each in its sidecar, and what stands in for ROS 2 actions."""
-    given = sidecars_given(args.sidecar)
-
-    def make_makers(parts: Parts, arbiter: Arbiter | None) -> Mapping[Kind, Maker]:
-        def make_policy(manifest: RSkillManifest) -> Skill:
-            from vram_arbiter.clients.sidecar.policy import PolicyClient
-            from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
-            from vram_arbiter.runner.skills.wiring import wire_up
-
-            description = parts.hal.description
-            wiring = wire_up(manifest, description, description.rest_pose_rad)
-            speeds = parts.gate.for_skill(manifest, ()).limits.speeds_rad_s
-            return SidecarPolicy(
-                manifest,
-                wiring,
-                PolicyClient(sidecar_endpoint(manifest.name, given, os.environ)),
-                arbiter,
-                period_s=1.0 / file.robot.rate_hz,
-                speeds_rad_s=speeds,
-                sent=parts.hal.sent,
-            )
-
-        def make_trajectory(manifest: RSkillManifest) -> Skill:
-            from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
-
-            limits = parts.gate.for_skill(manifest, ()).limits
-            return FollowJointTrajectory(
-                manifest, limits, period_s=1.0 / file.robot.rate_hz, sent=parts.hal.sent
-            )
-
-        follow = StandIn(make_trajectory, frozenset({ControlMode.JOINT_POSITION}))
-        known = {TRAJECTORY: follow, **ros_servers(file.robot)}
-        stand_ins = StandIns(known, parts.hal.description.joint_names)
-        return {Kind.VLA: make_policy, Kind.ROS_ACTION: stand_ins}
-
-    return make_makers
-
-
-def ros_servers(robot: RobotEnvironment) -> dict[str, StandIn]:
-    """Return the actions that ROS 2 servers execute, by interface. Raises ConfigError."""
-    if not robot.ros_actions:
-        return {}
-    need("ros_actions", "cyclonedds", extra="ros2")
-    from vram_arbiter.runner.ros2.action_skill import RosAction
-    from vram_arbiter.runner.sensors.ros2_dds import domain_of
-
-    try:
-        domain = domain_of()
-    except ValueError as error:
-        raise ConfigError(f"ros_actions: {error}") from error
-    served = StandIn(
-        lambda manifest: RosAction(manifest, domain),
-        frozenset({ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST}),
-    )
-    return dict.fromkeys(robot.ros_actions, served)
 
 
 class Deploy:
