@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.runner.sensors.test_gstreamer_to_ros import NETWORK
+from tests.support.dds import NETWORK
 from vram_arbiter.runner.protocols import Done, Goal, Hold
 from vram_arbiter.runner.ros2.action_skill import RosAction
 from vram_arbiter.runner.ros2.messages import read, write

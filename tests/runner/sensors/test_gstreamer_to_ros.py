@@ -6,6 +6,7 @@ import uuid
 
 import pytest
 
+from tests.support.dds import NETWORK
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors.factory import make_reader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
@@ -18,13 +19,6 @@ pytest.importorskip("cyclonedds")
 
 CLOCK = SystemClock()
 WAIT_NS = 60 * 10**9
-NETWORK = (
-    '<CycloneDDS><Domain Id="any"><General><AllowMulticast>false</AllowMulticast>'
-    '<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>'
-    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
-    "<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
-    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>'
-)
 
 
 def test_recorders_see_the_same_pictures(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.runner.sensors.test_gstreamer_to_ros import NETWORK
+from tests.support.dds import NETWORK
 from tests.support.waiting import until
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic, said
 from vram_arbiter.schemas.config.robot import RobotEnvironment, load_robot

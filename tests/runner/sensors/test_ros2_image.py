@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.dds import NETWORK
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors import SlotReader
 from vram_arbiter.runner.sensors.factory import make_reader
@@ -26,13 +27,6 @@ from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 pytestmark = pytest.mark.heavy  # Cyclone DDS
 
-NETWORK = (
-    '<CycloneDDS><Domain Id="any"><General><AllowMulticast>false</AllowMulticast>'
-    '<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces></General>'
-    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
-    "<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
-    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>'
-)
 DOMAIN = "77"
 Reading = Callable[[SlotReader], SlotReader]
 
