@@ -16,7 +16,7 @@ from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Robot
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.robots.units import LerobotUnits
-from vram_arbiter.schemas.errors import ConfigError, InternalError
+from vram_arbiter.schemas.errors import ConfigError, FrameStale, InternalError, ModelError
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.recording.recorder import DatasetRecorder
@@ -114,7 +114,12 @@ async def check_recording[R: Robot](
     from vram_arbiter.runner.recording.sample import sample_of
 
     for _ in range(SAMPLE_TRIES):
-        if (sample := await control.call(lambda: sample_of(runner))) is not None:
+        try:
+            sample = await control.call(lambda: sample_of(runner))
+        except (FrameStale, ModelError) as error:
+            hint = "choose an encoding with colors for this camera, or leave it out"
+            raise ConfigError(f"nothing could be recorded: {error.message}", hint=hint) from error
+        if sample is not None:
             await asyncio.to_thread(recorder.check, sample)
             return
     raise InternalError(f"the robot showed no state in {SAMPLE_TRIES} ticks")

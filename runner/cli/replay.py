@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from vram_arbiter.runner.recording.reader import Recorded, RecordedGoal, read_frame
-from vram_arbiter.runner.recording.rows import ROBOT
+from vram_arbiter.runner.recording.rows import LEROBOT, ROBOT
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
@@ -110,9 +110,10 @@ def as_text(recorded: Recorded, link: str | None) -> str:
     )
     if tick["violations"]:
         lines.append(("safety", tick["violations"]))
-    if recorded.units == ROBOT:
+    if recorded.units in (ROBOT, LEROBOT):
+        unit = " rad" if recorded.units == ROBOT else ""  # lerobot's differ by joint
         lines += [
-            ("joint", f"{name}: at {value:+.4f} rad, told {recorded.action[name]:+.4f}")
+            ("joint", f"{name}: at {value:+.4f}{unit}, told {recorded.action[name]:+.4f}")
             for name, value in recorded.state.items()
         ]
     else:  # a world's own numbers, and what it was sent: they need not be related

@@ -57,6 +57,7 @@ class EpisodeWriter:
         self._refused = ""  # goal whose rows cannot be recorded
         self._mark = ""  # the operator's verdict on the goal that is being recorded
         self._finished: list[tuple[str, int]] = []  # goals with an episode, and that episode
+        self._left_none = False  # the last goal has no episode: the one before has to be named
 
     def row(self, row: Row, pictures: list[bytes]) -> None:
         """Add one row of a goal; the first one begins its episode.
@@ -114,7 +115,8 @@ class EpisodeWriter:
                 self._mark = verdict
                 self._tell({"kind": "marked", "goal_id": goal, "episode": None})
                 return
-            if not finished or goal_id not in ("", finished):
+            unnamed = finished if self._left_none else ""
+            if not finished or goal_id not in (unnamed, finished):
                 what = "no goal was recorded" if not finished else f"the last one is {finished}"
                 hint = "mark a goal while it runs, or before the next one"
                 raise BadRequest(f"goal {goal_id or '?'} cannot be marked: {what}", hint=hint)
@@ -123,6 +125,7 @@ class EpisodeWriter:
                     raise BadRequest(f"the next goal, {goal}, is being recorded")
                 commit.undo(self._files.root)
                 self._finished.pop()
+                self._left_none = True
             else:
                 commit.mark(self._files.root, episode, verdict)
             self._tell({"kind": "marked", "goal_id": finished, "episode": episode})
@@ -182,12 +185,14 @@ class EpisodeWriter:
         index = self._files.finish({**about, **note, "incomplete": incomplete})
         self._goal = self._last = None
         self._finished.append((first["goal_id"], index))
+        self._left_none = False
         self._tell(
             {"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows}
         )
 
     def _forget(self) -> None:
         self._goal = self._last = None
+        self._left_none = True
         self._files.abandon()
 
     def _tell(self, message: wire.Header) -> None:

@@ -136,7 +136,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         record_goal(made, goal("worse"), DONE, 2)
         until(lambda: made.counts.episodes == 5)
         assert made.mark("worse", "discard")["episode"] == 4
-        assert made.mark("", "success")["goal_id"] == "torn"
+        with pytest.raises(BadRequest, match="the last one is torn"):
+            made.mark("", "success")  # meant for the one that is gone
+        assert made.mark("torn", "success")["episode"] == 3
     finally:
         made.close()
         logging.getLogger("vram_arbiter.runner.recording").removeHandler(handler)

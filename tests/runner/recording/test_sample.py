@@ -1,0 +1,68 @@
+"""What rows will look like is known before a goal moves the robot."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+pytest.importorskip("cv2", reason="needs the runner extra")
+
+from tests.runner.small_robots import FedCamera, Twin
+from vram_arbiter.runner.cli.recording import check_recording
+from vram_arbiter.runner.control.clock import SystemClock
+from vram_arbiter.runner.control.thread import ControlThread
+from vram_arbiter.runner.recording.rows import row_of
+from vram_arbiter.runner.recording.sample import sample_of
+from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
+
+
+def runner_with(camera: FedCamera) -> HardwareRunner:
+    clock = camera.clock
+    return hardware_runner(
+        Twin(clock), [(camera, 1e6)], lambda skill: JointRanges({}), clock=clock, rate_hz=200.0
+    )
+
+
+def test_a_sample_has_the_robots_columns_and_the_pictures_sizes() -> None:
+    runner = runner_with(FedCamera("front", SystemClock()))
+    runner.activate()
+    sample = sample_of(runner)
+    assert sample is not None
+    row, pictures = row_of(sample, runner.camera_names())
+    assert (
+        row["state_names"] == row["action_names"] == list(runner.robot.hal.description.joint_names)
+    )
+    assert row["frames"] == [{"camera": "front", "encoding": "rgb8", "width": 2, "height": 1}]
+    assert [len(picture) for picture in pictures] == [6]
+    runner.deactivate()
+
+
+def test_a_camera_without_colors_is_refused_before_a_goal() -> None:
+    """Regression: every tick of the session was left out of the dataset, one warning a goal."""
+
+    class Depth(FedCamera):
+        def show(self) -> None:
+            if self.feed is not None:
+                frame = SensorFrame(
+                    sensor_id=self.sensor_id,
+                    stamp_monotonic_ns=self.clock.now_ns(),
+                    stamp_wall_ns=0,
+                    encoding=FrameEncoding.DEPTH16,
+                    width=2,
+                    height=1,
+                    channels=1,
+                    data=bytes(4),
+                )
+                self.deliver(self.feed, frame)
+
+    async def start() -> None:
+        runner = runner_with(Depth("depth", SystemClock()))
+        unasked: Any = None  # the sample fails before the writer is asked
+        async with ControlThread(runner) as control:
+            await check_recording(unasked, control, runner)
+
+    with pytest.raises(ConfigError, match=r"nothing could be recorded: .*depth16"):
+        asyncio.run(start())
