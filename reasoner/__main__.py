@@ -1,8 +1,8 @@
 """`vram-reasoner`: run one task with the present runner and sidecars, serve tasks one after the
 other, or message a running reasoner.
 
-Exit codes: 0 the task succeeded or the service was ended, 1 the task failed, 2 wrong usage or configuration, 3 the runner, or the
-addressed reasoner, cannot be reached.
+Exit codes: 0 the task succeeded or the service was ended, 1 the task failed, 2 wrong usage or
+configuration, 3 the runner, or the addressed reasoner, cannot be reached.
 """
 
 import argparse

@@ -68,7 +68,9 @@ def test_a_motion_begins_when_it_is_confirmed_and_not_when_it_is_denied(tmp_path
 
     async def operator() -> None:
         await story.waits(1)
-        assert [call.tool for call in story.done] == ["query_scene"], "a question waits for nobody"
+        assert [call.tool for call in story.done] == ["query_scene"], (
+            "a question needs no confirmation"
+        )
         told = (await send(story.endpoint, {"op": "state"}))["motion"]
         assert told["number"] == 1
         assert "lab/grab" in told["text"]

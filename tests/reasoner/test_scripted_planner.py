@@ -516,7 +516,7 @@ def test_a_search_has_an_end() -> None:
 # -- words that the detector does not know
 def test_an_unknown_word_is_said_before_the_robot_drives() -> None:
     """Regression: for a thing that its detector has no word for it looked around the whole table
-    and told nobody.
+    and did not say so.
     """
     unknown = {"unknown_words": ["cube"]}
     said = dataclasses.replace(PALETTE, topics=frozenset({OPERATOR}))

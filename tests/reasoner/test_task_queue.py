@@ -69,7 +69,7 @@ def test_a_cancel_meets_the_task_that_it_names() -> None:
 
 
 def test_an_emergency_stop_clears_the_queue() -> None:
-    """The next task must not move the robot as soon as somebody resets the stop."""
+    """The next task must not move the robot as soon as the stop is reset."""
 
     async def story() -> list[tuple[int, str]]:
         queue = TaskQueue()
