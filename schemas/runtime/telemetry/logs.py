@@ -1,23 +1,24 @@
 """Log records to a collector: a handler of the standard library's `logging` on the SDK's logs.
 
 The SDK's own handler is deprecated, and one undecodable text in it would lose a whole batch.
-Imported only where logs are exported.
+The SDK is imported only where logs are exported.
 """
 
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from opentelemetry import trace
 from opentelemetry._logs import LogRecord, SeverityNumber
 from opentelemetry.context import Context, get_current
-from opentelemetry.sdk._logs import LoggerProvider
-from opentelemetry.sdk._logs.export import BatchLogRecordProcessor
-from opentelemetry.sdk.resources import Resource
 
 from vram_arbiter.schemas.runtime.telemetry import exported
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+
+if TYPE_CHECKING:
+    from opentelemetry.sdk._logs import LoggerProvider
+    from opentelemetry.sdk.resources import Resource
 
 OWN = ("opentelemetry", "urllib3", "requests")
 """Loggers of the export itself: a collector that is away must not be told so, again and again."""
@@ -31,8 +32,11 @@ _SEVERITIES = {
 _STACKTRACE = logging.Formatter()
 
 
-def install(resource: Resource, exporters: Sequence[Any]) -> Callable[[], object]:
+def install(resource: "Resource", exporters: Sequence[Any]) -> Callable[[], object]:
     """Send what the root logger gets to the exporters. Returns what ends it."""
+    from opentelemetry.sdk._logs import LoggerProvider
+    from opentelemetry.sdk._logs.export import BatchLogRecordProcessor
+
     provider = LoggerProvider(resource=resource, shutdown_on_exit=False)
     for exporter in exporters:
         provider.add_log_record_processor(BatchLogRecordProcessor(exporter))
@@ -49,7 +53,7 @@ def install(resource: Resource, exporters: Sequence[Any]) -> Callable[[], object
 class OtlpHandler(logging.Handler):
     """Hands each record to the SDK, which sends it from a thread of its own."""
 
-    def __init__(self, provider: LoggerProvider) -> None:
+    def __init__(self, provider: "LoggerProvider") -> None:
         super().__init__()
         self._provider = provider
 
