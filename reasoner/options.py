@@ -174,7 +174,7 @@ def check_task(task: str, planner: str) -> None:
 
 
 def check_files(arguments: argparse.Namespace) -> None:
-    """Raise ConfigError for a file of the other form: one task has a result, a service a history."""
+    """Raise ConfigError for a file of the other form: a task has a result, a service a history."""
     serves = arguments.command == "serve"
     if serves and arguments.result is not None:
         raise ConfigError("--result is for one task", hint="serve writes --history FILE")

@@ -1,8 +1,8 @@
 """One JSON request to a model server that may be slow, busy, broken or hostile.
 
 Bounded in time, bytes and tries. The limit is on the whole exchange: a server that sends a byte a
-second is as late as a silent one. A busy server (`BUSY_STATUSES`) is asked again until `busy_s` have
-passed, after the pause that its `Retry-After` names; a failing one and a broken connection
+second is as late as a silent one. A busy server (`BUSY_STATUSES`) is asked again until `busy_s`
+have passed, after the pause that its `Retry-After` names; a failing one and a broken connection
 `TRIES_MAX` times; a wrong key or a wrong request is not repeated.
 
 Not by the vendors' SDKs: they import 7 and 15 times as slowly, bring an HTTP stack of their own,

@@ -20,7 +20,7 @@ from vram_arbiter.schemas.tools import FunctionTool
 log = logging.getLogger(__name__)
 
 REFUSABLE = ("parallel_tool_calls", "max_completion_tokens")
-"""Parameters that some servers refuse: o1, o3 and o4-mini the first, strict older ones the second."""
+"""Parameters that some servers refuse: o1, o3 and o4-mini the first, older ones the second."""
 
 
 class OpenAiPlanner(LlmPlanner):

@@ -293,8 +293,9 @@ def _ask(robot: _Robot, question: str, why: str = "") -> Generator[ToolCall, Out
 def _put_down(
     place: str, answer: str, why: str, search: Search
 ) -> Generator[ToolCall, Outcome, Outcome]:
-    """Put down what the scene VLM says is held, and note where it stands by its own name: a detector
-    may take it for the wanted thing.
+    """Put down what the scene VLM says is held, and note where it stands by its own name.
+
+    A detector may take it for the wanted thing.
     """
     outcome = yield ExecuteRskill(rskill_id=place, deadline_s=NAVIGATE_DEADLINE_S, rationale=why)
     named = _NAMED.search(answer)

@@ -1,4 +1,4 @@
-"""What a look tells beside its answer: where it was, which words are unknown, the picture itself."""
+"""What a look tells beside its answer: its place, unknown words, the picture itself."""
 
 from typing import Any
 

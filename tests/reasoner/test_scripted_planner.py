@@ -420,8 +420,8 @@ def test_another_thing_in_the_hand_is_put_down_first() -> None:
 
 
 def test_what_was_put_down_is_not_taken_for_the_target() -> None:
-    """Regression: in the demo's world of seed 3 the second task took the red ball, which it had just
-    put down, for the red cube, and grabbed it three times.
+    """Regression: in the demo's world of seed 3 the second task took the red ball, which it had
+    just put down, for the red cube, and grabbed it three times.
     """
     here = [0.4, 0.2, 0.0]
 

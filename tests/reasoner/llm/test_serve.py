@@ -1,4 +1,4 @@
-"""`vram-reasoner serve` as a process: tasks from its socket, one after the other, until a signal."""
+"""`vram-reasoner serve` as a process: tasks from its socket in sequence, until a signal."""
 
 import asyncio
 import json
