@@ -4,7 +4,8 @@ A real daemon, a holder and a waiter, each a process of its own on a simulated G
 memory at once. Counted in the main thread of each, from the call of `acquire` to the grant: the
 product's functions that run, their files, and how often the next function to run lies in another
 file than the last one. Libraries, tests, and the threads that read the GPU and write the history
-are left out; so is what a program does before and after.
+are left out; so is what a program does before and after. The daemon's side ends when its loop has
+done the event of the grant: it reads the GPU for the new load before the counting is turned off.
 
 The path is warm: the scene plays once before it is counted, so that imports, encoders made on
 demand and filled caches are not part of it. Of five such runs the shortest counts: readings by
@@ -48,6 +49,10 @@ RUNS = 5
 PACKAGES = ("arbiter", "clients", "schemas")
 TARGETS = {"files": 30, "functions": 150, "switches": 300, "core modules": 12, "core functions": 80}
 
+
+GRANT = ("arbiter/core/scheduling/grants.py", "grant")
+LOOP = ("arbiter/host/process.py", "FineSelector.select")
+"""The daemon's event loop asks for what is ready: what it was told before is done."""
 
 LINES = ("<genexpr>", "<lambda>")
 """Code objects that are lines of their function."""
@@ -215,15 +220,23 @@ def record(folder: Path, *, cold: bool = False) -> dict[str, list[Step]]:
         tell("holder", "write")
         for path in out.values():
             _until(path.exists)
-        return {
+        steps: dict[str, list[Step]] = {
             side: [(file, name, line) for file, name, line in json.loads(path.read_text())]
             for side, path in out.items()
         }
+        return steps | {"daemon": until_granted(steps["daemon"])}
     finally:
         for program in programs.values():
             program.kill()
             program.communicate()
         arbiter.close()
+
+
+def until_granted(steps: list[Step]) -> list[Step]:
+    """Return the daemon's steps up to the end of the event in which it granted."""
+    names = [(file, name) for file, name, _ in steps]
+    granted = names.index(GRANT)
+    return steps[: names.index(LOOP, granted)]
 
 
 def _recorded(cold: bool) -> dict[str, list[Step]]:

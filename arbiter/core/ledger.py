@@ -273,7 +273,7 @@ class GpuLedger:
                 shown[account] = use.used_bytes
         explained_bytes = sum(use.held_bytes for use in self.stowaways.values())
         self.stowaway_bytes = explained_bytes + self.unattributed_bytes
-        complete = reading.listed_bytes() is not None
+        complete = all(use.used_bytes is not None for use in reading.processes or ())
         for account in self.accounts.values():
             count = shown.get(account)
             if reading.taken_at > account.changed_at and account.measured_bytes != (count or 0):

@@ -19,13 +19,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import learning
-from vram_arbiter.arbiter.core.events import (
-    AcquireRequested,
-    Reacquired,
-    ReattachedLease,
-    ReleaseReported,
-)
 from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.arbiter.core.model import refusals as no
@@ -159,7 +154,7 @@ class Standby(Feature):
             # a restart must not take a release that was asked for as one that was wished for
             core.record_lease(lease)
 
-    def on_release(self, core: Core, event: ReleaseReported, lease: Lease) -> None:
+    def on_release(self, core: Core, event: ev.ReleaseReported, lease: Lease) -> None:
         """Decide whether a lease goes on standby or is parked. Raises Refused.
 
         On standby it goes if the engine revoked it, no operator: a holder that releases by itself
@@ -238,7 +233,7 @@ class Standby(Feature):
         return leaves
 
     # -- wanted by the holder ----------------------------------------------------------------------
-    def acquire(self, core: Core, event: AcquireRequested) -> bool:
+    def acquire(self, core: Core, event: ev.AcquireRequested) -> bool:
         """Take an acquire whose process has a lease for the model that is away. Return whether it
         has one. Raises Refused."""
         lease, spec = known_by(core, event), event.spec
@@ -262,7 +257,7 @@ class Standby(Feature):
         self._call_back(core, lease, event, spec)
         return True
 
-    def reacquire(self, core: Core, event: Reacquired) -> None:
+    def reacquire(self, core: Core, event: ev.Reacquired) -> None:
         """Queue a lease that is away, or on its way there. Raises Refused."""
         lease = lease_for(core, event)
         if lease.process != core.clients[event.client].process:
@@ -282,7 +277,7 @@ class Standby(Feature):
         core.reply(event.client, event.request, AcquireReply("queued", status.view(core, lease)))
 
     def _call_back(
-        self, core: Core, lease: Lease, event: AcquireRequested | Reacquired, spec: LeaseSpec
+        self, core: Core, lease: Lease, event: ev.AcquireRequested | ev.Reacquired, spec: LeaseSpec
     ) -> None:
         """Queue a lease that is away, as it is asked for now. Raises Refused."""
         client, request = core.clients[event.client], lease.request
@@ -290,7 +285,7 @@ class Standby(Feature):
         gpus = admission.places(core, spec, load_peak)
         check_waiters(core, client, spec.priority)
         request.load_peak_bytes, request.steady_bytes = load_peak, steady
-        if isinstance(event, AcquireRequested) and event.nonce != request.nonce:
+        if isinstance(event, ev.AcquireRequested) and event.nonce != request.nonce:
             _rename(core, lease, event.nonce)
             lease.spec = spec
             core.record_lease(lease)  # still away: if a restart ends the wait, it comes back so
@@ -415,7 +410,7 @@ class Standby(Feature):
         lease = core.leases[LeaseId(lease_id)]
         _end(core, lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
 
-    def on_reattached(self, core: Core, lease: Lease, item: ReattachedLease) -> None:
+    def on_reattached(self, core: Core, lease: Lease, item: ev.ReattachedLease) -> None:
         """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
         if item.state not in AWAY:
             return

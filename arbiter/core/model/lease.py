@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Wait
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -217,25 +218,58 @@ class Lease:
     features: tuple["Feature", ...] = field(default=(), repr=False, compare=False)  # concerned
 
     @classmethod
-    def recovered(
-        cls,
-        lease_id: LeaseId,
-        spec: LeaseSpec,
-        process: ProcessKey,
-        request: Request,
-        token: Token,
-        state: LeaseState,
-        now: float,
-        why: str,
-    ) -> "Lease":
-        """Return a lease that a restart found in one of the states RECOVERED; no other way leads
-        past the table."""
-        assert state in RECOVERED, f"{lease_id} cannot be found {state}"
-        lease = cls(lease_id, spec, process, ClientId(""), request, state, token)
-        lease.story.append((now, state, why))
-        lease.granted_at = lease.held_from = lease.ready_at = lease.uses.last_at = now
+    def recovered(cls, record: LeaseRecord, request: Request, now: float, why: str) -> "Lease":
+        """Return the lease of a record, in one of the states RECOVERED; no other way leads past the
+        table. Its holder has to reattach."""
+        revoked = record.state == "revoking"
+        state = LeaseState("held" if revoked or record.state == "debt" else record.state)
+        assert state in RECOVERED, f"{record.lease_id} cannot be found {state}"
         request.answered = True
+        lease = cls(
+            id=LeaseId(record.lease_id),
+            spec=record.spec,
+            process=ProcessKey(record.pid, record.start_ticks),
+            client=ClientId(""),
+            request=request,
+            state=state,
+            token=Token(*record.token),
+            gpu=None if record.gpu is None else GpuId(record.gpu),
+            granted_at=now,
+            held_from=now if record.held_from is None else min(now, record.held_from),
+            ready_at=now,
+            attached=False,
+            pinned=None if record.pinned is None else Order(*record.pinned),
+            departure=Departure(revoked_before=revoked, exiting=record.exiting),
+            observed=Observed(record.measured_bytes),
+            story=[(now, state, why)],
+        )
+        lease.uses.last_at = now
         return lease
+
+    def record(self, charge_bytes: int, *, debt: bool = False) -> LeaseRecord:
+        """Return the record of a lease that is resident, away, or over with its bytes still charged
+        (`debt`)."""
+        assert self.token is not None, f"{self.id} is recorded without a token"
+        state = "debt" if debt else self.state.value
+        if not debt and self.departure.revoked_before and self.state is LeaseState.HELD:
+            state = "revoking"  # and not by this daemon yet
+        return LeaseRecord(
+            lease_id=self.id,
+            token=(self.token.epoch, self.token.serial),
+            state=state,
+            gpu=self.gpu,
+            pid=self.process.pid,
+            start_ticks=self.process.start_ticks,
+            nonce=self.request.nonce,
+            charge_bytes=charge_bytes,
+            load_peak_bytes=self.request.load_peak_bytes,
+            measured_bytes=self.observed.reported_bytes,
+            exiting=self.departure.exiting,
+            spec=self.spec,
+            held_from=self.held_from,
+            pinned=None if self.pinned is None else (self.pinned.by, self.pinned.reason),
+            users=tuple([(*use.process, use.id, use.label) for use in self.users()]),
+        )
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
         """Go to another state. Raises IllegalTransition, and then nothing has changed."""

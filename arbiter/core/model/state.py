@@ -31,7 +31,7 @@ from vram_arbiter.arbiter.core.model.lease import (
     LeaseState,
     Use,
 )
-from vram_arbiter.arbiter.core.model.records import AnyRecord, LeaseRecord, ResidueRecord
+from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
 from vram_arbiter.arbiter.core.settings import SCHEDULING, Settings
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause
@@ -399,28 +399,7 @@ class Core:
         happened; a stale record makes a later recovery more careful.
         """
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
-        assert lease.token is not None, f"{lease.id} is recorded without a token"
-        state = "debt" if debt else lease.state.value
-        if not debt and lease.departure.revoked_before and lease.state is LeaseState.HELD:
-            state = "revoking"  # and not by this daemon yet
-        pinned, users = lease.pinned, lease.users()
-        record = LeaseRecord(
-            lease_id=lease.id,
-            token=(lease.token.epoch, lease.token.serial),
-            state=state,
-            gpu=lease.gpu,
-            pid=lease.process.pid,
-            start_ticks=lease.process.start_ticks,
-            nonce=lease.request.nonce,
-            charge_bytes=charge_bytes,
-            load_peak_bytes=lease.request.load_peak_bytes,
-            measured_bytes=lease.observed.reported_bytes,
-            exiting=lease.departure.exiting,
-            spec=lease.spec,
-            held_from=lease.held_from,
-            pinned=None if pinned is None else (pinned.by, pinned.reason),
-            users=tuple([(*u.process, u.id, u.label) for u in users]) if users else (),
-        )
+        record = lease.record(charge_bytes, debt=debt)
         for feature in lease.features:
             record = feature.to_record(lease, record)
         self.journal(f"lease:{lease.id}", record, gates=gates)

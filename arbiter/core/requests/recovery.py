@@ -11,15 +11,8 @@ not count until holders and readings say it again.
 
 from dataclasses import replace
 
+from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, learning
-from vram_arbiter.arbiter.core.events import (
-    DOUBT_KEY,
-    MemorySampled,
-    Reattached,
-    ReattachedLease,
-    Recovered,
-    Resumed,
-)
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState, Request, Use
@@ -37,7 +30,7 @@ from vram_arbiter.arbiter.core.requests.requests import become_held, keep, over
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.verification.schedule import begin_again, begin_for_lease
 from vram_arbiter.schemas import defaults
-from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey, Token
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.notes import ReattachedNote, RecoveredNote, ResumedNote, ServingNote
 from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
@@ -48,7 +41,7 @@ and the fence grace."""
 
 
 # -- restoring
-def on_recovered(core: Core, event: Recovered) -> None:
+def on_recovered(core: Core, event: ev.Recovered) -> None:
     """Restore what the journal names, then wait for the holders. Records of a GPU that is gone are
     dropped."""
     core.serving = False
@@ -126,34 +119,16 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
 
 def _found(core: Core, record: LeaseRecord, why: Why) -> Lease:
     """Return the lease of a record, known by its nonce; it is not charged yet."""
-    spec = record.spec
-    gpus = (GpuId(record.gpu),) if record.gpu is not None else ()
+    spec, gpus = record.spec, tuple(gpu.info.id for gpu in admission.selected(core, record.spec))
     request = Request(
         nonce=record.nonce,
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=record.load_peak_bytes,
         steady_bytes=max(spec.footprint.steady_bytes, spec.footprint.residue_bytes),
-        gpus=gpus or tuple(gpu.info.id for gpu in admission.selected(core, spec)),
+        gpus=gpus if record.gpu is None else (GpuId(record.gpu),),
     )
-    state = "held" if record.state in ("revoking", "debt") else record.state
-    lease = Lease.recovered(
-        LeaseId(record.lease_id),
-        spec,
-        ProcessKey(record.pid, record.start_ticks),
-        request,
-        Token(*record.token),
-        LeaseState(state),
-        core.now,
-        why,
-    )
-    lease.gpu = gpus[0] if gpus else None
-    lease.attached = False
-    lease.held_from = core.now if record.held_from is None else min(core.now, record.held_from)
-    lease.observed.reported_bytes = record.measured_bytes
-    lease.departure.exiting = record.exiting
-    lease.departure.revoked_before = record.state == "revoking"
-    lease.pinned = None if record.pinned is None else Order(*record.pinned)
+    lease = Lease.recovered(record, request, core.now, why)
     core.nonces[lease.process, record.nonce] = lease.id
     return lease
 
@@ -188,7 +163,7 @@ def _restore_residue(core: Core, key: str, record: ResidueRecord) -> None:
 
 
 # -- reattaching
-def on_reattached(core: Core, event: Reattached) -> None:
+def on_reattached(core: Core, event: ev.Reattached) -> None:
     """Take what a client says that it still holds. Every lease is answered for itself."""
     client = core.clients[event.client]
     answers: list[ReattachedView] = []
@@ -202,7 +177,7 @@ def on_reattached(core: Core, event: Reattached) -> None:
     core.reply(event.client, event.request, ReattachReply(tuple(answers)))
 
 
-def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
+def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     """Return the lease that a holder reattaches. Raises Refused.
 
     1. The lease is the one that the journal names, or its holder is believed.
@@ -239,7 +214,7 @@ def _reattach(core: Core, client: Client, item: ReattachedLease) -> Lease:
     return lease
 
 
-def _settle_token(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
+def _settle_token(core: Core, lease: Lease, client: Client, item: ev.ReattachedLease) -> None:
     """Settle that a holder knows its lease by another token. Raises Refused.
 
     Either a journal in doubt has lost the last grant, and the holder is right; or the lease came
@@ -256,7 +231,7 @@ def _settle_token(core: Core, lease: Lease, client: Client, item: ReattachedLeas
     raise Refused(no.WrongToken(item.lease, str(item.token)))
 
 
-def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLease) -> None:
+def _restore_uses(core: Core, lease: Lease, client: Client, item: ev.ReattachedLease) -> None:
     """Take what this client says runs as what runs, as far as its own uses go.
 
     Other connections, of this process too, answer for theirs: after a restart they may have begun
@@ -280,7 +255,7 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachedLeas
     core.wake(core.gpu_of(lease))
 
 
-def _adopt(core: Core, client: Client, item: ReattachedLease) -> Lease:
+def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     """Return a lease that the journal does not know, by its holder's word. Raises Refused.
 
     Its token is of an earlier epoch, and the engine recovers: else there is no such lease.
@@ -330,10 +305,10 @@ def account_for(core: Core, lease_id: str) -> None:
     if lease_id in core.recovering:
         core.recovering.remove(LeaseId(lease_id))
         if lease_id == EMPTY_JOURNAL:
-            core.forget(DOUBT_KEY)
+            core.forget(ev.DOUBT_KEY)
 
 
-def account_for_the_empty(core: Core, gpu: Gpu, sample: MemorySampled) -> None:
+def account_for_the_empty(core: Core, gpu: Gpu, sample: ev.MemorySampled) -> None:
     """Wait for no holder on a GPU that is read as good as empty.
 
     Holders that have not reattached live, and they alone can say that a lease is over, or their
@@ -358,7 +333,7 @@ def serve(core: Core) -> None:
 
 
 # -- resume from suspend
-def on_resumed(core: Core, event: Resumed) -> None:
+def on_resumed(core: Core, event: ev.Resumed) -> None:
     """Let no reading count that began before the machine was suspended, such as by a laptop's lid.
 
     The monotonic clock stood still, so no time to live ran out. Drivers may have moved or dropped

@@ -5,20 +5,8 @@ Permission: leases belong to a process, so a request on a lease must come from a
 process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
+from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, learning
-from vram_arbiter.arbiter.core.events import (
-    AcquireRequested,
-    CancelRequested,
-    LeaseRequest,
-    OomReported,
-    Reacquired,
-    ReadyReported,
-    ReleaseReported,
-    Renewed,
-    ResizeAsked,
-    RevokeAcknowledged,
-    UnloadStarted,
-)
 from vram_arbiter.arbiter.core.learning import check_load
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
@@ -67,7 +55,7 @@ def over(core: Core, lease_id: LeaseId) -> Refused:
     return Refused(ended.error or no.LeaseOver(ended.lease, ended.state, ended.revoked))
 
 
-def lease_for(core: Core, event: LeaseRequest) -> Lease:
+def lease_for(core: Core, event: ev.LeaseRequest) -> Lease:
     """Return a live lease by its exact token. Raises Refused."""
     lease = core.leases.get(event.lease)
     if lease is None:
@@ -79,7 +67,7 @@ def lease_for(core: Core, event: LeaseRequest) -> Lease:
     return lease
 
 
-def own_lease(core: Core, event: LeaseRequest) -> Lease:
+def own_lease(core: Core, event: ev.LeaseRequest) -> Lease:
     """Return a live lease of the client's own process; its time to live starts anew.
 
     Raises Refused.
@@ -106,7 +94,7 @@ def bad_state(lease: Lease, misfit: Misfit, use_id: str = "") -> Refused:
 
 
 # -- waiting
-def acquire(core: Core, event: AcquireRequested) -> Lease | None:
+def acquire(core: Core, event: ev.AcquireRequested) -> Lease | None:
     """Queue a new lease, unless it is of a gang. Return it; None: it was asked for already.
 
     The scheduling after this event may grant it at once, and answers either way. Raises Refused.
@@ -135,7 +123,7 @@ def acquire(core: Core, event: AcquireRequested) -> Lease | None:
     return lease
 
 
-def known_by(core: Core, event: AcquireRequested) -> Lease | None:
+def known_by(core: Core, event: ev.AcquireRequested) -> Lease | None:
     """Return the lease that an earlier acquire with the same nonce asked for. Raises Refused where
     it is over."""
     lease_id = core.nonces.get((core.clients[event.client].process, event.nonce))
@@ -147,7 +135,7 @@ def known_by(core: Core, event: AcquireRequested) -> Lease | None:
     return lease
 
 
-def _answer_again(core: Core, event: AcquireRequested, lease: Lease) -> None:
+def _answer_again(core: Core, event: ev.AcquireRequested, lease: Lease) -> None:
     """Answer a repeat as its lease is. The newest connection of a process is the one that
     listens."""
     core.hand_to(lease, event.client)
@@ -161,7 +149,7 @@ def _answer_again(core: Core, event: AcquireRequested, lease: Lease) -> None:
 
 def _new_lease(
     core: Core,
-    event: AcquireRequested,
+    event: ev.AcquireRequested,
     client: Client,
     load_peak: int,
     steady: int,
@@ -206,7 +194,7 @@ def answer_queued(core: Core) -> None:
         core.reply(lease.client, request.id, AcquireReply("queued", view))
 
 
-def cancel(core: Core, event: CancelRequested) -> None:
+def cancel(core: Core, event: ev.CancelRequested) -> None:
     """Give up a queued lease. One that was granted meanwhile must be released instead."""
     lease = core.leases.get(event.lease)
     if lease is None:
@@ -283,7 +271,7 @@ def check_shares(
 
 
 def note_refused(
-    core: Core, event: AcquireRequested | Reacquired | ResizeAsked, refusal: Refusal
+    core: Core, event: ev.AcquireRequested | ev.Reacquired | ev.ResizeAsked, refusal: Refusal
 ) -> None:
     """Note that a request for bytes was refused at once, by whom it was sent, and why.
 
@@ -302,14 +290,14 @@ def note_refused(
         seen.left_out += 1
         return
     seen.noted += 1
-    lease = None if isinstance(event, AcquireRequested) else core.leases.get(event.lease)
-    consumer = event.spec.consumer if isinstance(event, AcquireRequested) else ""
+    lease = None if isinstance(event, ev.AcquireRequested) else core.leases.get(event.lease)
+    consumer = event.spec.consumer if isinstance(event, ev.AcquireRequested) else ""
     core.note(RefusedNote(process.pid, refusal, consumer, seen.left_out), lease)
     seen.left_out = 0
 
 
 # -- holding
-def ready(core: Core, event: ReadyReported) -> None:
+def ready(core: Core, event: ev.ReadyReported) -> None:
     """Mark a lease loaded: from now on its steady bytes are charged, or what its holder measured.
 
     A repeat is answered again.
@@ -354,7 +342,7 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     core.wake(gpu)
 
 
-def renew(core: Core, event: Renewed) -> None:
+def renew(core: Core, event: ev.Renewed) -> None:
     """Keep leases alive. One that expired stays expired; one that is queued needs no renewal."""
     process = core.clients[event.client].process
     alive: list[str] = []
@@ -363,7 +351,9 @@ def renew(core: Core, event: Renewed) -> None:
         lease = core.leases.get(lease_id)
         try:
             if lease is None or lease.state is not LeaseState.QUEUED or lease.process != process:
-                lease = own_lease(core, LeaseRequest(event.client, event.request, lease_id, token))
+                lease = own_lease(
+                    core, ev.LeaseRequest(event.client, event.request, lease_id, token)
+                )
                 if not lease.attached:  # its time to live runs on: saying "alive" would be untrue
                     raise bad_state(lease, Misfit.NOT_REATTACHED)
             alive.append(lease_id)
@@ -373,7 +363,7 @@ def renew(core: Core, event: Renewed) -> None:
 
 
 # -- leaving
-def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
+def revoke_ack(core: Core, event: ev.RevokeAcknowledged) -> None:
     """Take down that a holder heard its revoke: it is not pushed again before the safe point."""
     lease = own_lease(core, event)
     asked = lease.departure.eviction
@@ -383,7 +373,7 @@ def revoke_ack(core: Core, event: RevokeAcknowledged) -> None:
     core.reply(event.client, event.request, StateReply(lease.state, len(lease.uses)))
 
 
-def unloading(core: Core, event: UnloadStarted) -> None:
+def unloading(core: Core, event: ev.UnloadStarted) -> None:
     """Begin the unloading of a holder at its safe point; a repeat is answered again.
 
     Refused while the lease is in use: this is the safe-point rule.
@@ -410,7 +400,7 @@ def unloading(core: Core, event: UnloadStarted) -> None:
     core.wake(gpu)
 
 
-def release(core: Core, event: ReleaseReported) -> None:
+def release(core: Core, event: ev.ReleaseReported) -> None:
     """Take a lease back from its holder. Its bytes stay charged until they are measured gone.
 
     A repeat is answered again; it never ends a lease that went on standby.
@@ -465,7 +455,7 @@ def note_ended(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> No
     core.note(UseEndedNote(use.id, use.label, ms, why, by), lease)
 
 
-def oom(core: Core, event: OomReported) -> None:
+def oom(core: Core, event: ev.OomReported) -> None:
     """Learn from an allocation that failed, if its holder asked for more than it was granted."""
     lease = own_lease(core, event)
     if lease.gpu is None:

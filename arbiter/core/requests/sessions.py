@@ -9,13 +9,7 @@ bytes of a lease that expired or was lost are measured gone before they are gran
 from collections.abc import Iterable
 from dataclasses import replace
 
-from vram_arbiter.arbiter.core.events import (
-    BYE,
-    ClientConnected,
-    ClientLeft,
-    JournalFailed,
-    ProcessDied,
-)
+from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.learning import model_name
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
@@ -30,7 +24,7 @@ from vram_arbiter.schemas.wire.notes import DeniedNote, ExpiredNote, JournalFail
 from vram_arbiter.schemas.wire.pushes import DeniedPush, LostPush
 
 
-def on_connected(core: Core, event: ClientConnected) -> None:
+def on_connected(core: Core, event: ev.ClientConnected) -> None:
     """Admit a client. The same instance on a new connection is the same client: its leases, waits
     and uses are the new connection's, and only the newest connection is remembered."""
     if event.client in core.clients:
@@ -54,7 +48,7 @@ def on_connected(core: Core, event: ClientConnected) -> None:
             core.want_sample(gpu, core.now - core.settings.sample_max_age_s)
 
 
-def on_left(core: Core, event: ClientLeft) -> None:
+def on_left(core: Core, event: ev.ClientLeft) -> None:
     """End the queued leases and the uses of a connection. Its resident leases end with a `bye`
     only."""
     client = core.clients.get(event.client)
@@ -74,7 +68,7 @@ def on_left(core: Core, event: ClientLeft) -> None:
             refusal = no.CancelledRequest(lease.id, Why.CLIENT_LEFT, event.reason)
             for feature in lease.features:
                 feature.give_up(core, lease, LeaseState.CANCELLED, refusal)
-        elif event.reason == BYE:
+        elif event.reason == ev.BYE:
             released(core, lease, exiting=False, why=Why.BYE)
 
 
@@ -93,7 +87,7 @@ def concerns(core: Core, client: ClientId) -> bool:
     return any(use.client == client for lease in used for use in lease.all_uses())
 
 
-def on_died(core: Core, event: ProcessDied) -> None:
+def on_died(core: Core, event: ev.ProcessDied) -> None:
     """End everything of a process. Its bytes become debts, measured gone before they count as
     free."""
     process = event.process
@@ -186,7 +180,7 @@ def lose(
 
 
 # -- the journal
-def on_journal_failed(core: Core, event: JournalFailed) -> None:
+def on_journal_failed(core: Core, event: ev.JournalFailed) -> None:
     """A grant that could not be written was not sent: it is taken back. The executor refuses the
     request whose reply it held back; a waiter that was to hear by push is denied here.
 

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
+from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction
-from vram_arbiter.arbiter.core.events import UseBegan, UseEnded, UseYielded
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.records import UserRecord
@@ -37,7 +37,7 @@ FROM_JOURNAL: Final = ClientId("")
 """The client of a use that was marked before a restart, until its process says it again."""
 
 
-def begin(core: Core, event: UseBegan) -> None:
+def begin(core: Core, event: ev.UseBegan) -> None:
     """Mark a use, or resume one that pauses. Refused once the holder was asked to leave.
 
     A repeat, perhaps on a new connection, is answered again: the use ends with that connection.
@@ -97,7 +97,7 @@ def _is_kept(lease: Lease, use: Use) -> bool:
     return use.process != lease.process and use in lease.users()
 
 
-def yield_(core: Core, event: UseYielded) -> None:
+def yield_(core: Core, event: ev.UseYielded) -> None:
     """Pause a use of one's own; a repeat changes nothing.
 
     A lease without busy uses is at its safe point.
@@ -116,7 +116,7 @@ def yield_(core: Core, event: UseYielded) -> None:
     core.reply(event.client, event.request, UsesReply(len(lease.uses)))
 
 
-def end(core: Core, event: UseEnded) -> None:
+def end(core: Core, event: ev.UseEnded) -> None:
     """End a use; one that is not there (any more) is fine."""
     lease = lease_for(core, event)
     key = (core.clients[event.client].process, event.use)

@@ -114,7 +114,8 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     for victim in plan:
         eviction.ask(core, gpu, victim, head)
     for gpu_id in request.gpus:
-        core.wake(core.gpus[gpu_id])  # requests behind `head` on its other GPUs may now proceed
+        if gpu_id != gpu.info.id:  # requests behind `head` on its other GPUs may now proceed
+            core.wake(core.gpus[gpu_id])
     return True
 
 
