@@ -25,7 +25,7 @@ has a bound.
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import ceil, inf
 from statistics import median
@@ -63,6 +63,15 @@ PAUSE_S: Final = 2.0
 PAUSE_MAX_S: Final = 60.0
 FORGOTTEN_S: Final = 600.0
 NAMES_MAX: Final = 256
+
+
+def newest[K, T](table: dict[K, T], name: K, make: Callable[[], T], most: int) -> T:
+    """Return the entry of a name, made if there is none, as the newest one of its table; the oldest
+    beyond `most` are forgotten."""
+    entry = table[name] = table.pop(name) if name in table else make()
+    while len(table) > most:
+        del table[next(iter(table))]
+    return entry
 
 
 # -- footprints ----------------------------------------------------------------------------------
@@ -135,11 +144,7 @@ class Footprints:
                     pass
 
     def _model(self, name: str) -> Measured:
-        model = self._models.pop(name, None) or Measured()
-        self._models[name] = model  # the newest last
-        while len(self._models) > MODELS_MAX:
-            del self._models[next(iter(self._models))]
-        return model
+        return newest(self._models, name, Measured, MODELS_MAX)
 
 
 def _counts(value: object) -> list[int]:
@@ -282,13 +287,13 @@ class Reuse:
         return (1 + sum(self.soon)) / (2 + len(self.soon))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Failures:
     """Loads of one model that failed in a row."""
 
-    count: int
-    last_at: float
-    cause: str  # of the last
+    count: int = 0
+    last_at: float = -inf
+    cause: str = ""  # of the last
 
 
 class Costs:
@@ -308,9 +313,8 @@ class Costs:
     # -- durations
     def learn(self, consumer: str, phase: str, seconds: float) -> None:
         """Remember how long a phase (`drain_s`, `unload_s`, `verify_s`, `load_s`) took."""
-        phases = self.durations.pop(consumer, {})
+        phases = newest(self.durations, consumer, dict[str, deque[float]], CONSUMERS_REMEMBERED)
         phases.setdefault(phase, deque(maxlen=LEARNT_REMEMBERED)).append(max(0.0, seconds))
-        _put(self.durations, consumer, phases, CONSUMERS_REMEMBERED)
 
     def learnt_s(self, consumer: str, phase: str) -> float | None:
         """Return the median of what was learned; None: never seen."""
@@ -327,9 +331,7 @@ class Costs:
     # -- returns
     def left(self, consumer: str, now: float) -> None:
         """A consumer's bytes are gone: whether it is wanted again soon is learned from now on."""
-        seen = self.reuse.pop(consumer, None) or Reuse()
-        seen.left_at = now
-        _put(self.reuse, consumer, seen, CONSUMERS_REMEMBERED)
+        newest(self.reuse, consumer, Reuse, CONSUMERS_REMEMBERED).left_at = now
 
     def wanted(self, consumer: str, now: float) -> None:
         """Learn whether a consumer is wanted again soon after it left."""
@@ -364,9 +366,9 @@ class Costs:
     # -- failed loads
     def load_failed(self, model: str, cause: str, now: float) -> None:
         """A holder died, or was lost, while it loaded."""
-        before = self.failures.pop(model, None)
-        count = 0 if before is None or now - before.last_at > FORGOTTEN_S else before.count
-        _put(self.failures, model, Failures(count + 1, now, cause), NAMES_MAX)
+        seen = newest(self.failures, model, Failures, NAMES_MAX)
+        seen.count = 1 if now - seen.last_at > FORGOTTEN_S else seen.count + 1
+        seen.last_at, seen.cause = now, cause
 
     def pause_s(self, model: str, now: float) -> float:
         """Return for how long no eviction is spent on a load of this model."""
@@ -395,9 +397,3 @@ def check_load(
             return
     seen = core.costs.failures[name]
     raise Refused(LoadFails(spec.consumer, spec.model, seen.count, seen.cause, wait_s))
-
-
-def _put[T](table: dict[str, T], name: str, value: T, most: int) -> None:
-    table[name] = value
-    while len(table) > most:
-        del table[next(iter(table))]

@@ -280,10 +280,7 @@ def note_refused(
     many were left out.
     """
     process = core.clients[event.client].process
-    seen = core.refusals.pop(process, None) or Refusals(core.now)
-    core.refusals[process] = seen
-    while len(core.refusals) > PROCESSES_REMEMBERED:
-        del core.refusals[next(iter(core.refusals))]
+    seen = learning.newest(core.refusals, process, lambda: Refusals(core.now), PROCESSES_REMEMBERED)
     seen.noted = max(0.0, seen.noted - (core.now - seen.at))
     seen.at = core.now
     if seen.noted > AT_ONCE - 1:
