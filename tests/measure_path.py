@@ -233,10 +233,13 @@ def record(folder: Path, *, cold: bool = False) -> dict[str, list[Step]]:
 
 
 def until_granted(steps: list[Step]) -> list[Step]:
-    """Return the daemon's steps up to the end of the event in which it granted."""
+    """Return the daemon's steps up to the end of the event in which it granted.
+
+    All of them if the counting was turned off before that: the waiter hears of its grant earlier.
+    """
     names = [(file, name) for file, name, _ in steps]
-    granted = names.index(GRANT)
-    return steps[: names.index(LOOP, granted)]
+    rest = names[names.index(GRANT) :]
+    return steps if LOOP not in rest else steps[: len(steps) - len(rest) + rest.index(LOOP)]
 
 
 def _recorded(cold: bool) -> dict[str, list[Step]]:

@@ -52,3 +52,11 @@ def test_generator_expressions_and_lambdas_are_lines_of_their_function() -> None
 def test_first_use_work_is_not_on_the_path(steps: dict[str, list[measure_path.Step]]) -> None:
     names = {name for side in steps.values() for _, name, _ in side}
     assert not [name for name in names if name == "<module>"]
+
+
+def test_the_daemons_side_ends_with_the_event_of_the_grant() -> None:
+    """Readings of the load that follows were counted too, as many as fitted."""
+    event = [("arbiter/core/arbiter.py", "Arbiter.handle", 1), (*measure_path.GRANT, 2)]
+    loop = (*measure_path.LOOP, 3)
+    assert measure_path.until_granted([loop, *event, loop, *event, loop]) == [loop, *event]
+    assert measure_path.until_granted([loop, *event]) == [loop, *event]
