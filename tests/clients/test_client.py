@@ -14,6 +14,7 @@ import pytest
 from anyio.streams.buffered import BufferedByteReceiveStream
 
 from tests.support.beside import Canceled, Start, within
+from tests.support.leases import states
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Eviction
@@ -46,10 +47,6 @@ pytestmark = [
 Spec = Callable[..., LeaseSpec]
 Until = Callable[[Callable[[], bool]], Awaitable[None]]
 WAIT_S = 60.0
-
-
-async def states(client: AsyncClient) -> dict[str, str]:
-    return {lease.consumer: lease.state for lease in (await client.status()).leases}
 
 
 async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:

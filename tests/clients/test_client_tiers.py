@@ -8,6 +8,7 @@ import anyio
 import pytest
 
 from tests.support.beside import Start, within
+from tests.support.leases import states
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease, AsyncUse, LeaseState
@@ -76,10 +77,6 @@ async def parkable(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
     )
     await detector.ready()
     return detector
-
-
-async def states(client: AsyncClient) -> dict[str, str]:
-    return {lease.consumer: lease.state for lease in (await client.status()).leases}
 
 
 async def test_a_standby_lease_returns_by_itself_when_there_is_room(

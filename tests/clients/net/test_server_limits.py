@@ -57,7 +57,7 @@ class Server:
 
 
 @asynccontextmanager
-async def serving(path: Path, **options: Any) -> AsyncIterator[Server]:
+async def router_at(path: Path, **options: Any) -> AsyncIterator[Server]:
     async with RouterServer(f"ipc://{path}", refused, **options) as router:
         server = Server(router)
         task = asyncio.create_task(router.serve(server.handle))
@@ -108,7 +108,7 @@ def test_the_first_message_may_be_the_largest_picture(tmp_path: Path, kind: int)
     """
 
     async def scenario() -> None:
-        async with serving(tmp_path / "s.sock") as server:
+        async with router_at(tmp_path / "s.sock") as server:
             client = Client(tmp_path / "s.sock", kind)
             answer = await client.ask({"op": "detect", "image": bytes(IMAGE_MESSAGE_MAX_BYTES)})
             assert answer == {"ok": True, "re": None, "size": IMAGE_MESSAGE_MAX_BYTES}
@@ -153,7 +153,7 @@ def test_a_message_that_costs_too_much_is_refused_and_its_sender_served_on(
     """
 
     async def scenario() -> None:
-        async with serving(tmp_path / "s.sock"):
+        async with router_at(tmp_path / "s.sock"):
             client = Client(tmp_path / "s.sock")
             assert (await client.ask(message))["code"] == code
             assert (await client.ask({"op": "ping", "id": 1}))["ok"]
@@ -164,7 +164,7 @@ def test_a_message_that_costs_too_much_is_refused_and_its_sender_served_on(
 
 def test_a_server_without_pictures_takes_a_mebibyte(tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with serving(tmp_path / "s.sock", message_max_bytes=MESSAGE_MAX_BYTES):
+        async with router_at(tmp_path / "s.sock", message_max_bytes=MESSAGE_MAX_BYTES):
             client = Client(tmp_path / "s.sock")
             answer = await client.ask({"op": "ping", "image": bytes(MESSAGE_MAX_BYTES)})
             assert answer["code"] == "message_too_large"
@@ -175,7 +175,7 @@ def test_a_server_without_pictures_takes_a_mebibyte(tmp_path: Path) -> None:
 
 def test_a_goal_may_be_a_trajectory_of_eight_hundred_points(tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with serving(tmp_path / "s.sock", message_max_bytes=MESSAGE_MAX_BYTES):
+        async with router_at(tmp_path / "s.sock", message_max_bytes=MESSAGE_MAX_BYTES):
             client = Client(tmp_path / "s.sock")
             point = {"positions": [0.1] * 6, "time_from_start": {"sec": 1, "nanosec": 5}}
             goal = {"op": "goal", "goal_params": {"trajectory": {"points": [point] * 800}}}
@@ -187,7 +187,7 @@ def test_a_goal_may_be_a_trajectory_of_eight_hundred_points(tmp_path: Path) -> N
 
 def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with serving(tmp_path / "s.sock") as server:
+        async with router_at(tmp_path / "s.sock") as server:
             client = Client(tmp_path / "s.sock")
             picture = bytes(IMAGE_MESSAGE_MAX_BYTES)
             for number in range(9):
@@ -214,7 +214,7 @@ def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(
 ) -> None:
     async def scenario() -> None:
         path = tmp_path / "s.sock"
-        async with serving(path) as server:
+        async with router_at(path) as server:
             greedy = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             greedy.setblocking(False)
             loop = asyncio.get_running_loop()
@@ -242,7 +242,7 @@ def test_a_peer_that_does_not_read_its_answers_delays_no_other_and_holds_little(
 def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
     async def scenario() -> None:
         path = tmp_path / "s.sock"
-        async with serving(path):
+        async with router_at(path):
             path.unlink()
             while not path.exists():
                 await asyncio.sleep(0.01)
