@@ -390,6 +390,8 @@ def test_raw_numbers_are_clipped_to_the_slots_bounds(panda: Bench) -> None:
 class Answers:
     """Stands for a policy's sidecar: the same chunk to every observation."""
 
+    connected = True
+
     def __init__(self, row: list[float]) -> None:
         self.row = row
         self.states: list[Any] = []
