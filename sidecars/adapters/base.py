@@ -4,7 +4,7 @@ An adapter knows its model and nothing of leases, sockets or bytes.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
@@ -54,3 +54,16 @@ class ModelAdapter(Protocol):
     def place(self, device: str) -> None: ...
 
     def run(self, call: ModelCall) -> Message: ...
+
+
+class OneNetwork:
+    """Part of an adapter whose model is one network that only has to be moved."""
+
+    _model: Any = None
+
+    @property
+    def networks(self) -> "Sequence[Module]":
+        return (self._model,)
+
+    def place(self, device: str) -> None:
+        self._model.to(device)

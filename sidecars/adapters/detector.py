@@ -13,7 +13,7 @@ from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
-from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
 from vram_arbiter.sidecars.adapters.inputs import to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
@@ -32,7 +32,7 @@ type _Found = tuple[list[float], list[str], list[list[float]]]
 """Scores, texts and boxes (x0, y0, x1, y1 in pixels), as long as each other."""
 
 
-class DetectorAdapter:
+class DetectorAdapter(OneNetwork):
     """The op `detect`: texts and a picture in, boxes in the picture's pixels out. Deterministic."""
 
     kind: Literal["detector"] = "detector"
@@ -44,7 +44,6 @@ class DetectorAdapter:
         self._contract = manifest.detector
         self._weights = weights
         self._processor: Any = None
-        self._model: Any = None
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -71,13 +70,6 @@ class DetectorAdapter:
         self._model = load_transformers(
             AutoModelForZeroShotObjectDetection, self._weights, **options
         )
-
-    @property
-    def networks(self) -> Sequence[Any]:
-        return (self._model,)
-
-    def place(self, device: str) -> None:
-        self._model.to(device)
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, DetectOp)

@@ -6,7 +6,6 @@ consent, and for a repository of the hub one commit, so that the files cannot ch
 
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,7 +15,7 @@ from vram_arbiter.schemas.errors import BadRequest, ConfigError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp
-from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
 from vram_arbiter.sidecars.adapters.detector import split_query
 from vram_arbiter.sidecars.adapters.inputs import to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
@@ -38,7 +37,7 @@ _MAPS: Final = (
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
-class LocateAnythingAdapter:
+class LocateAnythingAdapter(OneNetwork):
     """The op `detect`: texts and a picture in, boxes in the picture's pixels out.
 
     Greedy, so the same question gets the same answer. Every box has the score 1.0.
@@ -53,7 +52,6 @@ class LocateAnythingAdapter:
         self._contract = manifest.detector
         self._weights = with_own_code(manifest, weights)
         self._processor: Any = None
-        self._model: Any = None
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -76,13 +74,6 @@ class LocateAnythingAdapter:
 
         options = model_options(self._manifest, self._weights, device) | {CONSENT: True}
         self._model = load_transformers(AutoModel, self._weights, **options)
-
-    @property
-    def networks(self) -> Sequence[Any]:
-        return (self._model,)
-
-    def place(self, device: str) -> None:
-        self._model.to(device)
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, DetectOp)

@@ -10,7 +10,7 @@ from vram_arbiter.schemas.errors import BadRequest, LimitExceeded, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QueryOp
-from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
 from vram_arbiter.sidecars.adapters.inputs import to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode_all, of_one_size, within
@@ -27,7 +27,7 @@ ANSWER_MAX_S: Final = 120.0
 PROMPT_MAX_TOKENS: Final = 16_384
 
 
-class SceneVlmAdapter:
+class SceneVlmAdapter(OneNetwork):
     """The op `query`: pictures, a video and a question in, the answer out.
 
     Greedy, so the same question gets the same answer.
@@ -40,7 +40,6 @@ class SceneVlmAdapter:
         self._manifest = manifest
         self._weights = weights
         self._processor: Any = None
-        self._model: Any = None
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -68,13 +67,6 @@ class SceneVlmAdapter:
 
         options = model_options(self._manifest, self._weights, device)
         self._model = load_transformers(AutoModelForImageTextToText, self._weights, **options)
-
-    @property
-    def networks(self) -> Sequence[Any]:
-        return (self._model,)
-
-    def place(self, device: str) -> None:
-        self._model.to(device)
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, QueryOp)
