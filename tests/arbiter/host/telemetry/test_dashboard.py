@@ -98,5 +98,5 @@ def test_the_operators_guide_names_the_metrics_that_there_are() -> None:
         r"^Metrics of the programs.*?(?=^\*\*Logs)", GUIDE.read_text(), re.M | re.S
     )
     assert documented
-    named = set(re.findall(r"`(vram\.[a-z_.]+)`", documented[0]))
+    named = set(re.findall(r"`((?:vram|process)\.[a-z_.]+)`", documented[0]))
     assert named == {value for key, value in vars(names).items() if key.startswith("METRIC_")}
