@@ -104,7 +104,8 @@ class Session:
         self._greeted: Answer[None] = Answer()
         self._alarm_at = float("inf")
         self._alarm_moved = anyio.Event()
-        self._replies: dict[int, Answer[AnyReply]] = {}
+        self._replies: dict[int, Answer[AnyReply] | Answer[AnyReply | None]] = {}
+        self._until_loss: dict[int, Answer[AnyReply | None]] = {}
         self._lost = False
         self._distrusted = False  # since the last contact
 
@@ -250,6 +251,19 @@ class Session:
         finally:
             if self._replies.pop(request_id, None) is not None and not answer.done:
                 self.protocol.connection.forget(request_id)
+
+    async def told(self, request_id: int) -> None:
+        self.check_open()
+        answer: Answer[AnyReply | None] = Answer()
+        self._replies[request_id] = self._until_loss[request_id] = answer
+        try:
+            self.pump()
+            if self.connected:
+                await answer.wait()
+        finally:
+            self._replies.pop(request_id, None)
+            self._until_loss.pop(request_id, None)
+            self.protocol.connection.forget(request_id)
 
     def forget_use(self, use_id: str) -> None:
         self._foreign_uses.pop(use_id, None)
@@ -449,6 +463,8 @@ class Session:
             )
         self._lost = True
         self._contact_lost.set()
+        for answer in self._until_loss.values():
+            answer.set(None)
 
     def _granted(self, event: r.Granted) -> None:
         wait = self._waits.get(event.nonce)

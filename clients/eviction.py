@@ -49,6 +49,11 @@ class Driver(Protocol):
         """Send what is queued and wait for the answer to a request. Raises its typed error."""
         ...
 
+    async def told(self, request_id: int) -> None:
+        """Send what is queued and wait for the answer to a request, or for the loss of contact: it
+        is sent again when the arbiter is back. Raises its typed error."""
+        ...
+
     def forget_use(self, use_id: str) -> None:
         """Drop a use on the lease of another process: it has ended."""
         ...

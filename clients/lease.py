@@ -391,12 +391,14 @@ class AsyncUse:
         await lease._until_loaded()
         lease._departure.uses.add(self.use_id)
         driver = lease._driver
+        request = driver.protocol.holdings.use_begin(
+            lease._record, self.use_id, self._label, driver.now()
+        )
         try:
-            await driver.reply(
-                driver.protocol.holdings.use_begin(
-                    lease._record, self.use_id, self._label, driver.now()
-                )
-            )
+            if lease._record.held:
+                await driver.told(request)
+            else:  # the answer lets the next model load
+                await driver.reply(request)
         except BaseException:
             lease._departure.uses.discard(self.use_id)
             raise

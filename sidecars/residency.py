@@ -668,15 +668,11 @@ class Residency:
         self, lease: AsyncLease | None, label: str, *, handed: bool
     ) -> AsyncIterator[None]:
         """Mark a use. Under a handed-over token the caller's own use protects the model, also while
-        revoked.
-
-        Without contact to the arbiter nothing is marked: no lease can be granted then, and an
-        unload waits for the op in progress in any case.
-        """
+        revoked."""
         self._running += 1
         try:
             async with contextlib.AsyncExitStack() as stack:
-                if lease is not None and self._client is not None and self._client.connected:
+                if lease is not None:
                     try:
                         await stack.enter_async_context(lease.use(label))
                     except LeaseRevoking:

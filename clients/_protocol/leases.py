@@ -72,8 +72,9 @@ class Holdings:
         """The use counts from now on, so that a reattachment on the way names it."""
         record.uses.add(use_id)
 
-        def refused(_: VramError, __: float) -> None:
-            record.uses.discard(use_id)
+        def refused(error: VramError, _: float) -> None:
+            if not isinstance(error, ArbiterUnreachable):  # it may go on until the lease is fenced
+                record.uses.discard(use_id)
 
         message = {"op": "use_begin", **record.ref(), "use_id": use_id, "label": label}
         return self._ask(record, message, now, on_error=refused)

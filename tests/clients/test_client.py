@@ -549,6 +549,27 @@ with Client("runner") as client, client.use(sys.argv[1], token, "goal") as use:
 """
 
 
+async def test_a_use_begins_without_the_daemon_and_is_told_when_it_is_back(
+    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
+) -> None:
+    """Regression: a use that began before the client noticed the daemon's death waited until the
+    lease was fenced, and a robot's goal with it."""
+    arbiter = make_arbiter().start()
+    async with AsyncClient("sidecar", endpoint=arbiter.endpoint) as client, within(WAIT_S):
+        lease = await client.acquire(spec("a", 5))
+        await lease.ready()
+        arbiter.kill()
+        async with lease.use("not noticed yet"):
+            await until(lambda: not client.connected)
+            async with lease.use("noticed"):
+                await anyio.to_thread.run_sync(arbiter.start)
+                while not client.connected or (await client.status()).leases[0].uses != 2:
+                    await anyio.sleep(0.01)
+            assert (lease.state, lease.uses) == ("held", 1)
+        while (await client.status()).leases[0].uses:
+            await anyio.sleep(0.01)
+
+
 async def test_leases_and_uses_survive_a_kill_of_the_daemon(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
 ) -> None:
