@@ -19,7 +19,7 @@ def add_parser(
     episodes.add_argument("--dataset", type=Path, required=True)
     episodes.add_argument(
         "--marked", choices=("success", "failure"),
-        help="print the numbers of these episodes alone, as lerobot's --dataset.episodes takes them",
+        help="print only the numbers of these episodes, as lerobot's --dataset.episodes takes them",
     )  # fmt: skip
     return episodes
 

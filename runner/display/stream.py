@@ -1,7 +1,7 @@
 """What a runner sees and does as a Rerun recording: for a viewer, or in a file.
 
 `rerun` is imported when a stream is made; it is lerobot's visualizer (extra `viz`). Entities:
-`camera/NAME`, `state/JOINT`, `action/JOINT`, `base/…`, `tick/…`, `leases/NAME`, `goal` and `events`,
+`camera/NAME`, `state/JOINT`, `action/JOINT`, `base/…`, `tick/…`, `leases/NAME`, `goal`, `events`,
 on the timelines `time` and `tick`. Must not know threads, robots or sockets.
 """
 

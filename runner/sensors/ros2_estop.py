@@ -1,4 +1,4 @@
-"""Emergency stop by a ROS 2 topic: `std_msgs/Bool`, true stops. Over DDS, without a ROS installation.
+"""Emergency stop by a ROS 2 topic: `std_msgs/Bool`, true stops. Needs DDS, and no ROS installation.
 
 Fails to the safe side: a message that cannot be read stops the robot, and so does a listener that
 breaks down. A publisher that is away stops nothing: the topic is a button, not a dead man's switch.

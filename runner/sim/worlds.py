@@ -1,7 +1,7 @@
 """Worlds that the runner can simulate (`--env`), with their cameras, joints and skills.
 
-`so101` is our own scene, `gym:ID` any gymnasium environment, a preset one of the field's. Nothing is simulated here:
-`World.make` does that, on the control thread.
+`so101` is our own scene, `gym:ID` any gymnasium environment, a preset one of the field's. Nothing
+is simulated here: `World.make` does that, on the control thread.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Skills that this runner performs itself in place of a ROS 2 server, by interface type.
 
-A `ros_action` without a stand-in is refused before a goal could ask for it, with a list of the known
-ones. `runner.ros2` asks ROS 2 servers, where a deployment names the interface.
+A `ros_action` without a stand-in is refused before a goal could ask for it, with a list of the
+known ones. `runner.ros2` asks ROS 2 servers, where a deployment names the interface.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def test_find_navigate_grab_fits_in_eight_gib(tmp_path: Path) -> None:
     assert b"ftyp" in (tmp_path / "on" / "episode.mp4").read_bytes()[:64]
 
 
-@pytest.mark.nightly  # it starts all programs once more; they and the summary have tests of their own
+@pytest.mark.nightly  # it starts all programs once more; they have tests of their own
 def test_without_the_arbiter_the_same_loop_runs_out_of_memory(tmp_path: Path) -> None:
     code, summary = run_demo(tmp_path / "off", "--seed", "0", "--arbiter", "off")
     assert not summary["completed"]

@@ -1,5 +1,6 @@
-"""Prints the spans and metrics of some ticks on a robot as JSON: a program of its own, because a process has one
-tracer provider for good.
+"""Prints the spans and metrics of some ticks on a robot as JSON.
+
+A program of its own, because a process has one tracer provider for good.
 """
 
 import json

@@ -108,7 +108,8 @@ class Host:
 
     def start(self) -> None:
         arguments = [
-            "--name", self.kind.name, "--rskill", str(self.configs / self.kind.rskill / "rskill.yaml"),
+            "--name", self.kind.name,
+            "--rskill", str(self.configs / self.kind.rskill / "rskill.yaml"),
             "--configs", str(self.configs), "--footprint", "1GB,1GB,100MB",
             "--device", f"fake:{self.arbiter.card}", "--min-residency-s", "0", "--nice", "0",
         ]  # fmt: skip

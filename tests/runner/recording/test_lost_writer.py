@@ -1,4 +1,4 @@
-"""A writer that dies again and again: the session ends, after the goal that runs, with the reason."""
+"""A writer that dies again and again: the session ends after its goal, with the reason."""
 
 import threading
 from collections.abc import Callable

@@ -2,8 +2,9 @@
 step that it was predicted for, and the play goes on.
 
 A row is predicted for the step that is as many rows behind its observation as its place in the
-chunk; steps are counted in rows played, as the robot moves by nothing else. A chunk counts as in time exactly if the robot did not have to stand still before it: told by what
-was played, not by the player.
+chunk; steps are counted in rows played, as the robot moves by nothing else. A chunk counts as in
+time exactly if the robot did not have to stand still before it: told by what was played, not by the
+player.
 """
 
 import concurrent.futures
