@@ -100,9 +100,9 @@ def preset_of(name: str) -> Preset | None:
     """
     if name.startswith(LIBERO):
         raise ConfigError(
-            f"--env {name}: LIBERO (package hf-libero) is not played here: its policies move"
-            " an end effector by 7 numbers from a state of 8, and a world here has the same names for"
-            " both",
+            f"--env {name}: LIBERO (package hf-libero) is not played here: its policies"
+            " move an end effector by 7 numbers from a state of 8, and a world here has the same"
+            " names for both",
             hint="run `lerobot-eval --env.type=libero` under `vramctl run`, in an environment with"
             " `pip install 'lerobot[libero]'`",
         )

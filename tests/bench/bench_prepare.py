@@ -7,7 +7,8 @@ Real arbiter, simulator, detector and grab sidecars. The grab stands for a model
 weights come from a disk of 2 GB/s and reach the simulated GPU at 6 GB/s, as in the demo; the
 detector is resident and has to leave. Before each round the grab's weights are in neither memory;
 then the robot turns for some seconds, the hint is given at the beginning of the
-turn or not at all, and a goal of one control step follows. Prints a table and writes `out/bench/prepare.json`.
+turn or not at all, and a goal of one control step follows. Prints a table
+and writes `out/bench/prepare.json`.
 """
 
 import argparse
