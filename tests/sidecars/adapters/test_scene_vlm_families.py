@@ -176,10 +176,10 @@ def test_pictures_are_counted_before_any_is_looked_at(fields, reason):
 
 
 @pytest.mark.heavy
-def test_an_adapter_beside_a_model_is_refused(loaded, manifest):
+def test_an_adapter_beside_a_model_is_refused(loaded):
     """Regression: transformers adds an adapter unasked where PEFT is installed, and ignores it
     where it is not."""
-    adapter = loaded("qwen2_5_vl", manifest)
+    adapter = loaded("qwen2_5_vl")
     config = Path(adapter._weights.source) / "adapter_config.json"
     config.write_text('{"peft_type": "LORA", "base_model_name_or_path": "other/model"}')
     try:
