@@ -197,7 +197,7 @@ LOAD = """
 import asyncio, sys
 from vram_arbiter.clients.sidecar.base import SidecarClient
 async def load():
-    async with SidecarClient(sys.argv[1], connect_timeout_s=60) as sidecar:
+    async with SidecarClient(sys.argv[1], connect_timeout_s=170) as sidecar:
         await sidecar.load()
 asyncio.run(load())
 """
