@@ -22,7 +22,7 @@ from vram_arbiter.schemas.config.robot import DetectorConfig
 from vram_arbiter.schemas.errors import Evicted, ModelError
 from vram_arbiter.sidecars.wires import Wire, unread_reply
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy]  # pictures need numpy
 
 PERIOD_S, RELOAD_S = 0.5, 10.0
 
