@@ -10,8 +10,10 @@ the end of all, and answers with what it has finished or could not.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import logging
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -38,6 +40,7 @@ log = logging.getLogger("vram_arbiter.runner.recording")
 
 DISCARD = "discard"
 NICENESS = 10  # the control loop goes first
+_CAP_SYS_NICE, _CAPABILITY_VERSION_3 = 23, 0x20080522  # linux/capability.h
 ROWS_MIN = 2  # lerobot has no statistics of a single picture
 ROWS_MAX = 30 * 60 * 30  # half an hour at 30 Hz; a longer goal goes on in the next episode
 
@@ -220,6 +223,7 @@ def serve(peer: socket.socket) -> int:
             _answer(peer, {"kind": "refused", "error": _typed(root, error).to_wire()})
             return 2
         os.nice(NICENESS)
+        stay_ordinary()
         _answer(
             peer, {"kind": "ready", "repaired": repaired, "episodes": episodes, "frames": frames}
         )
@@ -232,6 +236,24 @@ def serve(peer: socket.socket) -> int:
                 _take(writer, *message)
         _take(writer, {"kind": "close", "goal_id": "", "status": status}, [])
     return 0
+
+
+def stay_ordinary() -> None:
+    """Give up the right to run before other programs, for this thread and all that it starts.
+
+    The AV1 encoder of lerobot's format (SVT-AV1) takes the highest real-time priority for each of
+    its threads where it may, as for root: they would run before the control loop.
+    """
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable: low words, then high ones
+    if libc.capget(header, sets):
+        raise OSError(ctypes.get_errno(), "capget")
+    for low_word in range(3):
+        sets[low_word] &= ~(1 << _CAP_SYS_NICE)
+    if libc.capset(header, sets):
+        raise OSError(ctypes.get_errno(), "capset")
 
 
 def _answer(peer: socket.socket, message: wire.Header) -> None:

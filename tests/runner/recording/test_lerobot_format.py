@@ -5,6 +5,9 @@
 import base64
 import json
 import math
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,6 +37,26 @@ pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
 ARM = so101(simulated=True)
 UNITS = lerobot_units_of(ARM)
 FRAMES = 4
+TO_REALTIME = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def ordinary() -> Iterator[None]:
+    """The AV1 encoder leaves the thread that uses it at the highest real-time priority where it may,
+    and every program that this thread starts: units that forbid it did not start in later tests."""
+    yield
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def test_a_writer_may_not_run_before_the_control_loop() -> None:
+    """Regression: as root, each of its encoder's 37 threads did."""
+    if subprocess.run([sys.executable, "-c", TO_REALTIME], check=False).returncode:
+        pytest.skip("this machine allows no program to run in real time")
+    started = "from vram_arbiter.runner.recording.writer import stay_ordinary; stay_ordinary(); "
+    done = subprocess.run(
+        [sys.executable, "-c", started + TO_REALTIME], check=False, capture_output=True, text=True
+    )
+    assert "PermissionError" in done.stderr
 
 
 def arm_tick(index: int) -> GoalTick:
