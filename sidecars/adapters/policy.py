@@ -10,6 +10,7 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
+from vram_arbiter.sidecars.adapters import lingbot
 from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, ModelCall
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
@@ -84,6 +85,9 @@ class PolicyAdapter:
     `n_obs_steps` control steps with the oldest first; the actions are then those of a robot that
     calls `select_action` at every step. lerobot's inference server cannot be followed here: it
     gives one observation to `predict_action_chunk`, on which these policies fail.
+
+    LingBot-VA's cache takes the observation after every action that it answered, so each call
+    after the first has to bring just these (`lingbot.act`).
     """
 
     kind: Literal["vla"] = "vla"
@@ -97,6 +101,7 @@ class PolicyAdapter:
         self._config: Any = None
         self._policy_class: Any = None
         self._policy: Any = None
+        self._encoders: tuple[Any, ...] = ()  # networks that are no part of the policy's module
         self._before: Any = None
         self._after: Any = None
         self._observations: Observations | None = None
@@ -129,6 +134,8 @@ class PolicyAdapter:
             self._config.use_bf16 = self._dtype is Dtype.BF16
         if self._family.dtype_field is not None:
             setattr(self._config, self._family.dtype_field, TORCH_NAMES[self._dtype])
+        if self._family.replays:
+            lingbot.settle(self._config, self._weights.source)
 
     @property
     def _has_own_dtype(self) -> bool:
@@ -147,6 +154,8 @@ class PolicyAdapter:
         self._guided = False
         self._policy = policy if self._has_own_dtype else _cast(policy, torch_type(self._dtype))
         self._quantize(device)
+        if self._family.replays:
+            self._encoders = lingbot.load_encoders(policy)
         self._make_processors()
         _need_absolute(self._after, self._weights.source)
         need_statistics(self._before, self._config.input_features, self._weights.source)
@@ -154,8 +163,14 @@ class PolicyAdapter:
         self._observations = Observations(
             self._config.input_features,
             self._manifest.image_preprocessing,
-            self._config.n_obs_steps if self._family.queues else 1,
+            self._steps_max,
         )
+
+    @property
+    def _steps_max(self) -> int:
+        if self._family.replays:
+            return lingbot.STEPS_MAX
+        return int(self._config.n_obs_steps) if self._family.queues else 1
 
     def _quantize(self, device: str) -> None:
         """Quantize linear layers to NF4 where the manifest says int4; on `meta`, choose them."""
@@ -167,11 +182,12 @@ class PolicyAdapter:
 
     @property
     def networks(self) -> Sequence[Any]:
-        return (self._policy,)
+        return (self._policy, *self._encoders)
 
     def place(self, device: str) -> None:
         self._config.device = self._device = device
-        self._policy.to(device)
+        for network in self.networks:
+            network.to(device)
         from lerobot.processor import DeviceProcessorStep
 
         for step in self._before.steps:  # not read again: a tokenizer takes up to a second
@@ -300,7 +316,7 @@ class PolicyAdapter:
                     hint="the sidecar's log has the tokens; nothing was sent to the robot",
                 )
             return chunk
-        return _select(self._policy, steps)
+        return (lingbot.act if self._family.replays else _select)(self._policy, steps)
 
     @property
     def _selects(self) -> bool:

@@ -28,14 +28,13 @@ _OWN_STEPS: Final = ("lerobot.", "vram_arbiter.")
 _NOT_COMPARED: Final[Mapping[str, Mapping[str, object]]] = {
     "groot": {"use_relative_actions": True},  # each row needs the state that its chunk began with
     "molmoact2": {"inference_action_mode": "discrete", "enable_lora_vlm": True},
+    "lingbot_va": {"camera_layout": "robotwin_tshape"},
     "wall_x": {"prediction_mode": "fast"},  # its tokenizer of actions is Python code of the hub
 }
 """Settings of a type's configuration that are refused."""
 _WHY_NOT: Final[Mapping[ModelFamily | None, str]] = {
     ModelFamily.FASTWAM: "its image encoder is in no checkpoint: lerobot reads it, in whatever "
     "revision, from a hub repository whose name is fixed in its code",
-    ModelFamily.LINGBOT_VA: "its image and text encoders are in no checkpoint: lerobot reads them, "
-    "in whatever revision, at the first action",
 }
 """lerobot's types that are not in `FAMILIES`."""
 
@@ -51,6 +50,8 @@ class Family:
     the only name of an image that its code finds. `remote_code`: what of it is Python files of a
     hub repository. `dtype_field` is the field of its configuration that names the number format, if
     it has one, and `casts` marks code that casts unasked; layers of either may stay float32.
+    `replays` marks a policy that computes with encoders of a folder of their own, and that needs
+    the observation after each of its actions.
     """
 
     types: tuple[str, ...]
@@ -61,6 +62,7 @@ class Family:
     remote_code: str | None = None
     dtype_field: str | None = None
     casts: bool = False
+    replays: bool = False
 
 
 FAMILIES: Final[Mapping[ModelFamily, Family]] = {
@@ -91,6 +93,14 @@ FAMILIES: Final[Mapping[ModelFamily, Family]] = {
     ),
     ModelFamily.GR00T: Family(
         ("groot",), ("diffusers", "tree"), precisions=_OWN_FLOATS, remote_code="backbone"
+    ),
+    ModelFamily.LINGBOT_VA: Family(
+        ("lingbot_va",),
+        ("diffusers",),
+        queues=True,
+        precisions=_OWN_FLOATS,
+        dtype_field="dtype",
+        replays=True,
     ),
     ModelFamily.WALL_X: Family(
         ("wall_x",), ("peft", "torchdiffeq", "qwen_vl_utils"), precisions=_BF16, casts=True
@@ -144,6 +154,11 @@ def computing_type(manifest: RSkillManifest, family: Family) -> Dtype:
     Raises: UnsupportedQuantization if the family's code does not run in it.
     """
     nf4 = nf4_of(manifest)
+    if nf4 is not None and family.replays:  # its code casts numbers to the type of its weights
+        raise UnsupportedQuantization(
+            f"{manifest.name}: a policy of family {manifest.model_family} is not quantized",
+            hint=f"use {' or '.join(sorted(family.precisions))}",
+        )
     dtype = manifest.quantization.dtype if nf4 is None else nf4.compute_dtype
     if dtype not in family.precisions:
         raise UnsupportedQuantization(

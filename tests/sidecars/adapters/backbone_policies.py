@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from tests.sidecars.adapters.policies import (
+    DIM,
     FRONT,
     SIDE_PX,
+    TASK,
     WORDS,
+    WRIST,
     features,
     save,
     save_tokenizer,
@@ -237,9 +240,49 @@ def save_molmoact2(folder: Path) -> None:
     save(folder, policy, FRONT)
 
 
+def save_lingbot_va(folder: Path) -> None:
+    """Its encoders lie beside it: they are in no checkpoint."""
+    import torch
+    from diffusers import AutoencoderKLWan
+    from lerobot.policies.lingbot_va.configuration_lingbot_va import LingBotVAConfig
+    from transformers import UMT5Config, UMT5EncoderModel
+
+    torch.manual_seed(1)
+    wan = folder / "wan"
+    AutoencoderKLWan(
+        base_dim=4, decoder_base_dim=4, z_dim=48, dim_mult=[1, 1, 1, 1], num_res_blocks=1,
+        is_residual=True, in_channels=12, out_channels=12, patch_size=2, scale_factor_spatial=16,
+        latents_mean=[0.1] * 48, latents_std=[0.5] * 48,
+    ).save_pretrained(wan / "vae")  # fmt: skip
+    UMT5EncoderModel(
+        UMT5Config(
+            vocab_size=2 * WORDS, d_model=16, d_kv=8, d_ff=16, num_layers=1, num_heads=2,
+        )
+    ).save_pretrained(wan / "text_encoder")  # fmt: skip
+    _save_t5_tokenizer(wan / "tokenizer")
+    config = LingBotVAConfig(
+        **features(FRONT, WRIST), wan_pretrained_path=str(wan), dtype="float32", num_layers=2,
+        num_attention_heads=2, attention_head_dim=24, action_dim=DIM + 2, text_dim=16, freq_dim=16,
+        ffn_dim=16, obs_cam_keys=[FRONT, WRIST], height=32, width=32, frame_chunk_size=2,
+        num_inference_steps=2, action_num_inference_steps=2, max_sequence_length=8,
+        used_action_channel_ids=list(range(DIM)),
+    )  # fmt: skip
+    save(folder, config, FRONT, WRIST)
+
+
+def _save_t5_tokenizer(folder: Path) -> None:
+    from tokenizers import Tokenizer, models
+    from transformers import T5TokenizerFast
+
+    words = ["<pad>", "</s>", "<unk>", *(f"\u2581{word}" for word in TASK.split())]
+    raw = Tokenizer(models.Unigram([(word, -1.0) for word in words], unk_id=2))
+    T5TokenizerFast(tokenizer_object=raw, extra_ids=0).save_pretrained(folder)
+
+
 SAVERS: dict[str, Callable[[Path], None]] = {
     "vla_jepa": save_vla_jepa,
     "wall_x": save_wall_x,
     "gr00t": save_groot,
     "molmoact2": save_molmoact2,
+    "lingbot_va": save_lingbot_va,
 }

@@ -4,6 +4,7 @@ A tiny checkpoint of each family is saved by lerobot (`policies.py`). The refere
 own loop in lerobot: preprocess, `select_action`, postprocess, at every control step.
 """
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
+from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.settings import read_model
 from vram_arbiter.sidecars.weights import Weights, read_config
 
@@ -36,13 +38,12 @@ ROWS = {  # actions in one answer
     "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
     "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5,
     "evo1": 5, "vla_jepa": 5, "wall_x": 5, "gr00t": 3,
-    "molmoact2": 3,
+    "molmoact2": 3, "lingbot_va": 4,
 }  # fmt: skip
 CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
 SEED = 2  # most policies draw their actions
 NOT_SERVED = {
     "openvla": "", "fastwam": "hub repository whose name is fixed in its code",
-    "lingbot_va": "at the first action",
 }  # fmt: skip
 
 
@@ -169,7 +170,7 @@ def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
     return np.stack(rows)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "lingbot_va"])
 def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: str) -> None:
     """Regression: policies with an observation history loaded, passed `--check`, and failed at the
     first `get_action`."""
@@ -196,6 +197,93 @@ def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: st
             actions += list(answer[:played])
         np.testing.assert_array_equal(np.stack(actions[: len(steps)]), expected, f"goal {goal}")
         adapter.run(EndpointCall(endpoint="reset"))
+
+
+def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]) -> None:
+    """Its cache takes the observations after its own actions: one too few or too many, and all
+    later actions would be others than lerobot's.
+
+    The encoders are shared, placed and counted as the policy is.
+    """
+    import numpy as np
+    import torch
+
+    weights = checkpoint("lingbot_va")
+    adapter = loaded("lingbot_va", weights)
+    assert len(adapter.networks) == 3
+    shared = HostWeights(adapter.networks, "test")
+    sizes = [sum(p.nbytes for p in network.parameters()) for network in adapter.networks]
+    assert shared.size_bytes >= sum(sizes)
+    shared.own()
+    adapter.place("cpu")
+    steps = observations(4 + 8 + 8)
+    expected = lerobots_own(weights, steps)
+    for goal in range(2):
+        torch.manual_seed(SEED)
+        with pytest.raises(BadRequest, match=r"has 2 control steps, .* needs 1"):
+            ask(adapter, stacked(steps[:2]))
+        actions = list(ask(adapter, steps[0]))
+        for wrong in (steps[1:4], steps[:5]):  # asked too early; an observation twice
+            with pytest.raises(BadRequest, match=rf"has {len(wrong)} control steps, .* needs 4"):
+                ask(adapter, stacked(wrong))
+        actions += [*ask(adapter, stacked(steps[1:5])), *ask(adapter, stacked(steps[5:13]))]
+        np.testing.assert_array_equal(np.stack(actions), expected, f"goal {goal}")
+        adapter.run(EndpointCall(endpoint="reset"))
+    policy = adapter._policy
+    ask(adapter, steps[0])
+    encode, policy._encode_frames = policy._encode_frames, None  # fails within an answer
+    with pytest.raises(TypeError):
+        ask(adapter, stacked(steps[1:5]))
+    policy._encode_frames = encode
+    torch.manual_seed(SEED)
+    np.testing.assert_array_equal(ask(adapter, steps[0]), expected[:4], "a new episode")
+    adapter.load("meta")
+    meta = [sum(p.nbytes for p in network.parameters()) for network in adapter.networks]
+    assert meta == sizes
+
+
+def test_lingbot_needs_its_encoders(checkpoint: Callable[[str], Weights], tmp_path: Path) -> None:
+    """diffusers and transformers fill a gap in a checkpoint with random numbers."""
+    from safetensors.torch import load_file, save_file
+
+    folder = tmp_path / "lingbot"
+    shutil.copytree(checkpoint("lingbot_va").source, folder)
+    config = folder / "config.json"
+    text = config.read_text()
+
+    def prepared(**changes: Any) -> PolicyAdapter:
+        config.write_text(json.dumps(json.loads(text) | changes))
+        adapter = make_adapter(manifest_of("lingbot_va"), Weights(str(folder), local=True))
+        assert isinstance(adapter, PolicyAdapter)
+        adapter.prepare()
+        return adapter
+
+    with pytest.raises(ModelError, match=r"'robbyant/lingbot-va-base' is no local folder with vae"):
+        prepared(wan_pretrained_path="robbyant/lingbot-va-base")
+    with pytest.raises(ModelError, match="camera_layout: robotwin_tshape is not served"):
+        prepared(camera_layout="robotwin_tshape")
+    with pytest.raises(ModelError, match="2 frames and 32 actions a chunk is not served"):
+        prepared(action_per_frame=16)
+    with pytest.raises(ModelError, match=r"obs_cam_keys names observation\.images\.top"):
+        prepared(obs_cam_keys=["observation.images.top"])
+    with pytest.raises(UnsupportedQuantization, match="is not quantized"):
+        make_adapter(manifest_of("lingbot_va", "int4"), Weights(str(folder), local=True))
+    adapter = prepared(wan_pretrained_path="wan")  # beside the checkpoint
+    for part in ("vae/diffusion_pytorch_model", "text_encoder/model"):
+        file = folder / "wan" / f"{part}.safetensors"
+        tensors = load_file(file)
+        dropped = sorted(tensors)[0]
+        for device in ("cpu", "meta"):
+            save_file({key: tensors[key] for key in tensors if key != dropped}, file)
+            with pytest.raises(ModelError, match="missing from it"):
+                adapter.load(device)
+            file.unlink()
+            with pytest.raises(ModelError):
+                adapter.load(device)
+        save_file(tensors, file, {"format": "pt"})
+    (folder / "wan/tokenizer/tokenizer.json").unlink()
+    with pytest.raises(ModelError, match=r"tokenizer has none of tokenizer\.json"):
+        prepared(wan_pretrained_path="wan")
 
 
 def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weights]) -> None:
