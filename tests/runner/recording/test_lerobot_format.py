@@ -42,8 +42,9 @@ TO_REALTIME = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param
 
 @pytest.fixture(autouse=True, scope="module")
 def ordinary() -> Iterator[None]:
-    """The AV1 encoder leaves the thread that uses it at the highest real-time priority where it may,
-    and every program that this thread starts: units that forbid it did not start in later tests."""
+    """The AV1 encoder leaves the thread that uses it at the highest real-time priority if it may,
+    with all programs that this thread starts: units that forbid it did not start in later tests.
+    """
     yield
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
