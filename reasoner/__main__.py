@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from vram_arbiter.reasoner.confirm import Confirmations
+from vram_arbiter.reasoner.json_lines import JsonLines
 from vram_arbiter.reasoner.loop import nothing_done
 from vram_arbiter.reasoner.options import (
     check_files,
@@ -26,8 +27,8 @@ from vram_arbiter.reasoner.options import (
     parser,
 )
 from vram_arbiter.reasoner.server import OperatorServer, send
-from vram_arbiter.reasoner.service import History, serve
-from vram_arbiter.reasoner.task_queue import TaskQueue
+from vram_arbiter.reasoner.service import serve
+from vram_arbiter.reasoner.task_queue import Task, TaskQueue
 from vram_arbiter.reasoner.workplace import Workplace
 from vram_arbiter.schemas.errors import (
     BadState,
@@ -37,7 +38,7 @@ from vram_arbiter.schemas.errors import (
     SidecarUnavailable,
     VramError,
 )
-from vram_arbiter.schemas.reasoner import Result
+from vram_arbiter.schemas.reasoner import HistoryLine, Result
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.telemetry.commands import command
@@ -140,8 +141,13 @@ async def _one_task(arguments: argparse.Namespace) -> Result:
 
 async def _serve(arguments: argparse.Namespace) -> None:
     """Serve tasks until a signal comes, which ends the running one like an operator's cancel."""
-    history = History(arguments.history)
-    queue = TaskQueue(lambda text: check_task(text, arguments.planner), history.add)
+    history = JsonLines(arguments.history, "--history")
+
+    def ended(task: Task) -> None:
+        if task.result is not None:
+            history.add(HistoryLine(task=task.view(), result=task.result))
+
+    queue = TaskQueue(lambda text: check_task(text, arguments.planner), ended)
 
     async def perform(workplace: Workplace) -> None:
         log.info("serving tasks on %s", endpoint(arguments.listen, "reasoner"))

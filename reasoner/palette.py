@@ -188,7 +188,7 @@ class Palette:
                 )
             case LocateInView() | QueryScene() | Look() if self._no_camera(call.camera):
                 return BadRequest(
-                    f"there is no camera {call.camera}",
+                    f"unknown camera {call.camera}",
                     hint=f"choose from {', '.join(self.cameras)}",
                 )
             case QueryTaskProgress() if not self.can_judge:

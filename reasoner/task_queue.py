@@ -128,7 +128,7 @@ class TaskQueue:
         found = next((task for task in self.tasks() if task.number == number), None)
         if found is None:
             raise BadRequest(
-                f"there is no task {number}", hint=f"the last {HISTORY_MAX} that ended are kept"
+                f"unknown task {number}", hint=f"the last {HISTORY_MAX} that ended are kept"
             )
         return found
 

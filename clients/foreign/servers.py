@@ -2,6 +2,7 @@
 work."""
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
@@ -16,7 +17,7 @@ LOOK_TIMEOUT_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Server:
+class Server(ABC):
     """A model server at `url`. A subclass says how it frees.
 
     Most load again with the next request, so there is nothing to restore.
@@ -30,7 +31,7 @@ class Server:
     keeps_context: ClassVar[bool] = True
     suspends: ClassVar[bool] = False
 
-    def check(self) -> None:
+    def check(self) -> None:  # noqa: B027  most have nothing to check
         """It needs nothing of this machine."""
 
     def busy(self) -> int | None:
@@ -43,10 +44,11 @@ class Server:
         """Return the number of requests in progress. Raises ActionFailed."""
         return None
 
+    @abstractmethod
     def free(self, pids: Sequence[int]) -> None:
-        raise NotImplementedError
+        """Free the GPU memory of the server, whose processes are `pids`. Raises ActionFailed."""
 
-    def restore(self, pids: Sequence[int]) -> None:
+    def restore(self, pids: Sequence[int]) -> None:  # noqa: B027  most have nothing to do
         """The next request loads the model."""
 
     def _get(self, path: str) -> Request:

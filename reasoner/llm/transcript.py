@@ -5,18 +5,14 @@ pictures are left out.
 """
 
 import base64
-import logging
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO
 
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.reasoner.json_lines import JsonLines
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.reasoner import TranscriptLine
 
-log = logging.getLogger(__name__)
-
-PICTURE_MIN_CHARS = 1024  # a shorter text is no picture
+PICTURE_MIN_CHARS = 1024  # a shorter text does not hold a picture
 
 
 class Transcript:
@@ -26,20 +22,10 @@ class Transcript:
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._file: IO[str] | None = None
-        if path is not None:
-            try:
-                self._file = path.open("a", encoding="utf-8", errors="backslashreplace")
-            except OSError as error:
-                raise ConfigError(
-                    f"--transcript {path} cannot be written: {error.strerror}",
-                    hint="name a file in a folder of your own",
-                ) from error
+        self._lines = JsonLines(path, "--transcript")
 
     def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        self._lines.close()
 
     def answered(self, request: JsonObject, answer: JsonObject) -> None:
         self._add(TranscriptLine(kind="answered", request=request, answer=answer, at=_now()))
@@ -53,15 +39,8 @@ class Transcript:
         self._add(TranscriptLine(kind="rejected", problem=problem, at=_now()))
 
     def _add(self, line: TranscriptLine) -> None:
-        if self._file is not None:
-            request = without_pictures(line.request)
-            line = line.model_copy(update={"request": request})
-            try:
-                self._file.write(line.model_dump_json(exclude_none=True) + "\n")
-                self._file.flush()  # a reasoner that is killed has said this much
-            except OSError as error:  # a full disk stops no robot
-                log.error("the transcript ends here: %s", error)
-                self._file = None
+        shown = line.model_copy(update={"request": without_pictures(line.request)})
+        self._lines.add(shown, without_none=True)
 
 
 def without_pictures(value: object) -> object:

@@ -140,7 +140,7 @@ class Display:
         self._put(_Ended(goal, ended))
 
     def facts(self) -> GoalData:
-        """Return nothing: a view is no result."""
+        """Return an empty map: a view adds nothing to the result."""
         return {}
 
     # -- any thread

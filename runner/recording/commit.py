@@ -159,7 +159,7 @@ def mark(root: Path, episode: int, verdict: str) -> None:
     """Note the operator's verdict on a committed episode."""
     record = last(root)
     if record is None or not 0 <= episode < record["episodes"]:
-        raise BadRequest(f"there is no episode {episode} in {root}")
+        raise BadRequest(f"unknown episode {episode} of {root}")
     line = json.dumps({"episode": episode, "marked": verdict}).encode() + b"\n"
     _note(root / FOLDER / EPISODES, record["notes_bytes"], line)
     grown = Commit(**{**record, "notes_bytes": record["notes_bytes"] + len(line)})

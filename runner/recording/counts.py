@@ -43,7 +43,7 @@ class Counts:
         log.info("the episode of goal %s is discarded", goal_id)
 
     def skip(self, goal_id: str, reason: str) -> None:
-        """Count a goal that is no episode."""
+        """Count a goal that did not become an episode."""
         self.skipped += 1
         log.warning("goal %s is not recorded: %s", goal_id, reason)
 

@@ -136,7 +136,7 @@ class EpisodeRows:
     videos: Mapping[str, Path]
 
     def named(self, row: ParquetRow, column: str) -> dict[str, float]:
-        """Return the values of a column by name; empty: there is no such column."""
+        """Return the values of a column by name; empty without such a column."""
         return _named(self.features, row, column)
 
 

@@ -15,7 +15,13 @@ import threading
 from typing import Any, Self
 
 from vram_arbiter.runner.ros2 import messages
-from vram_arbiter.runner.sensors.ros2_dds import cdr_of, dds_problems, full_topic, sample_of
+from vram_arbiter.runner.sensors.ros2_dds import (
+    cdr_of,
+    dds_problems,
+    full_topic,
+    qos_of,
+    sample_of,
+)
 from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
@@ -99,8 +105,6 @@ class ActionClient:
             DDSStatus,
             GuardCondition,
             InstanceState,
-            Policy,
-            Qos,
             ReadCondition,
             SampleState,
             ViewState,
@@ -110,15 +114,8 @@ class ActionClient:
         from cyclonedds.pub import DataWriter
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
-        from cyclonedds.util import duration
 
-        quality = Qos(
-            Policy.Reliability.Reliable(duration(seconds=1)),
-            Policy.Durability.Volatile,
-            Policy.History.KeepLast(REPLIES_KEPT),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.WriterDataLifecycle(autodispose=False),  # ROS disposes of nothing
-        )
+        quality = qos_of("reliable", writer=True, kept=REPLIES_KEPT, wait_s=1)
         participant = DomainParticipant(self._domain)
         self._guard: Any = GuardCondition(participant)
         waitset = WaitSet(participant)

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from vram_arbiter.runner.sensors.ros2_dds import cdr_of, sample_of
+from vram_arbiter.runner.sensors.ros2_dds import as_bytes
 
 type Fields = tuple[tuple[str, str], ...]
 
@@ -257,7 +257,4 @@ def dds_type(kind: str) -> Any:
         return types.array[one, count] if count else types.sequence[one]
 
     members = {name: of(entry) for name, entry in fields_of(kind)}
-    made = make_idl_struct(kind.partition("/")[2] + "_", dds_name(kind), members)
-    made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
-    made.serialize = lambda self, *_, **__: cdr_of(self)
-    return made
+    return as_bytes(make_idl_struct(kind.partition("/")[2] + "_", dds_name(kind), members))

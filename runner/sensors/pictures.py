@@ -71,7 +71,7 @@ def as_rgb(frame: SensorFrame) -> Any:
 
 
 def scaled_down(frame: SensorFrame, width: int) -> SensorFrame:
-    """Return a frame that is no wider than `width`, in its proportions; a narrower one as it is.
+    """Return a frame of at most `width`, in its proportions; a narrower one as it is.
 
     Depths are picked, colors averaged. Raises ValueError for a frame whose pixels are not at hand:
     a compressed one is not decoded for it.

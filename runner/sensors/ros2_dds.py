@@ -75,6 +75,11 @@ def dds_type(kind: MessageKind) -> Any:
     else:
         fields = {"header": header, "format": str, "data": sequence[uint8]}
         made = make_idl_struct("CompressedImage_", "sensor_msgs.msg.dds_.CompressedImage_", fields)
+    return as_bytes(made)
+
+
+def as_bytes(made: Any) -> Any:
+    """Let the samples of a DDS type stay as bytes (`cdr_of`, `sample_of`), and return the type."""
     made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
     made.serialize = lambda self, *_, **__: cdr_of(self)
     return made
@@ -93,18 +98,19 @@ def cdr_of(sample: Any) -> bytes:
     return cdr
 
 
-def qos_of(reliability: str, *, writer: bool) -> Any:
-    """Return ROS's quality of service: volatile, newest sample only, plain CDR.
+def qos_of(reliability: str, *, writer: bool, kept: int = 1, wait_s: int = 0) -> Any:
+    """Return ROS's quality of service: volatile, the newest `kept` samples, plain CDR.
 
-    A writer never waits for a slow reader: it drops.
+    A writer waits `wait_s` for a slow reader at most; then it drops.
     """
     from cyclonedds.core import Policy, Qos
+    from cyclonedds.util import duration
 
-    reliable = Policy.Reliability.Reliable(max_blocking_time=0)
+    reliable = Policy.Reliability.Reliable(duration(seconds=wait_s))
     return Qos(
         reliable if reliability == "reliable" else Policy.Reliability.BestEffort,
         Policy.Durability.Volatile,
-        Policy.History.KeepLast(1),
+        Policy.History.KeepLast(kept),
         Policy.DataRepresentation(use_cdrv0_representation=True),
         *(
             (Policy.WriterDataLifecycle(autodispose=False),) if writer else ()

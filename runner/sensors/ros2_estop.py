@@ -15,11 +15,12 @@ from contextlib import contextmanager
 from typing import Any
 
 from vram_arbiter.runner.sensors.ros2_dds import (
+    as_bytes,
     cdr_of,
     dds_problems,
     dds_topic,
     domain_of,
-    sample_of,
+    qos_of,
 )
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.errors import ConfigError
@@ -68,8 +69,6 @@ class _Listener:
             DDSStatus,
             GuardCondition,
             InstanceState,
-            Policy,
-            Qos,
             ReadCondition,
             SampleState,
             ViewState,
@@ -85,13 +84,8 @@ class _Listener:
             reader = DataReader(
                 participant,
                 Topic(participant, name, bool_type()),
-                qos=Qos(
-                    Policy.Reliability.Reliable(max_blocking_time=0),
-                    Policy.Durability.Volatile,
-                    # not the newest alone: a button that is let go at once has been pressed
-                    Policy.History.KeepLast(MESSAGES_KEPT),
-                    Policy.DataRepresentation(use_cdrv0_representation=True),
-                ),
+                # not the newest alone: a button that is let go at once has been pressed
+                qos=qos_of("reliable", writer=False, kept=MESSAGES_KEPT),
             )
             reader.set_status_mask(DDSStatus.RequestedIncompatibleQos)
             self._guard: Any = GuardCondition(participant)
@@ -146,7 +140,4 @@ def bool_type() -> Any:
     """Return the DDS type of `std_msgs/Bool`; its samples stay as bytes."""
     from cyclonedds.idl import make_idl_struct
 
-    made = make_idl_struct("Bool_", "std_msgs.msg.dds_.Bool_", {"data": bool})
-    made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
-    made.serialize = lambda self, *_, **__: cdr_of(self)
-    return made
+    return as_bytes(make_idl_struct("Bool_", "std_msgs.msg.dds_.Bool_", {"data": bool}))

@@ -31,7 +31,7 @@ def settle(config: Any, source: str) -> None:
     if lacking := [part for part in _PARTS if not (folder / part).is_dir()]:
         raise ModelError(
             f"{source}: its encoders are in no checkpoint, and wan_pretrained_path "
-            f"{config.wan_pretrained_path!r} is no local folder with {', '.join(lacking)}",
+            f"{config.wan_pretrained_path!r} is not a local folder with {', '.join(lacking)}",
             hint="download that repository and write the folder into the checkpoint's config.json",
         )
     words = folder / "tokenizer"

@@ -62,7 +62,7 @@ def test_a_cancel_meets_the_task_that_it_names() -> None:
         assert over == [2, 1]
         with pytest.raises(BadState, match="task 2 is over: canceled"):
             queue.cancel(2, "again")
-        with pytest.raises(BadRequest, match="there is no task 9"):
+        with pytest.raises(BadRequest, match="unknown task 9"):
             queue.cancel(9, "lunch")
 
     play(story)

@@ -80,7 +80,7 @@ def test_cameras_are_a_choice_and_another_one_is_told_back(
     assert "prompt" in offered["execute_rskill__lab__grab"]["properties"]
     assert "prompt" not in offered["execute_rskill__lab__navigate"]["properties"]
     assert set(offered["locate_in_view"]["properties"]) == {"query", "camera", "rationale"}
-    assert "there is no camera rear" in api.told(stand_in.asked[1])[-1]
+    assert "unknown camera rear" in api.told(stand_in.asked[1])[-1]
 
 
 def test_a_picture_is_shown_and_the_oldest_is_shown_no_more(

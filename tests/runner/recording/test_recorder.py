@@ -95,7 +95,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     root = tmp_path_factory.mktemp("recorded") / "set"
     made = recorder(root)
     made.start()
-    made.tick(tick(0, of=FIRST, targets={"pan": 0.0}))  # nobody has told the gripper anything yet
+    made.tick(tick(0, of=FIRST, targets={"pan": 0.0}))  # the gripper has no target yet
     record_goal(made, FIRST, DONE, 6)
     record_goal(made, SECOND, FAILED, 4)
     until(lambda: made.counts.episodes == 2)

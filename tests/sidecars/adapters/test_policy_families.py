@@ -258,7 +258,9 @@ def test_lingbot_needs_its_encoders(checkpoint: Callable[[str], Weights], tmp_pa
         adapter.prepare()
         return adapter
 
-    with pytest.raises(ModelError, match=r"'robbyant/lingbot-va-base' is no local folder with vae"):
+    with pytest.raises(
+        ModelError, match=r"'robbyant/lingbot-va-base' is not a local folder with vae"
+    ):
         prepared(wan_pretrained_path="robbyant/lingbot-va-base")
     with pytest.raises(ModelError, match="camera_layout: robotwin_tshape is not served"):
         prepared(camera_layout="robotwin_tshape")
