@@ -35,7 +35,7 @@ from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report.why import Standing
 from vram_arbiter.arbiter.core.requests import requests
 from vram_arbiter.arbiter.core.requests.requests import known_by
-from vram_arbiter.arbiter.core.scheduling import admission, grants
+from vram_arbiter.arbiter.core.scheduling import admission, grants, victims
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.wire.codes import Block, Wait
 from vram_arbiter.schemas.wire.explained import Because
@@ -145,7 +145,7 @@ class Gangs(Feature):
         gang.planned = planned
         _say(waiting, Wait.MAKING_ROOM if planned else Wait.NO_VICTIM)
         if not planned:
-            eviction.wake_when_evictable(core, gpu, gang.bundle(waiting))
+            victims.wake_when_evictable(core, gpu, gang.bundle(waiting))
         for gpu, some in planned:
             for victim in _in_the_way(core, gang, gpu, some) or ():
                 eviction.ask(core, gpu, victim, some[0])
@@ -198,7 +198,7 @@ class Gangs(Feature):
     def _relieve(self, core: Core, gpu: Gpu, gang: Gang, lease: Lease, over: int) -> None:
         """Revoke holders that have grown since the gang was admitted, or break it."""
         going = admission.leaving(gpu)
-        chosen = [] if going else eviction.choose_relief(core, gpu, going, over)
+        chosen = [] if going else victims.choose_relief(core, gpu, going, over)
         for victim in chosen:
             eviction.ask(core, gpu, victim, lease)
         if not going and not chosen:
@@ -386,4 +386,4 @@ def _in_the_way(core: Core, gang: Gang, gpu: Gpu, some: list[Lease]) -> list[Lea
     going, bundle = admission.leaving(gpu), gang.bundle(some)
     if admission.fits(gpu, bundle, going):
         return []
-    return eviction.choose_victims(core, gpu, bundle, going)
+    return victims.choose_victims(core, gpu, bundle, going)

@@ -15,12 +15,11 @@ from heapq import nlargest
 from math import inf
 
 from vram_arbiter.arbiter.core import learning
-from vram_arbiter.arbiter.core.eviction import ask_times, choose_victims, residency_ends_at
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
-from vram_arbiter.arbiter.core.scheduling import admission
+from vram_arbiter.arbiter.core.scheduling import admission, victims
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.explained import (
     Because,
@@ -253,7 +252,7 @@ def _condition(core: Core, lease: Lease, waiter: Lease | None) -> tuple[Conditio
     if not lease.evictable:
         return Condition.PINNED, None
     if waiter is not None:
-        ends_at = residency_ends_at(core, lease, waiter)
+        ends_at = victims.residency_ends_at(core, lease, waiter)
         if ends_at > core.now:
             stretched = ends_at > lease.ready_at + lease.spec.min_residency_s
             return (Condition.THRASHING if stretched else Condition.RESIDENCY), ends_at - core.now
@@ -368,9 +367,9 @@ def _asks(core: Core, gpu: Gpu, waiter: Lease) -> list[Step]:
     """Return which holders will be revoked, and when: at the first instant at which a sufficient
     set may be."""
     going = admission.leaving(gpu)
-    times = sorted({core.now, *ask_times(core, gpu, waiter)})
+    times = sorted({core.now, *victims.ask_times(core, gpu, waiter)})
     for at in times[: max(1, min(ASK_TIMES_MAX, WEIGHED_MAX // (1 + len(gpu.residents))))]:
-        chosen = choose_victims(core, gpu, waiter, going, at)
+        chosen = victims.choose_victims(core, gpu, waiter, going, at)
         if chosen is not None:
             return [
                 _step(core, NextAction.ASK, victim, at, _ripens(core, waiter, victim, at))
@@ -386,7 +385,7 @@ def _ripens(core: Core, waiter: Lease, victim: Lease, at: float) -> Because:
     """Return why a holder can be revoked at an instant and not before."""
     if at <= core.now:
         return Because.NEXT_READING
-    if at == residency_ends_at(core, victim, waiter):
+    if at == victims.residency_ends_at(core, victim, waiter):
         return Because.RESIDENCY
     return Because.AGEING if victim.uses else Because.TOGETHER
 

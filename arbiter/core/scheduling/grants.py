@@ -23,7 +23,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
-from vram_arbiter.arbiter.core.scheduling import admission
+from vram_arbiter.arbiter.core.scheduling import admission, victims
 from vram_arbiter.arbiter.core.verification.judge import note_pressure
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
@@ -87,9 +87,9 @@ def _relieve(core: Core, gpu: Gpu) -> None:
     leaving = admission.leaving(gpu)
     over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
     if over > 0:
-        for victim in eviction.choose_relief(core, gpu, leaving, over):
+        for victim in victims.choose_relief(core, gpu, leaving, over):
             eviction.ask(core, gpu, victim, None)
-        eviction.wake_when_evictable(core, gpu, None)
+        victims.wake_when_evictable(core, gpu, None)
 
 
 def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
@@ -103,12 +103,12 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     if gpu.verifications and admission.residue_under_measurement(gpu):
         request.reason = Wait.RESIDUE
         return False
-    plan = eviction.choose_victims(core, gpu, head, leaving)
+    plan = victims.choose_victims(core, gpu, head, leaving)
     if plan is None:
         request.reason = Wait.NO_VICTIM
-        eviction.wake_when_evictable(core, gpu, head)
+        victims.wake_when_evictable(core, gpu, head)
         return False
-    if len(request.gpus) > 1 and not eviction.is_best_place(core, gpu, head, plan):
+    if len(request.gpus) > 1 and not victims.is_best_place(core, gpu, head, plan):
         return False
     request.reason, request.planned_gpu = Wait.MAKING_ROOM, gpu.info.id
     for victim in plan:
