@@ -5,8 +5,8 @@ the larger of what it declares and the 95th percentile of what was measured; an 
 counts for the next loads whatever they measure. A footprint changes no charge: it counts from the
 next acquire on. In the order of a lease's life:
 
-1. `expected_bytes`: what a request is charged.
-2. `on_evidence`: a reading shows a lease. While it loads, its GPU is read often (`load_probe_s`),
+1. `expected_bytes`: what a request is charged (`grants.settle_for_less`: where that is too much).
+2. `on_evidence`: a reading shows a lease. While it loads, its GPU is read often (`probe_load_s`),
    so that the peak between two readings is short; a sampled peak is a lower bound all the same, so
    only one above the declared is drift. A resident is followed until it leaves. A process with
    several leases on one GPU shows one sum, of which nothing is learned.

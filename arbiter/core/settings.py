@@ -80,7 +80,7 @@ class Settings:
     verify_tolerance_bytes: int = d.VERIFY_TOLERANCE_BYTES
     sample_max_age_s: float = d.SAMPLE_MAX_AGE_S
     probe_period_s: float = d.PROBE_PERIOD_S
-    load_probe_s: float = d.LOAD_PROBE_S
+    probe_load_s: float = d.LOAD_PROBE_S
     fence_grace_s: float = d.FENCE_GRACE_S
     waiters_max: int = d.WAITERS_MAX
     leases_per_client_max: int = d.LEASES_PER_CLIENT_MAX

@@ -221,7 +221,7 @@ class Gangs(Feature):
             if core.now - share.short_since > core.settings.verify_timeout_s:
                 self._break(core, gang, GangEnd.NOT_FREED)
             else:
-                core.read_again(gpu, core.settings.load_probe_s)
+                core.read_again(gpu, core.settings.probe_load_s)
         return False
 
     # -- the end -----------------------------------------------------------------------------------

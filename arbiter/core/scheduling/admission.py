@@ -135,6 +135,13 @@ def added_bytes(gpu: Gpu, lease: Lease) -> int:
     return gpu.ledger.total_if(joining=joining(lease)) - gpu.ledger.total_bytes()
 
 
+def excess_bytes_alone(gpu: Gpu, lease: Lease) -> int:
+    """Return by how much a request exceeds the GPU once every other lease has left, beside what
+    live processes retain and stowaways hold; negative: it fits."""
+    others = {one.id: one.residue_bytes for one in gpu.residents.values() if one is not lease}
+    return gpu.ledger.total_if(others, joining(lease)) - gpu.ledger.budget_bytes
+
+
 def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
     """Return the most that a resident could ever get on top, once every other lease has ended."""
     going = {other.id: 0 for other in gpu.residents.values() if other is not lease}

@@ -106,7 +106,8 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     plan = victims.choose_victims(core, gpu, head, leaving)
     if plan is None:
         request.reason = Wait.NO_VICTIM
-        victims.wake_when_evictable(core, gpu, head)
+        if not settle_for_less(core, head):
+            victims.wake_when_evictable(core, gpu, head)
         return False
     if len(request.gpus) > 1 and not victims.is_best_place(core, gpu, head, plan):
         return False
@@ -116,6 +117,29 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     for gpu_id in request.gpus:
         if gpu_id != gpu.info.id:  # requests behind `head` on its other GPUs may now proceed
             core.wake(core.gpus[gpu_id])
+    return True
+
+
+def settle_for_less(core: Core, lease: Lease) -> bool:
+    """Charge a waiter less than was learned, though not less than it declares, if no candidate GPU
+    could hold that even once every other lease has left. Return whether it is charged less now.
+
+    What live processes retain and stowaways hold may stay for good, and those processes may
+    themselves wait behind this request. Nothing is settled while bytes are being measured.
+    """
+    request, gpus = lease.request, [core.gpus[gpu_id] for gpu_id in lease.request.gpus]
+    if request.extends is not None or any(gpu.verifications for gpu in gpus):
+        return False
+    excess = min(admission.excess_bytes_alone(gpu, lease) for gpu in gpus)
+    less = request.load_peak_bytes - excess
+    if excess <= 0 or less < lease.spec.footprint.load_peak_bytes:
+        return False
+    for gpu in gpus:
+        gpu.queue.discard(lease)
+    request.load_peak_bytes, request.steady_bytes = less, min(request.steady_bytes, less)
+    for gpu in gpus:
+        gpu.queue.add(lease)
+        core.wake(gpu)
     return True
 
 

@@ -231,6 +231,62 @@ def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
     assert driver.state(small) == "queued"
 
 
+# -- what was learned
+def learned(driver: CoreDriver, gib: float) -> Consumer:
+    """A consumer of 3 GiB that once took so much more, and left nothing on the GPU."""
+    person = driver.consumer("greedy")
+    lease = person.acquire(3 * GIB)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
+    person.load(lease, int(gib * GIB))
+    person.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    person.die()
+    driver.advance(3.0)
+    return driver.consumer("greedy")
+
+
+def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good() -> None:
+    """Regression: a request of 3 GiB of which 7.4 were learned waited for the context of a live
+    process, and the request of that very process waited behind it: neither was ever granted."""
+    driver = CoreDriver(8 * GIB)
+    greedy = learned(driver, 7.4)
+    old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
+    old.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    head, behind = greedy.acquire(3 * GIB), old.acquire(2 * GIB)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
+    charged = driver.gpu()["charged_bytes"]
+    assert charged == driver.gpu()["capacity_bytes"] - driver.gpu()["reserve_bytes"]
+    greedy.load(head, 3 * GIB)
+    driver.until(lambda: driver.state(behind) == "loading", limit_s=2.0)
+
+
+def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes() -> None:
+    """A pinned holder ends one day: until then the request keeps what was learned of it."""
+    driver = CoreDriver(8 * GIB)
+    greedy = learned(driver, 6)
+    old, lease = held_after_peak(driver, "old", 4, evictable=False)
+    head = greedy.acquire(3 * GIB)
+    driver.advance(1.0)
+    assert driver.state(head) == "queued"
+    old.unload(lease)
+    driver.until(lambda: driver.state(head) == "loading", limit_s=3.0)
+    assert driver.gpu()["charged_bytes"] == 6 * GIB
+
+
+def test_nothing_is_settled_below_the_declaration() -> None:
+    driver = CoreDriver(8 * GIB)
+    greedy = learned(driver, 7.4)
+    old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
+    old.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    head = greedy.acquire(int(7.3 * GIB))
+    driver.advance(2.0)
+    assert (driver.state(head), driver.view(head)["charge_bytes"]) == ("queued", int(7.4 * GIB))
+    old.die()
+    driver.until(lambda: driver.state(head) == "loading", limit_s=3.0)
+
+
 # -- whose bytes
 def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
     """It loaded 3 GiB before it asked: they are a part of its 6. Only the other one's bytes are
