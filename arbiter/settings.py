@@ -1,7 +1,7 @@
 """The configuration as the parts of the daemon take it: the engine, the sessions, the router."""
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from vram_arbiter.schemas.errors import ConfigError, ProbeFailed
 from vram_arbiter.schemas.runtime.connection import Limits
 from vram_arbiter.schemas.units import format_bytes
 
-DESCRIPTOR_RESERVE = 128
-"""For the daemon's own files: journal, history, event log, readings, telemetry."""
+DESCRIPTOR_RESERVE = 192
+"""For the daemon's own files: journal, history, event log, readings, telemetry, status page."""
 TOKEN_SECRET_BYTES = 16
 PARK_SHARE = 2
 """Of the host RAM that is available at start, one part in so many may keep parked weights."""
@@ -69,7 +69,6 @@ def core_settings(config: ArbiterConfig, gpus: tuple[GpuInfo, ...], opened: Open
         learnt=dict(opened.learnt),
         footprints=dict(opened.footprints),
         verify_tolerance_bytes=max(config.verify.tolerance_bytes, noise_bytes),
-        load_probe_s=config.probe.load_s,
         token_secret=secrets.token_hex(TOKEN_SECRET_BYTES),
         host_ram_budget_bytes=park_budget_bytes(config.host.park_budget_bytes),
     )
@@ -97,6 +96,16 @@ def router_limits(config: ArbiterConfig, open_files: int) -> Limits:
         connections_max=min(config.limits.connections_max, room),
         descriptor_reserve=DESCRIPTOR_RESERVE,
     )
+
+
+def core_changes(config: ArbiterConfig, keys: Collection[str]) -> dict[str, float]:
+    """Return the engine's constants among changed keys (`section.key`), by their names there."""
+    names = {field.name for field in fields(Settings)}
+    found: dict[str, float] = {}
+    for section, _, key in (path.partition(".") for path in keys):
+        value = getattr(getattr(config, section), key)
+        found.update({name: value for name in (key, f"{section}_{key}") if name in names})
+    return found
 
 
 def session_settings(config: ArbiterConfig, **given: object) -> SessionSettings:

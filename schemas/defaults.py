@@ -58,6 +58,7 @@ PROCESS_SHARE = 1 / 8  # of the places of a limit that all share: the most that 
 USER_SHARE = 3 / 4  # the most that the processes of one user may take together
 PRIORITY_RESERVE = 1 / 16  # of the places for waiters: kept for requests above the default priority
 STATUS_PAGE = 200  # leases in one reply to `status`: about 2 ms
+STATUS_DETAILS_PAGE = 32  # the same with details: each waiter costs an answer to `why`
 RATE_PER_CLIENT_PER_S = 2000
 RATE_PER_PROCESS_PER_S = 4000
 SUBSCRIBERS_MAX = 64

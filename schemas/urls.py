@@ -1,5 +1,7 @@
-"""URLs in configuration files and in the environment."""
+"""URLs and addresses in configuration files and in the environment."""
 
+import ipaddress
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 
@@ -16,3 +18,51 @@ def collector_url(text: str) -> str:
             f"expected the URL of a collector, got {shown!r}; write http://localhost:4318"
         )
     return text
+
+
+def webhook_url(text: str) -> str:
+    """Return `text`. Raises ValueError unless it is the URL of a webhook."""
+    parts = urlsplit(text)  # raises ValueError too
+    shown = text.rpartition("@")[2].partition("?")[0]
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.port == 0:
+        raise ValueError(f"expected the URL of a webhook such as https://HOST/PATH, got {shown!r}")
+    if parts.username is not None or parts.fragment:
+        raise ValueError(f"a webhook has neither user nor fragment, got {shown!r}")
+    if not text.isascii() or not text.isprintable() or " " in text:
+        raise ValueError(f"expected a URL without spaces and special characters, got {shown!r}")
+    return text
+
+
+@dataclass(frozen=True, slots=True)
+class HttpAddress:
+    """Where an HTTP server listens: a literal address and a port; 0: any free one."""
+
+    host: str
+    port: int
+
+    @property
+    def loopback(self) -> bool:
+        return ipaddress.ip_address(self.host).is_loopback
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def http_address(text: str) -> HttpAddress:
+    """Return the address that `127.0.0.1:9870`, `[::1]:9870`, `localhost:9870` or `9870` stands
+    for. Raises ValueError."""
+    host, colon, port = text.rpartition(":")
+    if not colon or host == "localhost":
+        host = "127.0.0.1"
+    elif host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        host = ""  # an IPv6 address without brackets
+    try:
+        number = int(port) if port.isascii() and port.isdigit() else -1
+        found = HttpAddress(str(ipaddress.ip_address(host)), number)
+    except ValueError:
+        number = -1
+    if not 0 <= number <= 65_535:
+        raise ValueError(f"expected ADDRESS:PORT such as 127.0.0.1:9870, got {text!r}")
+    return found

@@ -291,6 +291,13 @@ class Resumed:
 
 
 @dataclass(frozen=True, slots=True)
+class SettingsChanged:
+    """An operator changed constants: fields of `Settings` by name."""
+
+    changed: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """`next_deadline()` has come."""
 
@@ -319,5 +326,6 @@ Event = (
     | JournalFailed
     | Recovered
     | Resumed
+    | SettingsChanged
     | Tick
 )

@@ -14,11 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.urls import collector_url
+from vram_arbiter.schemas.urls import collector_url, http_address
 from vram_arbiter.schemas.yamltext import Path, parse_yaml, validated
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?$")]
 
 
 class _Section(BaseModel):
@@ -26,18 +27,18 @@ class _Section(BaseModel):
 
 
 class GpuConfig(_Section):
-    """Which cards are leased and how much of each."""
+    """Which GPUs are leased and how much of each."""
 
     source: str = "auto"
-    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA cards. `unified`:
-    the memory that CPU and GPU share on a Jetson or a GB10. `fake:8GiB`: one simulated card.
-    `fake:FOLDER`: the card in that folder.
+    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA GPUs. `unified`:
+    the memory that CPU and GPU share on a Jetson or a GB10. `fake:8GiB`: one simulated GPU.
+    `fake:FOLDER`: the GPU in that folder.
     """
     reserve_bytes: ByteSize = d.RESERVE_BYTES
-    """Bytes of every card that are never leased: driver, display, allocator slack. At least 15 % of
+    """Bytes of every GPU that are never leased: driver, display, allocator slack. At least 15 % of
     a memory shared with the CPU."""
     capacity_bytes: dict[str, ByteSize] = Field(default_factory=dict)
-    """Cap per card, by UUID or index as text: lease out less than the card has. A card that is not
+    """Cap per GPU, by UUID or index as text: lease out less than the GPU has. A GPU that is not
     named has no cap."""
 
     pids: Literal["auto", "own", "host"] = "auto"
@@ -54,14 +55,14 @@ class GpuConfig(_Section):
             value.startswith("fake:") and len(value) > 5
         ):
             raise ValueError(
-                f"{value!r} is no source of cards; write auto, nvml, unified, fake:8GiB or "
+                f"{value!r} is not a source of GPUs; write auto, nvml, unified, fake:8GiB or "
                 "fake:FOLDER"
             )
         sizes = (
             value.removeprefix("fake:") if value.startswith("fake:") and "/" not in value else ""
         )
         if sizes and not all(parse_bytes(size) for size in sizes.split(",")):
-            raise ValueError(f"{value!r} is a card without memory; write fake:8GiB")
+            raise ValueError(f"{value!r} is a GPU without memory; write fake:8GiB")
         return value
 
 
@@ -78,7 +79,7 @@ class SchedulingConfig(_Section):
     """Of two consumers that thrash, the resident one stays for the cost of a switch, at most this
     long. 0: never."""
     policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
-    """Order of the queue and choice of victims; docs/policies.md compares the policies."""
+    """Order of the queue and choice of victims (docs/explanation/policies.md)."""
 
 
 class RevokeConfig(_Section):
@@ -130,10 +131,10 @@ class VerifyConfig(_Section):
 
 
 class ProbeConfig(_Section):
-    """Reading the cards."""
+    """Readings of the GPUs."""
 
     deadline_s: Seconds = d.PROBE_DEADLINE_S
-    """A reading that takes longer has failed: the card is unknown, which blocks grants."""
+    """A reading that takes longer has failed: the GPU is unknown, which blocks grants."""
     period_s: Seconds = d.PROBE_PERIOD_S
     """Period of background readings while there are leases or waiters."""
     load_s: Annotated[float, Field(ge=0.005, le=60, allow_inf_nan=False)] = d.LOAD_PROBE_S
@@ -241,7 +242,7 @@ class StateConfig(_Section):
 
     dir: Annotated[str, Field(min_length=1)] | None = None
     """Folder of journal and history. Null: `$STATE_DIRECTORY` under systemd, else
-    `~/.local/state/vram-arbiter`; with a simulated card `state` in the runtime folder."""
+    `~/.local/state/vram-arbiter`; with a simulated GPU `state` in the runtime folder."""
 
 
 class LogConfig(_Section):
@@ -273,6 +274,39 @@ class TelemetryConfig(_Section):
         return None if value is None else collector_url(value)
 
 
+class HttpConfig(_Section):
+    """The status page: read-only, off by default."""
+
+    listen: str | None = None
+    """Address of the page: `127.0.0.1:9870`, `[::1]:9870`, or a port alone for 127.0.0.1; port 0:
+    any free one, said in the log. Another address than loopback needs `token_file`. Null: no
+    page."""
+    token_file: Annotated[str, Field(pattern="^/")] | None = None
+    """File of mode 0600 with the token that every request has to show. Null: no token, which only
+    loopback may do without."""
+    hosts: Annotated[tuple[HostName, ...], Field(max_length=16)] = ()
+    """Names under which browsers reach the page, beside addresses and localhost. A request under
+    another name is refused (DNS rebinding)."""
+
+    @field_validator("listen")
+    @classmethod
+    def _an_address(cls, value: str | None) -> str | None:
+        return None if value is None else str(http_address(value))
+
+    @model_validator(mode="after")
+    def _token_beyond_loopback(self) -> Self:
+        if self.listen is None or self.token_file is not None:
+            return self
+        address = http_address(self.listen)
+        if not address.loopback:
+            raise ValueError(
+                f"{address} is not a loopback address: the page needs http.token_file there; or "
+                f"listen on 127.0.0.1 and reach it by `ssh -L {address.port}:127.0.0.1:"
+                f"{address.port}`"
+            )
+        return self
+
+
 class ArbiterConfig(_Section):
     """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in
     bytes."""
@@ -291,6 +325,20 @@ class ArbiterConfig(_Section):
     state: StateConfig = StateConfig()
     log: LogConfig = LogConfig()
     telemetry: TelemetryConfig = TelemetryConfig()
+    http: HttpConfig = HttpConfig()
+
+
+LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
+    "scheduling": ("thrash_hold_max_s",),
+    "revoke": ("resend_s", "remind_s", "deadline_s", "terminate_grace_s"),
+    "verify": ("timeout_s", "confirm_s", "slow_poll_s"),
+    "probe": ("period_s", "load_s", "sample_max_age_s"),
+    "limits": ("waiters_max", "priority_reserve", "leases_per_client_max", "uses_per_lease_max"),
+    "history": ("max_events", "days"),
+    "log": ("level",),
+}
+"""Keys that a reload applies, by section; the others need a restart. Clients were told the grace
+and the heartbeat when they connected, so those two stay as they are."""
 
 
 def known_keys() -> Mapping[Path, Collection[str]]:

@@ -22,7 +22,7 @@ def test_each_constant_of_the_configuration_reaches_a_part() -> None:
         for key, _ in config[section]
         if not {key, f"{section}_{key}"} & names
     ]
-    assert unused == ["probe.deadline_s", "probe.load_s"], "these two are given by hand"
+    assert unused == ["probe.deadline_s"], "it is given by hand"
 
 
 def meminfo(root: Path, text: str) -> Path:

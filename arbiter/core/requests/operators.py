@@ -1,5 +1,5 @@
 """What an operator may do by hand: evict, pin and unpin, drain and resume, give up the lease of a
-dead holder.
+dead holder, change constants.
 
 Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does,
 and a lease in use is never given up. Every action is a note with the operator and the reason; a pin
@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 from vram_arbiter.arbiter.core import eviction
-from vram_arbiter.arbiter.core.events import DRAIN_KEY, OperatorAsked
+from vram_arbiter.arbiter.core.events import DRAIN_KEY, OperatorAsked, SettingsChanged
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.records import DrainRecord
@@ -44,6 +44,11 @@ def on_operator(core: Core, event: OperatorAsked) -> None:
     _TO_LEASE[event.action](core, lease, order)
     view = status.view(core, lease) if lease.id in core.leases else None
     core.reply(event.client, event.request, OperatorReply(lease.state, view))
+
+
+def on_settings(core: Core, event: SettingsChanged) -> None:
+    """Replace constants. What is under way keeps the timers that are set."""
+    core.settings = replace(core.settings, **event.changed)  # type: ignore[arg-type]
 
 
 def find(core: Core, target: str) -> Lease:

@@ -19,6 +19,7 @@ from tests.support.core_driver import Consumer, CoreDriver, as_wire
 from tests.support.engine_state import state_of
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Push, Reply
+from vram_arbiter.arbiter.core.events import SettingsChanged
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
@@ -296,6 +297,12 @@ class Leases(RuleBasedStateMachine):
     def probe(self) -> None:
         self.breaks("probe")
         self.driver.card.failing = "" if self.driver.card.failing else "probe died"
+
+    @rule(deadline_s=st.sampled_from([5.0, 30.0]), waiters=st.sampled_from([2, 1000]))
+    def reload(self, deadline_s: float, waiters: int) -> None:
+        """Constants change while requests wait and holders leave."""
+        changed = {"revoke_deadline_s": deadline_s, "verify_timeout_s": deadline_s / 3}
+        self.driver.post(SettingsChanged({**changed, "waiters_max": waiters}))
 
     @precondition(lambda self: self.quiet("restart"))
     @rule()

@@ -1,13 +1,15 @@
 """The configuration: file and model say the same, and every mistake is named with its line."""
 
+import json
 import re
 
 import pytest
 import yaml
+from jsonschema import Draft202012Validator
 
 from tests.support.paths import ROOT
 from vram_arbiter.schemas import defaults
-from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
+from vram_arbiter.schemas.config.arbiter import LIVE_KEYS, ArbiterConfig, load_config
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.yamltext import parse_yaml
 
@@ -38,6 +40,28 @@ def test_every_key_of_the_example_has_a_comment_with_its_default() -> None:
                 break
             comment.append(line)
         assert "Default:" in " ".join(comment), f"{path} has no comment that states its default"
+
+
+def test_the_example_marks_the_keys_that_a_reload_applies() -> None:
+    section, comment, marked = "", "", set()
+    for line in EXAMPLE.read_text().splitlines():
+        if found := re.match(r"(  )?(\w+):", line):
+            section = section if found[1] else found[2]
+            if "Reload: yes." in comment:
+                marked.add((section, found[2]))
+        comment = comment + line if line.lstrip().startswith("#") else ""
+    assert marked == {(section, key) for section, keys in LIVE_KEYS.items() for key in keys}
+
+
+def test_an_editor_accepts_the_example_and_marks_mistakes() -> None:
+    """By the JSON Schema that its first line names. A size is a number, or a text such as 8GiB."""
+    text = EXAMPLE.read_text()
+    first = re.match(r"# yaml-language-server: \$schema=(\S+)\n", text)
+    assert first
+    reader = Draft202012Validator(json.loads((EXAMPLE.parent / first[1]).read_text()))
+    assert list(reader.iter_errors(yaml.safe_load(text))) == []
+    for mistake in ({"verfiy": {}}, {"verify": {"timeout_s": -1}}, {"gpu": {"reserve_bytes": -1}}):
+        assert list(reader.iter_errors(mistake)), mistake
 
 
 def test_every_key_of_the_model_has_a_description() -> None:
