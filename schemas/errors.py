@@ -57,224 +57,323 @@ class InternalError(VramError):
 
 # -- the wire itself
 class BadFrame(CallerError):
-    code = "bad_frame"  # not msgpack, not a map
+    """The frame is not a msgpack map."""
+
+    code = "bad_frame"
 
 
 class BadRequest(CallerError):
-    code = "bad_request"  # a map, but with wrong fields; details.fields lists them
+    """A field is missing, unknown or wrong; `details.fields` lists them."""
+
+    code = "bad_request"
 
 
 class UnknownOp(CallerError):
-    code = "unknown_op"  # details.known lists the ops
+    """There is no such request; `details.known` lists those that exist."""
+
+    code = "unknown_op"
 
 
 class MessageTooLarge(CallerError):
+    """The message exceeds a limit; the message names it."""
+
     code = "message_too_large"
 
 
 class VersionMismatch(CallerError):
+    """Client and server speak different versions of the wire."""
+
     code = "version_mismatch"
 
 
 class UnknownSession(TransientError):
-    code = "unknown_session"  # no hello yet, or the arbiter restarted: say hello and re-attach
+    """No hello yet, or the arbiter restarted: say hello and reattach."""
+
+    code = "unknown_session"
 
 
 class NotPermitted(CallerError):
-    code = "not_permitted"  # role or process does not allow it
+    """The role or the process does not allow it."""
+
+    code = "not_permitted"
 
 
 class LimitExceeded(CallerError):
-    code = "limit_exceeded"  # details.limit names it
+    """A limit of clients, leases, uses, waiters or requests a second; `details.limit` names
+    it."""
+
+    code = "limit_exceeded"
 
 
 # -- leases
 class VramInsufficient(CallerError):
-    code = "vram_insufficient"  # can never fit: details.needed_bytes, capacity_bytes, reserve_bytes
+    """It can never fit: `details.needed_bytes`, `capacity_bytes`, `reserve_bytes`."""
+
+    code = "vram_insufficient"
 
 
 class HostRamInsufficient(TransientError):
-    code = (
-        "host_ram_insufficient"  # no room to park: details.needed_bytes, budget_bytes, booked_bytes
-    )
+    """No host RAM is left to park: `details.needed_bytes`, `budget_bytes`, `booked_bytes`."""
+
+    code = "host_ram_insufficient"
 
 
 class LoadFailing(TransientError):
-    # its loads failed several times in a row, and an eviction would be needed: details.retry_in_s,
-    # cause
+    """Its loads failed several times in a row, and it needs an eviction: `details.retry_in_s`,
+    `cause`."""
+
     code = "load_failing"
 
 
 class GangBroken(TransientError):
-    # another member was denied, lost or gave up before all were granted: details.gang, why
+    """Another member was denied, lost or gave up before all were granted: `details.gang`,
+    `why`."""
+
     code = "gang_broken"
 
 
 class WouldDeadlock(CallerError):
-    # the wait is for what a use of this process keeps: details.cycle, the uses and waits in it
+    """It waits for what a use of this process keeps; `details.cycle` has the uses and waits."""
+
     code = "would_deadlock"
 
 
 class UnknownGpu(CallerError):
+    """No GPU has this UUID or index."""
+
     code = "unknown_gpu"
 
 
 class UnknownLease(CallerError):
+    """No lease has this id or consumer."""
+
     code = "unknown_lease"
 
 
 class StaleToken(CallerError):
-    code = "stale_token"  # the lease was granted again or never to you
+    """The lease was granted again, or never to this client."""
+
+    code = "stale_token"
 
 
 class LeaseRevoking(TransientError):
-    code = "lease_revoking"  # the holder was asked to leave: no new use begins
+    """The holder was asked to leave: no new use begins."""
+
+    code = "lease_revoking"
 
 
 class LeaseExpired(CallerError):
+    """The lease was not renewed within its TTL: acquire again."""
+
     code = "lease_expired"
 
 
 class LeaseLost(CallerError):
-    code = "lease_lost"  # revoked, expired or fenced: acquire again
+    """The lease was revoked, expired or fenced: acquire again."""
+
+    code = "lease_lost"
 
 
 class BadState(CallerError):
-    code = "bad_state"  # the request does not fit the lease's state; details.story
+    """The request does not fit the lease's state; `details.story` has its last changes."""
+
+    code = "bad_state"
 
 
 class WaitTimeout(TransientError):
-    code = "wait_timeout"  # details.why explains what blocked
+    """The wait's own time limit ended; `details.why` explains what blocked."""
+
+    code = "wait_timeout"
 
 
 class HolderBusy(TransientError):
-    code = "holder_busy"  # deadline of the ladder passed under the policy `deny`
+    """A holder outstayed the deadline of its revocation, and the lease asked for `deny`."""
+
+    code = "holder_busy"
 
 
 class Cancelled(CallerError):
+    """It was canceled or stopped before it was done."""
+
     code = "cancelled"
 
 
 class JournalUnavailable(OperatorError):
+    """The journal cannot be written: nothing is granted until it can."""
+
     code = "journal_unavailable"
 
 
 # -- the daemon
 class ArbiterUnreachable(TransientError):
+    """The arbiter does not answer: not running, hanging, or another socket."""
+
     code = "arbiter_unreachable"
 
 
 class UntrustedServer(OperatorError):
-    code = (
-        "untrusted_server"  # another user's process serves the socket: details.uid, user, endpoint
-    )
+    """Another user's process serves the socket: `details.uid`, `user`, `endpoint`."""
+
+    code = "untrusted_server"
 
 
 class AlreadyRunning(OperatorError):
+    """Another arbiter serves the socket or uses the state folder."""
+
     code = "already_running"
 
 
 class ConfigError(OperatorError):
-    code = "config_error"  # details.fields: path, line, problem
+    """A flag, a file or a variable is wrong; `details.fields` has path, line and problem."""
+
+    code = "config_error"
 
 
 class UnsupportedQuantization(ConfigError):
-    # a number format that the device or this program cannot compute in: details.dtype, supported
+    """Device or program cannot compute in this number format: `details.dtype`, `supported`."""
+
     code = "unsupported_quantization"
 
 
 class NoGpu(OperatorError):
+    """There is no driver, no GPU, or not the one that is asked for."""
+
     code = "no_gpu"
 
 
 class ProbeFailed(TransientError):
+    """A GPU could not be read, or answered nonsense."""
+
     code = "probe_failed"
 
 
 # -- sidecars
 class Evicted(TransientError):
-    code = "evicted"  # never to be read as "object not found"
+    """The model left the GPU; never to be read as "object not found"."""
+
+    code = "evicted"
 
 
 class NotResident(TransientError):
+    """The model is not on the GPU, and the request does not load it."""
+
     code = "not_resident"
 
 
 class Loading(TransientError):
+    """The model loads."""
+
     code = "loading"
 
 
 class ModelError(CallerError):
+    """The model failed at this request, or does not answer."""
+
     code = "model_error"
 
 
 class OutOfMemory(TransientError):
-    code = "oom"  # the card was full: real or simulated
+    """The GPU was full, real or simulated."""
+
+    code = "oom"
 
 
 class SidecarUnavailable(TransientError):
-    code = "sidecar_unavailable"  # cannot be started or reached; details.exit_code, log
+    """A sidecar cannot be started or reached: `details.exit_code`, `log`."""
+
+    code = "sidecar_unavailable"
 
 
 class CalibrationFailed(OperatorError):
-    # a footprint could not be measured; details.exit_code and log of a program that ended early
+    """A footprint could not be measured: `details.exit_code`, `log` of a program that ended
+    early."""
+
     code = "calibration_failed"
 
 
 # -- programs that know nothing of the arbiter
+class InstallFailed(OperatorError):
+    """`vramctl install`: a command of the machine, or a file."""
+
+    code = "install_failed"
+
+
 class ActionFailed(TransientError):
-    code = "action_failed"  # a program did not free or restore its memory; details.url, status
+    """A program did not free or restore its memory: `details.url`, `status`."""
+
+    code = "action_failed"
 
 
 class CheckpointUnsupported(OperatorError):
-    code = "checkpoint_unsupported"  # driver, architecture, package or privileges
+    """Driver, architecture, package or privileges do not allow suspending a program."""
+
+    code = "checkpoint_unsupported"
 
 
 # -- runner and reasoner
 class RunnerUnreachable(TransientError):
-    code = "runner_unreachable"  # it does not answer: not running, or hanging
+    """The runner does not answer: not running, or hanging."""
+
+    code = "runner_unreachable"
 
 
 class ReasonerUnreachable(TransientError):
-    code = "reasoner_unreachable"  # no episode runs there, or it hangs
+    """No reasoner runs there, or it hangs."""
+
+    code = "reasoner_unreachable"
 
 
 class GoalRejected(CallerError):
+    """The goal does not fit the robot, the skill or the moment, or was not reached."""
+
     code = "goal_rejected"
 
 
 class EstopRequested(OperatorError):
-    # the emergency stop is latched: a person looks, then starts the runner again
+    """The emergency stop is latched: look at the robot, then start the runner again."""
+
     code = "estop_requested"
 
 
 class RobotFault(OperatorError):
-    # the robot's hardware does not answer, or answers nonsense: cables, power, calibration
+    """The robot does not answer, or answers nonsense: cables, power, calibration."""
+
     code = "robot_fault"
 
 
 class EnvironmentFailed(OperatorError):
-    # a simulated world raised, or told what cannot be: its own code, or its packages
+    """A simulated world raised, or reported what cannot be: its own code or packages."""
+
     code = "environment_failed"
 
 
 class FrameStale(TransientError):
-    code = "frame_stale"  # no frame young enough: fail closed
+    """No camera frame is young enough."""
+
+    code = "frame_stale"
 
 
 class StateStale(TransientError):
-    code = "state_stale"  # the robot does not say, or no longer, where its joints are: fail closed
+    """The robot does not report, or no longer reports, where its joints are."""
+
+    code = "state_stale"
 
 
 class UnknownSkill(CallerError):
+    """No installed skill has this name."""
+
     code = "unknown_skill"
 
 
 class ManifestInvalid(OperatorError):
+    """A skill's manifest is wrong; the message lists the findings."""
+
     code = "manifest_invalid"
 
 
 class LlmError(TransientError):
+    """The language model failed, or its answers cannot be read."""
+
     code = "llm_error"
 
 

@@ -7,7 +7,7 @@ same effects.
      1.2 requests: acquire, reacquire and cancel · ready, uses, renew, oom · revoke_ack, unloading,
      release · reattach · operators
      1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the
-     restart, a resume from suspend
+     restart, a resume from suspend, changed constants
      1.4 time: every timer that is due
   2. recovery ends when every lease is accounted for
   3. waits that could never end are denied; broken gangs end; GPUs are granted (its own numbered
@@ -17,7 +17,7 @@ same effects.
 It must not know how effects are performed, nor that a wire exists.
 """
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import replace
 from typing import Any
 
@@ -31,13 +31,14 @@ from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.refusals import NoSession, Refused
 from vram_arbiter.arbiter.core.model.state import Core, Turn
-from vram_arbiter.arbiter.core.report import status, why
+from vram_arbiter.arbiter.core.report import status, usage, why
 from vram_arbiter.arbiter.core.report.status import Figures, PageKey
+from vram_arbiter.arbiter.core.report.usage import GpuUsage
 from vram_arbiter.arbiter.core.requests import operators, recovery, requests, sessions, uses
 from vram_arbiter.arbiter.core.scheduling import deadlock, grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
-from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -59,6 +60,7 @@ _FACTS: Mapping[type, _Step] = {
     ev.JournalFailed: sessions.on_journal_failed,
     ev.Recovered: recovery.on_recovered,
     ev.Resumed: recovery.on_resumed,
+    ev.SettingsChanged: operators.on_settings,
 }
 _REQUESTS: Mapping[type, _Step] = {
     ev.CancelRequested: requests.cancel,
@@ -203,7 +205,7 @@ class Arbiter:
         for gpu in core.turn.touched.values():
             lists = gpu.sample is not None and gpu.sample.processes is not None
             if lists and gpu.residents.by_state[LeaseState.LOADING]:
-                core.read_again(gpu, settings.load_probe_s)
+                core.read_again(gpu, settings.probe_load_s)
             elif ("probe", gpu.info.id) not in core.timers and (
                 core.clients
                 or gpu.residents
@@ -229,11 +231,23 @@ class Arbiter:
         reader: ProcessKey | None = None,
         after: PageKey | None = None,
         limit: int | None = None,
+        *,
+        details: bool = False,
     ) -> StatusReply:
         """Return a page of the status. `reader`: the process that asks; None: an operator, for all
-        tokens."""
+        tokens. `details`: with those of each lease."""
         self._core.now = max(self._core.now, now)
-        return status.status(self._core, self._standby.host_ram(), reader, after, limit)
+        page = status.status(self._core, self._standby.host_ram(), reader, after, limit)
+        if details:
+            shown = why.details(self._core, [lease.lease_id for lease in page.leases])
+            page = replace(page, details=shown)
+        return page
+
+    def leases(self, ids: Iterable[LeaseId], now: float) -> StatusReply:
+        """Return the status with these leases alone, without tokens."""
+        self._core.now = max(self._core.now, now)
+        host_ram = self._standby.host_ram()
+        return status.status(self._core, host_ram, ProcessKey(0, 0), only=ids)
 
     def why(self, consumer: str, now: float) -> WhyReply:
         """Explain why a consumer is not running."""
@@ -248,6 +262,10 @@ class Arbiter:
     def figures(self) -> Figures:
         """The present in numbers (`status.figures`)."""
         return status.figures(self._core)
+
+    def usage(self) -> tuple[GpuUsage, ...]:
+        """How the bytes of each GPU are divided now (`usage.usage`)."""
+        return usage.usage(self._core)
 
     def learnt(self) -> dict[str, dict[str, float]]:
         """Return the learned durations, in the shape of `Settings.learnt`."""

@@ -173,7 +173,7 @@ _CONDITIONS: Final[Mapping[Condition, str]] = {
     Condition.THRASHING: "may stay {seconds:.1f} s more (they keep throwing each other out)",
     Condition.PRIORITY: "is in use and has priority {one.priority}, the waiter "
     "{one.waiter_priority}",
-    Condition.IN_USE: "is in use",
+    Condition.IN_USE: "is in use for {seconds:.0f} s",
     Condition.IDLE: "is idle and may be asked",
     Condition.CONTEXT: "keeps its context until it exits",
     Condition.RETAINED: "keeps more than its context until its process (pid {one.pid}) gives it "

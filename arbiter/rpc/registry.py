@@ -40,7 +40,11 @@ class Decisions(Protocol):
         ...
 
     def status(
-        self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
+        self,
+        reader: ProcessKey | None,
+        after: tuple[int, float, int] | None = None,
+        *,
+        details: bool = False,
     ) -> StatusReply: ...
 
     def why(self, consumer: str) -> WhyReply: ...

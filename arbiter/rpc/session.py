@@ -290,9 +290,9 @@ class SessionTable:
                 self._welcome(session, request)
             case w.Ping():
                 self.reply(client, re, PingReply(self._settings.server))
-            case w.Status(after=page):
+            case w.Status():
                 reader = None if session.role == "operator" else session.peer.process
-                decisions.when_read(lambda: self._status(client, re, reader, page))
+                decisions.when_read(lambda: self._status(client, re, reader, request))
             case w.Why(consumer=consumer):
                 decisions.when_read(lambda: self.reply(client, re, decisions.why(consumer)))
             case w.History():
@@ -321,12 +321,12 @@ class SessionTable:
     def _status(
         self,
         client: ClientId,
-        request: RequestId,
+        re: RequestId,
         reader: ProcessKey | None,
-        page: tuple[int, float, int] | None,
+        request: w.Status,
     ) -> None:
-        status = self._decisions.status(reader, page)
-        self.reply(client, request, replace(status, problems=tuple(self._problems())))
+        status = self._decisions.status(reader, request.after, details=request.details)
+        self.reply(client, re, replace(status, problems=tuple(self._problems())))
 
     def _subscribe(self, session: Session) -> None:
         subscribers, settings, peer = self._registry.subscribers, self._settings, session.peer

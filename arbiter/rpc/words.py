@@ -304,8 +304,12 @@ def reply(body: AnyReply) -> AnyReply:
                     for one in leases
                 )
             )
-        case StatusReply(gpus=gpus):
-            return replace(body, gpus=tuple(map(explained.worded_gpu, gpus)))
+        case StatusReply(gpus=gpus, details=details):
+            told = tuple(
+                one if one.why is None else replace(one, why=explained.worded(one.why))
+                for one in details
+            )
+            return replace(body, gpus=tuple(map(explained.worded_gpu, gpus)), details=told)
         case WhyReply(leases=leases):
             return replace(body, leases=tuple(map(explained.worded, leases)))
         case _:

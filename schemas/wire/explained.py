@@ -27,7 +27,7 @@ class Condition(StrEnum):
     RESIDENCY = "residency"  # `seconds` of its minimum residency are left
     THRASHING = "thrashing"  # it and the waiter evict each other; `seconds` are left
     PRIORITY = "priority"  # in use, above the waiter's priority
-    IN_USE = "in_use"
+    IN_USE = "in_use"  # `seconds`: since its oldest use began
     IDLE = "idle"  # it may be revoked
     CONTEXT = "context"  # a live process keeps its CUDA context
     RETAINED = "retained"  # a live process keeps more than that
@@ -182,6 +182,20 @@ class Explanation:
     drifted: bool = False  # it holds more or less than declared
     back: Return | None = None  # where it is away
     due_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseDetail:
+    """What a status adds to a lease where it is asked for details.
+
+    `declared_bytes`: resident; of a request or a load the load peak. `measured_bytes`: the newest
+    reading, or the holder's word; None: unknown. `why`: of a lease that waits or is away.
+    """
+
+    lease_id: str
+    declared_bytes: int
+    measured_bytes: int | None = None
+    why: Explanation | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -481,6 +481,8 @@ DAEMON_KINDS: Final = (
     "journal_doubted",
     "record_stopped",
     "record_resumed",
+    "config_reloaded",
+    "config_refused",
 )
-"""What the daemon itself adds to the history: its starts and ends, and what is wrong with its own
-files."""
+"""What the daemon itself adds to the history: its starts and ends, changes of its configuration,
+and what is wrong with its own files."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
-from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.explained import LeaseDetail, WhyReply
 from vram_arbiter.schemas.wire.views import GpuView, HostRamView, LeaseView, Totals
 
 
@@ -120,15 +120,20 @@ class StatusReply:
     drained: str  # the operator that drained the arbiter, and why; "" while it grants
     problems: tuple[str, ...]  # what is wrong with the daemon's own files, in words
     next: tuple[int, float, int] | None = None  # there may be more: ask again with this as `after`
+    details: tuple[LeaseDetail, ...] = ()  # of each lease of the page, where they are asked for
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryReply:
-    """Events after a number, oldest first. `problem`: why older ones cannot be read, in words."""
+    """Events after a number, oldest first. `problem`: why older ones cannot be read, in words.
+
+    `numbering` names the history that the numbers belong to. Another name: the numbers began again.
+    """
 
     events: tuple[JsonMap, ...]
     last_seq: int
     problem: str = ""
+    numbering: str = ""
 
 
 @dataclass(frozen=True, slots=True)

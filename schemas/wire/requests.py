@@ -183,9 +183,12 @@ class Oom(OnLease):
 
 
 class Status(_Request):
-    """The state of everything. Leases come in pages: `after` is the `next` of the page before."""
+    """The state of everything. Leases come in pages: `after` is the `next` of the page before.
+    `details`: with declared and measured bytes, and why each waiter waits; its pages are
+    shorter."""
 
     op: Literal["status"]
+    details: bool = False
     after: tuple[Literal[0, 1], Annotated[float, Field(allow_inf_nan=False)], Serial] | None = None
 
 

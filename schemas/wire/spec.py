@@ -43,21 +43,26 @@ class LeaseSpec:
     model_id: Name
     footprint: Footprint
     revision: Annotated[str, Limits(max_length=d.NAME_MAX_CHARS)] = ""
-    gpu: Name = "any"  # uuid, index or `any`
+    gpu: Name = "any"
+    """UUID, index, or `any`."""
     mode: Literal["exclusive", "shared"] = "shared"
     priority: Annotated[int, Limits(ge=0, le=d.PRIORITY_MAX)] = d.PRIORITY
     evictable: bool = True
     ttl_s: Annotated[float, Limits(ge=0.5, le=3600)] = d.LEASE_TTL_S
+    """Seconds without a renewal after which the lease expires; the client renews by itself."""
     min_residency_s: Seconds = d.MIN_RESIDENCY_S
-    # what a waiter gets when a holder outstays the ladder's deadline
+    """Seconds after the load in which it is not revoked."""
     on_deadline: Literal["wait", "deny"] = "wait"
-    # what may be done to its own process if that outstays the deadline idle
+    """What the waiter gets when a holder outstays the deadline of its revocation."""
     on_overstay: Literal["wait", "terminate", "kill"] = "wait"
-    standby: bool = False  # asked to leave, it comes back by itself when there is room
-    park_bytes: Bytes = 0  # host RAM that keeps its weights while it is away; 0: not parked
+    """What may be done to the holder's own process if it outstays the deadline idle."""
+    standby: bool = False
+    """Evicted, it returns by itself when there is room."""
+    park_bytes: Bytes = 0
+    """Host RAM that keeps its weights while it is away; 0: it is not parked."""
     gang: Gang | None = None
-    # the process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it
     independent: bool = False
+    """The process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it."""
 
     @property
     def model(self) -> str:

@@ -9,7 +9,7 @@
 Reads only, and only when asked: the plan costs a search for victims per instant.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from heapq import nlargest
 from math import inf
@@ -26,6 +26,7 @@ from vram_arbiter.schemas.wire.explained import (
     Blocker,
     Condition,
     Explanation,
+    LeaseDetail,
     NextAction,
     Return,
     Situation,
@@ -86,10 +87,28 @@ def why(core: Core, consumer: str) -> WhyReply:
     return WhyReply(consumer, told, more=len(mine[EXPLAINED_MAX:]))
 
 
-def explain(core: Core, lease: Lease, *, plan: bool = False) -> Explanation:
+def details(core: Core, lease_ids: Iterable[str]) -> tuple[LeaseDetail, ...]:
+    """Return what a page of the status adds to each of its leases."""
+    return tuple(_detail(core, core.leases[LeaseId(lease_id)]) for lease_id in lease_ids)
+
+
+def _detail(core: Core, lease: Lease) -> LeaseDetail:
+    sizes, resident = lease.spec.footprint, lease.gpu is not None
+    waits = lease.state is LeaseState.QUEUED or lease.state in AWAY
+    peak = lease.state in (LeaseState.QUEUED, LeaseState.LOADING)
+    return LeaseDetail(
+        lease_id=lease.id,
+        declared_bytes=sizes.load_peak_bytes if peak else sizes.steady_bytes,
+        measured_bytes=learning.held_bytes(core.gpu_of(lease), lease) or None if resident else None,
+        why=explain(core, lease, plan=True, brief=True) if waits else None,
+    )
+
+
+def explain(core: Core, lease: Lease, *, plan: bool = False, brief: bool = False) -> Explanation:
     """Explain one lease: what it needs, what is in its way, and when it is loaded.
 
     `plan`: with the next steps. They also give an estimate where no holder was revoked yet.
+    `brief`: without the blockers of a request behind others, which are the head's own.
     """
     standing = standing_of(core, lease)
     gpu, kept = standing.gpu, standing.reserved_bytes
@@ -114,7 +133,7 @@ def explain(core: Core, lease: Lease, *, plan: bool = False) -> Explanation:
         gang=standing.gang,
     )
     if lease.state is LeaseState.QUEUED:
-        return _explain_waiter(core, lease, standing, free, told, plan=plan)
+        return _explain_waiter(core, lease, standing, free, told, plan=plan, brief=brief)
     eviction = lease.departure.eviction
     return replace(
         told,
@@ -128,7 +147,14 @@ def explain(core: Core, lease: Lease, *, plan: bool = False) -> Explanation:
 
 
 def _explain_waiter(
-    core: Core, lease: Lease, standing: Standing, free: int, told: Explanation, *, plan: bool
+    core: Core,
+    lease: Lease,
+    standing: Standing,
+    free: int,
+    told: Explanation,
+    *,
+    plan: bool,
+    brief: bool,
 ) -> Explanation:
     gpu, request, kept = standing.gpu, lease.request, standing.reserved_bytes
     needed = request.load_peak_bytes if kept else admission.added_bytes(gpu, standing.request)
@@ -136,7 +162,8 @@ def _explain_waiter(
     raised = request.load_peak_bytes > lease.spec.footprint.load_peak_bytes
     # a gang has the place of its foremost member
     position = min(status.position(core, member) for member in standing.fellows)
-    blockers = _blockers(core, gpu, standing.request, deficit)
+    behind = brief and position > 1
+    blockers = () if behind else _blockers(core, gpu, standing.request, deficit)
     situation = _situation(core, standing, lease, position, blocked=bool(blockers))
     leaving = _leaving(gpu) if situation is Situation.MAKING_ROOM else ()
     steps = _steps(core, standing, lease) if plan else ()
@@ -259,7 +286,9 @@ def _condition(core: Core, lease: Lease, waiter: Lease | None) -> tuple[Conditio
         aged = waiter.priority_at(core.now, core.settings.ageing_s_per_point)
         if lease.uses and lease.spec.priority > aged:
             return Condition.PRIORITY, None
-    return (Condition.IN_USE if lease.uses else Condition.IDLE), None
+    if lease.uses:
+        return Condition.IN_USE, core.now - next(iter(lease.uses.values())).began_at
+    return Condition.IDLE, None
 
 
 def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:

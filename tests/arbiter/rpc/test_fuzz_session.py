@@ -56,7 +56,7 @@ class Recording:
     def when_read(self, answer: Callable[[], None]) -> None:
         answer()
 
-    def status(self, *page: object) -> StatusReply:
+    def status(self, *page: object, details: bool = False) -> StatusReply:
         return IDLE_STATUS
 
     def why(self, consumer: str) -> WhyReply:
@@ -110,9 +110,13 @@ class RealCore:
         answer()
 
     def status(
-        self, reader: ProcessKey | None = None, after: tuple[int, float, int] | None = None
+        self,
+        reader: ProcessKey | None = None,
+        after: tuple[int, float, int] | None = None,
+        *,
+        details: bool = False,
     ) -> StatusReply:
-        return self.arbiter.status(self.plant.now, reader, after, d.STATUS_PAGE)
+        return self.arbiter.status(self.plant.now, reader, after, d.STATUS_PAGE, details=details)
 
     def why(self, consumer: str) -> WhyReply:
         return self.arbiter.why(consumer, self.plant.now)

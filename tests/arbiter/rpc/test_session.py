@@ -62,7 +62,11 @@ class Bench:
         answer()
 
     def status(
-        self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
+        self,
+        reader: ProcessKey | None,
+        after: tuple[int, float, int] | None = None,
+        *,
+        details: bool = False,
     ) -> StatusReply:
         self.asked_status = (reader, after)
         return IDLE_STATUS

@@ -136,7 +136,7 @@ def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
     conditions = {b["consumer"]: b["text"] for b in why(driver, "w")["blockers"]}
     assert conditions == {
         "busy": "is in use and has priority 90, the waiter 50",
-        "even": "is in use",
+        "even": "is in use for 0 s",
         "calm": "is idle and may be asked",
         "keeper": "is pinned",
     }

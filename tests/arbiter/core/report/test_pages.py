@@ -3,6 +3,7 @@
 from typing import Any
 
 from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held, why
 from vram_arbiter.arbiter.core.arbiter import DUE_MAX
 from vram_arbiter.arbiter.core.events import Tick
 from vram_arbiter.arbiter.core.report.why import BLOCKERS_MAX, EXPLAINED_MAX
@@ -127,3 +128,26 @@ def test_waits_that_end_together_are_denied_in_slices() -> None:
     driver.post(Tick())
     driver.post(Tick())
     assert len(driver.notes("denied")) == len(leases)
+
+
+def test_details_say_what_why_says() -> None:
+    """The words and the estimate of a waiter come from the arbiter, in one request for all."""
+    driver = CoreDriver(8 * GIB)
+    held(driver, "detector", 5)
+    first, second = driver.consumer("grab"), driver.consumer("vlm")
+    first.acquire(6 * GIB)
+    second.acquire(7 * GIB)
+    driver.advance(0.001)
+    told = driver.status(details=True)
+    assert "details" not in driver.status()
+    detector, grab, vlm = told["details"]
+    assert [lease["lease_id"] for lease in told["leases"]] == [
+        detail["lease_id"] for detail in told["details"]
+    ]
+    assert (detector["declared_bytes"], detector["measured_bytes"]) == (5 * GIB, 5 * GIB)
+    assert "why" not in detector
+    assert grab["why"] == why(driver, "grab")
+    behind = why(driver, "vlm")
+    assert vlm["why"]["text"] == behind["text"]
+    assert (vlm["why"]["eta_s"], vlm["why"]["plan"]) == (behind["eta_s"], behind["plan"])
+    assert not vlm["why"]["blockers"], "the blockers are the head's"
