@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import secrets
 import sqlite3
 import sys
 import time
@@ -38,6 +39,8 @@ QUESTIONS_MAX = 256
 """Questions about older events that wait for the disk; the next one is answered with a problem."""
 PRUNE_EVERY_EVENTS = 2000
 SEQ_MAX = 1 << 52
+NAME_BYTES = 8
+"""Of the random name that a numbering gets when it begins."""
 EVENT_MAX_CHARS = 1 << 25
 AT_ONCE = frozenset({"operator"})
 """Kinds that do not wait for the next batch: an order must survive a crash that follows at once."""
@@ -51,6 +54,7 @@ _SCHEMA = """
 CREATE TABLE IF NOT EXISTS events
     (seq INTEGER PRIMARY KEY, at_wall_s REAL NOT NULL, kind TEXT NOT NULL, json TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS events_by_time ON events (at_wall_s);
+CREATE TABLE IF NOT EXISTS numbering (name TEXT NOT NULL);
 """
 _QUESTION = """
 SELECT seq, at_wall_s, json FROM events
@@ -66,11 +70,16 @@ class History:
     """
 
     def __init__(
-        self, store: "_Store | None", last_seq: int, wall: Callable[[], float] = time.time
+        self,
+        store: "_Store | None",
+        last_seq: int,
+        wall: Callable[[], float] = time.time,
+        numbering: str | None = None,
     ) -> None:
         self._store = store
         self._wall = wall
         self._last_seq = last_seq
+        self._numbering = numbering or secrets.token_hex(NAME_BYTES)
         self._ring: deque[Event] = deque(maxlen=RING_EVENTS)
         self._disk: DiskWriter[Event] | None = None
         self.problem = "history is kept in memory only: its file cannot be used"
@@ -93,7 +102,7 @@ class History:
         for attempt in (1, 2):
             try:
                 store = _Store(path, max_events, days, wall)
-                return cls(store, store.last_seq(), wall)
+                return cls(store, store.last_seq(), wall, store.numbering())
             except (sqlite3.DatabaseError, OSError) as error:
                 log.error("history %s: %s", path, error)
                 if attempt == 2 or not path.is_file() or not _is_damage(error):
@@ -106,6 +115,11 @@ class History:
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         if self._disk is not None:
             self._disk.start(loop)
+
+    def keep(self, max_events: int, days: float) -> None:
+        """Keep this many events for this long from the next pruning on."""
+        if self._store is not None:
+            self._store.max_events, self._store.days = max_events, days
 
     @property
     def last_seq(self) -> int:
@@ -134,20 +148,22 @@ class History:
             found = [
                 e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)
             ]
-            done(HistoryReply(tuple(found[:limit]), self._last_seq))
+            done(self._reply(found[:limit]))
             return
 
         def answer(found: list[Event] | DiskFailed) -> None:
             if isinstance(found, DiskFailed):
-                done(HistoryReply((), self._last_seq, str(found)))
+                done(self._reply((), str(found)))
             else:
-                done(HistoryReply(tuple(found), self._last_seq))
+                done(self._reply(found))
 
         try:
             disk.ask(lambda: store.find(after, limit, kinds), answer)
         except DiskBehind:
-            problem = "the disk of the history does not answer"
-            done(HistoryReply((), self._last_seq, problem))
+            done(self._reply((), "the disk of the history does not answer"))
+
+    def _reply(self, events: Sequence[Event], problem: str = "") -> HistoryReply:
+        return HistoryReply(tuple(events), self._last_seq, problem, self._numbering)
 
     def close(self) -> None:
         """Write what is left and end the writer."""
@@ -197,8 +213,8 @@ class _Store:
     def __init__(self, path: Path, max_events: int, days: float, wall: Callable[[], float]) -> None:
         self._wall = wall
         self._opened_at = time.monotonic()
-        self._max_events = max_events
-        self._days = days
+        self.max_events = max_events
+        self.days = days
         self._since_prune = 0
         self._owed: deque[Event] = deque(maxlen=BUFFER_MAX)
         self._earlier = 0  # the last number of earlier runs
@@ -228,12 +244,32 @@ class _Store:
                 raise sqlite3.DatabaseError(
                     f"an event has the number {row[0]}, more than {SEQ_MAX}"
                 )
+            used = self._name() is not None
         except BaseException:
             self._db.close()
             raise
         if row is not None:
             self._earlier = int(row[0]) + (0 if row[1] == CLEAN_END else SKIPPED_AFTER_CRASH)
+        elif used:  # the run that made the file was killed before it wrote an event
+            self._earlier = SKIPPED_AFTER_CRASH
         return self._earlier
+
+    def numbering(self) -> str:
+        """Return the name of this file's numbering, made with the file. Raises
+        sqlite3.DatabaseError."""
+        try:
+            name = self._name()
+            if name is None:
+                name = secrets.token_hex(NAME_BYTES)
+                self._db.execute("INSERT INTO numbering VALUES (?)", (name,))
+        except BaseException:
+            self._db.close()
+            raise
+        return name
+
+    def _name(self) -> str | None:
+        row = self._db.execute("SELECT name FROM numbering").fetchone()
+        return None if row is None else str(row[0])
 
     def write(self, items: Sequence[Event]) -> None:
         self._owed.extend(items)
@@ -257,9 +293,9 @@ class _Store:
         """
         self._since_prune = 0
         self._db.execute(
-            "DELETE FROM events WHERE seq <= (SELECT MAX(seq) FROM events) - ?", (self._max_events,)
+            "DELETE FROM events WHERE seq <= (SELECT MAX(seq) FROM events) - ?", (self.max_events,)
         )
-        age_s = self._days * 86_400
+        age_s = self.days * 86_400
         up_to = self._earlier if time.monotonic() - self._opened_at < age_s else sys.maxsize
         self._db.execute(
             "DELETE FROM events WHERE at_wall_s < ? AND seq <= ?", (wall_s - age_s, up_to)

@@ -178,11 +178,16 @@ class Journal:
         return cls(folder / "journal.sqlite", boot_id, connection, seal, digests, opened)
 
     @property
+    def doubted(self) -> bool:
+        """Whether the records may not name every lease."""
+        return DOUBT_KEY in self._digests and DOUBT_KEY in self.opened.records
+
+    @property
     def problems(self) -> list[str]:
         """What an operator should know, a line each. A doubt, of this start or of one before it,
         counts until the core deletes it."""
         doubt = ""
-        if DOUBT_KEY in self._digests and DOUBT_KEY in self.opened.records:
+        if self.doubted:
             why = self.opened.records[DOUBT_KEY].get("why")
             doubt = (
                 f"the journal may not name every lease ({why}): grants wait until each holder had "

@@ -20,6 +20,7 @@ from vram_arbiter.arbiter.core.model.records import (
     LeaseRecord,
     ResidueRecord,
 )
+from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -54,3 +55,15 @@ def record_of(key: str, data: JsonMap) -> AnyRecord:
 def records_of(data: Mapping[str, JsonMap]) -> dict[str, AnyRecord]:
     """Return the records by their keys. Raises ValueError."""
     return {key: record_of(key, record) for key, record in data.items()}
+
+
+def processes_of(records: Mapping[str, AnyRecord]) -> list[ProcessKey]:
+    """The processes that the journal's records belong to, and those that use what belongs to
+    others; each once."""
+    found = set()
+    for record in records.values():
+        if isinstance(record, LeaseRecord | ResidueRecord):
+            found.add(ProcessKey(record.pid, record.start_ticks))
+        if isinstance(record, LeaseRecord):
+            found.update(ProcessKey(pid, ticks) for pid, ticks, _, _ in record.users)
+    return sorted(found)

@@ -51,6 +51,23 @@ async def read(
     return await answer
 
 
+def test_a_numbering_has_a_name_as_long_as_its_file(tmp_path: Path) -> None:
+    """A reader that goes on at a number could not tell that the numbers had begun again."""
+    names: list[str] = []
+
+    async def test(history: History) -> None:
+        names.append((await read(history)).numbering)
+
+    with_history(tmp_path, test)
+    with_history(tmp_path, test)
+    for path in tmp_path.glob("history.sqlite*"):
+        path.unlink()
+    with_history(tmp_path, test)
+    first, again, other = names
+    assert first == again != other
+    assert all(names)
+
+
 def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
     async def test(history: History) -> None:
         event = history.append("granted", {"lease_id": "L1-1"})
@@ -65,7 +82,8 @@ def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
             "L1-1",
             "L1-2",
         ]
-        assert (await read(history, after=99)) == HistoryReply((), 3)
+        beyond = await read(history, after=99)
+        assert (beyond.events, beyond.last_seq, beyond.problem) == ((), 3, "")
 
     with_history(tmp_path, test)
 
@@ -120,14 +138,15 @@ def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
 
 def test_number_and_age_are_bounded(tmp_path: Path) -> None:
     async def many(history: History) -> None:
+        history.keep(100, 7.0)  # a reload, after a start with another number
         for _ in range(module.PRUNE_EVERY_EVENTS + 10):
             history.append("x", {})
 
     async def look(history: History) -> None:
         assert (await read(history)).events[0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
 
-    with_history(tmp_path, many, max_events=100)
-    with_history(tmp_path, look, max_events=100)
+    with_history(tmp_path, many)
+    with_history(tmp_path, look)
     store = module._Store(tmp_path / "history.sqlite", 100, 1.0, time.time)
     store.last_seq()
     store.prune(time.time() + 2 * 86_400)
@@ -178,6 +197,21 @@ def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(
     later.prune(1.8e9)
     assert later.find(0, 100, ()) == [], "the next run may"
     later.close()
+
+
+def test_numbers_are_not_given_out_twice_after_a_crash_before_the_first_write(
+    tmp_path: Path,
+) -> None:
+    """Regression: a daemon that was killed in its first moments began at 1 again, and a reader that
+    had seen those numbers took none of the new events."""
+    path = tmp_path / "history.sqlite"
+    first = module._Store(path, 1000, 7.0, time.time)
+    assert first.last_seq() == 0
+    first.numbering()
+    first.close()
+    again = module._Store(path, 1000, 7.0, time.time)
+    assert again.last_seq() == SKIPPED_AFTER_CRASH
+    again.close()
 
 
 def test_a_broken_database_is_put_aside(tmp_path: Path) -> None:
