@@ -6,6 +6,7 @@ import faulthandler
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
@@ -36,13 +37,18 @@ exit codes:
   74  the output cannot be written (a full disk behind a redirection)
   70  a defect: the core's state became invalid; the log says how, a restart recovers the leases
 
+signals:
+  SIGTERM, SIGINT  stop; leases stay with their holders
+  SIGHUP           read the configuration file again; a wrong one is refused, and the former one
+                   stays in force
+
 environment:
   VRAM_ARBITER_ENDPOINT   endpoint, if neither --endpoint nor wire.endpoint is given
   VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated GPU (else RUNTIME_DIRECTORY,
                           XDG_RUNTIME_DIR/vram-arbiter, /run/user/UID/vram-arbiter,
                           for root /run/vram-arbiter)
   OTEL_EXPORTER_OTLP_ENDPOINT, OTEL_METRICS_EXPORTER=prometheus and the other standard OTEL_
-                          variables switch telemetry on (docs/operating.md)
+                          variables switch telemetry on (docs/reference/telemetry.md)
 """
 
 
@@ -79,6 +85,12 @@ def parser() -> argparse.ArgumentParser:
         "as well",
     )
     made.add_argument(
+        "--http",
+        metavar="ADDRESS:PORT",
+        help="serve the status page, read-only, e.g. on 127.0.0.1:9870; beyond loopback it needs "
+        "http.token_file",
+    )
+    made.add_argument(
         "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
     )
     made.add_argument(
@@ -98,12 +110,12 @@ def config_of_service(environ: Mapping[str, str]) -> Path | None:
     return found if folder and found.exists() else None
 
 
-def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
-    """The file's configuration with the flags over it. Raises ConfigError."""
+def effective_config(flags: argparse.Namespace, file: Path | None) -> ArbiterConfig:
+    """Return the file's configuration with the flags over it. Raises ConfigError."""
     config = ArbiterConfig()
-    if flags.config is not None:
-        text = read_text(flags.config, hint="--config needs a readable YAML file")
-        config = load_config(text, str(flags.config))
+    if file is not None:
+        text = read_text(file, hint="--config needs a readable YAML file")
+        config = load_config(text, str(file))
     values = config.model_dump()
     for section, key, value, flag in (
         ("gpu", "source", flags.gpu, "--gpu"),
@@ -111,6 +123,7 @@ def effective_config(flags: argparse.Namespace) -> ArbiterConfig:
         ("state", "dir", flags.state_dir, "--state-dir"),
         ("wire", "group", flags.group, "--group"),
         ("wire", "operators_group", flags.operators_group, "--operators-group"),
+        ("http", "listen", flags.http, "--http"),
         ("log", "format", flags.log_format, "--log-format"),
         ("log", "level", flags.log_level, "--log-level"),
     ):
@@ -155,13 +168,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     # the manager's watchdog kills by SIGABRT: the log then says where the daemon was stuck
     faulthandler.enable()
     try:
-        flags.config = flags.config or config_of_service(os.environ)
-        config = effective_config(flags)
+        file = flags.config or config_of_service(os.environ)
+        config = effective_config(flags, file)
         # late: --help and --version need none of it
         from vram_arbiter.arbiter.daemon import Daemon
         from vram_arbiter.arbiter.host.process import give_back_freed_memory, new_loop
         from vram_arbiter.arbiter.log import set_up_logging, write_in_thread
         from vram_arbiter.arbiter.places import find_places
+        from vram_arbiter.arbiter.reload import Source
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:
@@ -175,15 +189,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 )
             )
             print(
-                f"{flags.config or 'built-in configuration'}: ok (would serve {places.endpoint}, "
+                f"{file or 'built-in configuration'}: ok (would serve {places.endpoint}, "
                 f"gpu {config.gpu.source})"
             )
             return 0
         set_up_logging(config.log.format, config.log.level)
         give_back_freed_memory()
+        source = Source(
+            lambda: flags.config or config_of_service(os.environ), partial(effective_config, flags)
+        )
 
         async def serve() -> int:
-            return await Daemon(config, os.environ, version()).run()
+            return await Daemon(config, os.environ, version(), source).run()
 
         close_log = write_in_thread()
         try:

@@ -17,14 +17,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import ProcessDied, Recovered, Tick
-from vram_arbiter.arbiter.core.model.records import AnyRecord, LeaseRecord, ResidueRecord
-from vram_arbiter.arbiter.core.report.status import Figures
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
 from vram_arbiter.arbiter.host.executor import Executor
@@ -37,10 +35,11 @@ from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.prober import Prober, within
 from vram_arbiter.arbiter.host.process import raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
-from vram_arbiter.arbiter.host.records import record_of, records_of
+from vram_arbiter.arbiter.host.records import processes_of, record_of, records_of
 from vram_arbiter.arbiter.host.systemd import Notifier
-from vram_arbiter.arbiter.inbox import Inbox, SuspendWatch
+from vram_arbiter.arbiter.inbox import NO_READER, Inbox, SuspendWatch
 from vram_arbiter.arbiter.places import Places, find_places, take_folders
+from vram_arbiter.arbiter.reload import Reload, Source
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.peer import group_id
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
@@ -60,8 +59,11 @@ from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.telemetry import setup as otel
 from vram_arbiter.schemas.runtime.telemetry.commands import TRACEPARENT_VARIABLE
 from vram_arbiter.schemas.units import format_bytes
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import StatusReply
 
 if TYPE_CHECKING:
+    from vram_arbiter.arbiter.host.telemetry.metrics import Picture
     from vram_arbiter.arbiter.host.telemetry.traced import Traced
 
 log = logging.getLogger(__name__)
@@ -98,15 +100,21 @@ class Daemon:
     _journal: Journal
     _history: History
     _gpus: tuple[GpuInfo, ...]
+    _made_at: float  # monotonic, of the engine
     _engine: Arbiter
     _inbox: Inbox
     _watch: ProcessWatch
     _sessions: SessionTable
     _executor: Executor
+    _reload: Reload
     _traced: "Traced | None"
 
-    def __init__(self, config: ArbiterConfig, environ: Mapping[str, str], version: str) -> None:
+    def __init__(
+        self, config: ArbiterConfig, environ: Mapping[str, str], version: str, source: Source
+    ) -> None:
+        """`source`: where SIGHUP reads the configuration again."""
         self._config = config
+        self._source = source
         self._environ = environ
         self._version = version
         self._server = f"vram-arbiter {version}"
@@ -119,10 +127,13 @@ class Daemon:
             await self._start(undo)
             for number in (signal.SIGTERM, signal.SIGINT):
                 self._loop.add_signal_handler(number, self._stop.set)
+            self._loop.add_signal_handler(signal.SIGHUP, self._reload.ask)
             gc.freeze()  # modules stay: no collection has to look at them again
             notifier.ready(self._status_text())
             beat = self._loop.create_task(self._beat(notifier))
             undo.callback(beat.cancel)
+            reloads = self._loop.create_task(self._reload.serve(notifier, self._status_text))
+            undo.callback(reloads.cancel)
             await self._stop.wait()
             notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
             if self._exit_code == EXIT_OK:
@@ -155,6 +166,7 @@ class Daemon:
             operators_gid=operators,
         )
         self._connect_parts(probe, sessions, undo)  # 3
+        await self._open_page(undo)
         self._tell_past(places)  # 4
         router = Router(places.socket, self._sessions, limits, group)  # 5
         undo.push_async_callback(router.aclose)
@@ -182,7 +194,7 @@ class Daemon:
         probe, self._gpus = await self._open_gpus(places)
         settings = core_settings(config, self._gpus, opened)
         try_records(self._journal, settings)
-        made_at = time.monotonic()
+        self._made_at = made_at = time.monotonic()
         self._engine = Arbiter(settings, made_at)
         recorder = None
         if config.record.enabled:
@@ -223,6 +235,7 @@ class Daemon:
         )
         undo.callback(prober.close)
         undo.callback(inbox.close)
+        self._reload = Reload(self._config, self._source, inbox, self._history, self._say)
         self._watch = ProcessWatch(loop, start_ticks, self._process_died)
         undo.callback(self._watch.close)
         self._sessions = SessionTable(
@@ -241,7 +254,44 @@ class Daemon:
         )
         inbox.perform, inbox.sample = self._executor.perform, prober.sample
         if traced is not None:
-            traced.watch(loop, self._figures)
+            traced.watch(loop, self._picture)
+
+    async def _open_page(self, undo: contextlib.AsyncExitStack) -> None:
+        """Serve the status page, if it is asked for; else nothing of it is imported.
+
+        Raises ConfigError.
+        """
+        if self._config.http.listen is None:
+            return
+        from vram_arbiter.arbiter.http.page import DaemonParts, StatusPage
+
+        inbox, history = self._inbox, self._history
+
+        def worded(status: StatusReply) -> StatusReply:
+            return cast(StatusReply, words.reply(replace(status, problems=tuple(self._problems()))))
+
+        parts = DaemonParts(
+            status=lambda after: worded(inbox.status(NO_READER, after)),
+            leases=lambda ids: worded(inbox.leases(ids)),
+            why=lambda lease: cast(WhyReply, words.reply(inbox.why(lease))),
+            when_read=inbox.when_read,
+            usage=self._engine.usage,
+            history=history.read,
+            last_seq=lambda: history.last_seq,
+            started_at=self._made_at,
+            server=self._server,
+        )
+        page = StatusPage.open(self._config.http, parts)
+        undo.callback(page.close)
+        await page.start()
+        performed = inbox.perform
+
+        def perform(effects: Sequence[Effect]) -> None:
+            performed(effects)
+            page.performed(effects)
+
+        inbox.perform = perform
+        log.info("status page: http://%s", page.address)
 
     def _tell_past(self, places: Places) -> None:
         """Tell history and log what was found, and the engine what the journal remembers."""
@@ -349,13 +399,21 @@ class Daemon:
 
     def _problems(self) -> list[str]:
         """What an operator should know of the daemon's own files, in words."""
-        return [found for found in (*self._journal.problems, self._history.problem) if found]
+        own = (*self._journal.problems, self._history.problem, self._reload.problem)
+        return [found for found in own if found]
 
-    def _figures(self) -> Figures | None:
-        """What telemetry shows of the engine; None at the end."""
+    def _picture(self) -> "Picture | None":
+        """What telemetry shows of the present; None at the end."""
         if self._inbox.closed:
             return None
-        return replace(self._engine.figures(), journal_healthy=not self._journal.problem)
+        from vram_arbiter.arbiter.host.telemetry.metrics import Picture
+
+        return Picture(
+            self._engine.figures(),
+            journal_healthy=not self._journal.problem,
+            journal_doubted=self._journal.doubted,
+            config_refused=bool(self._reload.problem),
+        )
 
     def _status_text(self) -> str:
         named = (f"{gpu.name} ({format_bytes(gpu.capacity_bytes)})" for gpu in self._gpus)
@@ -377,15 +435,3 @@ def try_records(journal: Journal, settings: Settings) -> None:
     except Exception as error:
         log.exception("the engine cannot read the journal's records")
         journal.put_aside(f"{type(error).__name__}: {error}")
-
-
-def processes_of(records: Mapping[str, AnyRecord]) -> list[ProcessKey]:
-    """The processes that the journal's records belong to, and those that use what belongs to
-    others; each once."""
-    found = set()
-    for record in records.values():
-        if isinstance(record, LeaseRecord | ResidueRecord):
-            found.add(ProcessKey(record.pid, record.start_ticks))
-        if isinstance(record, LeaseRecord):
-            found.update(ProcessKey(pid, ticks) for pid, ticks, _, _ in record.users)
-    return sorted(found)

@@ -14,15 +14,15 @@ import logging
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event, Resumed, Tick
 from vram_arbiter.schemas.codec import to_map
-from vram_arbiter.schemas.defaults import STATUS_PAGE
-from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
+from vram_arbiter.schemas.defaults import STATUS_DETAILS_PAGE, STATUS_PAGE
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -165,10 +165,19 @@ class Inbox:
                 self.sample(gpu)
 
     def status(
-        self, reader: ProcessKey | None, after: tuple[int, float, int] | None = None
+        self,
+        reader: ProcessKey | None,
+        after: tuple[int, float, int] | None = None,
+        *,
+        details: bool = False,
     ) -> StatusReply:
         """A page of the status as `reader` may see it; None: an operator."""
-        return self._core.status(self._clock(), reader, after, STATUS_PAGE)
+        limit = STATUS_DETAILS_PAGE if details else STATUS_PAGE
+        return self._core.status(self._clock(), reader, after, limit, details=details)
+
+    def leases(self, ids: Iterable[LeaseId]) -> StatusReply:
+        """The status with these leases alone, without tokens."""
+        return self._core.leases(ids, self._clock())
 
     def why(self, consumer: str) -> WhyReply:
         return self._core.why(consumer, self._clock())

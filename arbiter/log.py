@@ -21,7 +21,7 @@ refusals_log = logging.getLogger("arbiter.refusals")
 
 _WARNINGS = (
     "probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed",
-    "journal_put_aside", "record_stopped",
+    "journal_put_aside", "record_stopped", "config_refused",
 )  # fmt: skip
 _DETAILS = (
     "use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok",

@@ -1,11 +1,12 @@
-"""sd_notify in thirty lines: tells the service manager READY, STATUS, WATCHDOG and STOPPING over
-its datagram socket.
+"""sd_notify in thirty lines: tells the service manager READY, RELOADING, STATUS, WATCHDOG and
+STOPPING over its datagram socket.
 
 No socket (not started by systemd): every call does nothing. Must not know what the daemon does.
 """
 
 import os
 import socket
+import time
 from collections.abc import Mapping
 
 READY_S = 1.0
@@ -29,6 +30,10 @@ class Notifier:
 
     def ready(self, status: str) -> None:
         self._send(f"READY=1\nSTATUS={status}\nMAINPID={os.getpid()}", READY_S)
+
+    def reloading(self) -> None:
+        """Ended by `ready`. The time lets a manager of type `notify-reload` match the two."""
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}", READY_S)
 
     def status(self, text: str) -> bool:
         """False: the manager's queue is full, and it has to be said again."""

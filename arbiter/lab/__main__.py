@@ -63,9 +63,18 @@ def parser() -> argparse.ArgumentParser:
         default=None,
         help=f"print N decisions (default: {TIMELINE_LINES} for one policy, else 0)",
     )
+    tell = commands.add_parser(
+        "story",
+        help="the events of a recorded log as the history has them, for `vramctl timeline`",
+        description="Print the events, readings and GPUs of an event log as JSON.",
+        epilog=_EXIT,
+    )
+    tell.add_argument("log", metavar="LOG", type=Path)
+    tell.add_argument("--json", action="store_true", dest="as_json", help="the only form")
     add_version(made)
-    for command in (again, what):
+    for command in (again, what, tell):
         add_version(command)
+    for command in (again, what):
         command.add_argument(
             "--policy",
             metavar="NAME",
@@ -88,8 +97,13 @@ def _count(written: str) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns the exit code."""
     flags = parser().parse_args(argv)
-    policies = list(SCHEDULING if "all" in flags.policy else dict.fromkeys(flags.policy))
     try:
+        if flags.command == "story":
+            from vram_arbiter.arbiter.lab.story import story
+
+            print(to_json(story(replay.load(flags.log))))
+            return DONE
+        policies = list(SCHEDULING if "all" in flags.policy else dict.fromkeys(flags.policy))
         if flags.command == "simulate":
             simulate(flags.scenario, policies or [DEFAULT], flags.timeline, as_json=flags.as_json)
         elif policies:

@@ -20,6 +20,7 @@ import bench_death
 import bench_eviction
 import bench_grants
 import bench_handover
+import bench_page
 import bench_rest
 import bench_runner
 import bench_throughput
@@ -33,6 +34,7 @@ SUBJECTS = {
     "eviction": bench_eviction.run,
     "death": bench_death.run,
     "rest": bench_rest.run,
+    "page": bench_page.run,
     "core": bench_core.run,
     "attacks": bench_attacks.run,
 }

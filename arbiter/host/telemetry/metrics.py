@@ -7,17 +7,21 @@ is not shown at all.
 """
 
 import asyncio
-import operator
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
 
 from opentelemetry import metrics
 from opentelemetry.context import Context
 from opentelemetry.metrics import CallbackOptions, Observation
 
+from vram_arbiter.arbiter.core.model.lease import Verdict
 from vram_arbiter.arbiter.core.report.status import Figures, GpuFigures
-from vram_arbiter.schemas.runtime.telemetry import names as names
+from vram_arbiter.schemas.runtime.telemetry import names
+from vram_arbiter.schemas.runtime.telemetry.instruments import INSTRUMENTS
+from vram_arbiter.schemas.runtime.telemetry.meters import new_counter, new_histogram
 
 PICTURE_S = 1.0
 PICTURE_MAX_AGE_S = 10.0
@@ -28,8 +32,22 @@ CONSUMERS_MAX = 200
 lives as long as the daemon."""
 OTHERS = "(others)"
 
-type _Read = Callable[[Figures], Iterable[Observation]]
-"""A figure of the engine as a gauge shows it."""
+REFUSALS_FROM_ZERO = ("stale_token",)
+LOSSES = ("lease_expired", "lease_lost")
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """The present: the engine's figures, and the state of the daemon's own files."""
+
+    engine: Figures
+    journal_healthy: bool = True
+    journal_doubted: bool = False
+    config_refused: bool = False
+
+
+type _Read = Callable[[Picture], Iterable[Observation]]
+"""A figure as a gauge shows it."""
 
 
 class LeaseMetrics:
@@ -41,53 +59,54 @@ class LeaseMetrics:
         self._clock = clock
         self._consumers: set[str] = set()
         # swapped as a whole: other threads read it
-        self._picture: tuple[float, Figures] | None = None
+        self._picture: tuple[float, Picture] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        count, span = meter.create_counter, meter.create_histogram
-        self._grants = count(names.METRIC_GRANTS, "{grant}", "Leases granted")
-        self._denials = count(names.METRIC_DENIALS, "{denial}", "Leases refused or denied")
-        self._wait = span(names.METRIC_WAIT, "s", "From the request to the grant")
-        left = "Leases that were asked to leave and measured gone, or not"
-        self._evictions = count(names.METRIC_EVICTIONS, "{eviction}", left)
-        made_room = "From the first ask to the grant that needed the room"
-        self._handover = span(names.METRIC_HANDOVER, "s", made_room)
-        self._journal_write = span(
-            names.METRIC_JOURNAL_WRITE, "s", "One transaction of the journal"
-        )
-        failed = "Transactions of the journal that failed"
-        self._journal_failures = count(names.METRIC_JOURNAL_FAILURES, "{failure}", failed)
-        self._journal_failures.add(0)  # the series exists before the first failure
-        for name, unit, what, read in self._gauges():
-            meter.create_observable_gauge(name, [self._shown(read)], unit, what)
+        count, span = partial(new_counter, meter), partial(new_histogram, meter)
+        self._grants = count(names.METRIC_GRANTS)
+        self._denials = count(names.METRIC_DENIALS)
+        self._refusals = count(names.METRIC_REFUSALS)
+        self._wait = span(names.METRIC_WAIT)
+        self._evictions = count(names.METRIC_EVICTIONS)
+        self._verdicts = count(names.METRIC_VERDICTS)
+        self._losses = count(names.METRIC_LOSSES)
+        self._ooms = count(names.METRIC_OOMS)
+        self._handover = span(names.METRIC_HANDOVER)
+        self._journal_write = span(names.METRIC_JOURNAL_WRITE)
+        self._journal_failures = count(names.METRIC_JOURNAL_FAILURES)
+        self._begin_at_zero()
+        for name, read in self._gauges():
+            meter.create_observable_gauge(name, [self._shown(read)], *INSTRUMENTS[name][:2])
         labels = {names.ATTR_VERSION: version, names.ATTR_PYTHON: platform.python_version()}
         build = [Observation(1, labels)]
-        meter.create_observable_gauge(
-            names.METRIC_BUILD, [lambda _: build], "", "Version of the daemon"
-        )
+        name = names.METRIC_BUILD
+        meter.create_observable_gauge(name, [lambda _: build], *INSTRUMENTS[name][:2])
 
-    def _gauges(self) -> Iterable[tuple[str, str, str, _Read]]:
-        """Name, unit, meaning and reader of each figure that is shown as it is."""
-        used, capacity = operator.attrgetter("used_bytes"), operator.attrgetter("capacity_bytes")
-        over = operator.attrgetter("pressure_bytes")
-        since = "Since the newest successful reading"
-        drained, healthy = (
-            "while an operator's drain stops grants",
-            "while the journal can be written",
-        )
-        yield names.METRIC_WAITERS, "{lease}", "Leases that wait", _waiters
-        yield names.METRIC_CHARGED, "By", "Bytes that are leased", self._charged
-        yield names.METRIC_MEASURED, "By", "Bytes that are held, by consumer", self._measured
-        yield names.METRIC_USED, "By", "Bytes that are held on the GPU", _by_gpu(used)
-        yield names.METRIC_CAPACITY, "By", "Bytes of the GPU", _by_gpu(capacity)
-        yield names.METRIC_PRESSURE, "By", "Bytes held beyond what was granted", _by_gpu(over)
-        yield names.METRIC_READING_AGE, "s", since, self._reading_age
-        yield names.METRIC_DRAINED, "", f"1 {drained}", _flag(lambda seen: seen.drained)
-        yield (
-            names.METRIC_JOURNAL_HEALTHY,
-            "",
-            f"1 {healthy}",
-            _flag(lambda seen: seen.journal_healthy),
-        )
+    def _begin_at_zero(self) -> None:
+        """Export the series of rare failures before the first one: Prometheus' `increase` does not
+        count a series that begins at 1, and the alert would miss it."""
+        self._journal_failures.add(0)
+        self._ooms.add(0)
+        for code in LOSSES:
+            self._losses.add(0, {names.ATTR_ERROR_TYPE: code})
+        for code in REFUSALS_FROM_ZERO:
+            self._refusals.add(0, {names.ATTR_ERROR_TYPE: code})
+        for verdict in Verdict:
+            self._verdicts.add(0, {names.ATTR_VERDICT: verdict})
+
+    def _gauges(self) -> Iterable[tuple[str, _Read]]:
+        yield names.METRIC_WAITERS, _one(lambda seen: seen.engine.waiters)
+        yield names.METRIC_OLDEST_WAIT, _one(lambda seen: seen.engine.oldest_wait_s)
+        yield names.METRIC_CHARGED, self._charged
+        yield names.METRIC_MEASURED, self._measured
+        yield names.METRIC_USED, _by_gpu(lambda gpu: gpu.used_bytes)
+        yield names.METRIC_CAPACITY, _by_gpu(lambda gpu: gpu.capacity_bytes)
+        yield names.METRIC_PRESSURE, _by_gpu(lambda gpu: gpu.pressure_bytes)
+        yield names.METRIC_READABLE, _by_gpu(lambda gpu: int(gpu.used_bytes is not None))
+        yield names.METRIC_READING_AGE, self._reading_age
+        yield names.METRIC_DRAINED, _one(lambda seen: seen.engine.drained)
+        yield names.METRIC_JOURNAL_HEALTHY, _one(lambda seen: seen.journal_healthy)
+        yield names.METRIC_JOURNAL_DOUBTED, _one(lambda seen: seen.journal_doubted)
+        yield names.METRIC_CONFIG_REFUSED, _one(lambda seen: seen.config_refused)
 
     def granted(
         self, consumer: str, waited_s: float, handover_s: float | None, context: Context
@@ -101,10 +120,27 @@ class LeaseMetrics:
             self._handover.record(handover_s, labels, context)
 
     def denied(self, code: str) -> None:
-        self._denials.add(1, {names.ATTR_REASON: code})
+        """A request for a lease ended without one."""
+        self._denials.add(1, {names.ATTR_ERROR_TYPE: code})
+
+    def refused(self, code: str) -> None:
+        """A request of any kind was refused."""
+        self._refusals.add(1, {names.ATTR_ERROR_TYPE: code})
+
+    def judged(self, verdict: str) -> None:
+        """A verification has a verdict, resolved or not."""
+        self._verdicts.add(1, {names.ATTR_VERDICT: verdict})
 
     def evicted(self, verdict: str) -> None:
         self._evictions.add(1, {names.ATTR_VERDICT: verdict})
+
+    def lost(self, code: str) -> None:
+        """A lease ended without a release: its process died, or its TTL passed."""
+        self._losses.add(1, {names.ATTR_ERROR_TYPE: code})
+
+    def out_of_memory(self) -> None:
+        """A holder reported a failed allocation."""
+        self._ooms.add(1)
 
     def wrote(self, seconds: float, *, failed: bool) -> None:
         """One transaction of the journal."""
@@ -112,10 +148,10 @@ class LeaseMetrics:
         if failed:
             self._journal_failures.add(1)
 
-    def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Figures | None]) -> None:
-        """`read` gives the figures of the core, or None when they can no longer be trusted."""
-        figures = read()
-        self._picture = None if figures is None else (self._clock(), figures)
+    def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Picture | None]) -> None:
+        """`read` gives the present, or None when it can no longer be trusted."""
+        picture = read()
+        self._picture = None if picture is None else (self._clock(), picture)
         self._timer = loop.call_later(PICTURE_S, self.watch, loop, read)
 
     def close(self) -> None:
@@ -133,18 +169,18 @@ class LeaseMetrics:
 
         return callback
 
-    def _charged(self, figures: Figures) -> Iterable[Observation]:
-        for gpu in figures.gpus:
+    def _charged(self, seen: Picture) -> Iterable[Observation]:
+        for gpu in seen.engine.gpus:
             yield from self._by_consumer(gpu.gpu, gpu.charged)
 
-    def _measured(self, figures: Figures) -> Iterable[Observation]:
-        for gpu in figures.gpus:
+    def _measured(self, seen: Picture) -> Iterable[Observation]:
+        for gpu in seen.engine.gpus:
             if gpu.measured is not None:
                 yield from self._by_consumer(gpu.gpu, gpu.measured)
 
-    def _reading_age(self, figures: Figures) -> Iterable[Observation]:
+    def _reading_age(self, seen: Picture) -> Iterable[Observation]:
         now = self._clock()
-        for gpu in figures.gpus:
+        for gpu in seen.engine.gpus:
             if gpu.read_at is not None:
                 yield Observation(max(0.0, now - gpu.read_at), {names.ATTR_GPU: gpu.gpu})
 
@@ -166,23 +202,21 @@ class LeaseMetrics:
         return consumer
 
 
-def _waiters(figures: Figures) -> Iterable[Observation]:
-    yield Observation(figures.waiters)
+def _one(figure: Callable[[Picture], float]) -> _Read:
+    """Return the gauge of one figure; a flag is 1 or 0."""
 
-
-def _by_gpu(figure: Callable[[GpuFigures], int | None]) -> _Read:
-    """The gauge of one figure of each GPU; an unknown one (None) has no series."""
-
-    def read(figures: Figures) -> Iterable[Observation]:
-        for gpu in figures.gpus:
-            if (count := figure(gpu)) is not None:
-                yield Observation(count, {names.ATTR_GPU: gpu.gpu})
+    def read(seen: Picture) -> Iterable[Observation]:
+        yield Observation(+figure(seen))
 
     return read
 
 
-def _flag(flag: Callable[[Figures], bool]) -> _Read:
-    def read(figures: Figures) -> Iterable[Observation]:
-        yield Observation(int(flag(figures)))
+def _by_gpu(figure: Callable[[GpuFigures], int | None]) -> _Read:
+    """Return the gauge of one figure of each GPU; an unknown one (None) has no series."""
+
+    def read(seen: Picture) -> Iterable[Observation]:
+        for gpu in seen.engine.gpus:
+            if (count := figure(gpu)) is not None:
+                yield Observation(count, {names.ATTR_GPU: gpu.gpu})
 
     return read

@@ -39,6 +39,7 @@ from vram_arbiter.schemas.wire.notes import (
     ExpiredNote,
     GrantedNote,
     LostNote,
+    OomNote,
     QueuedNote,
     ReadyNote,
     ReleasedNote,
@@ -124,10 +125,12 @@ class LeaseTelemetry:
                 case fx.Push(_, RevokePush() as push) if push.lease_id in asked:
                     traceparent = push.traceparent or None
                     self._begin_evict(*asked.pop(push.lease_id), traceparent, self._wall_ns())
-                case fx.Refuse(_, _, refusal) if refusal.code in told:
-                    told.remove(refusal.code)
-                case fx.Refuse(_, _, refusal) if _refuses_a_lease(refusal):
-                    self._counts.denied(refusal.code)
+                case fx.Refuse(_, _, refusal):
+                    self._counts.refused(refusal.code)
+                    if refusal.code in told:
+                        told.remove(refusal.code)
+                    elif _refuses_a_lease(refusal):
+                        self._counts.denied(refusal.code)
 
     def revoke(self, body: AnyPush) -> AnyPush:
         """A push on its way out; a `revoke` names its own span, so that the holder's unloading
@@ -151,6 +154,8 @@ class LeaseTelemetry:
         """One note and its event in the history. Returns `trace_id` and `span_id` of what it
         belongs to, for its line of the log."""
         about = note.about
+        if isinstance(note.body, VerifiedNote):  # of a dead process without a lease too
+            self._counts.judged(note.body.verdict)
         if about is None or about.lease_id is None:
             return _NONE
         lease_id, at_ns, reason = about.lease_id, int(event["at_wall_s"] * 1e9), event.get("reason")
@@ -173,7 +178,10 @@ class LeaseTelemetry:
             case ReleasedNote():
                 span = self._let_go(about, "", at_ns)
             case LostNote() | ExpiredNote():
+                self._counts.lost(f"lease_{note.kind}")
                 span = self._let_go(about, f"{note.kind}: {reason}", at_ns)
+            case OomNote():
+                self._counts.out_of_memory()
             case VerifiedNote() as verdict:
                 span = self._verdict(about, verdict, at_ns)
             case ResizedNote() if lease_id in self._growths:

@@ -8,8 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from opentelemetry import metrics, trace
 
 from vram_arbiter.arbiter.core.effects import Effect, Note
-from vram_arbiter.arbiter.core.report.status import Figures
-from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
+from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics, Picture
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.telemetry import names as names
@@ -71,7 +70,7 @@ class Traced:
         self._metrics = LeaseMetrics(metrics.get_meter(names.TRACER), version=version)
         self.leases = Harmless(LeaseTelemetry(trace.get_tracer(names.TRACER), self._metrics))
 
-    def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Figures | None]) -> None:
+    def watch(self, loop: asyncio.AbstractEventLoop, read: Callable[[], Picture | None]) -> None:
         self._metrics.watch(loop, read)
 
     def close(self, code: int = 0, error: BaseException | None = None) -> None:
