@@ -35,6 +35,7 @@ EXTRA_OF: Mapping[str, str] = {
     "av": "dataset",
     "cyclonedds": "ros2",
     "rerun": "viz",
+    "mcp": "mcp",
 }
 
 

@@ -4,6 +4,7 @@ their span, and nothing at all when off."""
 import http.client
 import json
 import re
+import signal
 import socket
 import subprocess
 import time
@@ -69,6 +70,7 @@ def hand_over(arbiter: ArbiterProcess) -> dict[str, Any]:
 
 
 def test_a_handover_is_one_trace(make_arbiter: Make, collector: Collector) -> None:
+    """Regression: the name of a log record's event was its whole sentence, with sizes and ids."""
     arbiter = make_arbiter(arguments=("--log-format", "json")).start(collector.environ())
     revoke = hand_over(arbiter)
     arbiter.stop()
@@ -99,13 +101,19 @@ def test_a_handover_is_one_trace(make_arbiter: Make, collector: Collector) -> No
         acquire.span_id,
         evict.span_id,
     )
-    grants = collector.points("vram.lease.grants")
+    told = {line.event_name: line for line in collector.lines() if line.trace_id == TRACE}
+    assert told["vram_arbiter.granted"].span_id == acquire.span_id
+    assert told["vram_arbiter.granted"].attributes["vram.consumer"] == "policy"
+    assert told["vram_arbiter.verified"].attributes["vram.verdict"] == "verified"
+    grants = collector.points("vram_arbiter.lease.grants")
     assert {point.attributes["vram.consumer"]: point.value for point in grants[-2:]} == {
         "detector": 1,
         "policy": 1,
     }
-    assert collector.points("vram.evictions")[-1].attributes == {"vram.verdict": "verified"}
-    assert collector.points("vram.handover")[-1].count == 1
+    assert collector.points("vram_arbiter.lease.evictions")[-1].attributes == {
+        "vram.verdict": "verified"
+    }
+    assert collector.points("vram_arbiter.handover.duration")[-1].count == 1
 
 
 def in_order(spans: dict[str, ReceivedSpan]) -> None:
@@ -124,12 +132,16 @@ def test_prometheus_reads_the_cards_on_loopback(make_arbiter: Make) -> None:
     assert found, arbiter.log
     port = int(found[1])
     for wanted in (
-        r'^vram_lease_grants_total\{vram_consumer="policy"\} 1\.0$',
-        r'^vram_gpu_capacity_bytes\{vram_gpu="[^"]+"\} 8\.589934592e\+09$',
-        r"^vram_handover_seconds_count\{.*\} 1\.0$",
+        r'^vram_arbiter_lease_grants_total\{vram_consumer="policy"\} 1\.0$',
+        r'^vram_arbiter_gpu_capacity_bytes\{vram_gpu="[^"]+"\} 8\.589934592e\+09$',
+        r"^vram_arbiter_handover_duration_seconds_count\{.*\} 1\.0$",
         r'service_name="vram-arbiter"',
     ):
         scraped(port, wanted)
+    (arbiter.runtime / "arbiter.yaml").write_text("telemetri: {}\n")
+    assert arbiter.process is not None
+    arbiter.process.send_signal(signal.SIGHUP)
+    scraped(port, r"^vram_arbiter_config_refused 1\.0$")
 
     other = make_arbiter(config=f"telemetry:\n  prometheus_port: {port}\n")
     other.spawn()

@@ -61,6 +61,7 @@ class LogLine:
     trace_id: str
     span_id: str
     attributes: dict[str, Any]
+    event_name: str = ""
 
 
 class _Server(ThreadingHTTPServer):
@@ -270,6 +271,7 @@ def decode_lines(body: bytes) -> list[LogLine]:
             trace_id=line.trace_id.hex(),
             span_id=line.span_id.hex(),
             attributes=_attributes(line.attributes),
+            event_name=line.event_name,
         )
         for group in ExportLogsServiceRequest.FromString(body).resource_logs
         for scope in group.scope_logs

@@ -6,7 +6,7 @@ The SDK is imported only where logs are exported.
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from opentelemetry import trace
@@ -22,6 +22,16 @@ if TYPE_CHECKING:
 
 OWN = ("opentelemetry", "urllib3", "requests")
 """Loggers of the export itself: a collector that is away must not be told so, again and again."""
+EVENTS = "vram_arbiter"
+"""Namespace of the arbiter's events; the last part is the kind in the history."""
+_EVENT_LABELS = {
+    "consumer": telemetry.ATTR_CONSUMER,
+    "lease_id": telemetry.ATTR_LEASE,
+    "gpu": telemetry.ATTR_GPU,
+    "verdict": telemetry.ATTR_VERDICT,
+    "code": telemetry.ATTR_ERROR_TYPE,
+    "reason": telemetry.ATTR_REASON,
+}
 _SEVERITIES = {
     logging.DEBUG: (SeverityNumber.DEBUG, "DEBUG"),
     logging.INFO: (SeverityNumber.INFO, "INFO"),
@@ -69,10 +79,12 @@ class OtlpHandler(logging.Handler):
 def converted(record: logging.LogRecord) -> LogRecord:
     """Return the record as OpenTelemetry's, with the span that it belongs to."""
     number, word = _SEVERITIES.get(record.levelno, (SeverityNumber.UNSPECIFIED, record.levelname))
+    name, labels = _event(record)
     attributes: dict[str, str | int] = {
         "code.function.name": record.funcName or "",
         "code.line.number": record.lineno,
         "thread.name": record.threadName or "",
+        **labels,
     }
     if record.exc_info and (error := record.exc_info[1]) is not None:
         attributes[telemetry.ATTR_EXCEPTION_TYPE] = type(error).__qualname__
@@ -87,8 +99,17 @@ def converted(record: logging.LogRecord) -> LogRecord:
         severity_number=number,
         body=exported.text(record.getMessage()),
         attributes=dict(exported.attributes(attributes)),
-        event_name=exported.text(str(getattr(record, "event", None) or "")) or None,
+        event_name=name,
     )
+
+
+def _event(record: logging.LogRecord) -> tuple[str | None, dict[str, str]]:
+    """Return the name of the event that a line of the arbiter tells, and its labels."""
+    event = getattr(record, "event", None)
+    if not isinstance(event, Mapping):
+        return None, {}
+    labels = {label: str(event[key]) for key, label in _EVENT_LABELS.items() if key in event}
+    return f"{EVENTS}.{event['kind']}", labels
 
 
 def _context(record: logging.LogRecord) -> Context:

@@ -53,54 +53,60 @@ EVENT_DAEMON_STOPPED = "vram.event.daemon_stopped"  # the lease goes on, its spa
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
 EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
 
-# -- metrics: name, unit in the name's comment; labels are ATTR_ names
-METRIC_GRANTS = "vram.lease.grants"  # 1, by consumer
-METRIC_DENIALS = "vram.lease.denials"  # 1, by reason
-METRIC_WAIT = "vram.lease.wait"  # s, from request to grant
-METRIC_WAITERS = "vram.lease.waiters"  # 1, now
-METRIC_EVICTIONS = "vram.evictions"  # 1, by verdict
-METRIC_HANDOVER = "vram.handover"  # s, from the first ask to the grant that needed the room
-METRIC_CHARGED = "vram.gpu.charged"  # By, by GPU and consumer
-METRIC_MEASURED = (
-    "vram.gpu.measured"  # By, by GPU and consumer; the sum over consumers is METRIC_USED
-)
-METRIC_USED = "vram.gpu.used"  # By, by GPU
-METRIC_CAPACITY = "vram.gpu.capacity"  # By, by GPU
-METRIC_PRESSURE = "vram.gpu.pressure"  # By, by GPU: held beyond what was granted
-METRIC_READING_AGE = "vram.gpu.reading_age"  # s, by GPU: since the newest successful reading
-METRIC_DRAINED = "vram.drained"  # 1 while an operator's drain stops grants, else 0
-METRIC_JOURNAL_HEALTHY = "vram.journal.healthy"  # 1, or 0 while the journal cannot be written
-METRIC_JOURNAL_WRITE = "vram.journal.write"  # s, one transaction
-METRIC_JOURNAL_FAILURES = "vram.journal.failures"  # 1, transactions that failed
-METRIC_BUILD = "vram.build.info"  # always 1, by version and Python's version
-METRIC_TICK = "vram.tick.duration"  # s
-METRIC_INFERENCE = "vram.inference.duration"  # s
-METRIC_CHUNK = "vram.chunk.latency"  # s, by skill: from a chunk's request to its answer
-METRIC_PREFETCH = "vram.chunk.prefetch"  # 1, by skill and outcome: hit or miss
-METRIC_STANDING = "vram.chunk.standing_steps"  # 1, by skill: steps without an action to play
-METRIC_START_LATE = "vram.tick.start_delay"  # s, by skill: from a goal's first action on
-METRIC_DEADLINE_MISSES = "vram.tick.deadline_misses"  # 1: violations of the tick's time budget
-METRIC_HAL_READ = "vram.hal.read.duration"  # s: the robot's joint state
-METRIC_HAL_SEND = "vram.hal.send.duration"  # s: an action to the motors
-METRIC_SENSOR_AGE = "vram.sensor.age"  # s, by sensor: of what a tick read
-METRIC_STALE_READS = "vram.sensor.stale_reads"  # 1, by sensor: reads without a fresh value
-METRIC_WORLD_STALE = "vram.world.stale"  # 1, by component: world states in which it was stale
-METRIC_ESTOPS = "vram.estops"  # 1
-METRIC_SAFETY_VIOLATIONS = "vram.safety.violations"  # 1
-METRIC_WITHHELD = "vram.safety.withheld"  # 1
-METRIC_LOOKS = "vram.detector.looks"  # 1, by sensor and type of error: of continuous detectors
-METRIC_STALE_DETECTIONS = "vram.detector.stale"  # 1, by sensor: answers that were too old
-METRIC_GOALS = "vram.goals"  # 1, by skill and state
-METRIC_TOOL_CALLS = "vram.reasoner.tool_calls"  # 1, by tool and outcome
-METRIC_SIDECAR_LOAD = "vram.sidecar.load"  # s, by model
-METRIC_SIDECAR_REQUEST = "vram.sidecar.request"  # s, by operation and outcome
-# of every program; the first two have the names of OpenTelemetry's conventions
-METRIC_CPU_TIME = "process.cpu.time"  # s, by mode
-METRIC_MEMORY = "process.memory.usage"  # By
-METRIC_GPU_MEMORY = "vram.process.gpu_memory"  # By, by GPU: what this process holds there
+# -- metrics; units and descriptions are in `instruments`
+METRIC_GRANTS = "vram_arbiter.lease.grants"
+METRIC_DENIALS = "vram_arbiter.lease.denials"
+METRIC_REFUSALS = "vram_arbiter.request.refusals"
+METRIC_WAIT = "vram_arbiter.lease.wait.duration"
+METRIC_WAITERS = "vram_arbiter.lease.waiters"
+METRIC_OLDEST_WAIT = "vram_arbiter.lease.oldest_wait"
+METRIC_EVICTIONS = "vram_arbiter.lease.evictions"
+METRIC_VERDICTS = "vram_arbiter.lease.verdicts"
+METRIC_LOSSES = "vram_arbiter.lease.losses"
+METRIC_OOMS = "vram_arbiter.lease.ooms"
+METRIC_HANDOVER = "vram_arbiter.handover.duration"
+METRIC_CHARGED = "vram_arbiter.gpu.charged"
+METRIC_MEASURED = "vram_arbiter.gpu.measured"  # the sum over consumers is METRIC_USED
+METRIC_USED = "vram_arbiter.gpu.used"
+METRIC_CAPACITY = "vram_arbiter.gpu.capacity"
+METRIC_PRESSURE = "vram_arbiter.gpu.pressure"
+METRIC_READABLE = "vram_arbiter.gpu.readable"
+METRIC_READING_AGE = "vram_arbiter.gpu.reading_age"
+METRIC_DRAINED = "vram_arbiter.drained"
+METRIC_JOURNAL_HEALTHY = "vram_arbiter.journal.healthy"
+METRIC_JOURNAL_DOUBTED = "vram_arbiter.journal.doubted"
+METRIC_JOURNAL_WRITE = "vram_arbiter.journal.write.duration"
+METRIC_JOURNAL_FAILURES = "vram_arbiter.journal.failures"
+METRIC_CONFIG_REFUSED = "vram_arbiter.config.refused"
+METRIC_BUILD = "vram_arbiter.build.info"
+METRIC_TICK = "vram_runner.tick.duration"
+METRIC_INFERENCE = "vram_runner.inference.duration"
+METRIC_CHUNK = "vram_runner.chunk.duration"
+METRIC_PREFETCH = "vram_runner.chunk.prefetches"
+METRIC_STANDING = "vram_runner.chunk.standing_steps"
+METRIC_START_LATE = "vram_runner.tick.start_delay"
+METRIC_DEADLINE_MISSES = "vram_runner.tick.deadline_misses"
+METRIC_HAL_READ = "vram_runner.hal.read.duration"
+METRIC_HAL_SEND = "vram_runner.hal.send.duration"
+METRIC_SENSOR_AGE = "vram_runner.sensor.age"
+METRIC_STALE_READS = "vram_runner.sensor.stale_reads"
+METRIC_WORLD_STALE = "vram_runner.world.stale_states"
+METRIC_ESTOPS = "vram_runner.estops"
+METRIC_SAFETY_VIOLATIONS = "vram_runner.safety.violations"
+METRIC_WITHHELD = "vram_runner.safety.withheld_actions"
+METRIC_LOOKS = "vram_runner.detector.looks"
+METRIC_STALE_DETECTIONS = "vram_runner.detector.stale_answers"
+METRIC_GOALS = "vram_runner.goals"
+METRIC_GPU_MEMORY = "vram_runner.gpu.memory.usage"
+METRIC_TOOL_CALLS = "vram_reasoner.tool_calls"
+METRIC_SIDECAR_LOAD = "vram_sidecar.load.duration"
+METRIC_SIDECAR_REQUEST = "vram_sidecar.request.duration"
+# of every program, by OpenTelemetry's conventions
+METRIC_CPU_TIME = "process.cpu.time"
+METRIC_MEMORY = "process.memory.usage"
 
 # -- attributes and labels: a closed set, so that no metric's cardinality grows with use
-ATTR_LEASE = "vram.lease_id"  # spans only
+ATTR_LEASE = "vram.lease_id"  # spans and log records only
 ATTR_CONSUMER = "vram.consumer"
 ATTR_MODEL = "vram.model"
 ATTR_GPU = "vram.gpu"
@@ -129,8 +135,8 @@ ATTR_COMMAND = "cli.command"
 ATTR_EXIT_CODE = "process.exit.code"  # spans only
 
 # -- OpenTelemetry's conventions for language models: one span `chat MODEL` a request
-GEN_AI_TOKENS = "gen_ai.client.token.usage"  # {token}, by model and type
-GEN_AI_DURATION = "gen_ai.client.operation.duration"  # s, by model and error
+GEN_AI_TOKENS = "gen_ai.client.token.usage"
+GEN_AI_DURATION = "gen_ai.client.operation.duration"
 ATTR_CHAT_OPERATION = "gen_ai.operation.name"
 ATTR_PROVIDER = "gen_ai.provider.name"
 ATTR_REQUEST_MODEL = "gen_ai.request.model"

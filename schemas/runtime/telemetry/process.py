@@ -12,6 +12,7 @@ from opentelemetry import metrics
 from opentelemetry.metrics import CallbackOptions, Observation
 
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry.instruments import INSTRUMENTS
 
 PAGE_BYTES = resource.getpagesize()
 
@@ -19,12 +20,10 @@ PAGE_BYTES = resource.getpagesize()
 def observe() -> None:
     """Create the instruments. Call it once, after the SDK's provider is set."""
     meter = metrics.get_meter(telemetry.TRACER)
-    meter.create_observable_counter(
-        telemetry.METRIC_CPU_TIME, [_cpu_time], "s", "CPU time of this process"
-    )
-    meter.create_observable_up_down_counter(
-        telemetry.METRIC_MEMORY, [_memory], "By", "RAM of this process"
-    )
+    name = telemetry.METRIC_CPU_TIME
+    meter.create_observable_counter(name, [_cpu_time], *INSTRUMENTS[name][:2])
+    name = telemetry.METRIC_MEMORY
+    meter.create_observable_up_down_counter(name, [_memory], *INSTRUMENTS[name][:2])
 
 
 def observe_gpu() -> None:
@@ -32,9 +31,9 @@ def observe_gpu() -> None:
 
     Not for all: a driver that hangs would hang the export with it. Without an SDK nothing is read.
     """
-    metrics.get_meter(telemetry.TRACER).create_observable_gauge(
-        telemetry.METRIC_GPU_MEMORY, [_gpu_memory], "By", "GPU memory of this process"
-    )
+    name = telemetry.METRIC_GPU_MEMORY
+    meter = metrics.get_meter(telemetry.TRACER)
+    meter.create_observable_gauge(name, [_gpu_memory], *INSTRUMENTS[name][:2])
 
 
 def _cpu_time(_: CallbackOptions) -> Iterable[Observation]:

@@ -41,23 +41,6 @@ SAY_AGAIN_S = 300.0
 """Interval between two complaints about a collector that is away."""
 _PROTOCOLS = {"": "http", "http/protobuf": "http", "grpc": "grpc"}
 
-_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
-_BOUNDS_WRITE_S = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.05, 0.25, 1.0, 5.0)
-_BOUNDS_TICK_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.033, 0.04, 0.05,
-0.1, 0.25, 0.5, 1.0, 5.0)  # fmt: skip
-_BOUNDS: Mapping[str, Sequence[float]] = {
-    telemetry.METRIC_WAIT: _BOUNDS_S,
-    telemetry.METRIC_HANDOVER: _BOUNDS_S,
-    telemetry.METRIC_SIDECAR_LOAD: _BOUNDS_S,
-    telemetry.METRIC_JOURNAL_WRITE: _BOUNDS_WRITE_S,
-    telemetry.METRIC_TICK: _BOUNDS_TICK_S,
-    telemetry.METRIC_INFERENCE: _BOUNDS_TICK_S,
-    telemetry.METRIC_HAL_READ: _BOUNDS_TICK_S,
-    telemetry.METRIC_HAL_SEND: _BOUNDS_TICK_S,
-    telemetry.METRIC_SENSOR_AGE: _BOUNDS_TICK_S,
-    telemetry.METRIC_SIDECAR_REQUEST: _BOUNDS_TICK_S,
-}
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -309,7 +292,7 @@ def _make(
         ends.append(logs.install(resource, shippers))
     readers, port = _readers(planned, ends)
     if readers:
-        meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False, views=_views())
+        meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False)
         ends.append(meters.shutdown)
     if tracers is not None:
         trace.set_tracer_provider(tracers)
@@ -389,15 +372,6 @@ def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any]
     server.start()
     readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
     return readers, server.port
-
-
-def _views() -> list[Any]:
-    from opentelemetry.sdk.metrics.view import ExplicitBucketHistogramAggregation, View
-
-    return [
-        View(instrument_name=name, aggregation=ExplicitBucketHistogramAggregation(bounds))
-        for name, bounds in _BOUNDS.items()
-    ]
 
 
 def _quieten() -> None:

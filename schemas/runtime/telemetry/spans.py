@@ -70,6 +70,12 @@ def error_type(error: Exception) -> str:
     return error.code if isinstance(error, VramError) else type(error).__qualname__
 
 
+def failed(span: trace.Span, code: str) -> None:
+    """Mark a span as failed where no exception passes through it."""
+    span.set_attribute(telemetry.ATTR_ERROR_TYPE, code)
+    span.set_status(trace.Status(trace.StatusCode.ERROR, code))
+
+
 def begin(
     name: str, traceparent: str | None = None, attributes: Attributes | None = None
 ) -> trace.Span:

@@ -28,6 +28,23 @@ READ = """
         ],
     }))
 """
+OWN = """
+    from opentelemetry.sdk.metrics import MeterProvider
+    from opentelemetry.exporter.prometheus import PrometheusMetricReader
+    from opentelemetry import metrics
+    from prometheus_client import CollectorRegistry, generate_latest
+    from vram_arbiter.schemas.runtime.telemetry import process
+    registry = CollectorRegistry()
+    reader = PrometheusMetricReader(scope_info_enabled=False, registry=registry)
+    metrics.set_meter_provider(MeterProvider([reader]))
+    process.observe_gpu()
+    said = []
+    for mine in (0, 300):
+        with open(os.environ["NVML_STUB"], "a") as control:
+            control.write(f"process 0 graphics {os.getpid()} {mine}\\n" if mine else "")
+        said.append(generate_latest(registry).decode())
+    print(json.dumps(said))
+"""
 REFUSED = """
     from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
     from vram_arbiter.schemas.errors import VramError
@@ -154,3 +171,20 @@ def test_a_card_that_was_lost_is_read_again_after_the_driver_came_back(nvml: Nvm
     assert "Driver Not Loaded" in said[2]
     assert "no longer lists GPU-stub-0" in said[3]
     assert said[4:] == [5, 6]
+
+
+def test_a_program_shows_what_it_holds_itself(nvml: NvmlStub) -> None:
+    """As the runner's dashboard names it."""
+    pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
+    from tests.support import promql
+
+    idle, rendering = (promql.scrape(page) for page in answer_of_child(nvml, OWN))
+    (drawn,) = (
+        expression
+        for text, expression in promql.panels("runner.json").items()
+        if "gpu_memory_usage" in text
+    )
+    (selector,) = promql.selectors(drawn)
+    labels = frozenset({("vram_gpu", "GPU-stub-0")})
+    assert promql.matched(selector, idle) == {labels: 0.0}
+    assert promql.matched(selector, rendering) == {labels: 300.0}

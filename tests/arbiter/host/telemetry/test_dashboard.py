@@ -1,8 +1,10 @@
-"""The dashboard that is shipped shows what the daemon really exports, by the names that Prometheus
-sees."""
+"""Dashboard and alert rules of the arbiter against its real export: every metric and label that
+they name exists, and moves in a scene that causes it. An alert is silent before its scene and fires
+after it."""
 
-import json
 import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,19 +18,21 @@ from opentelemetry.sdk.metrics import MeterProvider
 from opentelemetry.trace import NoOpTracerProvider
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
-from prometheus_client.parser import text_string_to_metric_families
 
+from tests.support import promql
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import sent_away
-from vram_arbiter.arbiter.core.effects import Note, Push
-from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
+from tests.support.scenes import GIB, held, sent_away
+from vram_arbiter.arbiter.core.effects import Effect, Note
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.arbiter.host.journal import Journal
+from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics, Picture
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
 from vram_arbiter.arbiter.rpc import words
-from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.runtime.telemetry import names as names
+from vram_arbiter.schemas.ids import ProcessKey, Token
+from vram_arbiter.schemas.runtime.telemetry import names
+from vram_arbiter.schemas.runtime.telemetry.instruments import INSTRUMENTS
 
-GUIDE = ROOT / "docs" / "operating.md"
-DASHBOARD = ROOT / "configs" / "grafana" / "arbiter.json"
+GUIDE = ROOT / "docs" / "reference" / "metrics.md"
 
 
 class NeverCalled:
@@ -36,67 +40,217 @@ class NeverCalled:
         return None
 
 
+class Scene:
+    """An engine whose words reach the real metrics, as the executor hands them on, and a Prometheus
+    endpoint's page of them. Only metrics are on: there is no tracer."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.driver = CoreDriver(8 * GIB, start=False)
+        self.flags: dict[str, bool] = {}
+        self._registry = CollectorRegistry()
+        reader = PrometheusMetricReader(scope_info_enabled=False, registry=self._registry)
+        self.provider = MeterProvider([reader], shutdown_on_exit=False)
+        meter = self.provider.get_meter("test")
+        self.numbers = LeaseMetrics(meter, lambda: self.driver.now, "1.0")
+        tracer = NoOpTracerProvider().get_tracer("test")
+        self._telemetry = LeaseTelemetry(tracer, self.numbers)
+        self._heard = 0
+        self.driver.after_event = self._hear
+        self.driver.advance(0.01)
+
+    def _hear(self) -> None:
+        batch: Sequence[Effect] = self.driver.effects[self._heard :]
+        self._heard = len(self.driver.effects)
+        self._telemetry.outgoing(batch)
+        for note in (effect for effect in batch if isinstance(effect, Note)):
+            event = {"seq": 1, "at_wall_s": 1.8e9 + self.driver.now, **words.event(note)}
+            assert self._telemetry.observe(note, event) == {}
+
+    def page(self) -> promql.Scrape:
+        figures = self.driver.arbiter.figures()
+        loop: Any = NeverCalled()
+        self.numbers.watch(loop, lambda: Picture(figures, **self.flags))
+        return promql.scrape(generate_latest(self._registry).decode())
+
+
+# -- scenes that cause an alert
+def stops(scene: Scene) -> None:
+    scene.provider.shutdown()
+
+
+def cannot_be_read(scene: Scene) -> None:
+    scene.driver.card.failing = "the driver does not answer"
+    held_by_a_consumer(scene)
+
+
+def held_by_a_consumer(scene: Scene) -> None:
+    scene.driver.consumer("late").acquire(GIB)
+    scene.driver.advance(5.0)
+
+
+def takes_what_it_was_not_given(scene: Scene) -> None:
+    held(scene.driver, "det", 5)
+    scene.driver.card.set(ProcessKey(77, 1), 4 * GIB, scene.driver.now)
+    scene.driver.advance(5.0)
+
+
+def waits_for_ever(scene: Scene) -> None:
+    det, lease = held(scene.driver, "det", 5, ttl_s=3600.0)
+    det.use_begin(lease)
+    scene.driver.consumer("policy").acquire(5 * GIB)
+    scene.driver.advance(601.0)
+
+
+def frees_nothing(scene: Scene) -> None:
+    det, lease = held(scene.driver, "det", 5)
+    scene.driver.card.silent = True
+    det.release(lease)
+    scene.driver.advance(11.0)
+
+
+def is_silent(scene: Scene) -> None:
+    held(scene.driver, "det", 2, ttl_s=10.0)
+    scene.driver.advance(20.0)
+
+
+def uses_an_old_token(scene: Scene) -> None:
+    det, lease = held(scene.driver, "det", 2)
+    det.use_begin(lease, token=Token(1, 1))
+
+
+def runs_out_of_memory(scene: Scene) -> None:
+    det, lease = held(scene.driver, "det", 2)
+    det.oom(lease, GIB)
+
+
+def cannot_write(scene: Scene) -> None:
+    scene.numbers.wrote(0.001, failed=True)
+    scene.flags["journal_healthy"] = False
+
+
+def lost_its_journal(scene: Scene) -> None:
+    (scene.folder / "journal.sqlite").write_bytes(b"no database" * 1000)
+    journal = Journal.open(scene.folder, "boot")
+    scene.flags["journal_doubted"] = journal.doubted
+    journal.close()
+
+
+def refuses_its_configuration(scene: Scene) -> None:
+    scene.flags["config_refused"] = True
+
+
+def hands_over(scene: Scene) -> None:
+    sent_away(scene.driver)
+    scene.driver.consumer("huge").try_acquire(80 * GIB)
+    scene.numbers.wrote(0.001, failed=False)
+
+
+def is_drained(scene: Scene) -> None:
+    ops = scene.driver.consumer("ops")
+    request = scene.driver.next_request()
+    scene.driver.post(OperatorAsked(ops.client, request, "drain", "", "ops", "maintenance"))
+
+
+CAUSES: dict[str, Callable[[Scene], None]] = {
+    "VramArbiterDown": stops,
+    "VramGpuUnreadable": cannot_be_read,
+    "VramPressure": takes_what_it_was_not_given,
+    "VramStowaway": takes_what_it_was_not_given,
+    "VramWaiterStarving": waits_for_ever,
+    "VramVerificationFailed": frees_nothing,
+    "VramHolderSilent": is_silent,
+    "VramStaleToken": uses_an_old_token,
+    "VramOutOfMemory": runs_out_of_memory,
+    "VramJournalUnwritable": cannot_write,
+    "VramJournalDoubted": lost_its_journal,
+    "VramConfigRefused": refuses_its_configuration,
+    "VramDrained": is_drained,
+}
+
+
+type Pages = Mapping[str, tuple[promql.Scrape, promql.Scrape]]
+
+CONSTANT = {"vram_arbiter_build_info", "vram_arbiter_gpu_capacity_bytes"}
+OF_EVERY_PROCESS = {"process_cpu_time_seconds_total", "process_memory_usage_bytes"}
+"""A real runner exports them, in tests/runner/control/test_hardware_spans.py."""
+
+
 @pytest.fixture(scope="module")
-def exported() -> dict[str, set[str]]:
-    """Names of series → their labels, after a handover and a denial. Only metrics are on: there is
-    no tracer."""
-    registry = CollectorRegistry()
-    reader = PrometheusMetricReader(scope_info_enabled=False, registry=registry)
-    meters = MeterProvider([reader], shutdown_on_exit=False)
-    numbers = LeaseMetrics(meters.get_meter("test"))
-    telemetry = LeaseTelemetry(NoOpTracerProvider().get_tracer("test"), numbers)
-    driver = CoreDriver(8 * d.GIB)
-    sent_away(driver)
-    driver.consumer("huge").try_acquire(80 * d.GIB)
-    telemetry.outgoing(driver.effects)
-    for push in (effect for effect in driver.effects if isinstance(effect, Push)):
-        assert telemetry.revoke(push.body) == push.body, "no span of ours to name"
-    for note in (effect for effect in driver.effects if isinstance(effect, Note)):
-        event = {
-            "seq": 1,
-            "at_wall_s": 1.8e9,
-            **words.event(note),
-        }
-        assert telemetry.observe(note, event) == {}
-    numbers.wrote(0.001, failed=False)
-    figures = driver.arbiter.figures()
-    numbers.watch(NeverCalled(), lambda: figures)  # type: ignore[arg-type]
-    series: dict[str, set[str]] = {}
-    for family in text_string_to_metric_families(generate_latest(registry).decode()):
-        for sample in family.samples:
-            series.setdefault(sample.name, set()).update(sample.labels)
-    return series
+def pages(tmp_path_factory: pytest.TempPathFactory) -> Pages:
+    """Scrapes of an idle daemon, and of the same after each cause."""
+    found = {}
+    for name, cause in {**CAUSES, "a handover": hands_over}.items():
+        scene = Scene(tmp_path_factory.mktemp("journal"))
+        before = scene.page()
+        cause(scene)
+        found[name] = before, scene.page()
+    return found
 
 
-def expressions() -> list[str]:
-    panels = json.loads(DASHBOARD.read_text())["panels"]
-    return [target["expr"] for panel in panels for target in panel["targets"]]
-
-
-@pytest.mark.parametrize("expression", expressions())
-def test_every_curve_exists(expression: str, exported: dict[str, set[str]]) -> None:
-    known = set(re.findall(r"\bvram_\w+", expression))
-    names = {name for name in known if name in exported}
-    assert names, f"{known} is not exported: {sorted(exported)}"
-    labels = set().union(*(exported[name] for name in names))
-    assert known - names <= labels
-
-
-def test_every_metric_has_a_panel(exported: dict[str, set[str]]) -> None:
-    shown = " ".join(expressions())
-    own = {
-        re.sub(r"_(bucket|count|sum|total)$", "", name)
-        for name in exported
-        if name.startswith("vram_")
+@pytest.mark.parametrize("name", promql.alerts("vram-arbiter"))
+def test_an_alert_fires_after_its_cause_and_not_before(pages: Pages, name: str) -> None:
+    """Regression: `increase` does not count a series that begins at 1, so the first lost lease, or
+    the first failed verification, would have gone unseen."""
+    alert, (before, after) = promql.alerts("vram-arbiter")[name], pages[name]
+    assert not promql.fires(alert, before, before), "silent on an idle daemon"
+    assert promql.fires(alert, before, after), [
+        (str(one), promql.matched(one, before), promql.matched(one, after))
+        for one in promql.selectors(alert)
+    ]
+    assert not promql.fires(alert, *pages["a handover"]), "silent in daily work"
+    assert promql.grouped_by(alert) <= promql.TARGET_LABELS
+    labels = {
+        label
+        for one in promql.selectors(alert)
+        for key in promql.matched(one, before) | promql.matched(one, after)
+        for label, _ in key
     }
-    assert {name for name in own if name not in shown} == set()
+    assert promql.described("vram-arbiter")[name] <= labels, "in its texts"
 
 
-def test_the_operators_guide_names_the_metrics_that_there_are() -> None:
+def test_every_curve_exists_and_moves(pages: Pages) -> None:
+    every = [page for pair in pages.values() for page in pair]
+    assert promql.named_without_series("arbiter.json", every) == []
+    for text, expression in promql.panels("arbiter.json").items():
+        unknown = promql.unknown(expression, every)
+        assert not {one.removesuffix("{}") for one in unknown} - OF_EVERY_PROCESS, text
+        for selector in promql.selectors(expression):
+            if selector.name not in CONSTANT | OF_EVERY_PROCESS:
+                assert any(
+                    promql.matched(selector, before) != promql.matched(selector, after)
+                    for before, after in pages.values()
+                ), f"{selector} never moves"
+
+
+def test_every_metric_has_a_curve(pages: Pages) -> None:
+    shown = {
+        str(one.name).removesuffix("_bucket")
+        for expression in promql.panels("arbiter.json").values()
+        for one in promql.selectors(expression)
+    }
+    _, after = pages["a handover"]
+    assert {name for name in promql.metrics_of(after, "vram_") if name not in shown} == set()
+
+
+def test_names_and_units_follow_the_conventions(pages: Pages) -> None:
+    """Prometheus: base units and `_total` of counters in the name. OpenTelemetry: a namespace for
+    each program, a description for every metric."""
+    _, after = pages["a handover"]
+    for name in promql.metrics_of(after, "vram_"):
+        assert re.fullmatch(r"vram_arbiter(_[a-z]+)+", name), name
+    for name, (unit, description, bounds) in INSTRUMENTS.items():
+        assert re.match(r"(vram_(arbiter|runner|sidecar|reasoner)|process|gen_ai)\.", name)
+        assert unit in ("s", "By", "") or re.fullmatch(r"\{[a-z]+\}", unit), name
+        assert description[0].isupper() == (not description.startswith("1 ")), description
+        assert list(bounds) == sorted(set(bounds))
+        assert not name.endswith(".duration") or (unit == "s" and bounds), name
+    assert set(INSTRUMENTS) == {
+        value for key, value in vars(names).items() if key.startswith(("METRIC_", "GEN_AI_"))
+    }
+
+
+def test_the_reference_names_the_metrics_that_there_are() -> None:
     """A metric that is only written down makes an alert that never fires."""
-    documented = re.search(
-        r"^Metrics of the programs.*?(?=^\*\*Logs)", GUIDE.read_text(), re.M | re.S
-    )
-    assert documented
-    named = set(re.findall(r"`((?:vram|process)\.[a-z_.]+)`", documented[0]))
-    assert named == {value for key, value in vars(names).items() if key.startswith("METRIC_")}
+    named = set(re.findall(r"^\| `([a-z_.]+)`", GUIDE.read_text(), re.M))
+    assert named == set(INSTRUMENTS)

@@ -20,7 +20,7 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push
 from vram_arbiter.arbiter.host.telemetry import metrics as otel_metrics
 from vram_arbiter.arbiter.host.telemetry import spans as otel
-from vram_arbiter.arbiter.host.telemetry.metrics import OTHERS, LeaseMetrics
+from vram_arbiter.arbiter.host.telemetry.metrics import OTHERS, LeaseMetrics, Picture
 from vram_arbiter.arbiter.host.telemetry.spans import LeaseTelemetry
 from vram_arbiter.arbiter.host.telemetry.traced import Harmless
 from vram_arbiter.arbiter.rpc import words
@@ -219,7 +219,7 @@ def test_a_wait_that_ends_without_a_grant_ends_its_spans(
     assert [queue.name, acquire.name] == ["lease.queue", "lease.acquire"]
     word = "wait_timeout" if how == "timeout" else "cancelled"
     assert str(failed(acquire)).startswith(word)
-    assert heard.numbers("vram.lease.denials") == (
+    assert heard.numbers("vram_arbiter.lease.denials") == (
         {("wait_timeout",): 1} if how == "timeout" else {}
     )
     assert seconds(acquire) == pytest.approx(2.0 if how == "timeout" else 1.0, abs=0.01)
@@ -228,16 +228,19 @@ def test_a_wait_that_ends_without_a_grant_ends_its_spans(
     driver.advance(1.0)
     evict = heard.span("lease.evict")
     assert evict.context.trace_id == acquire.context.trace_id
-    assert heard.numbers("vram.evictions") == {("verified",): 1}
+    assert heard.numbers("vram_arbiter.lease.evictions") == {("verified",): 1}
 
 
 def test_what_is_refused_at_once_is_counted_once(driver: CoreDriver, heard: Listener) -> None:
     person = driver.consumer("huge")
     assert person.try_acquire(80 * GIB)
     held(driver, "det", 5, evictable=False)
-    assert heard.numbers("vram.lease.denials") == {("vram_insufficient",): 1}
+    assert heard.numbers("vram_arbiter.lease.denials") == {("vram_insufficient",): 1}
     person.try_acquire(1 * GIB, gpu="GPU-7")
-    assert heard.numbers("vram.lease.denials") == {("vram_insufficient",): 1, ("unknown_gpu",): 1}
+    assert heard.numbers("vram_arbiter.lease.denials") == {
+        ("vram_insufficient",): 1,
+        ("unknown_gpu",): 1,
+    }
 
 
 def test_what_is_refused_and_told_counts_once(driver: CoreDriver, heard: Listener) -> None:
@@ -245,7 +248,7 @@ def test_what_is_refused_and_told_counts_once(driver: CoreDriver, heard: Listene
     first.acquire(5 * GIB, gang=("g", 2))
     second.try_acquire(5 * GIB, gang=("g", 2))
     assert [note["code"] for note in driver.notes("denied")] == ["vram_insufficient"] * 2
-    assert heard.numbers("vram.lease.denials") == {("vram_insufficient",): 2}
+    assert heard.numbers("vram_arbiter.lease.denials") == {("vram_insufficient",): 2}
     assert {str(failed(span)).partition(":")[0] for span in heard.spans()} == {"vram_insufficient"}
 
 
@@ -262,7 +265,7 @@ def test_a_holder_that_dies_while_it_loads_fails_its_spans(
     assert str(failed(acquire)).startswith("lost: ")
     verify = heard.span("lease.verify")
     assert parent_of(verify) is None
-    assert heard.numbers("vram.evictions") == {}, "nobody asked it to leave"
+    assert heard.numbers("vram_arbiter.lease.evictions") == {}, "nobody asked it to leave"
 
 
 def test_a_victim_that_is_lost_fails_its_eviction(driver: CoreDriver, heard: Listener) -> None:
@@ -360,7 +363,7 @@ def test_an_unresolved_verdict_is_an_event_of_its_verification(
         ("vram.event.verdict", {"vram.verdict": "contested"})
     ]
     assert seconds(verify) == pytest.approx(15.0, abs=0.5)
-    assert heard.numbers("vram.evictions") == {("verified",): 1}
+    assert heard.numbers("vram_arbiter.lease.evictions") == {("verified",): 1}
 
 
 def test_a_bad_verdict_fails_the_verification(driver: CoreDriver, heard: Listener) -> None:
@@ -372,7 +375,7 @@ def test_a_bad_verdict_fails_the_verification(driver: CoreDriver, heard: Listene
     det.release(lease)
     driver.advance(11.0)
     assert failed(heard.span("lease.verify")) == "contested"
-    assert heard.numbers("vram.evictions") == {("contested",): 1}
+    assert heard.numbers("vram_arbiter.lease.evictions") == {("contested",): 1}
 
 
 def test_the_daemons_end_ends_every_span(driver: CoreDriver, heard: Listener) -> None:
@@ -502,7 +505,7 @@ def test_whatever_happens_spans_end_and_nest(busy: CoreDriver) -> None:
         else:
             assert span.name in ("lease.acquire", "lease.verify", "lease.evict")
     granted = [e for e in busy.effects if isinstance(e, Note) and e.kind == "granted"]
-    assert sum(heard.numbers("vram.lease.grants").values()) == len(granted) > 0
+    assert sum(heard.numbers("vram_arbiter.lease.grants").values()) == len(granted) > 0
 
 
 # -- numbers
@@ -515,12 +518,14 @@ def test_counts_and_times_of_a_handover(driver: CoreDriver, heard: Listener) -> 
     det.use_end(lease)
     det.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
-    assert heard.numbers("vram.lease.grants") == {("det",): 1, ("policy",): 1}
-    waits = heard.numbers("vram.lease.wait")
+    assert heard.numbers("vram_arbiter.lease.grants") == {("det",): 1, ("policy",): 1}
+    waits = heard.numbers("vram_arbiter.lease.wait.duration")
     assert waits[("det",)] == pytest.approx(0.0, abs=0.01)
     assert waits[("policy",)] == pytest.approx(2.0, abs=0.1)
-    assert heard.numbers("vram.handover")[("policy",)] == pytest.approx(2.0, abs=0.1)
-    assert heard.numbers("vram.evictions") == {("verified",): 1}
+    assert heard.numbers("vram_arbiter.handover.duration")[("policy",)] == pytest.approx(
+        2.0, abs=0.1
+    )
+    assert heard.numbers("vram_arbiter.lease.evictions") == {("verified",): 1}
 
 
 class Ticks:
@@ -551,26 +556,27 @@ def test_gauges_show_the_present_and_nothing_that_is_old(
 ) -> None:
     trusted = True
     held(driver, "det", 2)
-    heard.metrics.watch(ticks, lambda: driver.arbiter.figures() if trusted else None)
-    assert heard.numbers("vram.gpu.charged") == {("GPU-0", "det"): 2 * GIB}
-    assert heard.numbers("vram.gpu.measured") == {("GPU-0", "det"): 2 * GIB}
-    assert heard.numbers("vram.gpu.used") == {("GPU-0",): 2 * GIB}
-    assert heard.numbers("vram.gpu.capacity") == {("GPU-0",): 8 * GIB}
-    assert heard.numbers("vram.lease.waiters") == {(): 0}
+    heard.metrics.watch(ticks, lambda: Picture(driver.arbiter.figures()) if trusted else None)
+    assert heard.numbers("vram_arbiter.gpu.charged") == {("GPU-0", "det"): 2 * GIB}
+    assert heard.numbers("vram_arbiter.gpu.measured") == {("GPU-0", "det"): 2 * GIB}
+    assert heard.numbers("vram_arbiter.gpu.used") == {("GPU-0",): 2 * GIB}
+    assert heard.numbers("vram_arbiter.gpu.capacity") == {("GPU-0",): 8 * GIB}
+    assert heard.numbers("vram_arbiter.lease.waiters") == {(): 0}
     driver.consumer("policy").acquire(7 * GIB)
-    assert heard.numbers("vram.lease.waiters") == {(): 0}, "the loop looks once a second"
+    assert heard.numbers("vram_arbiter.lease.waiters") == {(): 0}, "the loop looks once a second"
     ticks.later.pop()()
-    assert heard.numbers("vram.lease.waiters") == {(): 1}
+    assert heard.numbers("vram_arbiter.lease.waiters") == {(): 1}
     driver.card.failing = "lost"
     driver.advance(1.1)
     ticks.later.pop()()
-    assert heard.numbers("vram.gpu.measured") == {}, "unknown is no number"
-    assert heard.numbers("vram.gpu.charged") == {("GPU-0", "det"): 2 * GIB}
+    assert heard.numbers("vram_arbiter.gpu.measured") == {}, "unknown is no number"
+    assert heard.numbers("vram_arbiter.gpu.charged") == {("GPU-0", "det"): 2 * GIB}
     heard.now += otel_metrics.PICTURE_MAX_AGE_S + 1.0
-    assert heard.numbers("vram.gpu.charged") == {}, "a stuck loop knows nothing of the present"
+    charged = heard.numbers("vram_arbiter.gpu.charged")
+    assert charged == {}, "a stuck loop knows nothing of the present"
     trusted = False
     ticks.later.pop()()
-    assert heard.numbers("vram.lease.waiters") == {}, "nor does an engine that failed"
+    assert heard.numbers("vram_arbiter.lease.waiters") == {}, "nor does an engine that failed"
     heard.metrics.close()
     assert ticks.later == []
 
@@ -582,12 +588,12 @@ def test_the_sum_over_consumers_is_what_the_gpu_holds(
     held(driver, "det", 2)
     driver.card.overhead_bytes = 300 * MIB
     driver.advance(1.1)
-    heard.metrics.watch(ticks, lambda: driver.arbiter.figures())  # type: ignore[arg-type]
-    by_consumer = heard.numbers("vram.gpu.measured")
+    heard.metrics.watch(ticks, lambda: Picture(driver.arbiter.figures()))  # type: ignore[arg-type]
+    by_consumer = heard.numbers("vram_arbiter.gpu.measured")
     assert ("GPU-0", "") not in by_consumer
     assert (
         sum(by_consumer.values())
-        == heard.numbers("vram.gpu.used")[("GPU-0",)]
+        == heard.numbers("vram_arbiter.gpu.used")[("GPU-0",)]
         == 2 * GIB + 300 * MIB
     )
 
@@ -595,17 +601,17 @@ def test_the_sum_over_consumers_is_what_the_gpu_holds(
 def test_the_health_of_the_daemon_in_numbers(
     driver: CoreDriver, heard: Listener, ticks: Ticks
 ) -> None:
-    heard.metrics.watch(ticks, lambda: driver.arbiter.figures())  # type: ignore[arg-type]
+    heard.metrics.watch(ticks, lambda: Picture(driver.arbiter.figures()))  # type: ignore[arg-type]
     heard.telemetry.wrote(0.002, failed=False)
     heard.telemetry.wrote(0.1, failed=True)
-    assert heard.numbers("vram.journal.healthy") == {(): 1}
-    assert heard.numbers("vram.journal.write")[()] == pytest.approx(0.102)
-    assert heard.numbers("vram.journal.failures") == {(): 1}
-    assert heard.numbers("vram.drained") == {(): 0}
-    assert heard.numbers("vram.gpu.pressure") == {("GPU-0",): 0}
-    assert set(heard.numbers("vram.build.info").values()) == {1}
+    assert heard.numbers("vram_arbiter.journal.healthy") == {(): 1}
+    assert heard.numbers("vram_arbiter.journal.write.duration")[()] == pytest.approx(0.102)
+    assert heard.numbers("vram_arbiter.journal.failures") == {(): 1}
+    assert heard.numbers("vram_arbiter.drained") == {(): 0}
+    assert heard.numbers("vram_arbiter.gpu.pressure") == {("GPU-0",): 0}
+    assert set(heard.numbers("vram_arbiter.build.info").values()) == {1}
     heard.now = driver.now + 3.0
-    assert heard.numbers("vram.gpu.reading_age")[("GPU-0",)] == pytest.approx(3.0, abs=0.1)
+    assert heard.numbers("vram_arbiter.gpu.reading_age")[("GPU-0",)] == pytest.approx(3.0, abs=0.1)
 
 
 def test_names_that_clients_invent_do_not_grow_the_metrics(
@@ -617,7 +623,7 @@ def test_names_that_clients_invent_do_not_grow_the_metrics(
         person.load(lease)
         person.unload(lease)
         driver.advance(0.1)
-    grants = heard.numbers("vram.lease.grants")
+    grants = heard.numbers("vram_arbiter.lease.grants")
     assert len(grants) == otel_metrics.CONSUMERS_MAX + 1
     assert grants[(OTHERS,)] == 5
 

@@ -65,8 +65,8 @@ t = o.set_up('robot', prometheus_port=0, attributes={'robot': 'a\\ud800'})
 half = 'half a pair: \\ud800'
 with tracing.span('good', attributes={'a': 'b'}):
     tracing.event(half, what=half)
-    meters.count('vram.goals', {'rskill.id': half})
-    meters.measure('vram.sidecar.load', 1.0, {'vram.model': half})
+    meters.count('vram_runner.goals', {'rskill.id': half})
+    meters.measure('vram_sidecar.load.duration', 1.0, {'vram.model': half})
 with tracing.span(half, attributes={half: half, 'long': 'x' * 5_000_000, 'big': 1 << 70}):
     pass
 try:
@@ -98,8 +98,8 @@ def test_half_a_surrogate_pair_costs_no_other_span_and_no_metric() -> None:
         assert len(odd.attributes["long"]) == TEXT_MAX_CHARS
         assert failed.status == f"OSError: {sent}"
         assert failed.events[0].attributes["exception.message"] == sent
-        (point,) = collector.points("vram.goals")
+        (point,) = collector.points("vram_runner.goals")
         assert point.attributes == {"rskill.id": sent}
-        assert 'vram_goals_total{rskill_id="half a pair: \\\\ud800"} 1.0' in result.stdout
+        assert 'vram_runner_goals_total{rskill_id="half a pair: \\\\ud800"} 1.0' in result.stdout
         assert 'robot="a\\\\ud800"' in result.stdout
         assert 'site="l\\\\udcfcbeck"' in result.stdout

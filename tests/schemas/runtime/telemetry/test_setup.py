@@ -222,7 +222,7 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
             ("vram.event.estop_requested", {"who": "operator"})
         ]
         assert {tick.service, goal.service} == {"vram-runner"}
-        (point,) = collector.points("vram.goals")
+        (point,) = collector.points("vram_runner.goals")
         assert (point.value, point.attributes, point.service) == (
             3,
             {"outcome": "succeeded"},
@@ -245,7 +245,7 @@ def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, ke
         assert {span.trace_id for span in collector.spans()} <= {"a" * 32}
         assert result.stdout.startswith(f"00-{'a' * 32}-"), "the chain is passed on, kept or not"
         collector.wait(
-            lambda: bool(collector.points("vram.goals")), "metrics, which are never sampled"
+            lambda: bool(collector.points("vram_runner.goals")), "metrics, which are never sampled"
         )
 
 
@@ -255,10 +255,9 @@ def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
         "import http.client, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.runtime.telemetry import names as n\n"
         "t = o.set_up('vram-arbiter', prometheus_port=0)\n"
-        "from opentelemetry import metrics\n"
-        "m = metrics.get_meter(n.TRACER)\n"
-        "m.create_counter(n.METRIC_GRANTS).add(2, {n.ATTR_CONSUMER: 'detector'})\n"
-        "m.create_histogram(n.METRIC_WAIT, unit='s').record(0.3)\n"
+        "from vram_arbiter.schemas.runtime.telemetry import meters\n"
+        "meters.count(n.METRIC_GRANTS, {n.ATTR_CONSUMER: 'detector'}, 2)\n"
+        "meters.measure(n.METRIC_WAIT, 0.3)\n"
         "c = http.client.HTTPConnection('127.0.0.1', t.prometheus_port, timeout=60)\n"
         "c.request('GET', '/metrics')\n"
         "print(c.getresponse().read().decode())\n"
@@ -270,9 +269,9 @@ def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
     )
     assert (result.returncode, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
-    assert 'vram_lease_grants_total{vram_consumer="detector"} 2.0' in lines
-    assert 'vram_lease_wait_seconds_bucket{le="0.25"} 0.0' in lines
-    assert 'vram_lease_wait_seconds_bucket{le="0.5"} 1.0' in lines
+    assert 'vram_arbiter_lease_grants_total{vram_consumer="detector"} 2.0' in lines
+    assert 'vram_arbiter_lease_wait_duration_seconds_bucket{le="0.25"} 0.0' in lines
+    assert 'vram_arbiter_lease_wait_duration_seconds_bucket{le="0.5"} 1.0' in lines
     assert any('service_name="vram-arbiter"' in line for line in lines)
     assert lines[-1] == "refused"
 
