@@ -158,8 +158,12 @@ class AsyncClient:
             traceparent: trace of the wait; None takes the current span's.
             fields: other fields of LeaseSpec, such as `priority`, `gpu` or `standby`.
 
-        Raises: WaitTimeout (details.why: what blocked), VramInsufficient, UnknownGpu, HolderBusy,
-            LimitExceeded, BadRequest; inside a use also WouldDeadlock (`clients.use_context`).
+        Raises:
+            WaitTimeout: it was not granted in time; details.why says what blocked.
+            VramInsufficient: it can never fit.
+            WouldDeadlock: the wait is for what a use of this process keeps.
+            VramError: UnknownGpu, HolderBusy, LimitExceeded or BadRequest.
+
         Canceling the caller gives the place in the queue, or the lease, back.
         """
         wanted = lease_spec(spec, self._name, vram, model, fields)
@@ -266,15 +270,23 @@ class AsyncClient:
             )
         )
 
-    async def status(self) -> StatusReply:
+    async def status(self, *, details: bool = False) -> StatusReply:
         """Return the state of everything, with the leases of all pages. A lease that moves
-        meanwhile is listed once, or not at all."""
-        first = page = await self._asked(StatusReply, "status")
+        meanwhile is listed once, or not at all.
+
+        `details`: with declared and measured bytes of each lease, and why each waiter waits.
+        """
+        asked: JsonMap = {"details": True} if details else {}
+        first = page = await self._asked(StatusReply, "status", asked)
         leases = {lease.lease_id: lease for lease in page.leases}
+        told = {detail.lease_id: detail for detail in page.details}
         while page.next is not None:
-            page = await self._asked(StatusReply, "status", {"after": page.next})
+            page = await self._asked(StatusReply, "status", {**asked, "after": page.next})
             leases |= {lease.lease_id: lease for lease in page.leases}
-        return replace(first, leases=tuple(leases.values()), next=None)
+            told |= {detail.lease_id: detail for detail in page.details}
+        return replace(
+            first, leases=tuple(leases.values()), details=tuple(told.values()), next=None
+        )
 
     async def why(self, consumer: str) -> WhyReply:
         """Return what blocks a consumer, by how many bytes, on which condition, and what

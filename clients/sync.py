@@ -398,9 +398,9 @@ class Client:
         """Send any request of `schemas.wire.requests` that has no method here."""
         return self._portal.call(self._client.ask, op, fields, timeout_s=timeout_s)
 
-    def status(self) -> StatusReply:
+    def status(self, *, details: bool = False) -> StatusReply:
         """Return the state of everything; see `AsyncClient.status`."""
-        return self._portal.call(self._client.status)
+        return self._portal.call(self._client.status, details=details)
 
     def why(self, consumer: str) -> WhyReply:
         """Return what blocks this consumer; see `AsyncClient.why`."""

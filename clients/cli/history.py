@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.clients.cli import arguments, text
-from vram_arbiter.clients.cli.replies import ENVELOPE, answer
+from vram_arbiter.clients.cli.replies import ENVELOPE, OK, answer
 from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.plain import JsonMap, Message
 
@@ -76,8 +76,8 @@ def since(written: str) -> float:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-_AGO = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)")
-_UNITS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+AGO = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)")
+UNITS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 
 def parse_since(written: str, now_wall_s: float) -> float:
@@ -86,14 +86,14 @@ def parse_since(written: str, now_wall_s: float) -> float:
 
     Raises ValueError that says what may be written.
     """
-    if ago := _AGO.fullmatch(written.strip()):
-        return now_wall_s - float(ago[1]) * _UNITS[ago[2]]
+    if ago := AGO.fullmatch(written.strip()):
+        return now_wall_s - float(ago[1]) * UNITS[ago[2]]
     if ":" in written and "-" not in written:  # a bare number is no time of day
         with contextlib.suppress(ValueError):
             clock = datetime.time.fromisoformat(written.strip())
             today = datetime.datetime.fromtimestamp(now_wall_s)
             at = datetime.datetime.combine(today.date(), clock).timestamp()
-            return at if at <= now_wall_s else at - _UNITS["d"]
+            return at if at <= now_wall_s else at - UNITS["d"]
     with contextlib.suppress(ValueError):
         return datetime.datetime.fromisoformat(written.strip()).timestamp()
     raise ValueError(f"expected 90s, 10m, 2h, 1d, 14:30 or '2026-11-21 14:30', got {written!r}")
@@ -143,7 +143,7 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 def collect(wanted: Wanted, endpoint: str | None) -> Message:
     """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises
     `Unreachable`."""
-    reply = _page(NEVER, 1, (), endpoint)
+    reply = page(NEVER, 1, (), endpoint)
     if not reply.get("ok"):
         return reply
     last_seq = int(reply.get("last_seq", 0))
@@ -162,7 +162,7 @@ def collect(wanted: Wanted, endpoint: str | None) -> Message:
 
 def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
     found: list[Any] = []
-    while (reply := _page(after, PAGE, wanted.kinds, endpoint)).get("ok"):
+    while (reply := page(after, PAGE, wanted.kinds, endpoint)).get("ok"):
         events = reply.get("events", [])
         found += [event for event in events if wanted.keeps(event)]
         if wanted.after is None:
@@ -173,26 +173,27 @@ def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
     return reply
 
 
-def _page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
+def page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
+    """Ask for the events after a number. Raises `Unreachable`."""
     return request.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)}, endpoint)
 
 
 def _start(wanted: Wanted, last_seq: int, endpoint: str | None) -> int:
     """A number before the first event that can be wanted."""
     if wanted.since_wall_s is not None:
-        return _before(wanted.since_wall_s, last_seq, endpoint)
+        return first_since(wanted.since_wall_s, last_seq, endpoint)
     if wanted.kinds or wanted.consumers:
         return 0
     # numbers have gaps: the start of the tail cannot be computed
     return max(0, last_seq - wanted.limit - GAP_MAX)
 
 
-def _before(wall_s: float, last_seq: int, endpoint: str | None) -> int:
+def first_since(wall_s: float, last_seq: int, endpoint: str | None) -> int:
     """By halves: a number not later than the first event since that time."""
     low, high = 0, last_seq
     while high - low > PAGE:
         middle = (low + high) // 2
-        events = _page(middle, 1, (), endpoint).get("events", [])
+        events = page(middle, 1, (), endpoint).get("events", [])
         if events and events[0]["at_wall_s"] < wall_s:
             low = middle
         else:
@@ -207,6 +208,8 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
     Raises ArbiterUnreachable if no arbiter answers at first.
     """
     from vram_arbiter.clients.client import AsyncClient
+    from vram_arbiter.clients.feed import Cursor
+    from vram_arbiter.clients.feed import follow as feed
 
     def tell(event: JsonMap) -> None:
         if wanted.keeps(event):
@@ -215,35 +218,17 @@ async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None 
     client = AsyncClient(
         "vramctl history", endpoint=endpoint, role="observer", connect_timeout_s=request.TIMEOUT_S
     )
-    live: asyncio.Queue[Message] = asyncio.Queue()
-
-    async def listen() -> None:
-        async for event in client.subscribe():
-            live.put_nowait(dict(event))
-
     async with client:
-        listening = asyncio.create_task(listen())
-        try:
-            await asyncio.sleep(
-                0
-            )  # the subscription is on its way, so nothing falls between it and the past
-            await client.ping()
-            past = await asyncio.to_thread(collect, wanted, client.endpoint)
-            last = int(past.get("last_seq", 0))
-            known_wall_s = time.time()  # whatever happened before has a number up to `last`
-            for event in past.get("events", []):
-                tell(event)
-            while True:
-                event = await live.get()
-                if event["seq"] <= last and event["at_wall_s"] > known_wall_s:
-                    last = 0  # the arbiter began a new history: its numbers start at 1 again
-                if event["seq"] > last + 1:  # the arbiter was away, or we were slow
-                    missed = await client.history(last, PAGE)
-                    for older in missed.events:
-                        if last < older["seq"] < event["seq"]:
-                            tell(older)
-                if event["seq"] > last:
-                    last, known_wall_s = event["seq"], max(known_wall_s, event["at_wall_s"])
-                    tell(event)
-        finally:
-            listening.cancel()
+        newest = await client.history(NEVER, 1)  # whatever comes later is followed
+        past = await asyncio.to_thread(collect, wanted, client.endpoint)
+        told = 0
+        for event in past.get("events", []):
+            tell(event)
+            told = event["seq"]
+        cursor = Cursor({newest.numbering: newest.last_seq})
+        async with contextlib.aclosing(feed(client, cursor)) as batches:
+            async for events in batches:
+                for event in events:
+                    if event["seq"] > told or cursor.numbering != newest.numbering:
+                        tell(event)
+    return OK

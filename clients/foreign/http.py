@@ -8,8 +8,8 @@ environment, so that a request goes to the named host and nowhere else.
 import http.client
 import ipaddress
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
@@ -25,14 +25,24 @@ SHOWN_MAX_CHARS: Final = 200
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request. `body`: JSON as text; "" for none."""
+    """One request. `body`: JSON as text; "" for none. `headers`: beside those of the body."""
 
     url: str
     method: str = "POST"
     body: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.method} {self.url}"
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """One answer. `headers`: names in lower case."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
 
 
 def checked_url(url: str, *, remote: bool) -> str:
@@ -62,12 +72,13 @@ def _is_here(host: str) -> bool:
         return host == "localhost"
 
 
-def answer(request: Request, deadline: Deadline) -> tuple[int, bytes]:
-    """Return the status and the body. Raises ActionFailed where there is no answer in time."""
+def answer(request: Request, deadline: Deadline) -> Reply:
+    """Return the answer. Raises ActionFailed where there is none in time."""
     parts = urlsplit(request.url)
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
     target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
     headers = {"Content-Type": "application/json"} if request.body else {}
+    headers |= request.headers
     assert parts.hostname is not None, f"{request.url} was not checked"
     connection = kind(parts.hostname, parts.port, timeout=deadline.left_s(str(request)))
     try:
@@ -90,19 +101,19 @@ def answer(request: Request, deadline: Deadline) -> tuple[int, bytes]:
         ) from error
     finally:
         connection.close()
-    return reply.status, body
+    return Reply(reply.status, {key.lower(): value for key, value in reply.getheaders()}, body)
 
 
 def call(request: Request, deadline: Deadline) -> bytes:
     """Return the body of a success. Raises ActionFailed for any other status than 2xx."""
-    status, body = answer(request, deadline)
-    if not 200 <= status < 300:
-        told = printable(body.decode(errors="replace"))[:SHOWN_MAX_CHARS]
+    reply = answer(request, deadline)
+    if not 200 <= reply.status < 300:
+        told = printable(reply.body.decode(errors="replace"))[:SHOWN_MAX_CHARS]
         raise ActionFailed(
-            f"{request}: answered {status}" + (f": {told}" if told else ""),
-            details={"status": status, "url": request.url},
+            f"{request}: answered {reply.status}" + (f": {told}" if told else ""),
+            details={"status": reply.status, "url": request.url},
         )
-    return body
+    return reply.body
 
 
 def call_json(request: Request, deadline: Deadline) -> object:

@@ -137,13 +137,13 @@ class LlamaCpp(Server):
         busy = 0
         for model in self._models(deadline, lambda status: status == "loaded"):
             request = self._get(f"/slots?model={quote(model, safe='')}")
-            status, body = answer(request, deadline)
-            if status != 200:
+            reply = answer(request, deadline)
+            if reply.status != 200:
                 return None  # --no-slots
             try:
-                slots = json.loads(body)
+                slots = json.loads(reply.body)
             except ValueError as error:
-                raise ActionFailed(f"{request}: expected JSON, got {body[:40]!r}") from error
+                raise ActionFailed(f"{request}: expected JSON, got {reply.body[:40]!r}") from error
             busy += sum(bool(slot.get("is_processing")) for slot in slots)
         return busy
 

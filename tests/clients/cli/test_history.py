@@ -201,16 +201,9 @@ def test_following_goes_on_after_a_restart_with_a_new_history(
         for path in arbiter.state.glob("*"):
             path.unlink() if path.is_file() else shutil.rmtree(path)
         arbiter.start()
-        while process.poll() is None and not arbiter_has_two_clients(arbiter):
-            pass
+        # perhaps before the follower is back
         assert vramctl("drain", "-r", "after", environ=arbiter.environ).returncode == 0
         assert json.loads(output.readline())["reason"] == "after"
     finally:
         process.kill()
         process.wait()
-
-
-def arbiter_has_two_clients(arbiter: ArbiterProcess) -> bool:
-    """The follower has come back."""
-    clients = json.loads(vramctl("status", "--json", environ=arbiter.environ).stdout)["clients"]
-    return int(clients) >= 2
