@@ -1,0 +1,240 @@
+"""Screen and keys of `vramctl top`, on Textual."""
+
+import time
+from typing import ClassVar
+
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.events import Resize
+from textual.widgets import Input, Static
+
+from vram_arbiter.clients.cli.text import duration, plural
+from vram_arbiter.clients.cli.top import gpus
+from vram_arbiter.clients.cli.top.dialogs import Confirm, Help
+from vram_arbiter.clients.cli.top.feed import Feed, Order
+from vram_arbiter.clients.cli.top.gpus import Samples
+from vram_arbiter.clients.cli.top.leases import Leases
+from vram_arbiter.clients.cli.top.rows import ORDERS, Row, Table, arranged, fitted, rows_of
+from vram_arbiter.schemas.runtime.printable import printable
+
+TICK_S = 1.0
+"""Between two redraws without news: ages are shown in seconds."""
+SAID_S = 8.0
+"""For so long the outcome of an order is shown in the last line."""
+
+
+class Top(App[None]):
+    """The live view. Orders need a confirmation."""
+
+    CSS = """
+    Screen { layout: vertical; }
+    #head, #gpus, #titles, #selected, #events, #keys { height: auto; }
+    #titles { text-style: bold underline; }
+    #selected, #events { border-top: solid $panel; }
+    Leases { height: 1fr; min-height: 3; scrollbar-size-vertical: 1; overflow-x: hidden; }
+    #filter { display: none; height: 1; border: none; padding: 0; }
+    #filter.shown { display: block; }
+    """
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q,ctrl+c", "quit", "quit", priority=False),
+        Binding("s", "sort(1)", "sort"),
+        Binding("S", "sort(-1)", "sort back"),
+        Binding("slash", "filter", "filter"),
+        Binding("e", "evict", "evict"),
+        Binding("p", "pin", "pin"),
+        Binding("d", "drain", "drain"),
+        Binding("question_mark", "help", "keys"),
+    ]
+
+    def __init__(self, feed: Feed) -> None:
+        super().__init__(ansi_color=True)  # the terminal's own colors; none at all with NO_COLOR
+        self._feed = feed
+        self._order = "queue"
+        self._wanted = ""
+        self._said: tuple[float, str, str] = (0.0, "", "")  # until, what, style
+
+    def compose(self) -> ComposeResult:
+        yield Static(id="head")
+        yield Static(id="gpus")
+        yield Static(id="titles")
+        yield Leases()
+        what = "consumer, model, lease, state or GPU"
+        yield Input(id="filter", placeholder=what, compact=True, select_on_focus=False)
+        yield Static(id="selected")
+        yield Static(id="events")
+        yield Static(id="keys")
+
+    def on_mount(self) -> None:
+        self.query_one(Leases).focus()
+        self._feed.changed = self.show
+        self.run_worker(self._feed.run(), exit_on_error=True)
+        self.set_interval(TICK_S, self.show)
+        self.show()
+
+    def on_resize(self, event: Resize) -> None:
+        self.call_after_refresh(self.show)
+
+    def on_leases_moved(self) -> None:
+        self._show_selected()
+
+    # -- drawing
+    def show(self) -> None:
+        """Draw what the feed knows."""
+        if not self.is_running or not self.screen_stack:
+            return
+        base, feed, width = self.screen_stack[0], self._feed, self.size.width
+        status, lost_s = feed.status, feed.lost_s
+        base.query_one("#head", Static).update(self._head(lost_s))
+        base.query_one("#keys", Static).update(self._keys())
+        if status is None:
+            return
+        samples = [feed.samples.get(gpu.gpu, Samples()) for gpu in status.gpus]
+        panel = gpus.panel(status, samples, width, self.size.height)
+        base.query_one("#gpus", Static).update(Text("\n".join(panel), no_wrap=True))
+        table = Table(width - 1)  # the last column is the scroll bar's
+        rows = arranged(rows_of(status), self._order, self._wanted)
+        base.query_one("#titles", Static).update(Text(table.head(), no_wrap=True))
+        base.query_one(Leases).show(rows, table)
+        self._show_selected()
+        most = 1 if self.size.height <= 24 else 1 + (self.size.height - 24) // 3
+        shown = Text("\n".join(fitted(line, width) for line in list(feed.events)[-most:]))
+        base.query_one("#events", Static).update(shown)
+
+    def _head(self, lost_s: float | None) -> Text:
+        feed, width = self._feed, self.size.width
+        shown = Text(no_wrap=True, overflow="ellipsis")
+        if lost_s is not None:
+            since = f"the arbiter cannot be reached, since {lost_s:.0f} s"
+            shown.append(f"{since}; what it said last:" if width >= 70 else since, "bold red")
+        elif feed.status is None:
+            shown.append("waiting for the arbiter's first answer")
+        else:
+            roles = {None: "observer", "": "operator"}
+            shown.append(gpus.header(feed.status, roles.get(feed.refusal, "observer"), width))
+        for line in [] if feed.status is None else gpus.notices(feed.status):
+            shown.append(f"\n{fitted(line, width)}", "bold yellow")
+        return shown
+
+    def _show_selected(self) -> None:
+        base = self.screen_stack[0]
+        row, height = base.query_one(Leases).row, self.size.height
+        lines = gpus.selected_lines(row, self.size.width, 2 if height <= 24 else 4)
+        if row is None and self._feed.status is not None:
+            known = self._feed.status.leases
+            lines = [f"no lease matches {printable(self._wanted)!r}" if known else "no leases"]
+        base.query_one("#selected", Static).update(Text("\n".join(lines), no_wrap=True))
+
+    def _keys(self) -> Text:
+        until, said, style = self._said
+        if time.monotonic() < until:
+            return Text(said, style=style)
+        shown = Text(no_wrap=True, overflow="ellipsis")
+        refused = bool(self._feed.refusal)
+        drained = self._feed.status is not None and bool(self._feed.status.drained)
+        order = self._order if self.size.width >= 70 else ""
+        for key, what in (("s", f"sort {order}".rstrip()), ("/", "filter")):
+            shown.append(f"{key} ", "bold").append(f"{what}  ")
+        names = (("e", "evict"), ("p", "pin"), ("d", "resume" if drained else "drain"))
+        if refused:
+            shown.append("e p d: operators only  ", "dim")
+        else:
+            for key, what in names:
+                shown.append(f"{key} ", "bold").append(f"{what}  ")
+        for key, what in (("?", "keys"), ("q", "quit")):
+            shown.append(f"{key} ", "bold").append(f"{what}  ")
+        if self._wanted and self.size.width >= 70:
+            shown.append(f"filter: {printable(self._wanted)}", "bold yellow")
+        return shown
+
+    def _say(self, said: str, style: str) -> None:
+        self._said = (time.monotonic() + SAID_S, said, style)
+        self.show()
+
+    # -- keys
+    def action_sort(self, by: int) -> None:
+        names = list(ORDERS)
+        self._order = names[(names.index(self._order) + by) % len(names)]
+        self._say(f"sorted by {self._order}", "bold")
+
+    def action_filter(self) -> None:
+        field = self.query_one("#filter", Input)
+        field.add_class("shown")
+        field.focus()
+
+    def on_input_changed(self, event: Input.Changed) -> None:
+        if event.input.id == "filter":
+            self._wanted = event.value
+            self.show()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        if event.input.id == "filter":
+            self._close_filter()
+
+    def key_escape(self) -> None:
+        if len(self.screen_stack) == 1:
+            self.query_one("#filter", Input).value = ""
+            self._close_filter()
+
+    def _close_filter(self) -> None:
+        self.query_one("#filter", Input).remove_class("shown")
+        self.query_one(Leases).focus()
+
+    def action_help(self) -> None:
+        self.push_screen(Help(self._feed.refusal))
+
+    def action_evict(self) -> None:
+        if (row := self._selected()) is not None:
+            uses = row.lease.uses
+            then = f"It finishes {plural(uses, 'use')} first." if uses else "It is idle."
+            self._ask(Order("evict", row.lease.lease_id), f"Evict {_name(row)}? {then}", "Evict")
+
+    def action_pin(self) -> None:
+        if (row := self._selected()) is None:
+            return
+        if row.lease.pinned:
+            question = f"Unpin {_name(row)}, pinned by {row.lease.pinned}?"
+            self._ask(Order("unpin", row.lease.lease_id), question, "Unpin")
+        else:
+            question = f"Pin {_name(row)}? It is not evicted until it is unpinned."
+            self._ask(Order("pin", row.lease.lease_id), question, "Pin")
+
+    def action_drain(self) -> None:
+        status = self._feed.status
+        if status is not None and status.drained:
+            question = f"Resume? Drained by {status.drained}."
+            self._ask(Order("resume"), question, "Resume")
+        else:
+            question = "Drain? Nothing new is granted until it is resumed; holders keep theirs."
+            self._ask(Order("drain"), question, "Drain")
+
+    def _selected(self) -> Row | None:
+        row = self.query_one(Leases).row
+        if row is None:
+            self._say("no lease is selected", "bold yellow")
+        return row
+
+    def _ask(self, order: Order, question: str, yes: str) -> None:
+        """Ask for a confirmation. One that is not allowed to operate is told so by the arbiter."""
+        if self._feed.refusal:
+            self._say(self._feed.refusal, "bold red")
+            return
+
+        def answered(reason: str | None) -> None:
+            if reason is None:
+                self._say(f"not done: {order.action}", "bold")
+            else:
+                self.run_worker(self._send(Order(order.action, order.target, reason)))
+
+        self.push_screen(Confirm(printable(question), yes), answered)
+
+    async def _send(self, order: Order) -> None:
+        self._say(f"{order.action}: sent", "bold")
+        done, said = await self._feed.order(order)
+        self._say(said, "bold green" if done else "bold red")
+
+
+def _name(row: Row) -> str:
+    since = duration(row.since_s)
+    return f"{row.lease.consumer} ({row.lease.lease_id}), {row.lease.state} for {since}"
