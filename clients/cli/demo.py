@@ -42,6 +42,7 @@ from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.units import parse_bytes
+from vram_arbiter.schemas.urls import HttpAddress, http_address
 
 DESCRIPTIONS = {
     "demo": "Run find, navigate, grab on a simulated SO-101 inside an 8 GiB GPU budget. Exits 0 if "
@@ -90,11 +91,27 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         help="fake:SIZE, or nvml on a machine with an NVIDIA GPU (default: %(default)s)",
     )
     parser.add_argument(
+        "--http",
+        metavar="ADDRESS:PORT",
+        type=_address,
+        help="serve the arbiter's status page meanwhile, e.g. on 9870",
+    )
+    parser.add_argument(
         "--out",
         type=Path,
         default=Path("out/demo"),
         help="folder for summary.json, timeline.png, episode.mp4 and logs (default: %(default)s)",
     )
+
+
+def _address(text: str) -> HttpAddress:
+    try:
+        found = http_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    if not found.loopback or not found.port:
+        raise argparse.ArgumentTypeError(f"expected a port of loopback such as 9870, got {found}")
+    return found
 
 
 def run(args: argparse.Namespace) -> int:
@@ -110,17 +127,21 @@ def run(args: argparse.Namespace) -> int:
             "without the arbiter no program reads a real GPU; use --gpu fake:8GiB with --arbiter "
             "off"
         )
+    if args.http is not None and not arbiter:
+        args.parser.error("the status page is the arbiter's; leave --http or --arbiter off out")
     packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
     need("the demo", *packages, extra="all")
     out: Path = args.out
-    summary = asyncio.run(_demo(args.seed, arbiter, args.gpu, out))
+    summary = asyncio.run(_demo(args.seed, arbiter, args.gpu, args.http, out))
     print(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
     print(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
     oom = summary["oom_events"] > 0
     return 0 if (summary["completed"] and not oom if arbiter else oom) else 1
 
 
-async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> JsonObject:
+async def _demo(
+    seed: int, arbiter: bool, gpu: str, http: HttpAddress | None, out: Path
+) -> JsonObject:
     shutil.rmtree(out, ignore_errors=True)
     (out / "logs").mkdir(parents=True)
     runtime = Path(
@@ -132,7 +153,9 @@ async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> JsonObject:
             {RUNTIME_VARIABLE: str(runtime), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"},
         )
         try:
-            return await _episode(programs, runtime, seed=seed, arbiter=arbiter, gpu=gpu, out=out)
+            return await _episode(
+                programs, runtime, seed=seed, arbiter=arbiter, gpu=gpu, http=http, out=out
+            )
         finally:
             await programs.stop_all()
     finally:
@@ -140,7 +163,14 @@ async def _demo(seed: int, arbiter: bool, gpu: str, out: Path) -> JsonObject:
 
 
 async def _episode(
-    programs: Programs, runtime: Path, *, seed: int, arbiter: bool, gpu: str, out: Path
+    programs: Programs,
+    runtime: Path,
+    *,
+    seed: int,
+    arbiter: bool,
+    gpu: str,
+    http: HttpAddress | None,
+    out: Path,
 ) -> JsonObject:
     card = runtime / "fakegpu"
     if gpu.startswith("fake:"):
@@ -149,7 +179,15 @@ async def _episode(
     async with contextlib.AsyncExitStack() as stack:
         runner = await stack.enter_async_context(RunnerClient(f"ipc://{runtime}/runner.sock"))
         client = await _boot(
-            programs, runtime, runner, stack, seed=seed, arbiter=arbiter, gpu=gpu, out=out
+            programs,
+            runtime,
+            runner,
+            stack,
+            seed=seed,
+            arbiter=arbiter,
+            gpu=gpu,
+            http=http,
+            out=out,
         )
         target = (await runner.ground_truth())["target"]
         task = f"grab the {target}"
@@ -210,6 +248,7 @@ async def _boot(
     seed: int,
     arbiter: bool,
     gpu: str,
+    http: HttpAddress | None,
     out: Path,
 ) -> AsyncClient | None:
     """Start everything and wait until each answers. The arbiter's client, if there is an
@@ -218,6 +257,8 @@ async def _boot(
         f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take "
         "a while) …"
     )
+    if arbiter:
+        print(f"live in another terminal: vramctl top --endpoint ipc://{runtime}/arbiter.sock")
     without = [] if arbiter else ["--no-arbiter"]
     client = None
     if arbiter:
@@ -225,8 +266,11 @@ async def _boot(
         config = runtime / "arbiter.yaml"
         # a larger real card is budgeted like the small one
         config.write_text(f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n')
-        await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config))
+        page = [] if http is None else ["--http", str(http)]
+        await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config), *page)
         client = await stack.enter_async_context(_arbiter_client(runtime))
+        if http is not None:
+            print(f"status page: http://{http}")
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
     for name, rskill in SIDECARS.items():
         manifest = str(configs_folder(os.environ) / "rskills" / rskill / "rskill.yaml")

@@ -9,13 +9,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.clients.cli.timeline.command import write
+from vram_arbiter.clients.cli.timeline.reader import Reader
+from vram_arbiter.clients.cli.timeline.story import Mark, within
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
-from vram_arbiter.schemas.units import format_bytes
 
 SPLIT = ("wait_ms", "drain_ms", "unload_ms", "verify_ms", "load_ms", "total_ms")
-COLOURS = {"detector": "#d1495b", "scene-vlm": "#3d7ea6", "grab": "#5b8c5a"}
-OTHER_COLOUR = "#8d8d8d"
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,64 +131,22 @@ def draw_timeline(
     wall_offset_s: float,
     title: str,
 ) -> None:
-    """Stacked bytes per program over seconds since the start; capacity as a line; evictions and
-    refusals marked."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    names = [name for name in COLOURS if any(point.name == name for point in story.points)]
-    names += sorted({point.name for point in story.points} - set(names))
-    times, stacks = _stacks(story.points, names, start_s)
-    figure, axes = pyplot.subplots(figsize=(11, 4.2), layout="constrained")
-    if times:
-        colours = [COLOURS.get(name, OTHER_COLOUR) for name in names]
-        axes.stackplot(times, stacks, step="post", labels=names, colors=colours, alpha=0.85)
-    axes.axhline(capacity_bytes / GIB, color="black", linewidth=1.2)
-    axes.annotate(f"capacity {format_bytes(capacity_bytes)}", (0.005, capacity_bytes / GIB),
-    xycoords=("axes fraction", "data"),
-                  xytext=(0, 3), textcoords="offset points", fontsize=8)  # fmt: skip
+    """Draw the bytes of each program since the start as `vramctl timeline` does; each refused
+    allocation is a moment."""
+    begin_s = start_s + wall_offset_s
+    gpu = next((str(event["gpu"]) for event in events if event.get("gpu")), "GPU")
+    reader = Reader(begin_s)
+    held = reader.gpu(gpu, "GPU", capacity_bytes, 0).held
+    ends = [begin_s + 1.0]
+    for point in sorted(story.points, key=lambda point: point.at_s):
+        at_s = point.at_s + wall_offset_s
+        held.setdefault(point.name, []).append((at_s, point.held_bytes))
+        ends.append(at_s)
     for event in events:
-        at_s = event["at_wall_s"] - wall_offset_s - start_s
-        if event["kind"] == "revoke_asked":
-            axes.axvline(at_s, color="#333333", linestyle=":", linewidth=1)
-            axes.annotate(
-                f"evict {event.get('consumer', '')}",
-                (at_s, capacity_bytes / GIB * 1.08),
-                rotation=30,
-                fontsize=8,
-            )
+        if event["kind"] != "oom":  # the card's log has them all
+            reader.event(event)
+            ends.append(event["at_wall_s"])
     for at_s in story.refused_at_s:
-        axes.plot(
-            [at_s - start_s],
-            [capacity_bytes / GIB],
-            marker="x",
-            color="#d00000",
-            markersize=11,
-            markeredgewidth=3,
-        )
-    axes.set(
-        xlabel="seconds",
-        ylabel="GiB on the GPU",
-        ylim=(0, capacity_bytes / GIB * 1.25),
-        title=title,
-    )
-    if times:
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
-
-
-def _stacks(
-    points: Sequence[Point], names: Sequence[str], start_s: float
-) -> tuple[list[float], list[list[float]]]:
-    held = dict.fromkeys(names, 0)
-    times: list[float] = []
-    stacks: list[list[float]] = [[] for _ in names]
-    for point in sorted(points, key=lambda point: point.at_s):
-        held[point.name] = point.held_bytes
-        times.append(point.at_s - start_s)
-        for stack, name in zip(stacks, names, strict=True):
-            stack.append(held[name] / GIB)
-    return times, stacks
+        reader.mark(Mark(at_s + wall_offset_s, "oom", "out of memory", gpu))
+    story_told = reader.story(max(ends))
+    write(path, within(story_told, story_told.first_s, story_told.end_s), title)

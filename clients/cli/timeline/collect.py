@@ -1,0 +1,205 @@
+"""Events for a timeline: from the daemon's history over its socket, or from an event log.
+
+A lease that was granted before the asked range is found in earlier pages of the history. An event
+log is read by the arbiter's own program, which clients never import.
+"""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vram_arbiter.clients.cli import history
+from vram_arbiter.clients.cli.history import NEVER
+from vram_arbiter.clients.cli.offline import LABORATORY
+from vram_arbiter.clients.cli.status import all_pages
+from vram_arbiter.clients.cli.timeline.reader import Reader
+from vram_arbiter.clients.cli.timeline.story import Story, within
+from vram_arbiter.clients.net.request import Unreachable
+from vram_arbiter.schemas.codec import from_map
+from vram_arbiter.schemas.defaults import RESERVE_BYTES
+from vram_arbiter.schemas.errors import ArbiterUnreachable, OperatorError, from_wire
+from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.views import LeaseView
+
+SIZES = ("granted", "ready", "resized", "verified", "released", "standby", "parked", "queued")
+"""Kinds of events that tell the bytes and the GPU of a lease; of earlier times no others count."""
+BACK = 8
+"""By this factor the look back grows until every lease's beginning is found."""
+
+
+class EmptyTimeline(OperatorError):
+    """Nothing happened in the range that was asked for."""
+
+    code = "empty_timeline"
+
+
+class HistoryUnreadable(OperatorError):
+    """The daemon cannot read its own history now."""
+
+    code = "history_unreadable"
+
+
+class BadEventLog(OperatorError):
+    """An event log that cannot be read; the message says which file and line."""
+
+    code = "bad_log"
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Which part of the events: since a wall time, or the last seconds before their end."""
+
+    since_wall_s: float | None = None
+    last_s: float | None = None
+
+    def begin_s(self, end_s: float, first_s: float) -> float:
+        """Return where it begins; with neither, at the first event."""
+        if self.since_wall_s is not None:
+            return self.since_wall_s
+        return first_s if self.last_s is None else end_s - self.last_s
+
+
+def from_history(wanted: Range, endpoint: str | None) -> Story:
+    """Read the history of a running daemon. Raises EmptyTimeline, ArbiterUnreachable, and what the
+    arbiter refuses."""
+    try:
+        return _from_history(wanted, endpoint)
+    except Unreachable as error:
+        raise ArbiterUnreachable(str(error), hint=error.hint) from error
+
+
+def _from_history(wanted: Range, endpoint: str | None) -> Story:
+    begin = wanted.begin_s(time.time(), 0.0)
+    last_seq = int(_checked(history.page(NEVER, 1, (), endpoint))["last_seq"])
+    start = history.first_since(begin, last_seq, endpoint)
+    events = [one for one in _events(start, NEVER, (), endpoint) if one["at_wall_s"] >= begin]
+    status = from_map(StatusReply, _checked(all_pages("status", {}, endpoint)))
+    end = time.time()
+    earlier = _earlier(events, status.leases, begin, last_seq, endpoint)
+    if not events and not status.leases:
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(begin))
+        raise EmptyTimeline(
+            f"nothing happened since {since}, and no lease is held",
+            hint="ask for a longer time with --last or --since",
+        )
+    reader = Reader(begin)
+    for gpu in status.gpus:
+        title = f"GPU {gpu.index} {gpu.name}"
+        reader.gpu(gpu.gpu, title, gpu.capacity_bytes, gpu.reserve_bytes)
+        if gpu.measured_used_bytes is not None:
+            reader.reading(end - (gpu.sample_age_s or 0.0), gpu.gpu, gpu.measured_used_bytes)
+    for event in [*earlier, *events]:
+        reader.event(event)
+    reader.snapshot(end, status.leases)
+    story = reader.story(end, status.problems)
+    return within(story, max(begin, story.first_s), end)
+
+
+def _earlier(
+    events: Sequence[JsonMap],
+    leases: Sequence[LeaseView],
+    begin_s: float,
+    last_seq: int,
+    endpoint: str | None,
+) -> list[JsonMap]:
+    """Return events before the range that tell the size of leases whose grant is not in it."""
+    begun = {one["lease_id"] for one in events if one["kind"] in ("queued", "granted")}
+    told = {one["lease_id"] for one in events if one.get("lease_id")}
+    unknown = (told | {lease.lease_id for lease in leases}) - begun
+    first = int(events[0]["seq"]) if events else last_seq + 1
+    back, found = history.PAGE, list[JsonMap]()
+    while unknown and first > 1:
+        after = max(0, first - 1 - back)
+        found = [
+            one for one in _events(after, first, SIZES, endpoint) if one.get("lease_id") in unknown
+        ]
+        if not after or unknown <= {one["lease_id"] for one in found if one["kind"] == "granted"}:
+            break
+        back *= BACK
+    return [one for one in found if one["at_wall_s"] <= begin_s]
+
+
+def _events(
+    after: int, before: int, kinds: Sequence[str], endpoint: str | None
+) -> Iterator[JsonMap]:
+    """Yield the events with numbers between two."""
+    while True:
+        events = _checked(history.page(after, history.PAGE, kinds, endpoint))["events"]
+        yield from (event for event in events if event["seq"] < before)
+        if len(events) < history.PAGE or events[-1]["seq"] >= before:
+            return
+        after = events[-1]["seq"]
+
+
+def _checked(reply: Message) -> Message:
+    """Raise the arbiter's error, or a history that cannot be read, as an error."""
+    if not reply.get("ok"):
+        raise from_wire(reply["error"])
+    if reply.get("problem"):
+        raise HistoryUnreadable(reply["problem"], hint="look at the daemon's log and its disk")
+    return reply
+
+
+# -- event log
+def from_log(log: Path, wanted: Range) -> Story:
+    """Read an event log. Raises BadEventLog for one that is damaged, EmptyTimeline for one without
+    events, and for a range outside it."""
+    told = read_log(log)
+    try:
+        return story_of(told, wanted)
+    except (KeyError, TypeError, ValueError) as error:
+        raise _unread(log, f"{type(error).__name__}: {error}") from error
+
+
+def read_log(log: Path) -> JsonMap:
+    """Have the arbiter's program read a log. Raises BadEventLog."""
+    done = subprocess.run(
+        [sys.executable, "-m", LABORATORY, "story", "--json", str(log)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    try:
+        told: Message = json.loads(done.stdout)
+    except ValueError as error:
+        raise _unread(log, f"the reader ended with {done.returncode}") from error
+    if "error" in told:
+        raise BadEventLog(told["error"]["message"], hint=told["error"]["hint"])
+    return told
+
+
+def _unread(log: Path, problem: str) -> BadEventLog:
+    hint = "`vramctl replay` says what is wrong with it"
+    return BadEventLog(f"{log} cannot be read: {problem}", hint=hint)
+
+
+def story_of(told: JsonMap, wanted: Range) -> Story:
+    """Make the story of what `read_log` returned. Raises EmptyTimeline."""
+    events, end = told["events"], float(told["end_wall_s"])
+    if not events and not any(snapshot["leases"] for snapshot in told["snapshots"]):
+        raise EmptyTimeline("the event log holds no events", hint="give the log of a longer run")
+    begin = max(wanted.begin_s(end, told["begin_wall_s"]), told["begin_wall_s"])
+    if begin >= end:
+        raise EmptyTimeline(
+            f"the event log ends at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(end))}",
+            hint="ask for an earlier time with --since, or for --last",
+        )
+    reader = Reader(told["begin_wall_s"])
+    for gpu in told["gpus"]:
+        title = f"GPU {gpu['index']} {gpu['name']}"
+        reader.gpu(gpu["id"], title, gpu["capacity_bytes"], gpu.get("reserve_bytes", RESERVE_BYTES))
+    for at_s, name, used in told["readings"]:
+        reader.reading(at_s, name, used)
+    feed = [(one["at_wall_s"], 1, one) for one in events]
+    feed += [(one["at_wall_s"], 0, one) for one in told["snapshots"]]
+    for at_s, is_event, one in sorted(feed, key=lambda entry: entry[:2]):
+        if is_event:
+            reader.event(one)
+        else:
+            reader.snapshot(at_s, [from_map(LeaseView, lease) for lease in one["leases"]])
+    return within(reader.story(end, told["notices"]), begin, end)
