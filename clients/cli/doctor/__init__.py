@@ -1,0 +1,112 @@
+"""`vramctl doctor`: examines installation, machine and arbiter, and changes nothing."""
+
+import argparse
+import json
+import os
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import vram_arbiter
+from vram_arbiter.clients.cli import arguments
+from vram_arbiter.clients.cli.doctor import (
+    access,
+    cgroup,
+    clocks,
+    driver,
+    health,
+    installation,
+    orphans,
+    ports,
+)
+from vram_arbiter.clients.cli.doctor.findings import WRONG, Check, Report, Severity, examine
+from vram_arbiter.clients.cli.doctor.machine import ask_nvml, this_installation, this_machine
+from vram_arbiter.clients.cli.replies import NO, OK, UNREACHABLE
+from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.runtime.version import version
+
+DESCRIPTIONS = {
+    "doctor": "Examine installation, driver, socket, permissions, clocks, cgroups, suspend, "
+    "leftovers, ports, units, and what the arbiter says of itself and its GPUs. Each finding names "
+    "the command that mends it; nothing is changed. Exits 0 without a warning or error, 1 with "
+    "one, 3 if the arbiter cannot be reached."
+}
+
+CHECKS: Final[Sequence[tuple[str, Check]]] = (
+    ("installation", installation.origins),
+    ("driver", driver.driver),
+    ("devices", driver.devices),
+    ("suspend", driver.suspend),
+    ("socket", access.socket),
+    ("permissions", access.permissions),
+    ("operators", access.operators),
+    ("versions", installation.versions),
+    ("daemon", health.daemon),
+    ("probe", health.probe),
+    ("stowaways", health.stowaways),
+    ("orphans", orphans.sockets),
+    ("files", orphans.files),
+    ("clocks", clocks.wall),
+    ("clocks", clocks.monotonic),
+    ("cgroup", cgroup.memory),
+    ("oom", cgroup.out_of_memory),
+    ("parked", cgroup.parked),
+    ("ports", ports.arbiters),
+    ("ports", ports.ports),
+    ("units", installation.units),
+)
+"""Checks with the first part of their findings' codes, in the order of the report."""
+
+_WIDTH: Final = 22
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    arguments.add_json(parser)
+    arguments.add_endpoint(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    return doctor(as_json=args.as_json, endpoint=args.endpoint)
+
+
+def doctor(*, as_json: bool, endpoint: str | None) -> int:
+    """Examine this machine and print the report. Return the exit code."""
+    where = endpoint or arbiter_endpoint(os.environ, os.getuid())
+    installed = this_installation(str(Path(vram_arbiter.__file__).parent), version())
+    machine = this_machine(where, ask_nvml(), installed)
+    report = Report(where, examine(machine, CHECKS))
+    if as_json:
+        print(json.dumps(to_map(report), indent=2))
+    else:
+        print("\n".join(lines_of(report, color=sys.stdout.isatty())))
+    if machine.arbiter.problem is not None:
+        return UNREACHABLE
+    return NO if any(one.severity in WRONG for one in report.findings) else OK
+
+
+def lines_of(report: Report, *, color: bool = False) -> list[str]:
+    """Return the report as lines: severity, code, what was found; below it what mends it."""
+    lines = [printable(f"examined for {report.endpoint}")]
+    for one in report.findings:
+        mark = f"{one.severity.upper() if one.severity in WRONG else one.severity:<8}"
+        if color:
+            mark = f"\x1b[{_COLORS[one.severity]}m{mark}\x1b[0m"
+        lines.append(f"{mark} {one.code:<{_WIDTH}} {printable(one.found)}")
+        if one.fix and one.severity is not Severity.OK:
+            lines.append(f"{'':<{9 + _WIDTH}} → {printable(one.fix)}")
+    counts = Counter(one.severity for one in report.findings)
+    said = ", ".join(f"{counts[one]} {one}" for one in Severity if counts[one])
+    return [*lines, said]
+
+
+_COLORS: Final = {
+    Severity.OK: "32",
+    Severity.NOTE: "36",
+    Severity.UNKNOWN: "35",
+    Severity.WARNING: "33",
+    Severity.ERROR: "31",
+}

@@ -1,0 +1,87 @@
+"""Checks of what the arbiter says: its files, grants, GPUs, processes without a lease."""
+
+from collections.abc import Iterator
+from typing import Final
+
+from vram_arbiter.clients.cli.doctor.findings import (
+    CouldNotLook,
+    Finding,
+    error,
+    note,
+    ok,
+    warning,
+)
+from vram_arbiter.clients.cli.doctor.machine import Machine
+from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.views import GpuView
+
+READS: Final = {
+    "unified": "memory shared with the CPU, read from /proc/meminfo",
+    "fake": "a simulated GPU",
+}
+
+
+def status_of(m: Machine) -> StatusReply:
+    """Return what the arbiter said. Raises CouldNotLook."""
+    if m.arbiter.status is None:
+        raise CouldNotLook("no arbiter answers")
+    return m.arbiter.status
+
+
+def daemon(m: Machine) -> Iterator[Finding]:
+    """The daemon serves, grants, and can write its files."""
+    if (refusal := m.arbiter.refusal) is not None:
+        yield error("daemon.refuses", refusal.message, refusal.hint or "vramctl status")
+        return
+    status = status_of(m)
+    yield ok("daemon.serves", f"{status.phase}, epoch {status.epoch}, {status.clients} clients")
+    for problem in status.problems:
+        full = "cannot be written" in problem or "does not answer" in problem
+        yield error("daemon.files", problem, "df -h /var/lib" if full else "vramctl status")
+    if status.drained:
+        yield error("daemon.drained", f"drained by {status.drained}", "vramctl resume")
+
+
+def probe(m: Machine) -> Iterator[Finding]:
+    """Each GPU can be read, and holds no more than was granted."""
+    gpus = status_of(m).gpus
+    if not gpus:
+        yield error("probe.none", "the arbiter leases no GPU", "nvidia-smi")
+    for gpu in gpus:
+        yield _gpu(m, gpu)
+
+
+def _gpu(m: Machine, gpu: GpuView) -> Finding:
+    name, blocked = f"gpu {gpu.index} {gpu.name}", gpu.blocked
+    if gpu.measured_used_bytes is None:
+        why = "" if blocked is None else f" ({blocked.text})"
+        what = f"{name}: its probe does not answer, nothing is granted{why}"
+        return error("probe.unreadable", what, "nvidia-smi")
+    if gpu.pressure_bytes:
+        over = format_bytes(gpu.pressure_bytes)
+        return error(
+            "probe.pressure",
+            f"{name}: {over} more are held than were granted",
+            "vramctl history --kind pressure --kind stowaway --kind drift",
+        )
+    if blocked is not None:
+        return note("probe.blocked", f"{name}: no grants now: {blocked.text}", "vramctl status")
+    return ok("probe.reads", f"{name}: its probe answers ({READS.get(gpu.source, gpu.source)})")
+
+
+def stowaways(m: Machine) -> Iterator[Finding]:
+    """Every process with bytes on a GPU has a lease."""
+    found = [one for gpu in status_of(m).gpus for one in gpu.processes if one.stowaway]
+    for one in found:
+        size = "unknown bytes" if one.used_bytes is None else format_bytes(one.used_bytes)
+        words = [word for word in m.command_line(one.pid) if word]
+        vram = size.replace(" ", "") if one.used_bytes else "SIZE"
+        again = " ".join(words) if words else one.name
+        yield warning(
+            "stowaways.process",
+            f"pid {one.pid} {one.name} holds {size} without a lease",
+            f"kill {one.pid}; vramctl run --vram {vram} -- {again}",
+        )
+    if not found:
+        yield ok("stowaways.none", "every GPU process has a lease")

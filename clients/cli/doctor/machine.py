@@ -1,0 +1,361 @@
+"""The machine as the checks of `vramctl doctor` see it.
+
+Files are read below `root`, so a test can lay out a machine of its own. What the arbiter and NVML
+say is asked once, before the checks run. Nothing is changed.
+"""
+
+import contextlib
+import grp
+import os
+import pwd
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from vram_arbiter.clients.cli.doctor.findings import CouldNotLook
+from vram_arbiter.clients.net import request
+from vram_arbiter.schemas.codec import CodecError
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
+from vram_arbiter.schemas.runtime.peercred import credentials
+from vram_arbiter.schemas.wire.decode import decode_reply
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
+
+CONNECT_S: Final = 1.0
+EVENTS: Final = 500
+"""Of the history, for jumps of the clock."""
+SYSTEM_STATE: Final = "/var/lib/vram-arbiter"
+UNIT: Final = "vram-arbiter.service"
+
+
+@dataclass(frozen=True, slots=True)
+class Nvml:
+    """What NVML says. `problem`: why it does not work, under the name of its error class."""
+
+    version: str = ""
+    gpus: int = 0
+    without_memory: bool = False  # Jetson and GB10: their memory is the machine's
+    problem: str = ""
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Arbiter:
+    """What the arbiter at the endpoint says. `status` None: it does not answer, `problem` says why;
+    `refusal`: it answered with an error."""
+
+    status: StatusReply | None = None
+    history: tuple[JsonMap, ...] = ()
+    server: str = ""  # its version
+    pid: int | None = None  # 0: of another pid namespace
+    uid: int | None = None
+    problem: request.Unreachable | None = None
+    refusal: ErrorView | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Import:
+    """Where this program comes from. `copies`: folders on the path that have the package;
+    `strays`: modules of it that were imported from elsewhere."""
+
+    package: str
+    version: str
+    bin: str  # of this interpreter
+    copies: Sequence[str] = ()
+    strays: Sequence[str] = ()
+    programs: Mapping[str, str] = field(default_factory=dict)  # on PATH: name → resolved path
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """Readings of the kernel's clocks, in seconds."""
+
+    wall: float
+    monotonic: float
+    boottime: float
+
+
+@dataclass(frozen=True)
+class Machine:
+    """All that checks may look at."""
+
+    endpoint: str
+    arbiter: Arbiter
+    installed: Import
+    nvml: Nvml = field(default_factory=Nvml)
+    root: Path = Path("/")
+    environ: Mapping[str, str] = field(default_factory=dict)
+    uid: int = 0
+    gids: frozenset[int] = frozenset({0})
+    clocks: Clocks = Clocks(2e9, 1.0, 1.0)
+    group_name: Callable[[int], str] = str
+    group_members: Callable[[str], Sequence[str]] = lambda name: ()
+    user_name: Callable[[int], str] = str
+
+    # -- files
+    def path(self, name: str) -> Path:
+        """Return the place of an absolute path of this machine."""
+        return self.root / name.lstrip("/")
+
+    def text(self, name: str) -> str | None:
+        """Return a file's text; None where there is none. Raises CouldNotLook."""
+        try:
+            return self.path(name).read_text(errors="replace")
+        except (FileNotFoundError, NotADirectoryError, ProcessLookupError):
+            return None
+        except OSError as error:
+            raise CouldNotLook(f"{name}: {error.strerror}") from error
+
+    def exists(self, name: str) -> bool:
+        """Whether there is such a file, also a link that leads nowhere. Raises CouldNotLook."""
+        try:
+            os.lstat(self.path(name))
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError as error:
+            raise CouldNotLook(f"{name}: {error.strerror}") from error
+        return True
+
+    def names(self, folder: str) -> list[str]:
+        """Return the names in a folder, sorted; none where there is no folder. Raises
+        CouldNotLook."""
+        try:
+            return sorted(os.listdir(self.path(folder)))
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        except OSError as error:
+            raise CouldNotLook(f"{folder}: {error.strerror}") from error
+
+    def stat(self, name: str) -> os.stat_result | None:
+        """Return what the file system says of a file; None where there is none. Raises
+        CouldNotLook."""
+        try:
+            return os.stat(self.path(name))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except OSError as error:
+            raise CouldNotLook(f"{name}: {error.strerror}") from error
+
+    def may(self, found: os.stat_result, needed: int) -> bool:
+        """Whether this user has the permission bits `needed` (4 read, 2 write, 1 search)."""
+        shift = 6 if found.st_uid == self.uid else 3 if found.st_gid in self.gids else 0
+        return self.uid == 0 or (found.st_mode >> shift) & needed == needed
+
+    # -- processes
+    def pids(self) -> Iterator[int]:
+        """Yield the pids of the processes that can be seen."""
+        yield from (int(name) for name in self.names("/proc") if name.isdecimal())
+
+    def command_line(self, pid: int) -> list[str]:
+        """Return the arguments of a process; none of one that ended."""
+        with contextlib.suppress(CouldNotLook):
+            return (self.text(f"/proc/{pid}/cmdline") or "").rstrip("\0").split("\0")
+        return []
+
+    def daemon_file(self, name: str) -> str:
+        """Return a file of the daemon's folder in /proc. Raises CouldNotLook."""
+        pid = self.arbiter.pid
+        if not pid:
+            why = "it belongs to a pid namespace that cannot be seen from here"
+            raise CouldNotLook("no arbiter answers" if pid is None else f"the arbiter: {why}")
+        found = self.text(f"/proc/{pid}/{name}")
+        if found is None:
+            raise CouldNotLook(f"/proc/{pid}/{name} is not there")
+        return found
+
+    # -- commands of a fix
+    @property
+    def sudo(self) -> str:
+        return "" if self.uid == 0 else "sudo "
+
+    @property
+    def socket(self) -> str:
+        """Path of the endpoint's socket. Raises CouldNotLook."""
+        try:
+            return socket_path(self.endpoint)
+        except ConfigError as error:
+            raise CouldNotLook(error.message) from error
+
+    @property
+    def is_system(self) -> bool:
+        """Whether the endpoint is the one of the system's unit."""
+        return self.endpoint.startswith(f"ipc://{SYSTEM_RUNTIME}/")
+
+    def service(self, action: str) -> str:
+        """Return the command that starts, or restarts, the arbiter of this endpoint."""
+        if self.is_system:
+            return f"{self.sudo}systemctl {action} vram-arbiter"
+        unit = any(self.exists(f"{folder}/{UNIT}") for folder in user_folders(self.environ))
+        if unit and self.endpoint.startswith("ipc:///run/user/"):
+            return f"systemctl --user {action} vram-arbiter"
+        stop = f"kill {self.arbiter.pid}; " if action == "restart" and self.arbiter.pid else ""
+        return f"{stop}vram-arbiter --endpoint {self.endpoint}"
+
+
+def user_folders(environ: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the folders of user units, the user's own first."""
+    home = environ.get("XDG_CONFIG_HOME") or f"{environ.get('HOME', '/root')}/.config"
+    return (f"{home}/systemd/user", "/etc/systemd/user", "/usr/lib/systemd/user")
+
+
+# -- this machine
+def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
+    """Look at the machine that this program runs on."""
+    return Machine(
+        endpoint=endpoint,
+        arbiter=ask_arbiter(endpoint),
+        installed=installed,
+        nvml=nvml,
+        environ=os.environ,
+        uid=os.geteuid(),
+        gids=frozenset({os.getegid(), *os.getgroups()}),
+        clocks=Clocks(
+            time.time(),
+            time.clock_gettime(time.CLOCK_MONOTONIC),
+            time.clock_gettime(time.CLOCK_BOOTTIME),
+        ),
+        group_name=_group_name,
+        group_members=_group_members,
+        user_name=_user_name,
+    )
+
+
+def ask_arbiter(endpoint: str) -> Arbiter:
+    """Ask the arbiter, and the kernel who it is."""
+    try:
+        status = request.ask("status", {}, endpoint)
+        pid, uid = _listener(endpoint)
+        if not status.get("ok"):
+            return Arbiter(pid=pid, uid=uid, refusal=_error(status))
+        ping = request.ask("ping", {}, endpoint)
+        last = request.ask("history", {"after": 1 << 62, "limit": 1}, endpoint)
+        after = max(0, int(last.get("last_seq", 0)) - EVENTS)
+        events = request.ask("history", {"after": after, "limit": EVENTS}, endpoint)
+        told, name = decode_reply("history", events), decode_reply("ping", ping)
+        assert isinstance(told, HistoryReply)
+        assert isinstance(name, PingReply)
+        body = decode_reply("status", status)
+        assert isinstance(body, StatusReply)
+        return Arbiter(body, told.events, name.server, pid, uid)
+    except request.Unreachable as error:
+        return Arbiter(problem=error)
+    except (CodecError, KeyError) as error:
+        view = ErrorView("internal", f"its answer is not understood: {error}", "", {})
+        return Arbiter(refusal=view)
+
+
+def _error(reply: JsonMap) -> ErrorView:
+    error = reply["error"]
+    return ErrorView(error["code"], error["message"], error.get("hint", ""), {})
+
+
+def _listener(endpoint: str) -> tuple[int | None, int | None]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(CONNECT_S)
+        try:
+            probe.connect(socket_path(endpoint))
+            pid, uid, _ = credentials(probe)
+        except (OSError, ConfigError):
+            return None, None
+    return pid, uid
+
+
+def this_installation(package: str, version: str) -> Import:
+    """Look where this program and its namesakes lie."""
+    name = Path(package).name
+    copies = [
+        str(Path(entry or ".").resolve() / name)
+        for entry in sys.path
+        if (Path(entry or ".") / name / "__init__.py").is_file()
+    ]
+    programs = {
+        program: os.path.realpath(found)
+        for program in ("vramctl", "vram-arbiter")
+        if (found := shutil.which(program))
+    }
+    files = {
+        str(module.__file__)
+        for key, module in sys.modules.items()
+        if key.partition(".")[0] == name and getattr(module, "__file__", None)
+    }
+    return Import(
+        package=package,
+        version=version,
+        bin=os.path.dirname(sys.executable),
+        copies=tuple(dict.fromkeys(copies)),
+        strays=tuple(sorted(file for file in files if not file.startswith(f"{package}/"))),
+        programs=programs,
+    )
+
+
+def ask_nvml() -> Nvml:
+    """Ask NVIDIA's library. The daemon, not this program, decides what is leased."""
+    import pynvml
+
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError as error:
+        return Nvml(problem=str(error), error=type(error).__name__)
+    try:
+        version = pynvml.nvmlSystemGetDriverVersion()
+        gpus = int(pynvml.nvmlDeviceGetCount())
+        for index in range(gpus):
+            try:
+                pynvml.nvmlDeviceGetMemoryInfo(pynvml.nvmlDeviceGetHandleByIndex(index))
+            except pynvml.NVMLError_NotSupported:
+                return Nvml(version, gpus, without_memory=True)
+    except pynvml.NVMLError as error:
+        return Nvml(problem=str(error), error=type(error).__name__)
+    finally:
+        pynvml.nvmlShutdown()
+    return Nvml(version, gpus)
+
+
+def is_listening(machine: Machine, path: str) -> bool:
+    """Whether a process listens on a unix socket. Raises CouldNotLook."""
+    return unix_sockets(machine).get(path, False)
+
+
+def unix_sockets(machine: Machine) -> Mapping[str, bool]:
+    """Return the paths of bound unix sockets by the kernel's table, and which of them listen.
+    Raises CouldNotLook."""
+    table = machine.text("/proc/net/unix")
+    if table is None:
+        raise CouldNotLook("/proc/net/unix is not there")
+    found: dict[str, bool] = {}
+    for line in table.splitlines()[1:]:
+        words = line.split(maxsplit=7)
+        if len(words) == 8:
+            found[words[7]] = found.get(words[7], False) or bool(int(words[3], 16) & _LISTENS)
+    return found
+
+
+_LISTENS: Final = 0x10000  # __SO_ACCEPTCON, linux/net.h
+
+
+def _group_name(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def _group_members(name: str) -> Sequence[str]:
+    try:
+        return tuple(grp.getgrnam(name).gr_mem)
+    except KeyError:
+        return ()
+
+
+def _user_name(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)

@@ -1,0 +1,362 @@
+"""Machines for the tests of `vramctl doctor`: a sound one, and each case of what may be wrong."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vram_arbiter.clients.cli.doctor.machine import Arbiter, Clocks, Import, Machine, Nvml
+from vram_arbiter.clients.net.request import Unreachable
+from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.wire.codes import Block
+from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.views import (
+    BlockView,
+    GpuView,
+    HostRamView,
+    ProcessView,
+    Totals,
+)
+
+PID, UID, OTHER = 700, 4242, 4243
+SOCKET = "/run/vram-arbiter/arbiter.sock"
+UNIT = "[Service]\nExecStart=/opt/vram-arbiter/bin/vram-arbiter --group vram-arbiter\n"
+UNIX = "Num RefCount Protocol Flags Type St Inode Path\n"
+TCP = "  sl  local_address rem_address   st\n"
+GROUP = "/sys/fs/cgroup/system.slice/vram-arbiter.service"
+SOUND: Mapping[str, str] = {
+    "/proc/driver/nvidia/version": "NVRM version: NVIDIA UNIX x86_64  580.95.05  Tue Sep 23\n",
+    "/proc/driver/nvidia/params": "PreserveVideoMemoryAllocations: 1\n",
+    "/sys/power/state": "freeze mem disk\n",
+    "/dev/nvidiactl": "",
+    "/dev/nvidia0": "",
+    "/dev/nvidia-uvm": "",
+    "/run/systemd/system/x": "",
+    SOCKET: "",
+    f"{SOCKET}.lock": "",
+    "/proc/net/unix": f"{UNIX}0: 00000002 00000000 00010000 0001 01 55 {SOCKET}\n",
+    "/proc/net/tcp": TCP,
+    "/proc/locks": "",
+    "/proc/meminfo": "MemAvailable: 16777216 kB\nSwapTotal: 4194304 kB\nSwapFree: 4194304 kB\n",
+    "/proc/self/timens_offsets": "monotonic     0     0\nboottime      0     0\n",
+    f"/proc/{PID}/cmdline": "/opt/python3\0/opt/vram-arbiter/bin/vram-arbiter\0",
+    f"/proc/{PID}/cgroup": "0::/system.slice/vram-arbiter.service\n",
+    f"/proc/{PID}/oom_score_adj": "-500\n",
+    f"/proc/{PID}/status": "Name:\tvram-arbiter\nVmSwap:\t       0 kB\n",
+    "/sys/fs/cgroup/cgroup.controllers": "cpu memory\n",
+    f"{GROUP}/memory.max": "max\n",
+    "/var/lib/vram-arbiter/journal.sqlite": "",
+    "/opt/vram-arbiter/bin/vram-arbiter": "",
+    "/etc/systemd/system/vram-arbiter.service": UNIT,
+    "/etc/systemd/system/multi-user.target.wants/vram-arbiter.service": "",
+    **{
+        f"/etc/systemd/system/systemd-suspend.service.requires/{unit}.service": ""
+        for unit in ("nvidia-suspend", "nvidia-resume", "nvidia-hibernate")
+    },
+}
+GPU = GpuView("GPU-1", 0, "RTX", "nvml", 8 * GIB, 0, 0, 0, 0, 0.1, 0, None, ())
+STOWAWAY = ProcessView(77, "notebook", GIB, (), 0, 0, True)
+STATUS = StatusReply(
+    1, "serving", 5.0, (GPU,), (), Totals(0, 0), 2, HostRamView(8 * GIB, 0), "", ()
+)
+EVENTS = tuple({"seq": n, "kind": "granted", "at_wall_s": 1.9e9 + n} for n in range(3))
+SILENT = Unreachable("no arbiter answers", "look")
+
+
+def lay(root: Path, files: Mapping[str, str | None]) -> None:
+    """Write files below a folder; None removes one."""
+    for name, text in files.items():
+        place = root / name.lstrip("/")
+        if text is None:
+            place.unlink()
+        else:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(text)
+
+
+def sound(root: Path) -> Machine:
+    """A machine on which nothing is wrong."""
+    lay(root, SOUND)
+    for name in (SOCKET, "/dev/nvidiactl", "/dev/nvidia0", "/dev/nvidia-uvm"):
+        (root / name.lstrip("/")).chmod(0o660)
+    (root / "run/vram-arbiter").chmod(0o1770)
+    gid = (root / SOCKET.lstrip("/")).stat().st_gid
+    return Machine(
+        endpoint=f"ipc://{SOCKET}",
+        arbiter=Arbiter(STATUS, EVENTS, "vram-arbiter 0.2.0", PID, OTHER),
+        installed=Import("/opt/lib/site-packages/vram_arbiter", "0.2.0", "/opt/vram-arbiter/bin"),
+        nvml=Nvml("580.95.05", 1),
+        root=root,
+        environ={"HOME": "/home/op"},
+        uid=UID,
+        gids=frozenset({gid}),
+        clocks=Clocks(1.95e9, 1000.0, 1000.2),
+        group_name=lambda gid: "vram-arbiter",
+        group_members=lambda name: ("op",),
+        user_name=lambda uid: {UID: "op", OTHER: "vram-arbiter"}.get(uid, str(uid)),
+    )
+
+
+# -- what is wrong, case by case
+@dataclass(frozen=True)
+class Case:
+    """What is wrong, by `files` and by fields of the machine, and a part of the command that mends
+    it."""
+
+    code: str
+    fix: str
+    files: Mapping[str, str | None] = ()  # type: ignore[assignment]
+    change: Callable[[Machine], Machine] = lambda m: m
+
+    def __str__(self) -> str:
+        return self.code
+
+
+def status(**fields: Any) -> Callable[[Machine], Machine]:
+    return lambda m: replace(m, arbiter=replace(m.arbiter, status=replace(STATUS, **fields)))
+
+
+def gpu(**fields: Any) -> Callable[[Machine], Machine]:
+    return status(gpus=(replace(GPU, **fields),))
+
+
+def arbiter_of(**fields: Any) -> Callable[[Machine], Machine]:
+    return lambda m: replace(m, arbiter=replace(m.arbiter, **fields))
+
+
+def field(**fields: Any) -> Callable[[Machine], Machine]:
+    return lambda m: replace(m, **fields)
+
+
+def installed_files(**fields: Any) -> Callable[[Machine], Machine]:
+    return lambda m: replace(m, installed=replace(m.installed, **fields))
+
+
+def silent(m: Machine) -> Machine:
+    return replace(m, arbiter=Arbiter(problem=SILENT))
+
+
+def mode(name: str, bits: int, change: Callable[[Machine], Machine] = lambda m: m) -> Any:
+    def changed(m: Machine) -> Machine:
+        m.path(name).chmod(bits)
+        return change(m)
+
+    return changed
+
+
+def elsewhere(m: Machine) -> Machine:
+    return replace(
+        m,
+        endpoint="ipc:///run/user/4242/vram-arbiter/arbiter.sock",
+        arbiter=Arbiter(problem=SILENT),
+    )
+
+
+def masked(m: Machine) -> Machine:
+    place = m.path("/etc/systemd/system/vram-arbiter.service")
+    place.unlink()
+    place.symlink_to("/dev/null")
+    return m
+
+
+def own_path(m: Machine) -> Machine:
+    program = m.path("/opt/vram-arbiter/bin/vramctl")
+    program.write_text("")
+    found = {"vramctl": "/usr/local/lib/other/vramctl"}
+    return replace(m, installed=replace(m.installed, bin=str(program.parent), programs=found))
+
+
+def locked(m: Machine) -> Machine:
+    place = m.path(f"{SOCKET}.lock")
+    m.path("/proc/locks").write_text(
+        f"1: FLOCK  ADVISORY  WRITE {PID} 00:1b:{place.stat().st_ino} 0 EOF\n"
+    )
+    return m
+
+
+SECOND = {"/proc/800/cmdline": "/home/x/bin/python\0-m\0vram_arbiter.arbiter\0"}
+USER_UNIT = {
+    "/home/op/.config/systemd/user/vram-arbiter.service": UNIT,
+    "/home/op/.config/systemd/user/default.target.wants/vram-arbiter.service": "",
+}
+SERVED = {"/proc/net/tcp": f"{TCP} 0: 0100007F:24F8 00000000:0000 0A 0:0 0:0 0 1000 0 9 1\n"}
+PCI = "/sys/bus/pci/devices/0000:01:00.0"
+GONE: Mapping[str, str | None] = {"/proc/driver/nvidia/version": None}
+NOT_FOUND = field(
+    nvml=Nvml(problem="NVML Shared Library Not Found", error="NVMLError_LibraryNotFound")
+)
+
+CASES = [
+    Case(
+        "installation.mixed",
+        "pip uninstall",
+        change=installed_files(strays=["/a/site-packages/v/x.py"]),
+    ),
+    Case(
+        "installation.shadowed",
+        "unset PYTHONPATH",
+        change=installed_files(copies=["/src/vram_arbiter"]),
+    ),
+    Case("installation.path", "ln -sf", change=own_path),
+    Case("versions.differ", "restart vram-arbiter", change=arbiter_of(server="vram-arbiter 0.1.0")),
+    Case(
+        "versions.wire",
+        "restart vram-arbiter",
+        change=arbiter_of(
+            status=None, refusal=ErrorView("version_mismatch", "wire 3, not 4", "", {})
+        ),
+    ),
+    Case(
+        "driver.mismatch",
+        "reboot",
+        change=field(nvml=Nvml(problem="x", error="NVMLError_LibRmVersionMismatch")),
+    ),
+    Case(
+        "driver.broken",
+        "nvidia-smi",
+        change=field(nvml=Nvml(problem="Unknown Error", error="NVMLError_Unknown")),
+    ),
+    Case(
+        "driver.not-loaded",
+        "modprobe nvidia",
+        {**GONE, f"{PCI}/vendor": "0x10de\n", f"{PCI}/class": "0x030000\n"},
+        NOT_FOUND,
+    ),
+    Case("driver.none", "fake:8GiB", GONE, NOT_FOUND),
+    Case("devices.missing", "nvidia-modprobe", {"/dev/nvidia-uvm": None}),
+    Case("devices.closed", "usermod --append --groups", change=mode("/dev/nvidia0", 0o600)),
+    Case(
+        "suspend.memory-lost",
+        "NVreg_PreserveVideoMemoryAllocations=1",
+        {"/proc/driver/nvidia/params": "PreserveVideoMemoryAllocations: 0\n"},
+    ),
+    Case(
+        "suspend.units",
+        "systemctl enable nvidia-resume",
+        {"/etc/systemd/system/systemd-suspend.service.requires/nvidia-resume.service": None},
+    ),
+    Case(
+        "socket.endpoint",
+        "export VRAM_ARBITER_ENDPOINT",
+        change=field(endpoint="tcp://127.0.0.1:1"),
+    ),
+    Case(
+        "socket.untrusted",
+        "VRAM_ARBITER_SERVER_USERS",
+        change=arbiter_of(problem=Unreachable("served by uid 5", "", "untrusted_server")),
+    ),
+    Case("socket.elsewhere", "ipc:///run/vram-arbiter/arbiter.sock", change=elsewhere),
+    Case("socket.missing", "systemctl start vram-arbiter", {SOCKET: None}, silent),
+    Case("socket.closed", "usermod", change=mode(SOCKET, 0o600, silent)),
+    Case(
+        "socket.closed",
+        "usermod --append --groups vram-arbiter op",
+        change=lambda m: replace(silent(m), gids=frozenset({9})),
+    ),
+    Case("socket.dead", "systemctl start vram-arbiter", {"/proc/net/unix": UNIX}, silent),
+    Case("socket.silent", "systemctl restart vram-arbiter", change=silent),
+    Case("permissions.socket", "chmod 0660", change=mode(SOCKET, 0o666)),
+    Case("permissions.folder", "chmod 1770", change=mode("/run/vram-arbiter", 0o777)),
+    Case("permissions.session", "newgrp", change=field(gids=frozenset({9}))),
+    Case(
+        "permissions.group",
+        "usermod",
+        change=field(gids=frozenset({9}), group_members=lambda name: ()),
+    ),
+    Case("permissions.root", "systemctl start", change=arbiter_of(uid=0)),
+    Case("operators.may-not", "vram-operators op", change=field(group_members=lambda name: ())),
+    Case(
+        "daemon.refuses",
+        "wait",
+        change=arbiter_of(status=None, refusal=ErrorView("limit_exceeded", "full", "wait", {})),
+    ),
+    Case("daemon.files", "df -h", change=status(problems=("the journal cannot be written",))),
+    Case("daemon.drained", "vramctl resume", change=status(drained="op: driver")),
+    Case("probe.none", "nvidia-smi", change=status(gpus=())),
+    Case("probe.unreadable", "nvidia-smi", change=gpu(measured_used_bytes=None)),
+    Case("probe.pressure", "--kind pressure", change=gpu(pressure_bytes=GIB)),
+    Case(
+        "probe.blocked",
+        "vramctl status",
+        change=gpu(blocked=BlockView(Block.LOADING, text="x loads")),
+    ),
+    Case(
+        "stowaways.process",
+        "kill 77; vramctl run --vram 1GiB -- python train.py",
+        {"/proc/77/cmdline": "python\0train.py\0"},
+        gpu(processes=(STOWAWAY,)),
+    ),
+    Case("orphans.socket", "rm /run/vram-arbiter/grab.sock", {"/run/vram-arbiter/grab.sock": ""}),
+    Case("orphans.lock", "rm /run/vram-arbiter/arbiter.sock.lock", {SOCKET: None}, silent),
+    Case("orphans.unlinked", "systemctl restart", {SOCKET: None}, lambda m: silent(locked(m))),
+    Case(
+        "files.aside",
+        "rm /var/lib/vram-arbiter/journal.sqlite.corrupt-1",
+        {"/var/lib/vram-arbiter/journal.sqlite.corrupt-1": ""},
+    ),
+    Case("clocks.unset", "set-ntp true", change=field(clocks=Clocks(3600.0, 1.0, 1.0))),
+    Case(
+        "clocks.jumped",
+        "set-ntp true",
+        change=arbiter_of(history=(*EVENTS, {"seq": 3, "kind": "x", "at_wall_s": 1.8e9})),
+    ),
+    Case(
+        "clocks.jumped",
+        "set-ntp true",
+        change=arbiter_of(history=({"seq": 3, "kind": "x", "at_wall_s": 1.96e9},)),
+    ),
+    Case(
+        "clocks.namespace",
+        "unshare",
+        {"/proc/self/timens_offsets": "boottime     -100         0\n"},
+    ),
+    Case("clocks.slept", "--kind resumed", change=field(clocks=Clocks(1.95e9, 1000.0, 4600.0))),
+    Case(
+        "cgroup.limit",
+        "set-property vram-arbiter.service MemoryMax=infinity",
+        {f"{GROUP}/memory.max": "67108864\n"},
+    ),
+    Case(
+        "cgroup.limit",
+        "set-property system.slice MemoryHigh=infinity",
+        {"/sys/fs/cgroup/system.slice/memory.high": "1048576\n"},
+    ),
+    Case("cgroup.killed", "MemoryMax=infinity", {f"{GROUP}/memory.events": "oom 1\noom_kill 2\n"}),
+    Case("oom.score", f"tee /proc/{PID}/oom_score_adj", {f"/proc/{PID}/oom_score_adj": "0\n"}),
+    Case("oom.swapped", "MemorySwapMax=0", {f"/proc/{PID}/status": "VmSwap:\t    9000 kB\n"}),
+    Case(
+        "parked.budget",
+        "park_budget_bytes",
+        {"/proc/meminfo": "MemAvailable: 2097152 kB\nSwapTotal: 0 kB\n"},
+    ),
+    Case(
+        "parked.no-swap",
+        "mkswap",
+        {"/proc/meminfo": "MemAvailable: 16777216 kB\nSwapTotal: 0 kB\n"},
+    ),
+    Case("ports.arbiters", "kill 800", SECOND),
+    Case(
+        "ports.taken",
+        "sed -i 's/\\b9464\\b/9465/' /etc/vram-arbiter/arbiter.yaml && sudo systemctl restart",
+        {"/etc/vram-arbiter/arbiter.yaml": "telemetry:\n  prometheus_port: 9464\n", **SERVED},
+    ),
+    Case(
+        "ports.taken",
+        "vram-arbiter --http 127.0.0.1:9465",
+        {f"/proc/{PID}/cmdline": "vram-arbiter\0--http\x00127.0.0.1:9464\0", **SERVED},
+    ),
+    Case(
+        "units.missing",
+        "vramctl install",
+        {name: None for name in SOUND if name.endswith("/vram-arbiter.service")},
+    ),
+    Case("units.both", "systemctl --user disable", USER_UNIT),
+    Case(
+        "units.disabled",
+        "systemctl enable --now",
+        {"/etc/systemd/system/multi-user.target.wants/vram-arbiter.service": None},
+    ),
+    Case("units.masked-system", "unmask", change=masked),
+    Case("units.program-system", "vramctl install", {"/opt/vram-arbiter/bin/vram-arbiter": None}),
+]

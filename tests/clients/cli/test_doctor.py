@@ -1,0 +1,150 @@
+"""`vramctl doctor` on machines laid out in folders: each finding where it is due, and none on a
+sound machine."""
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from tests.clients.cli.doctor_cases import (
+    CASES,
+    GONE,
+    NOT_FOUND,
+    SOCKET,
+    Case,
+    arbiter_of,
+    field,
+    lay,
+    silent,
+    sound,
+)
+from tests.support.paths import ROOT
+from vram_arbiter.clients.cli import doctor
+from vram_arbiter.clients.cli.doctor.findings import WRONG, Finding, Report, Severity, examine
+from vram_arbiter.clients.cli.doctor.machine import Machine
+from vram_arbiter.schemas.codec import to_map
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return sound(tmp_path)
+
+
+def test_a_sound_machine_has_no_finding(machine: Machine) -> None:
+    findings = examine(machine, doctor.CHECKS)
+    assert [one for one in findings if one.severity is not Severity.OK] == []
+    assert len(findings) >= len(doctor.CHECKS)
+
+
+# -- each finding
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_each_finding_fires_and_names_a_command(case: Case, machine: Machine) -> None:
+    lay(machine.root, dict(case.files))
+    findings = examine(case.change(machine), doctor.CHECKS)
+    found = [one for one in findings if one.code == case.code]
+    assert found, [one for one in findings if one.severity is not Severity.OK]
+    assert case.fix in found[0].fix
+    assert found[0].severity is not Severity.OK
+
+
+def test_every_finding_has_a_case_and_a_line_in_the_reference() -> None:
+    text = "".join(path.read_text() for path in (ROOT / "clients/cli/doctor").glob("*.py"))
+    codes = set(re.findall(r'(?:error|warning|note)\(\s*f?"([a-z]+\.[a-z-]+)', text))
+    assert len(codes) > 40
+    tried = {case.code for case in CASES}
+    assert {code for code in codes if not any(one.startswith(code) for one in tried)} == set()
+    page = (ROOT / "docs/reference/doctor.md").read_text()
+    assert {code for code in tried if f"`{code}`" not in page} == set()
+
+
+def test_the_state_folder_is_that_of_the_configuration(machine: Machine) -> None:
+    """Files put aside there were not seen."""
+    lay(machine.root, {"/etc/vram-arbiter/arbiter.yaml": "state:\n  dir: /srv/a\n"})
+    lay(machine.root, {"/srv/a/journal.sqlite.corrupt-1": ""})
+    (found,) = examine(machine, (("files", doctor.orphans.files),))
+    assert found.fix == "sudo rm /srv/a/journal.sqlite.corrupt-1"
+
+
+# -- what cannot be examined
+@pytest.mark.parametrize(
+    ("code", "files", "change"),
+    [
+        ("devices.unknown", GONE, NOT_FOUND),
+        ("suspend.unknown", {"/proc/driver/nvidia/params": None}, lambda m: m),
+        ("daemon.unknown", {}, silent),
+        ("probe.unknown", {}, silent),
+        ("stowaways.unknown", {}, silent),
+        ("clocks.unknown", {}, silent),
+        ("versions.unknown", {}, silent),
+        ("cgroup.unknown", {"/sys/fs/cgroup/cgroup.controllers": None}, lambda m: m),
+        ("oom.unknown", {}, arbiter_of(pid=0)),
+        ("parked.unknown", {"/proc/meminfo": None}, lambda m: m),
+        ("orphans.unknown", {"/proc/net/unix": None}, lambda m: m),
+        ("files.unknown", {}, field(endpoint="ipc:///run/user/1/a.sock")),
+        ("ports.unknown", {"/etc/vram-arbiter/arbiter.yaml": "http: [\n"}, lambda m: m),
+        ("permissions.unknown", {SOCKET: None}, silent),
+        ("units.unknown", {}, lambda m: os.rename(m.path("/run/systemd"), m.root / "x") or m),
+    ],
+)
+def test_what_cannot_be_examined_is_never_ok(
+    code: str,
+    files: Mapping[str, str | None],
+    change: Callable[[Machine], Machine],
+    machine: Machine,
+) -> None:
+    lay(machine.root, files)
+    findings = {one.code: one for one in examine(change(machine), doctor.CHECKS)}
+    assert findings[code].severity is Severity.UNKNOWN
+    assert findings[code].found.startswith("could not look: ")
+
+
+def test_a_file_that_may_not_be_read_is_not_examined(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: object) -> list[str]:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "listdir", refuse)
+    findings = {one.code: one for one in examine(machine, doctor.CHECKS)}
+    assert findings["files.unknown"].found == (
+        "could not look: /var/lib/vram-arbiter: Permission denied"
+    )
+
+
+@pytest.mark.parametrize(
+    ("params", "state"),
+    [("UseKernelSuspendNotifiers: 1\nPreserveVideoMemoryAllocations: 0\n", "mem"), ("", "freeze")],
+)
+def test_a_driver_that_needs_no_units_for_a_suspend(
+    params: str, state: str, machine: Machine
+) -> None:
+    """NVIDIA 595 with open modules saves memory by the kernel's notifiers."""
+    lay(machine.root, {"/proc/driver/nvidia/params": params, "/sys/power/state": state})
+    findings = examine(machine, (("suspend", doctor.driver.suspend),))
+    assert [one.severity for one in findings] == [Severity.OK]
+
+
+def test_a_jetson_has_a_driver_of_its_own(machine: Machine) -> None:
+    """NVML is missing there, and doctor said that there was no GPU."""
+    lay(machine.root, {**GONE, "/dev/nvmap": ""})
+    (found,) = examine(NOT_FOUND(machine), (("driver", doctor.driver.driver),))
+    assert (found.code, found.severity) == ("driver.tegra", Severity.OK)
+
+
+# -- the report
+def test_a_report_is_typed_and_escaped() -> None:
+    report = Report(
+        "ipc:///x",
+        (Finding("a.b", Severity.ERROR, "bad \x1b[2J", "mend"), Finding("c.d", Severity.OK, "y")),
+    )
+    assert to_map(report)["findings"][0] == {
+        "code": "a.b", "severity": "error", "found": "bad \x1b[2J", "fix": "mend",
+    }  # fmt: skip
+    lines = doctor.lines_of(report)
+    assert lines[1].startswith("ERROR    a.b")
+    assert "\\x1b[2J" in lines[1]
+    assert lines[2].endswith("→ mend")
+    assert lines[-1] == "1 ok, 1 error"
+    assert {Severity.WARNING, Severity.ERROR} == WRONG
