@@ -4,8 +4,6 @@ SEED ?= 0
 ARBITER ?= on
 GPU ?= fake:8GiB
 OUT ?= out/demo
-PREFIX ?= /opt/vram-arbiter
-DESTDIR ?=
 ARGS ?=
 QUICK ?=
 # Seconds of `make chaos`.
@@ -27,7 +25,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core demo test test-core test-gpu nightly mutation lint format chaos sim \
-	bench bench-switch schemas install-units clean
+	bench bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -84,8 +82,8 @@ bench-switch: setup ## how fast a model of 500 MB is loaded, restored and evicte
 schemas: setup ## write the JSON Schemas after a model changed
 	$(BIN)/python -m vram_arbiter.schemas export schemas/json
 
-install-units: ## copy the systemd units (docs/systemd.md): PREFIX=/opt/vram-arbiter DESTDIR=
-	@bash .ci/install-units "$(PREFIX)" "$(DESTDIR)"
+docs: setup ## the documentation site in build/site; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean: ## remove environments, caches and outputs
 	rm -rf .venv .venv-core build dist out .coverage

@@ -36,7 +36,7 @@ put() { # put SOURCE PLACE: read-only
     mount --bind "$1" "$root$2"
     mount -o remount,bind,ro "$root$2"
 }
-# Units that a system has of its own are not started: only targets, and what `make install-units` copies.
+# Units that a system has of its own are not started: only targets, and what `vramctl install` writes.
 mount -t tmpfs -o mode=755 tmpfs "$root/etc/systemd"
 mkdir "$root"/etc/systemd/{system,user}
 mkdir -p "$root/opt"

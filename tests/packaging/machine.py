@@ -73,6 +73,8 @@ class Machine:
         self._process: subprocess.Popen[bytes] | None = None
         self._cgroup = _own_cgroup() / f"vram-machine-{os.getpid()}"
         self._scratch = Path(tempfile.mkdtemp(prefix="vm"))
+        self.prefix = self._scratch / "prefix"
+        """The machine's /opt/vram-arbiter, which is read-only inside."""
         try:
             self._prepare()
             self._boot()
@@ -85,7 +87,7 @@ class Machine:
         for name in ("notify", "layers"):
             (self._scratch / name).mkdir()
         install_into(
-            self._scratch / "prefix",
+            self.prefix,
             seen_at=Path("/opt/vram-arbiter"),
             python=Path("/opt/python") / PYTHON.relative_to(sys.base_prefix),
             dependencies=Path("/opt/site-packages"),
@@ -99,7 +101,7 @@ class Machine:
                 "unshare", "--fork", "--kill-child", "--pid", "--mount", "--uts", "--ipc", "--net",
                 "--cgroup",
                 str(Path(__file__).with_name("boot_machine.sh")), str(self._scratch), str(TREE),
-                str(self._scratch / "prefix"), sys.base_prefix, str(DEPENDENCIES),
+                str(self.prefix), sys.base_prefix, str(DEPENDENCIES),
             ]  # fmt: skip
             into_cgroup = (
                 f'echo $$ >{self._cgroup}/cgroup.procs && exec setpriv --pdeathsig KILL "$@"'

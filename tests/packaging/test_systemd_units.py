@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from vram_arbiter.clients.cli.installation.site import PROGRAMS, SYSTEM
+from vram_arbiter.clients.cli.main import run_main
 from vram_arbiter.schemas.config.arbiter import load_config
 
 TREE = Path(__file__).parents[2]
@@ -24,16 +26,20 @@ UNITS = (
     "vram-sidecar@.service",
     "vram-runner@.service",
     "vram-reasoner@.service",
+    "vram-reasoner.service",
 )
 HOLDERS = UNITS[1:]
 EXPOSURES_MAX = {
     "system/vram-arbiter.service": 1.0,
+    "system/vram-hooks.service": 1.7,  # the network of webhooks
     # the network of a model hub, memory that CUDA compiles into
     "system/vram-sidecar@.service": 2.0,
     "system/vram-runner@.service": 2.3,  # and cameras, motor buses and realtime scheduling
     "system/vram-reasoner@.service": 1.6,  # the network of a language model
+    "system/vram-reasoner.service": 1.6,
     # The tool counts what only a privileged manager can restrict, as if a user's manager could.
     "user/vram-arbiter.service": 6.2,
+    "user/vram-reasoner.service": 6.5,
 }
 """Figures of systemd 252. Each unit is at most 0.1 below its limit, so that a setting that goes
 missing shows."""
@@ -64,36 +70,33 @@ def unit(name: str, kind: str = "system") -> Settings:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """Units as the installer leaves them, for a prefix in which the programs are there."""
-    prefix = tmp_path / "prefix"
+    """Files as `vramctl install` leaves them for a Jetson, whose units have one drop-in more."""
+    prefix, root = tmp_path / "prefix", tmp_path / "root"
     (prefix / "bin").mkdir(parents=True)
-    for program in ("vram-arbiter", "vram-sidecar", "vram-runner", "vram-reasoner"):
+    for program in PROGRAMS:
         (prefix / "bin" / program).symlink_to(sys.executable)
-    done = install(str(prefix), str(tmp_path / "root"))
-    assert (done.returncode, done.stderr) == (0, "")
-    return tmp_path / "root"
-
-
-def install(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(TREE / ".ci" / "install-units"), *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    (root / "etc").mkdir(parents=True)
+    (root / "etc/nv_tegra_release").touch()
+    assert run_main(["install", "--root", str(root), "--prefix", str(prefix), "--yes"]) == 0
+    return root
 
 
 # -- what systemd says
 @needs_analyze
-@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("name", [*UNITS, "vram-hooks.service"])
 def test_verify_is_silent(installed: Path, name: str) -> None:
     done = analyze("verify", "--man=no", str(installed / "etc/systemd/system" / name))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @needs_analyze
-def test_verify_is_silent_about_the_user_instance(installed: Path, tmp_path: Path) -> None:
-    path = installed / "etc/systemd/user/vram-arbiter.service"
+@pytest.mark.parametrize("name", ["vram-arbiter.service", "vram-reasoner.service"])
+def test_verify_is_silent_about_the_user_instance(
+    installed: Path, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / name
+    text = (SOURCES / "user" / name).read_text()
+    path.write_text(text.replace("/opt/vram-arbiter", str(installed.parent / "prefix")))
     done = analyze("--user", "verify", "--man=no", str(path), XDG_RUNTIME_DIR=str(tmp_path))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
@@ -108,9 +111,9 @@ def test_verify_would_speak_up(installed: Path) -> None:
 
 @needs_analyze
 @pytest.mark.parametrize("name", EXPOSURES_MAX)
-def test_every_unit_is_hardened(installed: Path, name: str) -> None:
+def test_every_unit_is_hardened(name: str) -> None:
     """The daemon's unit alone was: those of runner, sidecar and user stood at 4.0, 3.4 and 7.5."""
-    path = installed / "etc/systemd" / name
+    path = SOURCES / name
     done = analyze("security", "--offline=true", "--no-pager", str(path))
     found = re.search(r"Overall exposure level for [^:]+: ([0-9.]+)", done.stdout)
     assert found, done.stdout + done.stderr
@@ -124,16 +127,15 @@ def test_every_unit_may_open_many_connections(name: str) -> None:
     assert unit(file, kind)["Service", "LimitNOFILE"] == ["65536"]
 
 
-def test_a_sidecar_reaches_the_gpu_of_a_jetson() -> None:
-    allowed = unit("vram-sidecar@.service")["Service", "DeviceAllow"]
-    for device in (
-        "/dev/nvmap",
-        "/dev/nvhost-gpu",
-        "/dev/nvhost-ctrl-gpu",
-        "/dev/nvgpu/igpu0/channel",
-    ):
-        assert f"{device} rw" in allowed
-    assert "video" in unit("vram-sidecar@.service")["Service", "SupplementaryGroups"][0]
+def test_the_units_reach_the_gpu_of_a_jetson(installed: Path) -> None:
+    for name in ("vram-arbiter.service", "vram-sidecar@.service", "vram-runner@.service"):
+        drop_in = installed / f"etc/systemd/system/{name}.d/tegra.conf"
+        allowed = settings_of(drop_in.read_text())["Service", "DeviceAllow"]
+        for device in ("nvmap", "nvhost-gpu", "nvhost-ctrl-gpu", "nvgpu/igpu0/channel"):
+            assert f"/dev/{device} rw" in allowed
+        assert settings_of(drop_in.read_text())["Service", "SupplementaryGroups"] == [
+            "video render"
+        ]
 
 
 def test_the_runner_reaches_cameras_buses_and_realtime() -> None:
@@ -235,6 +237,23 @@ def test_every_user_of_a_unit_is_created() -> None:
     assert used == set(created)
 
 
+def test_a_purge_knows_every_folder_of_the_units() -> None:
+    roots = {
+        "StateDirectory": Path("/var/lib"),
+        "CacheDirectory": Path("/var/cache"),
+        "RuntimeDirectory": Path("/run"),
+    }
+    written = set()
+    for path in (SOURCES / "system").glob("*.service"):
+        found = settings_of(path.read_text(encoding="utf-8"))
+        for key, root in roots.items():
+            for name in found.get(("Service", key), []):
+                written.add(root / name)
+                if ("Service", "DynamicUser") in found:  # the folder's name leads there
+                    written.add(root / "private" / name)
+    assert written == set(SYSTEM.state)
+
+
 def test_the_flags_of_the_units_are_understood(tmp_path: Path) -> None:
     """`ExecStart=` is a command line of ours: its options are those of the programs."""
     for name in UNITS:
@@ -251,35 +270,7 @@ def test_the_flags_of_the_units_are_understood(tmp_path: Path) -> None:
             assert flag in done.stdout, f"{name}: {flag}"
 
 
-# -- the installer, users and folders
-def test_the_prefix_takes_the_place_of_the_usual_one(installed: Path) -> None:
-    for path in sorted(installed.rglob("*.service")):
-        text = path.read_text()
-        assert "/opt/vram-arbiter" not in text
-        assert f"ExecStart={installed.parent}/prefix/bin/vram-" in text
-        assert path.stat().st_mode & 0o777 == 0o644
-    assert {path.name for path in (installed / "etc").iterdir()} == {
-        "systemd",
-        "sysusers.d",
-        "tmpfiles.d",
-    }
-
-
-def test_the_installer_refuses_what_cannot_work(tmp_path: Path) -> None:
-    assert install().returncode != 0
-    assert "absolute path" in install("relative", str(tmp_path)).stderr
-    assert "install the product first" in install(str(tmp_path / "nothing")).stderr
-    # A Python of pyenv or uv is below the home folder of its user; systemd said only 203/EXEC.
-    programs = tmp_path / "prefix" / "bin"
-    programs.mkdir(parents=True)
-    (programs / "vram-arbiter").symlink_to(sys.executable)
-    (programs / "python").symlink_to("/home/python3.12")
-    warned = install(
-        str(tmp_path / "prefix"), str(tmp_path / "root")
-    )  # without a root of its own it is refused
-    assert "the system's units cannot read /home/python3.12" in warned.stderr
-
-
+# -- users and folders
 @pytest.mark.skipif(
     shutil.which("systemd-sysusers") is None or os.getuid() != 0,
     reason="needs root and systemd-sysusers",
@@ -313,8 +304,8 @@ def test_users_and_folders_are_made_below_a_root_of_their_own(installed: Path) -
 
 
 def test_the_page_names_every_unit_and_the_example_configuration_loads() -> None:
-    page = (TREE / "docs" / "systemd.md").read_text(encoding="utf-8")
-    for name in (*UNITS, "usermod", "journalctl", "install-units", "systemctl --user"):
+    page = (TREE / "docs/how-to/systemd.md").read_text(encoding="utf-8")
+    for name in (*UNITS, "usermod", "journalctl", "vramctl install", "--user-units"):
         assert name.removesuffix(".service").removesuffix("@") in page
     for block in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL):
-        load_config(block, "docs/systemd.md")
+        load_config(block, "docs/how-to/systemd.md")

@@ -1,11 +1,14 @@
 """Every unit under a real systemd with a simulated GPU: it starts, serves, is killed, and comes
 back.
 
-The units as `make install-units` copies them once never started: a system call filter ended the
-daemon before its first line. Reading the files did not show that.
+Installed, upgraded and removed by `vramctl` as docs/how-to/systemd.md says. The units once never
+started: a system call filter ended the daemon before its first line. Reading the files did not show
+that.
 """
 
 import json
+import re
+import shutil
 import signal
 import subprocess
 import time
@@ -23,7 +26,7 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.skipif(OBSTACLE is not None, reason=f"no systemd can be started here: {OBSTACLE}"),
 ]
-PAGE = Path(__file__).parents[2] / "docs" / "systemd.md"
+PAGE = Path(__file__).parents[2] / "docs/how-to/systemd.md"
 SYSTEM = "/etc/systemd/system"
 ENDPOINT = "ipc:///run/vram-arbiter/arbiter.sock"
 ARBITER = "vram-arbiter.service"
@@ -37,27 +40,57 @@ def steps(heading: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def machine() -> Iterator[Machine]:
-    """Booted and set up by the commands of docs/systemd.md, with a simulated GPU; the units log
-    into files."""
+def booted() -> Iterator[Machine]:
+    """A machine whose units will log into files, with a simulated GPU."""
     made = Machine()
     try:
         made.run("mkdir", "-m", "1777", "/run/logs")
-        for folder, log in ((SYSTEM, "%n"), ("/etc/systemd/user", "%n.%u")):
-            output = f"append:/run/logs/{log}.log"
-            text = f"[Service]\nStandardOutput={output}\nStandardError={output}\n"
-            made.write(f"{folder}/vram-.service.d/log.conf", text)
+        made.run("groupadd", "--system", "--force", "render")  # a group of devices is not removed
+        output = "append:/run/logs/%n.log"
+        text = f"[Service]\nStandardOutput={output}\nStandardError={output}\n"
+        made.write(f"{SYSTEM}/vram-.service.d/log.conf", text)
         # Waiting 15 s for a watchdog shows no more than waiting 5 s does.
         made.write(f"{SYSTEM}/{ARBITER}.d/test.conf", "[Service]\nWatchdogSec=5\n")
-        made.write("/etc/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
-        install = steps("Install")
-        assert "-m venv" in install[0]  # these two are done: the environment is mounted
-        assert "pip install" in install[1]
-        for step in [*install[2:], steps("Permissions")[2]]:
-            made.run("bash", "-c", f"cd /opt/tree && {step}")
         yield made
     finally:
         made.close()
+
+
+@pytest.fixture(scope="module")
+def before(booted: Machine) -> set[str]:
+    """What was on the machine before the installation."""
+    return files_inside(booted)
+
+
+@pytest.fixture(scope="module")
+def machine(booted: Machine, before: set[str]) -> Machine:
+    """Set up by the commands of docs/how-to/systemd.md: first without a GPU, where everything but
+    the start succeeds, then again with a simulated one."""
+    install = steps("Install")
+    assert "-m venv" in install[0]  # these two are done: the environment is mounted
+    assert "pip install" in install[1]
+    command = ["env", "USER=daemon", "bash", "-c", f"{install[2].partition('#')[0]} --yes 2>&1"]
+    said = booted.run(*command, code=1)
+    assert f"{ARBITER} does not start" in said
+    assert 'ARBITER_OPTIONS="--gpu fake:8GiB" into /etc/vram-arbiter/arbiter.env' in said
+
+    booted.write("/etc/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
+    said = booted.run(*command)
+    assert [line.split()[0] for line in said.splitlines() if " same " not in line][1:] == ["start"]
+    return booted
+
+
+def files_inside(machine: Machine) -> set[str]:
+    """Return a line for each file, link and folder that an installation could touch, but for the
+    lock and the backups that the tools for users keep."""
+    places = "etc usr/local/bin usr/local/share var/lib var/cache run/vram-arbiter"
+    found = machine.run(
+        "bash", "-c",
+        f"cd /; find {places} \\( -path var/lib/dpkg -o -path var/lib/apt \\) -prune -o "
+        "-printf '%p %y %l %m %U\\n' 2>/dev/null; find etc usr/local -type f | xargs sha256sum",
+    )  # fmt: skip
+    kept = re.compile(r"\betc/(?:(?:passwd|group|shadow|gshadow|subuid|subgid)-|\.pwd\.lock)")
+    return {line for line in found.splitlines() if not kept.search(line)}
 
 
 def answer_of[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
@@ -117,6 +150,7 @@ def hit(machine: Machine, name: str) -> None:
 
 
 def test_each_group_may_do_its_part(machine: Machine) -> None:
+    """`daemon` and `games` are two users of Debian without a group of ours."""
     (text,) = machine.show(ARBITER, "StatusText")
     assert text.startswith("serving Simulated GPU")
     with held_inside(machine, "of-the-group", user="vram-robot"):
@@ -124,11 +158,15 @@ def test_each_group_may_do_its_part(machine: Machine) -> None:
     drain = ("vramctl", "drain", "--reason", "a test", "--endpoint", ENDPOINT)
     machine.run(*drain, user="vram-robot", code=1)
 
-    machine.run("vramctl", "status", "--endpoint", ENDPOINT, user="daemon", code=3)
+    machine.run("vramctl", "status", "--endpoint", ENDPOINT, user="games", code=3)
     for step in steps("Permissions")[:2]:
-        machine.run("env", "USER=daemon", "bash", "-c", step)
-    machine.run(*drain, user="daemon")
-    machine.run("vramctl", "resume", "--endpoint", ENDPOINT, user="daemon")
+        machine.run("env", "USER=games", "bash", "-c", step)
+    for operator in ("daemon", "games"):  # by --operators, and by hand
+        machine.run(*drain, user=operator)
+        machine.run("vramctl", "resume", "--endpoint", ENDPOINT, user=operator)
+    for step in steps("Permissions")[:2]:
+        group = step.split("--groups ")[1].split()[0]
+        machine.run("gpasswd", "--delete", "games", group)
 
 
 def test_a_killed_arbiter_comes_back_with_its_leases(machine: Machine) -> None:
@@ -152,6 +190,12 @@ def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
 
 def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> None:
     machine.write("/etc/vram-arbiter/arbiter.yaml", "gpu:\n  reserv_bytes: 1GiB\n")
+    machine.run("systemctl", "reload", ARBITER)
+    answer_of(
+        lambda: "config_refused" in machine.log(ARBITER) or None, lambda: machine.log(ARBITER)
+    )
+    status = machine.run("vramctl", "status", "--endpoint", ENDPOINT)
+    assert "did you mean reserve_bytes?" in status, "refused, and the arbiter goes on"
     machine.run("systemctl", "restart", ARBITER, code=1)
     assert machine.show(ARBITER, "ActiveState", "ExecMainStatus") == ["failed", "2"]
     machine.run("rm", "/etc/vram-arbiter/arbiter.yaml")
@@ -162,35 +206,30 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     """Such a manager has no privileges: a setting that drops capabilities keeps a unit from
     starting there."""
     home, runtime = "/tmp/home", "/run/user/robot"
-    machine.run(
-        "install",
-        "-d",
-        "-o",
-        "vram-robot",
-        "-m",
-        "700",
-        home,
-        runtime,
-        f"{home}/.config/vram-arbiter",
-    )
+    own = ["install", "-d", "-o", "vram-robot", "-m", "700"]
+    machine.run(*own, home, runtime, f"{home}/.config", f"{home}/.config/vram-arbiter")
     machine.write(f"{home}/.config/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
     machine.write(
         f"{SYSTEM}/manager.service",
         "[Service]\nType=notify\nUser=vram-robot\nDelegate=yes\nKillSignal=SIGKILL\n"
         "ExecStart=/lib/systemd/systemd --user\n"
+        "StandardError=append:/run/logs/manager.log\n"
         f"Environment=HOME={home} XDG_RUNTIME_DIR={runtime} "
-        "SYSTEMD_UNIT_PATH=/etc/systemd/user:/run/targets\n",
+        f"SYSTEMD_UNIT_PATH={home}/.config/systemd/user:/run/targets\n",
     )
     machine.run("ln", "-s", "multi-user.target", "/run/targets/default.target")
     machine.run("systemctl", "daemon-reload")
     machine.start("manager.service")
-    as_user = ["env", f"XDG_RUNTIME_DIR={runtime}", "systemctl", "--user"]
-    machine.run(*as_user, "start", "vram-arbiter", user="vram-robot")
-    assert (
-        leases_inside(machine, f"ipc://{runtime}/vram-arbiter/arbiter.sock", user="vram-robot")
-        == {}
-    )
+    as_user = ["env", f"HOME={home}", f"XDG_RUNTIME_DIR={runtime}", "vramctl"]
+    machine.run(*as_user, "install", "--yes", user="vram-robot", code=2)  # the machine's: for root
+    machine.run(*as_user, "install", "--user-units", "--yes", user="vram-robot")
+    endpoint = f"ipc://{runtime}/vram-arbiter/arbiter.sock"
+    assert leases_inside(machine, endpoint, user="vram-robot") == {}
+    machine.run(*as_user, "uninstall", "--user-units", "--purge", "--yes", user="vram-robot")
+    left = machine.run("find", home, runtime, "!", "-type", "d").split()
+    assert not [path for path in left if "vram" in path]
     machine.run("systemctl", "stop", "manager.service")
+    machine.run("rm", f"{SYSTEM}/manager.service")
 
 
 LOAD = """
@@ -242,3 +281,72 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     machine.run("systemctl", "stop", sidecar, runner)
     assert machine.show(sidecar, "Result") == ["success"]
     assert machine.show(runner, "Result") == ["success"]
+
+
+def put_next_version(machine: Machine) -> None:
+    """Replace the package under the running programs, as pip does; the next version's units
+    differ."""
+    (package,) = machine.prefix.glob("lib/python3*/site-packages/vram_arbiter")
+    fresh = package.with_name("fresh")
+    shutil.copytree(package, fresh)
+    for unit in (fresh / "configs/systemd/system").glob("*.service"):
+        unit.write_text(unit.read_text() + "# of the next version\n")
+    shutil.rmtree(package)
+    fresh.rename(package)
+
+
+def tokens_inside(machine: Machine) -> dict[str, list[int] | None]:
+    """The tokens of all leases, which an operator sees."""
+    code = (
+        "import json; from vram_arbiter.clients.net.request import ask\n"
+        f"reply = ask('status', {{}}, '{ENDPOINT}', role='operator')\n"
+        "print(json.dumps({lease['lease_id']: lease['token'] for lease in reply['leases']}))"
+    )
+    found: dict[str, list[int] | None] = json.loads(
+        machine.run("/opt/vram-arbiter/bin/python", "-c", code)
+    )
+    return found
+
+
+def test_an_upgrade_keeps_leases_and_files_of_the_operator(machine: Machine) -> None:
+    edited = f"{SYSTEM}/vram-sidecar@.service"
+    machine.write(edited, machine.read(edited) + "# of the operator\n")
+    with held_inside(machine, "first") as first, held_inside(machine, "second") as second:
+        put_next_version(machine)
+        said = machine.run("vramctl", "install", "--yes")
+        assert f"replace {SYSTEM}/{ARBITER}" in said
+        assert "+# of the next version" in said
+        assert f"{edited}: changed by hand" in said
+        assert machine.read(edited).endswith("# of the operator\n")
+        assert machine.read(f"{edited}.new").endswith("# of the next version\n")
+        assert "systemctl restart vram-arbiter" in said
+
+        tokens = tokens_inside(machine)
+        machine.run("systemctl", "restart", ARBITER)
+        for held in (first, second):
+            name = held["consumer"]
+            after = answer_of(
+                lambda name=name: (leases_inside(machine) or {}).get(name),
+                lambda: machine.log(ARBITER),
+            )
+            assert (after["lease_id"], after["pid"]) == (held["lease_id"], held["pid"])
+        assert tokens_inside(machine) == tokens
+        assert len(tokens) == 2
+        plan = machine.run("vramctl", "uninstall", "--dry-run")
+        assert "these hold a lease, and unload without an arbiter: first, second" in plan
+        assert None not in tokens.values()
+
+
+def test_a_removal_leaves_nothing_behind(machine: Machine, before: set[str]) -> None:
+    said = machine.run("vramctl", "uninstall", "--yes")
+    assert f"{SYSTEM}/vram-sidecar@.service: changed by hand" in said
+    assert f"{SYSTEM}/{ARBITER}.d/test.conf: not installed by vramctl" in said
+    kept = {line.split()[0].strip("/") for line in files_inside(machine) - before}
+    assert "etc/systemd/system/vram-sidecar@.service" in kept
+    assert "etc/vram-arbiter/arbiter.env" in kept
+    assert "var/lib/vram-arbiter" in kept
+    assert not [path for path in kept if "usr/local" in path or path.endswith(ARBITER)]
+
+    machine.run("rm", f"{SYSTEM}/vram-sidecar@.service")
+    machine.run("/opt/vram-arbiter/bin/vramctl", "uninstall", "--purge", "--yes")
+    assert files_inside(machine) ^ before == set()

@@ -1,0 +1,1 @@
+"""`vramctl install` and `uninstall`: a plan of steps, their effects, and what was installed."""

@@ -1,0 +1,97 @@
+"""What an installation consists of: the shipped units and snippets for one environment and group,
+links to the programs, and shell completions. It reads shipped files and compares nothing.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import vram_arbiter
+from vram_arbiter.clients.cli.installation.completion import completions
+from vram_arbiter.clients.cli.installation.site import (
+    ARBITER,
+    CLIENTS,
+    GROUP,
+    OF_USER,
+    PROGRAMS,
+    Site,
+    is_tegra,
+    tegra_devices,
+)
+
+SHIPPED = Path(vram_arbiter.__file__).parent / "configs"
+_PREFIX = "/opt/vram-arbiter"  # of the shipped files
+_ON_GPU = ("vram-arbiter.service", "vram-sidecar@.service", "vram-runner@.service")
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """The files and links of an installation, by their paths on the installed machine."""
+
+    files: dict[Path, str]
+    links: dict[Path, str]
+
+
+def wanted(site: Site, prefix: Path, group: str) -> Contents:
+    """Return what belongs on the machine."""
+    files = _files_of_system(site) if site.layout.system else _files_of_user(site)
+    files = {path: _adapted(text, prefix, group) for path, text in files.items()}
+    settings, shared = site.layout.settings, site.layout.shared
+    for name in ("arbiter.yaml", "hooks.yaml"):
+        files[settings / f"{name}.example"] = _read(name)
+    for place, text in completions().items():
+        files[shared / place] = text
+    links = {}
+    if prefix / "bin" != site.layout.programs:
+        links = {site.layout.programs / name: str(prefix / "bin" / name) for name in PROGRAMS}
+    return Contents(files, links)
+
+
+def _files_of_system(site: Site) -> dict[Path, str]:
+    units = site.layout.units
+    files = {units / name: _read(f"systemd/system/{name}") for name in (ARBITER, *CLIENTS)}
+    for path in sorted((SHIPPED / f"systemd/system/{ARBITER}.d").iterdir()):
+        files[units / f"{ARBITER}.d" / path.name] = path.read_text(encoding="utf-8")
+    for folder, name in (
+        ("sysusers.d", "vram-arbiter.conf"),
+        ("tmpfiles.d", "vram-arbiter.conf"),
+        ("profile.d", "vram-arbiter.sh"),
+    ):
+        files[Path("/etc") / folder / name] = _read(f"systemd/{folder}/{name}")
+    if is_tegra(site):
+        text = tegra_drop_in(_read("systemd/tegra.conf"), tegra_devices(site))
+        files |= {units / f"{name}.d" / "tegra.conf": text for name in _ON_GPU}
+    return files
+
+
+def _files_of_user(site: Site) -> dict[Path, str]:
+    return {site.layout.units / name: _read(f"systemd/user/{name}") for name in OF_USER}
+
+
+def tegra_drop_in(text: str, devices: list[str]) -> str:
+    """Return the shipped drop-in with the device nodes of this machine that it does not name."""
+    lines = [f"DeviceAllow={device} rw" for device in devices]
+    return text + "".join(f"{line}\n" for line in lines if line not in text.splitlines())
+
+
+def _read(name: str) -> str:
+    return (SHIPPED / name).read_text(encoding="utf-8")
+
+
+_GROUPS: tuple[tuple[str, Callable[[str], str]], ...] = (
+    (r"^Group=vram-arbiter$", lambda group: f"Group={group}"),
+    (r"--group vram-arbiter(?= )", lambda group: f"--group {group}"),
+    (r"^(m \S+ +)vram-arbiter$", lambda group: rf"\g<1>{group}"),
+    (r"^(d \S+ \d+ vram-arbiter) vram-arbiter", lambda group: rf"\1 {group}"),
+    (r"^u vram-arbiter ", lambda group: f"g {group} -\nm vram-arbiter {group}\nu vram-arbiter "),
+)
+"""Where the shipped files name the group that may connect, and what another one makes of it."""
+
+
+def _adapted(text: str, prefix: Path, group: str) -> str:
+    text = text.replace(_PREFIX, str(prefix))
+    if group != GROUP:
+        for pattern, other in _GROUPS:
+            text = re.sub(pattern, other(group), text, flags=re.MULTILINE)
+    return text

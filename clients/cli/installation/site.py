@@ -1,0 +1,141 @@
+"""Where an installation goes: this machine, one user's home, or a folder for another machine.
+
+Paths of the other modules are those of the installed machine; only `Site.at` knows the folder.
+"""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from vram_arbiter.schemas.errors import ConfigError
+
+ARBITER = "vram-arbiter.service"
+CLIENTS = (
+    "vram-hooks.service",
+    "vram-sidecar@.service",
+    "vram-runner@.service",
+    "vram-reasoner@.service",
+    "vram-reasoner.service",
+)
+OF_USER = (ARBITER, "vram-reasoner.service")
+PROGRAMS = ("vram-arbiter", "vramctl", "vram-sidecar", "vram-runner", "vram-reasoner")
+GROUP = "vram-arbiter"
+OPERATORS = "vram-operators"
+_NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Folders of one kind of installation."""
+
+    units: Path
+    settings: Path
+    programs: Path
+    shared: Path
+    """Of the shell completions."""
+    state: tuple[Path, ...]
+    """What the programs write: journals, caches, sockets."""
+    system: bool
+
+
+SYSTEM = Layout(
+    units=Path("/etc/systemd/system"),
+    settings=Path("/etc/vram-arbiter"),
+    programs=Path("/usr/local/bin"),
+    shared=Path("/usr/local/share"),
+    state=(
+        Path("/var/lib/vram-arbiter"),
+        Path("/var/lib/vram-runner"),
+        Path("/var/lib/vram-reasoner"),
+        Path("/var/lib/vram-hooks"),
+        Path("/var/lib/private/vram-hooks"),  # where that leads: its user exists while it runs
+        Path("/var/cache/vram-sidecar"),
+        Path("/var/cache/vram-runner"),
+        Path("/run/vram-arbiter"),
+    ),
+    system=True,
+)
+
+
+def layout_of_user(environ: Mapping[str, str], home: Path) -> Layout:
+    """Return the folders of one user (XDG base directories)."""
+
+    def folder(variable: str, otherwise: str) -> Path:
+        value = environ.get(variable, "")
+        return Path(value) if value.startswith("/") else home / otherwise
+
+    settings = folder("XDG_CONFIG_HOME", ".config")
+    kept = folder("XDG_STATE_HOME", ".local/state")
+    state = [kept / "vram-arbiter", kept / "vram-hooks"]
+    if runtime := environ.get("XDG_RUNTIME_DIR"):
+        state.append(Path(runtime) / "vram-arbiter")
+    return Layout(
+        units=settings / "systemd/user",
+        settings=settings / "vram-arbiter",
+        programs=home / ".local/bin",
+        shared=folder("XDG_DATA_HOME", ".local/share"),
+        state=tuple(state),
+        system=False,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One installation. `root` other than `/`: files alone, for another machine or an image."""
+
+    layout: Layout
+    root: Path = Path("/")
+
+    def at(self, path: Path) -> Path:
+        """Return where a path of the installed machine is on this one."""
+        return self.root / path.relative_to("/")
+
+    @property
+    def live(self) -> bool:
+        """Whether the services of this machine are meant."""
+        return self.root == Path("/")
+
+    @property
+    def record(self) -> Path:
+        """The file that says what was installed."""
+        return self.layout.settings / "installed.json"
+
+
+def check_name(name: str, what: str) -> str:
+    """Return a group's name. Raises ConfigError for one that no unit could hold."""
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"expected the name of a {what}, got {name!r}")
+    return name
+
+
+def is_tegra(site: Site) -> bool:
+    """Return whether the machine is a Jetson or another Tegra: its GPU has devices of its own."""
+    if site.at(Path("/etc/nv_tegra_release")).exists():
+        return True
+    try:
+        compatible = Path("/proc/device-tree/compatible").read_bytes() if site.live else b""
+    except OSError:
+        return False
+    return b"nvidia,tegra" in compatible
+
+
+def tegra_devices(site: Site) -> list[str]:
+    """Return the device nodes of a Tegra's GPU that are there.
+
+    They lie in folders of other names from one generation to the next (`/dev/nvgpu/igpu0` on Orin,
+    `/dev/nvgpu/igpu-0000:01:00.0` on Thor), and a unit takes no pattern for a device node.
+    """
+    devices = site.at(Path("/dev"))
+    patterns = ("nvmap", "nvsciipc", "nvhost-*", "host1x-*", "nvgpu/*/*")
+    found = {path for pattern in patterns for path in devices.glob(pattern) if not path.is_dir()}
+    return sorted(str(Path("/dev") / path.relative_to(devices)) for path in found)
+
+
+def user_home(environ: Mapping[str, str]) -> Path:
+    """Return the home folder of the calling user. Raises ConfigError."""
+    home = environ.get("HOME", "")
+    if not os.path.isabs(home):
+        raise ConfigError("no home folder: HOME is not set", hint="set it, or log in")
+    return Path(home)

@@ -1,0 +1,328 @@
+"""`vramctl install` and `uninstall` below a folder: the plan, what is kept, what is refused.
+
+On a machine with a real systemd they run in tests/packaging/test_units_start.py.
+"""
+
+import os
+import shutil
+import stat
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from vram_arbiter.clients.cli.installation import completion as completing
+from vram_arbiter.clients.cli.installation import environment, install, machine
+from vram_arbiter.clients.cli.installation.site import PROGRAMS
+from vram_arbiter.clients.cli.main import COMMANDS, run_main
+from vram_arbiter.schemas.errors import ConfigError
+
+UNIT = "etc/systemd/system/vram-arbiter.service"
+SIDECAR = "etc/systemd/system/vram-sidecar@.service"
+RECORD = "etc/vram-arbiter/installed.json"
+SHORT = {Path("bash-completion/completions/vramctl"): "complete vramctl\n"}
+
+
+@pytest.fixture(scope="module")
+def scripts() -> dict[Path, str]:
+    return completing.completions()
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder for another machine; its completion is short, because making it takes a second."""
+    monkeypatch.setattr("vram_arbiter.clients.cli.installation.contents.completions", lambda: SHORT)
+    return tmp_path / "root"
+
+
+def vramctl(root: Path, *arguments: str) -> int:
+    return run_main([*arguments, "--root", str(root)])
+
+
+def tree(root: Path) -> dict[str, tuple[int, bytes]]:
+    """Path → mode and content (a link's target) of everything that is not a folder."""
+    found = {}
+    for path in root.rglob("*"):
+        if path.is_symlink():
+            found[str(path.relative_to(root))] = (0, os.readlink(path).encode())
+        elif path.is_file():
+            mode = stat.S_IMODE(path.stat().st_mode)
+            found[str(path.relative_to(root))] = (mode, path.read_bytes())
+    return found
+
+
+def test_a_plan_is_shown_then_performed_once(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = ["install", "--prefix", "/opt/other"]
+    assert vramctl(root, *plan, "--dry-run") == 0
+    shown = capsys.readouterr().out
+    assert not root.exists(), "a dry run writes nothing"
+
+    assert vramctl(root, *plan, "--yes") == 0
+    assert capsys.readouterr().out == shown
+    files = tree(root)
+    assert {f"new     /{path}" for path in files if path.startswith("etc/systemd")} <= {
+        line.strip() for line in shown.splitlines()
+    }
+    for path, (mode, content) in files.items():
+        if path.startswith("etc/"):
+            assert mode == 0o644, path
+        if path.startswith("etc/systemd") and path.endswith(".service"):
+            assert b"ExecStart=/opt/other/bin/vram" in content
+            assert b"/opt/vram-arbiter" not in content
+    assert files["usr/local/bin/vramctl"] == (0, b"/opt/other/bin/vramctl")
+    assert f"{UNIT}.d/tegra.conf" not in files, "for a Jetson only"
+
+    written = os.stat(root / UNIT).st_ino
+    assert vramctl(root, *plan) == 0, "nothing to ask"
+    said = capsys.readouterr().out
+    assert "nothing to change" in said
+    assert " new " not in said
+    assert (tree(root), os.stat(root / UNIT).st_ino) == (files, written)
+
+
+def test_the_plan_needs_a_yes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = ["install", "--prefix", "/opt/one"]
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    for answer in ("", "n", "yesterday"):
+        monkeypatch.setattr("builtins.input", lambda _, answer=answer: answer)
+        assert vramctl(root, *plan) == 1
+        assert not root.exists()
+    monkeypatch.setattr("builtins.input", lambda _: "y")
+    assert vramctl(root, *plan) == 0
+    assert (root / UNIT).exists()
+
+
+def test_a_changed_file_is_kept_and_the_new_text_offered_once(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The next version is stood in for by another prefix, which changes every unit."""
+    new = root / f"{SIDECAR}.new"
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    (root / SIDECAR).write_text("# the operator's\n")
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    assert not new.exists(), "the product has no new text"
+
+    capsys.readouterr()
+    assert vramctl(root, "install", "--prefix", "/opt/two", "--yes") == 0
+    said = capsys.readouterr().out
+    assert f"keep    /{SIDECAR}: changed by hand; the new text goes to {new.name}" in said
+    assert "+ExecStart=/opt/two/bin/vram-arbiter --group" in said
+    assert (root / SIDECAR).read_text() == "# the operator's\n"
+    assert "/opt/two/bin/vram-sidecar" in new.read_text()
+
+    offered = new.read_text()
+    new.unlink()
+    assert vramctl(root, "install", "--prefix", "/opt/two") == 0
+    assert not new.exists(), "refused once"
+    assert vramctl(root, "install", "--prefix", "/opt/three", "--yes") == 0
+    (root / SIDECAR).write_text(offered.replace("/opt/two", "/opt/three"))
+    assert vramctl(root, "install", "--prefix", "/opt/three", "--yes") == 0
+    assert not new.exists(), "taken over: no longer needed"
+
+
+def test_a_link_and_a_file_of_others_stay(root: Path) -> None:
+    (root / "usr/local/bin").mkdir(parents=True)
+    (root / "usr/local/bin/vramctl").symlink_to("/home/me/vramctl")
+    (root / UNIT).parent.mkdir(parents=True)
+    (root / UNIT).symlink_to("/dev/null")  # masked
+    before = tree(root)
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    assert tree(root).items() >= before.items()
+    assert vramctl(root, "uninstall", "--yes") == 0
+    assert tree(root) == before
+
+
+@pytest.mark.parametrize("purge", [(), ("--purge",)])
+def test_a_removal_keeps_what_was_changed_unless_it_purges(
+    root: Path, purge: tuple[str, ...]
+) -> None:
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    (root / SIDECAR).write_text("# the operator's\n")
+    (root / "etc/vram-arbiter/arbiter.yaml").write_text("gpu: {}\n")
+    assert vramctl(root, "uninstall", "--yes", *purge) == 0
+    left = {SIDECAR, "etc/vram-arbiter/arbiter.yaml"}
+    assert set(tree(root)) == (set() if purge else left)
+    assert root.exists() != bool(purge), "the folders that it made are gone too"
+    assert vramctl(root, "uninstall") == 0, "nothing is installed"
+
+
+def test_another_group_is_named_everywhere_and_kept_by_the_next_installation(root: Path) -> None:
+    options = ["--prefix", "/opt/one", "--yes"]
+    assert vramctl(root, "install", "--group", "robots", *options) == 0
+    first = tree(root)
+    for unit in (UNIT, SIDECAR):
+        assert "\nGroup=robots\n" in (root / unit).read_text()
+    assert "--group robots --operators-group" in (root / UNIT).read_text()
+    users = (root / "etc/sysusers.d/vram-arbiter.conf").read_text()
+    assert "\ng robots -\n" in users
+    assert "\nm vram-robot   robots\n" in users
+    folders = (root / "etc/tmpfiles.d/vram-arbiter.conf").read_text()
+    assert "d /run/vram-arbiter 1770 vram-arbiter robots" in folders
+    assert vramctl(root, "install", *options) == 0
+    assert tree(root) == first
+
+
+def test_a_jetson_gets_the_device_nodes_that_it_has(root: Path) -> None:
+    node = "/dev/nvgpu/igpu-0000:01:00.0/ctrl"  # Thor; on Orin the folder is igpu0
+    for path in ("etc/nv_tegra_release", node.lstrip("/")):
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).touch()
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    assert f"DeviceAllow={node} rw\n" in (root / f"{SIDECAR}.d/tegra.conf").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--prefix", "relative"], "expected an absolute path"),
+        (["--prefix", "/opt/with space"], "expected an absolute path"),
+        (["--prefix", "/opt/%n"], "expected an absolute path"),
+        (["--prefix", "/opt/one", "--group", "no group"], "expected the name of a group"),
+        (["--prefix", "/opt/one", "--operators", "me"], "--operators needs the machine's units"),
+        (["--prefix", "/opt/one"], "--yes performs it"),
+    ],
+)
+def test_what_cannot_be_installed_is_refused(
+    root: Path, capsys: pytest.CaptureFixture[str], arguments: Sequence[str], says: str
+) -> None:
+    assert vramctl(root, "install", *arguments) == 2
+    assert says in capsys.readouterr().err
+    assert not root.exists()
+
+
+def test_the_machine_itself_is_for_root_and_a_user_for_himself(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(install.os, "getuid", lambda: 1000)
+    for command in ("install", "uninstall"):
+        assert run_main([command]) == 2
+        assert f"`vramctl {command} --user-units`" in capsys.readouterr().err
+    monkeypatch.setattr(install.os, "getuid", lambda: 0)
+    assert run_main(["install", "--user-units"]) == 2
+    assert "without sudo" in capsys.readouterr().err
+    monkeypatch.setattr(machine, "_BOOTED", tmp_path / "nothing")
+    assert run_main(["install"]) == 2
+    assert "systemd does not run on this machine" in capsys.readouterr().err
+
+
+def test_a_record_of_something_else_is_not_believed(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / RECORD).parent.mkdir(parents=True)
+    (root / RECORD).write_text('{"files": {"/etc/passwd": 3}}')
+    assert vramctl(root, "uninstall", "--yes") == 2
+    (root / RECORD).write_text("{}")
+    (root / RECORD).chmod(0o666)
+    assert vramctl(root, "uninstall", "--yes") == (2 if os.getuid() == 0 else 0)
+    if os.getuid() == 0:
+        assert "may be written by every user" in capsys.readouterr().err
+
+
+def test_a_removal_stops_units_of_ours_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without patterns systemctl lists every unit of the machine, and a second removal, which has
+    no unit left, once began to disable them all."""
+    listed = "-.mount loaded\nvram-runner@sim.service loaded\nssh.service loaded\n"
+    monkeypatch.setattr(machine, "command", lambda *_: listed)
+    wants = tmp_path / "multi-user.target.wants"
+    wants.mkdir()
+    for name in ("vram-runner@deploy.service", "ssh.service"):
+        (wants / name).touch()
+    found = machine.Services(system=True).known(["vram-runner@*.service"], tmp_path)
+    assert found == ["vram-runner@deploy.service", "vram-runner@sim.service"]
+    assert machine.Services(system=True).known([], tmp_path) == []
+
+
+# -- the environment that the units run
+def test_a_program_that_a_user_may_change_is_not_run_by_a_unit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A link is followed step by step: the folder of any of them decides what runs."""
+    environment.check_path(Path("/bin/sh"))  # a link of root's in a linked folder of root's
+    link = tmp_path / "sh"
+    link.symlink_to("/bin/sh")
+    with pytest.raises(ConfigError, match="the system's units cannot read /tmp"):
+        environment.check_path(Path("/tmp"))
+    monkeypatch.setattr(environment, "HIDDEN", ())
+    with pytest.raises(ConfigError, match=r"may be written by every user.*chmod go-w /tmp"):
+        environment.check_path(Path("/tmp"))
+    if os.getuid() == 0:
+        monkeypatch.setattr(environment, "writable_by_others", owner_only)
+        os.lchown(link, 12345, -1)
+        with pytest.raises(ConfigError, match=f"{link} belongs to uid 12345"):
+            environment.check_path(link)
+    link.unlink()
+    link.symlink_to(link)
+    with pytest.raises(ConfigError, match="too many links"):
+        environment.check_path(link)
+
+
+def owner_only(found: os.stat_result) -> str:
+    return "" if found.st_uid == 0 else f"belongs to uid {found.st_uid}"
+
+
+def test_an_environment_without_the_product_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"not found: .*/bin/vram-arbiter"):
+        environment.check_environment(tmp_path, system=False)
+    (tmp_path / "bin").mkdir()
+    for name in PROGRAMS:
+        (tmp_path / "bin" / name).write_text("#!/usr/bin/python3 of another product\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    with pytest.raises(ConfigError, match=r"bin/vram-arbiter is not a program of pip's"):
+        environment.check_environment(tmp_path, system=False)
+
+
+@pytest.mark.parametrize(("version", "says"), [("9.9", "has version 9.9"), (None, "cannot run")])
+def test_the_units_run_the_version_that_installs_them(
+    tmp_path: Path, version: str | None, says: str
+) -> None:
+    """An interpreter that answers as another version's does; without an answer none is there."""
+    python = tmp_path / "bin/python"
+    python.parent.mkdir()
+    answer = "exit 1" if version is None else f"""echo '["{version}", "/nowhere"]'"""
+    python.write_text(f"#!/bin/sh\n{answer}\n")
+    for name in PROGRAMS:
+        (tmp_path / "bin" / name).write_text(f"#!{python}\n")
+    for path in python.parent.iterdir():
+        path.chmod(0o755)
+    with pytest.raises(ConfigError, match=says):
+        environment.check_environment(tmp_path, system=False)
+
+
+# -- completion
+def test_completion_knows_every_command_and_its_options(
+    scripts: dict[Path, str], tmp_path: Path
+) -> None:
+    script = tmp_path / "vramctl.bash"
+    script.write_text(scripts[completing.PLACES["bash"]])
+    asked = (
+        'ask() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); '
+        '"$(complete -p vramctl | sed "s/.*-F //; s/ .*//")"; echo "${COMPREPLY[@]}"; }'
+    )
+    done = subprocess.run(
+        [
+            "bash", "-c",
+            f"source {script}; {asked}; ask vramctl ''; ask vramctl evict --re; "
+            "ask vramctl run --on-evict ''",
+        ],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    commands, options, choices = done.stdout.splitlines()
+    assert set(COMMANDS) <= set(commands.split())
+    assert options == "--reason"
+    assert "cuda-checkpoint" in choices.split()
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_completion_is_a_script_of_its_shell(
+    scripts: dict[Path, str], tmp_path: Path, shell: str
+) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    script = tmp_path / "script"
+    script.write_text(scripts[completing.PLACES[shell]])
+    subprocess.run([shell, "-n", str(script)], check=True)
