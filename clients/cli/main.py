@@ -55,6 +55,10 @@ COMMANDS: Mapping[str, Command] = {
     "why": Command("why", "explain why a consumer is not running", traced=False),
     "history": Command("history", "list grants, evictions and verdicts with their reasons"),
     "watch": Command("watch", "show status and events live"),
+    "timeline": Command(
+        "timeline.command", "draw GPU memory over time as .png, .html or a Perfetto trace"
+    ),
+    "top": Command("top.command", "show everything live on a whole terminal, with operator keys"),
     "evict": Command("operators", "revoke a lease; a use in flight finishes first"),
     "pin": Command("operators", "protect a lease from eviction until it is unpinned"),
     "unpin": Command("operators", "undo an operator's pin"),
@@ -66,6 +70,10 @@ COMMANDS: Mapping[str, Command] = {
         "calibrate", "measure what a model or a program needs, for the footprint file", wraps=True
     ),
     "doctor": Command("doctor", "check the installation, the daemon and its GPUs"),
+    "install": Command("install", "make the arbiter a service, after showing the plan"),
+    "uninstall": Command("install", "remove what `vramctl install` put on this machine"),
+    "hooks": Command("hooks", "run commands and webhooks for events"),
+    "mcp": Command("mcp", "serve status, why and history to agents"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
     "simulate": Command("offline", "simulate a scenario under one policy or more", passes_on=True),
     "demo": Command("demo", "run find, navigate, grab on a simulated arm inside 8 GiB"),
@@ -96,7 +104,9 @@ def run_main(argv: Sequence[str]) -> int:
         return UNREACHABLE if unreachable else NO
 
 
-def _parse_and_run(name: str, module: Any, arguments: Sequence[str]) -> int:
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """Return the parser of one command; not of one that another program parses."""
+    module = import_module(f"vram_arbiter.clients.cli.{COMMANDS[name].module}")
     parser = argparse.ArgumentParser(
         prog=f"vramctl {name}",
         description=module.DESCRIPTIONS[name],
@@ -104,6 +114,11 @@ def _parse_and_run(name: str, module: Any, arguments: Sequence[str]) -> int:
     )
     module.add_arguments(parser, name)
     add_version(parser)
+    return parser
+
+
+def _parse_and_run(name: str, module: Any, arguments: Sequence[str]) -> int:
+    parser = command_parser(name)
     wraps = COMMANDS[name].wraps
     args = parser.parse_args(_own(arguments) if wraps else arguments)
     args.command_name, args.parser = name, parser

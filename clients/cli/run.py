@@ -5,7 +5,7 @@ The lease belongs to `vramctl`, the bytes to its child: a consumer is a process 
 arbiter charges a child's bytes to its nearest ancestor with a lease. A program that leaves the tree
 (it daemonizes) or leases for itself is not covered.
 
-What happens on an eviction is `clients.foreign`'s; it is written down in docs/foreign-programs.md.
+What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs.md explains it.
 """
 
 import argparse
@@ -106,7 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 
 
 def _add_eviction(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("making room (docs/foreign-programs.md)")
+    group = parser.add_argument_group("making room (docs/how-to/foreign-programs.md)")
     group.add_argument(
         "--on-evict",
         choices=ON_EVICT,

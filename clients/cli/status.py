@@ -24,12 +24,12 @@ def run(args: argparse.Namespace) -> int:
         endpoint=args.endpoint,
         as_json=args.as_json,
         lines=text.status_lines,
-        question=_all_pages,
+        question=all_pages,
     )
     return code
 
 
-def _all_pages(op: str, fields: Mapping[str, object], endpoint: str | None) -> Message:
+def all_pages(op: str, fields: Mapping[str, object], endpoint: str | None) -> Message:
     """Return the whole status; the arbiter sends its leases in pages."""
     reply = ask(op, fields, endpoint)
     after = reply.pop("next", None)

@@ -61,6 +61,7 @@ PROGRAMS: Mapping[str, Program] = {
             "vram_arbiter.clients.client",
             "vram_arbiter.clients.cli.doctor",
             "vram_arbiter.clients.cli.history",
+            "vram_arbiter.clients.cli.hooks",
             "vram_arbiter.clients.cli.operators",
             "vram_arbiter.clients.cli.run",
             "vram_arbiter.clients.cli.status",

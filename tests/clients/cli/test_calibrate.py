@@ -442,7 +442,7 @@ async def test_programs_without_figures(gpu: Watched, card: Path) -> None:
     with pytest.raises(CalibrationFailed, match="cannot start"):
         await measure_program(gpu, QUICK, ["/no/such/program"], None, print)
     hide(card)
-    disturbed = await run(STOWAWAY, replace(QUICK, limit_s=0.1))
+    disturbed = await run(STOWAWAY, replace(QUICK, limit_s=1.0))
     assert "another program used it meanwhile" in disturbed.message
 
 

@@ -42,8 +42,8 @@ def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> No
         "try: main()\n"
         "except SystemExit as end: assert end.code == 3, end.code\n"
         "import msgpack, zmq\n"
-        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'rich', 'yaml', 'numpy'} & "
-        "set(sys.modules)\n"
+        "heavy = {'pydantic', 'asyncio', 'opentelemetry', 'rich', 'textual', 'yaml', 'numpy'}\n"
+        "heavy &= set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run(
@@ -103,9 +103,9 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
 
 
 EVERY_COMMAND = (
-    "status", "why", "history", "watch", "evict", "pin", "unpin", "drain", "resume", "release-dead",
-    "run", "doctor",
-    "replay", "simulate", "demo",
+    "status", "why", "history", "watch", "top",
+    "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
+    "hooks", "mcp", "replay", "simulate", "demo",
 )  # fmt: skip
 
 
@@ -163,12 +163,12 @@ def test_help_uses_the_width_of_the_terminal(nowhere: dict[str, str]) -> None:
 @pytest.mark.e2e
 def test_doctor_says_where_the_product_lies(nowhere: dict[str, str]) -> None:
     done = vramctl("doctor", "--json", environ=nowhere)
-    findings = {finding["what"]: finding for finding in json.loads(done.stdout)}
+    findings = {one["code"]: one for one in json.loads(done.stdout)["findings"]}
     assert done.returncode == 3
     root = Path(__file__).parents[3]
-    assert findings["installation"]["ok"]
-    assert str(root / "src/vram_arbiter") in findings["installation"]["says"]
-    assert findings["daemon"]["ok"] is False
+    assert findings["installation.origin"]["severity"] == "ok"
+    assert str(root / "src/vram_arbiter") in findings["installation.origin"]["found"]
+    assert findings["socket.missing"]["severity"] == "error"
 
 
 @pytest.mark.e2e
@@ -253,6 +253,7 @@ def test_an_operators_actions(client: Client, arbiter_daemon: ArbiterProcess, sp
     drained = vramctl("drain", "-r", "new driver", environ=environ)
     assert (drained.returncode, "new driver" in drained.stdout) == (0, True)
     assert "nothing is granted until `vramctl resume`" in vramctl("status", environ=environ).stdout
+    assert "drain" in vramctl("history", "--json", environ=environ).stdout  # it is on the disk
     arbiter_daemon.kill()
     arbiter_daemon.start()
     assert (
@@ -277,7 +278,8 @@ def test_doctor_fails_on_a_drained_daemon(
     assert vramctl("drain", "-r", "service", environ=arbiter.environ).returncode == 0
     done = vramctl("doctor", environ=arbiter.environ)
     assert done.returncode == 1
-    assert "BAD  grants             drained by" in done.stdout
+    assert "ERROR    daemon.drained" in done.stdout
+    assert "→ vramctl resume" in done.stdout
     assert vramctl("resume", environ=arbiter.environ).returncode == 0
     assert vramctl("doctor", environ=arbiter.environ).returncode == 0
 
@@ -286,8 +288,7 @@ def test_doctor_fails_on_a_drained_daemon(
 def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
     done = vramctl("doctor", environ=arbiter_daemon.environ)
     assert done.returncode == 0, done.stdout
-    assert "ok   gpu 0" in done.stdout
-    assert "its probe answers (a simulated card)" in done.stdout, "what reads the card is said"
+    assert "its probe answers (a simulated GPU)" in done.stdout, "what reads the GPU is said"
 
 
 @pytest.mark.e2e
