@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
 
     `adapter_for` lets a program serve a model of its own.
     """
-    flags = _parser().parse_args(arguments)
+    flags = parser().parse_args(arguments)
     service = (
         # one service per model, so that a trace shows which one it was
         f"vram-sidecar-{flags.name}"
@@ -205,7 +205,7 @@ def _gpu_of(device: str) -> str:
     return simulated(device).uuid
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vram-sidecar",
         description="Serve one model, under a lease of the VRAM arbiter.",

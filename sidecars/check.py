@@ -186,7 +186,19 @@ def _weights(
     # any failure of a model's code is a finding
     except Exception as error:  # noqa: BLE001
         return [Finding("weights", False, f"{type(error).__name__}: {error}")]
-    return [Finding("weights", True, f"{place.source} holds the whole model")]
+    whole = Finding("weights", True, f"{place.source} holds the whole model")
+    return [whole, *_features(adapter)]
+
+
+def _features(adapter: ModelAdapter) -> list[Finding]:
+    """Compare a policy's cameras and vectors, as the manifest has them, with the checkpoint's."""
+    from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
+
+    if not isinstance(adapter, PolicyAdapter):
+        return []
+    wrong = adapter.misfits()
+    says = "; ".join(wrong) or "cameras, state and action are the checkpoint's"
+    return [Finding("features", not wrong, says)]
 
 
 @contextlib.contextmanager

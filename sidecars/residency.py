@@ -8,9 +8,8 @@ own protocol (revoke, quiesce, release, fencing) is the client library's, which 
 back as a waiter, and the arbiter grants one on standby again when there is room (`_restore` loads
 then). Must not know sockets, wires or processes.
 
-Weights are in host RAM while the model is wanted, resident or parked. The arbiter grants the room
-for parked ones (`park_bytes`); where its budget is too small for them at all, they are dropped as
-soon as they are on the GPU.
+Weights are in host RAM (`host_copy`) while the model is wanted, resident or parked. The arbiter
+grants the room for parked ones (`park_bytes`).
 """
 
 import asyncio
@@ -43,6 +42,7 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.sidecars.host_copy import HostCopy
 from vram_arbiter.sidecars.model_process import Model, Models
 from vram_arbiter.sidecars.settings import Settings
 
@@ -58,8 +58,6 @@ TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
 }
 """State → states that may follow."""
 Token = tuple[int, int]
-FORESEEN_S: Final = 120.0
-"""How long weights that were read ahead wait for a request: longer than a drive."""
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
 _LEAVING = ("revoking", "unloading")
 _AWAY = ("standby", "parked")
@@ -84,10 +82,7 @@ class Residency:
         self._turn = asyncio.Lock()  # one attempt to become resident at a time
         self._model: Model | None = None
         self._prepared: asyncio.Task[None] | None = None
-        self._weights: asyncio.Task[int] | None = None  # on their way into host RAM, or there
-        self._foreseen: asyncio.Task[None] | None = None  # reads weights ahead of a request
-        self._expiry: asyncio.TimerHandle | None = None  # drops them where none comes
-        self._weights_bytes: int | None = None  # in host RAM, when they were there the last time
+        self._host = HostCopy(models, client, settings.footprint.steady_bytes)
         self._left = asyncio.Event()  # the unload or parking in progress is over
         self._called_off = asyncio.Event()  # the load in progress is not wanted any more
         self._ending = False
@@ -99,8 +94,6 @@ class Residency:
         # the call that brings a standby lease back
         self._calling: asyncio.Task[VramError | None] | None = None
         self._watching: asyncio.Task[None] | None = None  # the process's end
-        self._dropping: set[asyncio.Task[None]] = set()
-        self._keeping: asyncio.Task[None] | None = None  # asks whether the weights may stay
         self.lease: AsyncLease | None = None
         self.state: State = "unloaded"
         self.last_error: VramError | None = None
@@ -116,42 +109,12 @@ class Residency:
         """Read the weights into host RAM ahead of a request that `by` foresees.
 
         Only where the arbiter's budget of host RAM has room for them beside what is parked. They
-        are dropped where no request comes within `FORESEEN_S`. No lease is asked for.
+        are dropped where no request comes for minutes. No lease is asked for.
         """
         if self._client is None or self._ending or self.state != "unloaded":
             return  # else they are in host RAM already, or on their way
-        if self._foreseen is None or self._foreseen.done():
-            _log.info("%s says that the model is wanted soon", by)
-            if self._expiry is not None:
-                self._expiry.cancel()
-            ahead = self._read_ahead(self._client)
-            self._foreseen = asyncio.create_task(ahead, name="read ahead")
-
-    async def _read_ahead(self, client: AsyncClient) -> None:
-        try:
-            await self.prepared()
-            ram = (await client.status()).host_ram
-            size, room = self._settings.footprint.steady_bytes, ram.budget_bytes - ram.parked_bytes
-            if (size := self._weights_bytes or size) > room:
-                _log.info("%d bytes of weights, room for %d: they are not read ahead", size, room)
-                return
-            self._weights_bytes = await asyncio.shield(self._fetch())
-        except VramError as error:
-            _log.info("the weights are not read ahead: %s", error)
-            return
-        self._expiry = asyncio.get_running_loop().call_later(FORESEEN_S, self._unforeseen)
-
-    def _unforeseen(self) -> None:
-        if self.state == "unloaded" and not self.wanted:
-            _log.info("no request came for it: dropping the weights")
-            self._drop()
-
-    def _fetch(self) -> asyncio.Task[int]:
-        """Begin to read the weights into host RAM, if they are not there."""
-        if self._weights is None or self._weights.done():
-            self._weights = asyncio.create_task(self._models.load(), name="weights")
-            self._weights.add_done_callback(_look_at)
-        return self._weights
+        _log.info("%s says that the model is wanted soon", by)
+        self._host.read_ahead(self.prepared, lambda: self.state != "unloaded" or self.wanted)
 
     async def prepared(self) -> None:
         """Wait for the work that `prepare` began. Raises what ended it."""
@@ -262,15 +225,11 @@ class Residency:
     async def leave(self) -> None:
         """End of the program: after the op in progress, free everything."""
         self._ending = True
-        if self._expiry is not None:
-            self._expiry.cancel()
         lease = self.lease
-        tasks = (self._prepared, self._foreseen, self._weights)
-        under_way = {task for task in tasks if task and not task.done()}
-        for task in under_way:
-            task.cancel()
-        if under_way:
-            await asyncio.wait(under_way)
+        if self._prepared is not None and not self._prepared.done():
+            self._prepared.cancel()
+            await asyncio.wait({self._prepared})
+        await self._host.stop()
         await self._unload()
         await self._models.end()
         if lease is not None:
@@ -338,7 +297,7 @@ class Residency:
             if self.state != "unloaded":
                 self._to("unloaded")
             if not isinstance(error, WaitTimeout):  # asked again, it need not read them again
-                self._drop()
+                self._host.drop()
             if (
                 isinstance(error, asyncio.CancelledError)
                 and unloads != self._unloads
@@ -423,7 +382,7 @@ class Residency:
         """
         away = lease.state
         _log.info("requested: calling the lease back from %s", away)
-        self._fetch()
+        self._host.fetch()
         try:
             await lease.reacquire()
         except BadState:  # it returns by itself in this moment
@@ -461,9 +420,10 @@ class Residency:
         arbiter is told how much host RAM they take. Later they are read meanwhile.
         """
         wait_s = _left_s(deadline)
-        weights = self._fetch()
-        if self._weights_bytes is None:
-            self._weights_bytes = await asyncio.shield(weights)
+        reading = self._host.fetch()
+        weights_bytes = self._host.size_bytes
+        if weights_bytes is None:
+            weights_bytes = await self._host.fetched(reading)
         if self._client is None:
             return None
         if wait_s == 0.0:
@@ -471,7 +431,7 @@ class Residency:
                 f"{self._settings.name}: no time left to wait for the lease", hint="wait longer"
             )
         return await self._client.acquire(
-            self._settings.lease_spec(park_bytes=self._weights_bytes),
+            self._settings.lease_spec(park_bytes=weights_bytes),
             wait_s,
             unload=self._unload,
             park=self._park,
@@ -496,19 +456,20 @@ class Residency:
 
     async def _load_measured(self, lease: AsyncLease | None) -> None:
         began, unloads = time.monotonic(), self._unloads
+        labels = {telemetry.ATTR_MODEL: self._settings.manifest.name}
 
         def given_up() -> bool:
             return unloads != self._unloads if lease is None else lease.given_up
 
         try:
-            fetch = self._fetch()
+            reading = self._host.fetch()
             self._called_off.clear()
             called_off = asyncio.create_task(self._called_off.wait(), name="called off")
-            await asyncio.wait({fetch, called_off}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({reading, called_off}, return_when=asyncio.FIRST_COMPLETED)
             called_off.cancel()
             if given_up() or (lease and lease.state == "gone"):
                 raise self._unwanted()  # the weights may be read on, and are dropped then
-            self._weights_bytes = await asyncio.shield(fetch)
+            await self._host.fetched(reading)
             model = self._model = await self._models.start()
             if given_up() or (lease and lease.state == "gone"):
                 raise self._unwanted()  # before a byte was loaded
@@ -524,42 +485,25 @@ class Residency:
                 _log.info("the load was undone")
                 raise self._unwanted() from None
             _log.error("loading failed: %s", error)
+            if isinstance(error, Exception):
+                labels[telemetry.ATTR_ERROR_TYPE] = tracing.error_type(error)
+                meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
             raise
-        labels = {telemetry.ATTR_MODEL: self._settings.manifest.name}
         meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
         if measured is not None:
             tracing.note({telemetry.ATTR_BYTES: measured})
         self._last_use_s = self._resident_since_s = time.monotonic()
         self._to("resident")
         self._watching = asyncio.create_task(self._watch(model, lease), name="watch the model")
-        if self._client is not None and self._weights_bytes:
-            self._keeping = asyncio.create_task(self._keep_or_drop(self._client), name="host RAM")
+        self._host.drop_if_too_large(lambda: self.state == "resident")
         _log.info("resident after %.2f s: %s bytes on the GPU", time.monotonic() - began, measured)
-
-    def _drop(self) -> None:
-        """Free the host RAM of the weights, after what is asked of them now. A later `_fetch` reads
-        them again."""
-        task = asyncio.create_task(self._models.drop(), name="drop the weights")
-        self._dropping.add(task)
-        task.add_done_callback(self._dropping.discard)
-
-    async def _keep_or_drop(self, client: AsyncClient) -> None:
-        """Drop the weights from host RAM where the arbiter could never let them stay for a parked
-        lease."""
-        try:
-            budget_bytes = (await client.status()).host_ram.budget_bytes
-        except VramError as error:
-            _log.info("the budget of host RAM is unknown (%s): the weights stay", error.code)
-            return
-        if (self._weights_bytes or 0) > budget_bytes and self.state == "resident":
-            self._drop()
 
     async def _take_back(self, lease: AsyncLease | None, error: BaseException) -> None:
         """Undo a failed load. Whatever else fails in it, the lease ends: it would be renewed for
         ever."""
         try:
             await self._end_model(at_once=True)
-            self._drop()
+            self._host.drop()
             if lease is not None and isinstance(error, OutOfMemory) and not lease.given_up:
                 requested = int(
                     error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
@@ -592,7 +536,7 @@ class Residency:
             self._to("unloaded")
             self._left.set()
         _log.info("unloaded in %.2f s", time.monotonic() - began)
-        self._drop()
+        self._host.drop()
 
     async def _park(self) -> None:
         """Leave the GPU and keep the weights in host RAM: called by the lease."""
@@ -634,7 +578,7 @@ class Residency:
             hint="the next request loads it again; see the sidecar's log",
         )
         _log.error("%s", self.last_error)
-        self._drop()
+        self._host.drop()
         if lease is not None:
             try:
                 await lease.release()
@@ -695,12 +639,6 @@ class Residency:
                 hint="ask again about a new one: the model is there now",
                 details={"waited_s": waited_s},
             )
-
-
-def _look_at(task: asyncio.Task[int]) -> None:
-    """Take note of a failure, also where the request that wanted the weights has ended."""
-    if not task.cancelled() and (error := task.exception()) is not None:
-        _log.debug("the weights could not be read: %s", error)
 
 
 def _being_cancelled() -> bool:

@@ -19,7 +19,12 @@ from vram_arbiter.sidecars.adapters.policy_families import (
     need_packages,
     need_type,
 )
-from vram_arbiter.sidecars.adapters.policy_observations import Batch, Observations
+from vram_arbiter.sidecars.adapters.policy_observations import (
+    ACTION,
+    Batch,
+    Observations,
+    misfits,
+)
 from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
 from vram_arbiter.sidecars.quantization import TORCH_NAMES, nf4_of, quantize_linear, torch_type
 from vram_arbiter.sidecars.weights import (
@@ -48,7 +53,6 @@ _OURS: Final = {
     "inference_action_mode": "continuous",  # unset in most checkpoints; discrete is refused
 }
 """Fields of configurations that the sidecar decides."""
-_ACTION: Final = "action"
 _OWN_CHUNKING: Final = ("groot", "molmoact2")
 """Types whose real-time chunking is not lerobot's, and was not compared with it."""
 _LAZY: Final = "proc"
@@ -136,6 +140,12 @@ class PolicyAdapter:
             setattr(self._config, self._family.dtype_field, TORCH_NAMES[self._dtype])
         if self._family.replays:
             lingbot.settle(self._config, self._weights.source)
+
+    def misfits(self) -> list[str]:
+        """Return where the manifest contradicts the checkpoint's configuration. After `prepare`."""
+        config = self._config
+        chunk_size = getattr(config, "chunk_size", None)
+        return misfits(self._manifest, config.input_features, config.output_features, chunk_size)
 
     @property
     def _has_own_dtype(self) -> bool:
@@ -279,7 +289,7 @@ class PolicyAdapter:
                 hint="leave rtc out of policy_extras in the skill's manifest",
                 details={"fields": ["rtc"]},
             )
-        width = self._config.output_features[_ACTION].shape[0]
+        width = self._config.output_features[ACTION].shape[0]
         if any(len(row) != width for row in rtc.left_over):
             raise BadRequest(
                 f"rows of rtc.left_over must have {width} numbers",
@@ -288,7 +298,7 @@ class PolicyAdapter:
         self._enable_guidance()
         rows = torch.tensor(rtc.left_over, dtype=torch.float32)[None]
         with torch.no_grad():
-            left_over = self._before({**step, _ACTION: rows})[_ACTION]
+            left_over = self._before({**step, ACTION: rows})[ACTION]
         return {
             "prev_chunk_left_over": left_over,
             "inference_delay": rtc.inference_delay,
@@ -376,7 +386,7 @@ def _select(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
     """
     import torch
 
-    queue: Any = getattr(policy, "_queues", {}).get(_ACTION)
+    queue: Any = getattr(policy, "_queues", {}).get(ACTION)
     for step in steps[:-1]:
         queue.append(torch.empty(0))
         policy.select_action(dict(step))

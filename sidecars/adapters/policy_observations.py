@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.io_contracts import ImagePreprocessing
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.sidecars.images import decode
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 IMAGE_PREFIX = "observation.images."
+STATE, ACTION = "observation.state", "action"
 EMPTY_CAMERA = IMAGE_PREFIX + "empty_camera_"
 """Cameras that a checkpoint pads for itself; no robot has them."""
 
@@ -103,6 +105,37 @@ class Observations:
                 image[None], size=size, mode="bilinear", antialias=True
             )[0]
         return image
+
+
+def misfits(
+    manifest: RSkillManifest,
+    inputs: "Mapping[str, PolicyFeature]",
+    outputs: "Mapping[str, PolicyFeature]",
+    chunk_size: int | None,
+) -> list[str]:
+    """Return where a manifest contradicts its checkpoint, which the first goal would fail on.
+
+    `chunk_size` is the checkpoint's, None: it has none.
+    """
+    rules = manifest.image_preprocessing
+    template = rules.input_template if rules is not None else IMAGE_PREFIX + "{cam}"
+    keys = [one.vla_feature_key for one in manifest.sensors_required if one.modality == "rgb"]
+    named = {template.format(cam=key.rpartition(".")[2]) for key in keys if key}
+    found = [
+        f"the checkpoint reads {name}, which sensors_required does not name"
+        for name, feature in inputs.items()
+        if feature.type.value == "VISUAL" and not _is_padded(name) and name not in named
+    ]
+    for field, contract, feature in (
+        ("state_contract.dim", manifest.state_contract, inputs.get(STATE)),
+        ("action_contract.dim", manifest.action_contract, outputs.get(ACTION)),
+    ):
+        stated = None if contract is None else contract.dim
+        if stated is not None and feature is not None and (stated,) != tuple(feature.shape):
+            found.append(f"{field} is {stated}, the checkpoint has {feature.shape[0]} numbers")
+    if chunk_size is not None and manifest.chunk_size > chunk_size:
+        found.append(f"chunk_size is {manifest.chunk_size}, the checkpoint answers {chunk_size}")
+    return found
 
 
 def _is_padded(name: str) -> bool:

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.heavy
 
 GIB = 2**30
 CONFIGS = Path(__file__).parents[2] / "configs"
-PAGE = (CONFIGS.parent / "docs/models.md").read_text(encoding="utf-8")
+PAGE = (CONFIGS.parent / "docs/reference/models.md").read_text(encoding="utf-8")
 SHIPPED = sorted(CONFIGS.glob("rskills/*/rskill.yaml"))
 HEAD = (
     "version: 0.1.0\nembodiment_tags: [any]\nchunk_size: 1\ndescription: d\n"

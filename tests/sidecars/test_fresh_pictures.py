@@ -9,7 +9,8 @@ import pytest
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import SceneVlmClient
-from vram_arbiter.reasoner.tools import LOOKED_AT_MAX_S, Tools
+from vram_arbiter.reasoner.perception import LOOKED_AT_MAX_S
+from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.tools import QueryScene
 

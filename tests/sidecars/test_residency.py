@@ -199,16 +199,16 @@ async def test_a_model_that_is_wanted_soon_is_read_ahead_and_nothing_else(
             await asyncio.sleep(0.01)
         await residency.leave()
 
-        monkeypatch.setattr("vram_arbiter.sidecars.residency.FORESEEN_S", 0.0)
+        monkeypatch.setattr("vram_arbiter.sidecars.host_copy.FORESEEN_S", 0.0)
         again = Residency(settings(arbiter_daemon), models, client)
         again.announce("reasoner")
         while models.reads < 3 or models.in_host_ram:
             await asyncio.sleep(0.01)
         scarce = Models(weights_bytes=GB)
         crowded = Residency(settings(arbiter_daemon), scarce, client)
-        crowded._weights_bytes = (await client.status()).host_ram.budget_bytes + 1
+        crowded._host.size_bytes = (await client.status()).host_ram.budget_bytes + 1
         crowded.announce("reasoner")
-        await crowded._foreseen
+        await crowded._host._foreseen
         assert scarce.reads == 0
         for residency in (again, crowded):
             await residency.leave()

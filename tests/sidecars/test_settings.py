@@ -7,7 +7,7 @@ import pytest
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import parse_manifest
-from vram_arbiter.sidecars.__main__ import _parser, main, settings_from
+from vram_arbiter.sidecars.__main__ import main, parser, settings_from
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.settings import (
     DECLARED,
@@ -37,7 +37,7 @@ def rskill(tmp_path):
 
 
 def settings(*flags):
-    return settings_from(_parser().parse_args([str(flag) for flag in flags]))
+    return settings_from(parser().parse_args([str(flag) for flag in flags]))
 
 
 @pytest.mark.parametrize(
