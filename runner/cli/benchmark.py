@@ -24,6 +24,7 @@ from vram_arbiter.runner.cli.common import (
     connect_arbiter,
     default_skills,
     install_signals,
+    not_negative_int,
     positive,
     positive_int,
     sidecars_given,
@@ -111,6 +112,17 @@ def add_parser(
         "--parallel", type=positive_int, default=1, metavar="N",
         help="play N episodes of a cell at once, each in a world of its own; default 1",
     )  # fmt: skip
+    time = bench.add_mutually_exclusive_group()
+    time.add_argument(
+        "--latency-steps", type=not_negative_int, metavar="N",
+        help="a policy's answer takes N control steps; by default as many as it had actions left to"
+        " play when it was asked",
+    )  # fmt: skip
+    time.add_argument(
+        "--real-time", action="store_true",
+        help="tick at the world's rate and do not wait for the policy: its latency is this"
+        " machine's",
+    )  # fmt: skip
     bench.add_argument(
         "--episode-seconds",
         type=positive,
@@ -188,7 +200,7 @@ async def _play(lanes: Sequence[Entry], args: argparse.Namespace, stopping: asyn
     """Play one cell, its seeds dealt out to the lanes: each has its own world and contestant."""
     from vram_arbiter.runner.sim.benchmark import merged, release
 
-    benches = [_benchmark(entry, args) for entry in lanes]
+    benches = [benchmark_of(entry, args) for entry in lanes]
     contestants = [entry.contestant() for entry in lanes]
     watching = asyncio.create_task(_stop_with(stopping, benches))
     seeds = range(args.seed, args.seed + args.episodes)
@@ -214,9 +226,11 @@ async def _stop_with(stopping: asyncio.Event, benches: Sequence[Benchmark]) -> N
         bench.stop()
 
 
-def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
+def benchmark_of(entry: Entry, args: argparse.Namespace) -> Benchmark:
+    """Return a benchmark of the entry's world and task."""
     from vram_arbiter.runner.sim.benchmark import Benchmark
     from vram_arbiter.runner.sim.robot import sim_runner
+    from vram_arbiter.runner.sim.tasks import set_task
 
     world, task, arm = entry.world, entry.task, entry.world.arm
 
@@ -224,16 +238,11 @@ def _benchmark(entry: Entry, args: argparse.Namespace) -> Benchmark:
         return (world.instruction, {}) if arm is None or task is None else task.told(arm)
 
     if arm is not None and task is not None and world.environment is not None:
-        prepare = task.prepare
-        world.environment.about(
-            prepare=None if prepare is None else lambda seed: prepare(arm, seed),
-            judge=lambda: task.judge(arm),
-            steady=task.steady,
-        )
+        set_task(task, arm, world.environment)
     runner = sim_runner(
         world.make,
         cameras=world.cameras,
-        rate_hz=0,
+        rate_hz=world.control_hz if args.real_time else 0,
         max_steps=longest_of(world, args),
         ends_with_skill=True,
         video_camera=world.video_camera,
@@ -300,11 +309,16 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     from vram_arbiter.runner.sim.policies import policy_of
     from vram_arbiter.runner.sim.tasks import EXPERT, GRAB, TASKS, expert_policy, task_of
     from vram_arbiter.runner.sim.worlds import makers_of
-    from vram_arbiter.runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
+    from vram_arbiter.runner.skills.sidecar_policy import HUNG_WAITING_MIN_S
 
     if not args.skill and not args.policy:
         raise ConfigError(
             "there are no contestants", hint="--skill RSKILL or --policy random, any number of them"
+        )
+    if args.real_time and args.parallel > 1:
+        raise ConfigError(
+            f"--parallel {args.parallel}: episodes at once would slow each other down in real time",
+            hint="leave out --parallel or --real-time",
         )
     if args.task is not None and args.task not in TASKS:
         raise ConfigError(f"unknown --task {args.task}", hint=" or ".join(TASKS))
@@ -323,7 +337,12 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     for world in worlds_of(args):
         arm, environment = world.arm, world.environment
         makers = makers_of(
-            world, given, arbiter, period_s=1.0 / world.control_hz, wait_s=LOCKSTEP_WAIT_S
+            world,
+            given,
+            arbiter,
+            period_s=1.0 / world.control_hz,
+            wait_s=0.0 if args.real_time else HUNG_WAITING_MIN_S,
+            latency_steps=args.latency_steps,
         )
         catalogue = Catalogue(manifests, makers, refused=refused, body=world.body)
         for name in dict.fromkeys(args.skill):
@@ -386,5 +405,6 @@ def _write(
         ],
         seeds=(args.seed, args.seed + args.episodes - 1),
         parallel=args.parallel,
+        latency="real time" if args.real_time else args.latency_steps,
         complete=complete,
     )

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from vram_arbiter.runner.sim.benchmark import Cell, CellSummary
 from vram_arbiter.schemas.errors import ConfigError
@@ -20,14 +21,19 @@ def write_report(
     *,
     seeds: tuple[int, int],
     parallel: int,
+    latency: int | Literal["real time"] | None,
     complete: bool,
 ) -> None:
-    """Write the cells, each with its `max_steps`, whole or not at all. Raises ConfigError."""
+    """Write the cells, each with its `max_steps`, whole or not at all. Raises ConfigError.
+
+    `latency`: control steps that an answer took; None: until the actions before it were played.
+    """
     report = {
         "format": "vram-benchmark/1",
         "complete": complete,
         "seeds": seeds,
         "parallel": parallel,
+        "latency": latency,
         "cells": [
             {
                 **cell.summary(),

@@ -10,7 +10,9 @@ import asyncio
 import contextlib
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli.common import (
@@ -42,6 +44,10 @@ from vram_arbiter.schemas.errors import ConfigError, InternalError
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
 from vram_arbiter.schemas.runtime.extras import need
 
+if TYPE_CHECKING:
+    from vram_arbiter.runner.sim.policies import Policy
+    from vram_arbiter.runner.sim.worlds import World
+
 log = logging.getLogger("runner")
 
 SERVES = True
@@ -56,7 +62,9 @@ def add_world_flags(parser: argparse.ArgumentParser) -> None:
         "--scene", type=Path, help="scene file of so101; without it the built-in table"
     )
     parser.add_argument(
-        "--env-config", type=Path, help="how a gymnasium environment is to be read (docs/runner.md)"
+        "--env-config",
+        type=Path,
+        help="how a gymnasium environment is to be read (docs/reference/simulated-worlds.md)",
     )
     parser.add_argument(
         "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
@@ -74,8 +82,8 @@ def add_parser(
     add_world_flags(sim)
     sim.add_argument(
         "--policy",
-        help="random, scripted:MODULE or scripted:FILE.py plays --episodes episodes;"
-        " no goals are taken then",
+        help="random, scripted:MODULE, scripted:FILE.py or, in so101, expert (grabs) plays"
+        " --episodes episodes; no goals are taken then",
     )
     sim.add_argument("--episodes", type=positive_int, help="of --policy; default 1")
     sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
@@ -124,7 +132,6 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.protocols import DeadlinePolicy
     from vram_arbiter.runner.recording.video import VideoRecorder
     from vram_arbiter.runner.robots.so101 import lerobot_units_of
-    from vram_arbiter.runner.sim.policies import policy_of
     from vram_arbiter.runner.sim.robot import sim_runner
     from vram_arbiter.runner.sim.truth import truth_as_wire
     from vram_arbiter.runner.sim.worlds import makers_of, world_of
@@ -147,7 +154,7 @@ async def run(args: argparse.Namespace) -> int:
     check_display_flag(args)
     check_output("--video", args.video)
     check_output("--timings", args.timings)
-    policy = None if args.policy is None else policy_of(args.policy)
+    policy, told = (None, lambda: "") if args.policy is None else policy_in(world, args.policy)
     manifests = [] if policy is not None else read_manifests(args.skills or [default_skills()])
     given = sidecars_given(args.sidecar)
     if policy is None:
@@ -181,6 +188,7 @@ async def run(args: argparse.Namespace) -> int:
             episodes=None if policy is None else args.episodes or 1,
             max_steps=args.max_steps,
             policy=None if policy is None else policy.play,
+            told=told,
             video_camera=world.video_camera,
             video_every=world.video_every,
         )
@@ -263,6 +271,23 @@ async def run(args: argparse.Namespace) -> int:
         raise dataset.counts.error  # it was played for the recording
     await conclude_recording(dataset, args)
     return 1 if control.ended.exception() is not None else 0
+
+
+def policy_in(world: World, name: str) -> tuple[Policy, Callable[[], str]]:
+    """Return the policy of `--policy` in a world, and the task of its present episode in words.
+
+    Raises ConfigError for a policy that is unknown, or not for this world.
+    """
+    from vram_arbiter.runner.sim.policies import policy_of
+    from vram_arbiter.runner.sim.tasks import EXPERT, GRAB, expert_policy, set_task
+
+    arm, environment = world.arm, world.environment
+    if name != EXPERT:
+        return policy_of(name), lambda: world.instruction
+    if arm is None or environment is None:
+        raise ConfigError(f"--policy {EXPERT} grabs in so101, and does nothing else")
+    set_task(GRAB, arm, environment)
+    return expert_policy(arm, environment), lambda: GRAB.told(arm)[0]
 
 
 async def ready(control: ControlThread) -> None:

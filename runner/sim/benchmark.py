@@ -54,6 +54,11 @@ def wilson(successes: int, of: int) -> tuple[float, float] | None:
     )
 
 
+def mean(values: Sequence[float]) -> float | None:
+    """Return the mean; None without values."""
+    return sum(values) / len(values) if values else None
+
+
 @dataclass(frozen=True, slots=True)
 class Played:
     """Outcome of one seed. `success` None: the world does not judge, or `error` tells why not.
@@ -71,6 +76,7 @@ class Played:
     message: str = ""
     failed: bool = False  # by an error of the contestant's own
     seconds: float = 0.0
+    standing_steps: int = 0  # of `steps`: in the middle of the motion, without an action
     video: str | None = None
     trace_id: str | None = None  # of its span; None without telemetry
 
@@ -95,6 +101,7 @@ class CellSummary(TypedDict):
     success_rate: float | None
     interval_95: tuple[float, float] | None
     mean_steps: float | None
+    mean_standing_steps: float | None
     mean_reward: float | None
 
 
@@ -148,7 +155,7 @@ class Cell:
         rewards = [
             played.total_reward for played in self.episodes if played.total_reward is not None
         ]
-        steps = [played.steps for played in self.episodes if not played.unjudged_error]
+        ran = [played for played in self.episodes if not played.unjudged_error]
         return {
             "world": self.world,
             "contestant": self.contestant,
@@ -162,8 +169,9 @@ class Cell:
             "errors": self.errors,
             "success_rate": self.success_rate,
             "interval_95": wilson(self.successes, self.judged),
-            "mean_steps": sum(steps) / len(steps) if steps else None,
-            "mean_reward": sum(rewards) / len(rewards) if rewards else None,
+            "mean_steps": mean([one.steps for one in ran]),
+            "mean_standing_steps": mean([one.standing_steps for one in ran]),
+            "mean_reward": mean(rewards),
         }
 
 
@@ -233,7 +241,7 @@ class PolicyContestant:
 
 
 class Benchmark:
-    """`runner` runs as fast as it can; its episodes end with their skill.
+    """`runner` ticks at its own rate; its episodes end with their skill.
 
     `told` returns the goal of an episode, on the worker thread. `episode_s` bounds an episode on
     the wall clock (a contestant that never acts, a world that hangs between two steps).
@@ -356,19 +364,20 @@ class Benchmark:
         robot.video.recorder = recorder
         number, ends_s = robot.episode_idx, time.monotonic() + self._episode_s
         runner.begin_skill(contestant.player(robot.env, seed), goal, ended.append)
-        while (
-            robot.episode_idx == number and not ended
-        ):  # a skill that ends, ends the episode in the same tick
-            if self._stopping.is_set():
-                runner.end_skill()
-                return None
-            if time.monotonic() > ends_s:
-                runner.end_skill()
-                raise LimitExceeded(
-                    f"the episode is not over after {self._episode_s:.0f} s",
-                    details={"limit": "episode_seconds"},
-                )
-            runner.tick()
+        with runner.paced() as wait:
+            # a skill that ends, ends the episode in the same tick
+            while robot.episode_idx == number and not ended:
+                if self._stopping.is_set():
+                    runner.end_skill()
+                    return None
+                if time.monotonic() > ends_s:
+                    runner.end_skill()
+                    raise LimitExceeded(
+                        f"the episode is not over after {self._episode_s:.0f} s",
+                        details={"limit": "episode_seconds"},
+                    )
+                runner.tick()
+                wait()
         error = ended[0].error if ended and "episode" not in ended[0].data else None
         if error is not None and not isinstance(error, ModelError | LimitExceeded):
             raise error  # the episode may not even be one
@@ -379,6 +388,7 @@ class Benchmark:
             seed,
             False if error is not None and episode.success is not None else episode.success,
             steps=episode.steps,
+            standing_steps=ended[0].data.get("standing_steps", 0) if ended else 0,
             total_reward=episode.total_reward,
             truncated=episode.truncated,
             error=error.code if error is not None else "",

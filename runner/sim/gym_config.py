@@ -40,7 +40,8 @@ class GymConfig(BaseModel):
     numbers of an action, in their order (`runner.sim.gym_spaces`); `control_mode` gives their
     meaning. `hold` is the action that waits, as the environment itself takes it: without one the
     world stands still until an action comes. `success` is `info:KEY` or `return:NUMBER` (rewards of
-    the episode, summed).
+    the episode, summed). `instruction` is the task in words: policies are told it, and recordings
+    have it as the task of their episodes.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -57,6 +58,7 @@ class GymConfig(BaseModel):
     ] = ()  # which robot it is; skills for others are refused then
     hold: Held | None = None
     success: str = ""
+    instruction: str = ""
 
     @field_validator("joints", "velocities", mode="before")
     @classmethod

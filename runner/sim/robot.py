@@ -400,17 +400,19 @@ class EpisodeVideo:
 class PolicyEpisodes:
     """Plays every episode with a policy, as a goal of its own. The first error ends the run."""
 
-    def __init__(self, loop: SimRunner, make: MakePolicy) -> None:
+    def __init__(self, loop: SimRunner, make: MakePolicy, told: Callable[[], str]) -> None:
         self.error: VramError | None = None
         self._loop = loop
         self._make = make
+        self._told = told
 
     def begin(self, env: Environment, seed: int) -> None:
         player = self._make(env, seed)
         name = player.key.rskill_id
         span = tracing.begin(telemetry.SPAN_EPISODE, attributes={telemetry.ATTR_SKILL: name})
         with tracing.inside(span):
-            goal = Goal(f"seed-{seed}", name, traceparent=tracing.traceparent())
+            words = self._told()
+            goal = Goal(f"seed-{seed}", name, prompt=words, traceparent=tracing.traceparent())
 
         def ended(end: SkillEnded) -> None:
             outcome = "ok" if end.error is None else end.error.code
@@ -448,6 +450,7 @@ def sim_runner(
     max_steps: int | None = None,
     ends_with_skill: bool = False,
     policy: MakePolicy | None = None,
+    told: Callable[[], str] = lambda: "",
     recorder: VideoRecorder | None = None,
     video_camera: str = "overview",
     video_every: int = 3,
@@ -455,7 +458,7 @@ def sim_runner(
     """Compose a control loop on a simulated world.
 
     Args: as for `SimRobot`, `EpisodeVideo` and `ControlLoop`; `policy(env, seed)` plays every
-    episode from its reset tick on, instead of goals.
+    episode from its reset tick on, instead of goals; `told()` is that episode's task in words.
     """
     clock = clock or SystemClock()
     robot = SimRobot(
@@ -475,5 +478,5 @@ def sim_runner(
         robot, rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock, video=robot.video
     )
     if policy is not None:
-        robot.player = PolicyEpisodes(loop, policy)
+        robot.player = PolicyEpisodes(loop, policy, told)
     return loop

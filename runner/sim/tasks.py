@@ -114,6 +114,16 @@ def task_of(manifest: RSkillManifest) -> Task:
     return fitting[0]
 
 
+def set_task(task: Task, arm: SimEnv, environment: ArmEnvironment) -> None:
+    """Let the episodes of our own scene be about a task, from the next reset on."""
+    prepare = task.prepare
+    environment.about(
+        prepare=None if prepare is None else lambda seed: prepare(arm, seed),
+        judge=lambda: task.judge(arm),
+        steady=task.steady,
+    )
+
+
 def expert_policy(arm: SimEnv, environment: ArmEnvironment) -> Policy:
     """Return the scripted grab of the demonstrations.
 

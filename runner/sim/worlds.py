@@ -60,7 +60,7 @@ class World:
     robot: RobotDescription | None = None
     control_hz: float = float(CONTROL_HZ)  # its steps a second
     max_steps: int | None = None  # of an episode of a benchmark; None: as it is asked for
-    instruction: str = ""  # what a benchmark tells its policies
+    instruction: str = ""  # the task in words; our own scene's is its task's, by the seed
 
 
 def so101_world(scene_file: Path | None) -> World:
@@ -103,6 +103,7 @@ def gym_world(env_id: str, config: GymConfig, *, render: bool | None) -> World:
         rest=None,
         body=Body(embodiment_tags=tags) if tags else None,
         identity={"robot": GYM + env_id, "scene": env_id},
+        instruction=config.instruction,
     )
 
 
@@ -141,14 +142,20 @@ def world_of(
         name=env,
         control_hz=preset.control_hz,
         max_steps=preset.max_steps,
-        instruction=preset.instruction,
+        instruction=config.instruction or preset.instruction,
     )
 
 
 def makers_of(
-    world: World, given: Mapping[str, str], arbiter: Any, *, period_s: float, wait_s: float
+    world: World,
+    given: Mapping[str, str],
+    arbiter: Any,
+    *,
+    period_s: float,
+    wait_s: float,
+    latency_steps: int | None = None,
 ) -> dict[Kind, Maker]:
-    """Return the makers of the skills that can act in this world."""
+    """Return the makers of the skills that can act in this world; as `SidecarPolicy`."""
     from vram_arbiter.clients.sidecar.policy import PolicyClient
     from vram_arbiter.runner.skills.navigate import Navigate
     from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
@@ -177,6 +184,7 @@ def makers_of(
             arbiter,
             period_s=period_s,
             wait_s=wait_s,
+            latency_steps=latency_steps,
             speeds_rad_s=speeds,
             sent=sent,
         )

@@ -8,8 +8,9 @@ Row k of a chunk belongs to the k-th control step after its observation. As many
 played since are skipped; the next `keep` replace what is left of the chunk before. A step in which
 the robot stands still skips no row: the robot is still where the chunk expects it.
 
-In a simulator whose world waits (`wait_s`), a chunk is taken when the rows before it are played, as
-if the policy took that long: when its answer comes must not decide what an episode is.
+In a simulator whose world waits (`wait_s`), when an answer really comes must not decide what an
+episode is. There a chunk is taken `latency_steps` control steps after it was asked for, or when the
+rows before it are played, as if the policy took that long.
 
 A chunk after the first is a *hit* when it was there as its first row was due, a *miss* when the
 robot (or the simulated world) waited.
@@ -48,7 +49,8 @@ class ChunkPlayer:
     """Player of one goal's chunks.
 
     `keep` rows of a chunk are played, behind those that are skipped; None: all. `wait_s` is how
-    long `next_row` may wait for a chunk that is due.
+    long `next_row` may wait for a chunk that is due. `latency_steps` counts only with it; None: as
+    many steps as there are rows to play when the chunk is asked for.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class ChunkPlayer:
         prefetch_at: int = 0,
         keep: int | None = None,
         wait_s: float = 0.0,
+        latency_steps: int | None = None,
     ) -> None:
         if prefetch_at < 0:
             raise ValueError(f"prefetch_at must be 0 or more, not {prefetch_at}")
@@ -65,10 +68,12 @@ class ChunkPlayer:
         self._prefetch_at = prefetch_at
         self._keep = keep
         self._wait_s = wait_s
+        self._latency_steps = latency_steps if wait_s else None
         self._rows: deque[tuple[int, Row]] = deque()
         self._cut: Rows = ()  # of the newest chunk: its rows behind those that are played
         self._under_way: concurrent.futures.Future[Rows] | None = None
         self._asked_at = 0  # rows played before the observation of the chunk under way
+        self._steps_since = 0  # control steps since then
         self._late = False  # the chunk that is awaited was due and not there
         self._begun = -1  # the newest chunk of which a row was played
         self.chunks = 0
@@ -103,15 +108,17 @@ class ChunkPlayer:
                 raise ModelError(
                     "no observation for the next chunk", hint="the world state came without frames"
                 )
-            self._asked_at = self.played
+            self._asked_at, self._steps_since = self.played, 0
             self._under_way = self._fetch(observation)
         if (future := self._under_way) is not None:
-            if not self._rows and not future.done():
-                self._late = True
-                concurrent.futures.wait([future], self._wait_s)
-            if future.done() and not (self._rows and self._wait_s):
+            if self._due() and not future.done():
+                self._late = self._late or not (self._rows or self._latency_steps is not None)
+                if self._wait_s:
+                    concurrent.futures.wait([future], self._wait_s)
+            if self._due() and future.done():
                 self._under_way = None
                 self._collect(future)
+            self._steps_since += 1
         if not self._rows:
             self._late = True
             return None
@@ -121,6 +128,14 @@ class ChunkPlayer:
             return Played(chunk, row)
         late, self._late, self._begun = self._late, False, chunk
         return Played(chunk, row, first=True, prefetched=None if chunk == 0 else not late)
+
+    def _due(self) -> bool:
+        """Return whether the chunk under way may be taken in this control step."""
+        if not self._wait_s:
+            return True
+        if self._latency_steps is None:
+            return not self._rows
+        return self._steps_since >= self._latency_steps
 
     def _collect(self, future: concurrent.futures.Future[Rows]) -> None:
         """Take the rows of an answered request. Raises what it failed with."""

@@ -66,6 +66,7 @@ WITHDRAW_S = 3.0  # to take a load back; then the goal ends all the same
 HUNG_AFTER = 5.0  # times the manifest's time for a chunk: a policy that needs longer hangs …
 HUNG_MIN_S = 2.0  # … but a busy machine may take so long for any
 HUNG_FIRST_MIN_S = 10.0  # for a goal's first chunk, after which the model is warm
+HUNG_WAITING_MIN_S = 30.0  # where a simulated world waits: no time passes for its robot
 LOCKSTEP_WAIT_S = 2.0  # how long one tick of a simulator waits with its world
 STEP_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 STILL_WINDOW = (
@@ -106,7 +107,8 @@ class Arbiter(Protocol):
 class SidecarPolicy(SkillBase):
     """`arbiter` None: the sidecar loads at once.
 
-    `wait_s` > 0 lets a simulated world wait for chunks.
+    `wait_s` > 0 lets a simulated world wait for chunks; `latency_steps` is how many of its control
+    steps a chunk takes there (`chunks.ChunkPlayer`).
 
     `speeds_rad_s`, by joint, limits the way to the start pose and a policy's steps to what one
     period allows. The safety gate would rightly withhold larger leaps; absolute targets are
@@ -127,6 +129,7 @@ class SidecarPolicy(SkillBase):
         *,
         period_s: float,
         wait_s: float = 0.0,
+        latency_steps: int | None = None,
         revision: str = "",
         speeds_rad_s: Mapping[str, float] | None = None,
         sent: Callable[[], Mapping[str, float]] | None = None,
@@ -158,6 +161,7 @@ class SidecarPolicy(SkillBase):
         self._arbiter = arbiter
         self._period_s = period_s
         self._wait_s = wait_s
+        self._latency_steps = latency_steps
         self._steps = wiring.rollout.rollout_steps or max(1, round(wiring.rollout_s / period_s))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._use: Use | None = None
@@ -194,6 +198,7 @@ class SidecarPolicy(SkillBase):
             prefetch_at=self._wiring.rollout.prefetch_at,
             keep=self._wiring.steps_per_chunk,
             wait_s=self._wait_s,
+            latency_steps=self._latency_steps,
         )
 
     async def _occupy(self, goal: Goal) -> None:
@@ -289,10 +294,11 @@ class SidecarPolicy(SkillBase):
     def _limit_s(self, *, first: bool) -> float:
         """Return the time after which a policy that has not answered hangs."""
         budget = self.manifest.latency_budget
-        if not first:
-            return max(HUNG_MIN_S, HUNG_AFTER * budget.per_chunk_ms / 1e3)
-        budget_ms = budget.per_chunk_ms + (budget.warmup_ms or 0.0)
-        return max(HUNG_FIRST_MIN_S, HUNG_AFTER * budget_ms / 1e3)
+        budget_ms = budget.per_chunk_ms + (budget.warmup_ms or 0.0 if first else 0.0)
+        least_s = HUNG_FIRST_MIN_S if first else HUNG_MIN_S
+        if self._wait_s:
+            least_s = max(least_s, HUNG_WAITING_MIN_S)
+        return max(least_s, HUNG_AFTER * budget_ms / 1e3)
 
     # -- control thread
     def wants_frames(self) -> bool:

@@ -1,90 +1,93 @@
-"""Steps of the shipped grab with chunks asked for 0, 2 and 5 rows early.
+"""Steps and standing of the shipped grab, by how early its chunks are asked for.
 
-    python tests/bench/bench_prefetch.py [--episodes 40] [--seed 0] [--prefetch 0 2 5]
+    python tests/bench/bench_prefetch.py [--episodes 40] [--seed 0] [--cells 0/6 2/6 2/4 5/6]
+        [--latency 0 1 2 3 5] [--real-time]
 
 Real sidecar, real policy on the CPU, no arbiter; each row is one `vram-runner benchmark` over the
-same seeds, in which the world waits for late chunks, so that figures do not depend on the machine.
-Prints a table and writes `out/bench/prefetch.json`, the summaries of the cells.
+same seeds. The world waits for late chunks, and an answer takes `--latency` control steps, so that
+the figures do not depend on the machine. `--real-time` adds rows at 30 Hz with the sidecar's own
+latency: run it on a machine with nothing else to do.
+A cell is `prefetch_at/n_action_steps`. Prints a table and writes `out/bench/prefetch.json`, the
+summaries of the cells.
 """
 
 import argparse
+import asyncio
 import json
-import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
-from tests.support.paths import ROOT
+from tests.bench.grabs import MANIFEST, benchmark_arguments, grab_sidecar
+from vram_arbiter.runner.cli.benchmark import benchmark_of, entries_of
+from vram_arbiter.runner.sim.benchmark import CellSummary
 
-SKILL = "vram-arbiter/so101-grab"
-MANIFEST = ROOT / "configs" / "rskills" / "so101-grab" / "rskill.yaml"
-BOOT_S = 240.0
-
-
-def manifest_with(prefetch_at: int, folder: Path) -> Path:
-    """Write the shipped skill's manifest with another `prefetch_at`. Return its path."""
-    raw = yaml.safe_load(MANIFEST.read_text(encoding="utf-8"))
-    raw["policy_extras"]["prefetch_at"] = prefetch_at
-    path = folder / f"prefetch-{prefetch_at}" / "rskill.yaml"
-    path.parent.mkdir()
-    path.write_text(yaml.safe_dump(raw), encoding="utf-8")
-    return path
+HEAD = (
+    "| latency | prefetch_at | n_action_steps | steps | of them standing | success |\n"
+    "| --- | --- | --- | --- | --- | --- |"
+)
 
 
-def played(prefetch_at: int, endpoint: str, folder: Path, more: Sequence[str]) -> dict[str, object]:
-    """Return the summary of one cell. Raises CalledProcessError."""
-    out = folder / f"out-{prefetch_at}"
-    subprocess.run(
-        [
-            sys.executable, "-m", "vram_arbiter.runner", "benchmark", "--skill", SKILL,
-            "--skills", str(manifest_with(prefetch_at, folder)), "--sidecar", f"{SKILL}={endpoint}",
-            "--no-arbiter", "--no-videos", "--out", str(out), *more,
-        ],
-        check=True, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
-    (cell,) = json.loads((out / "benchmark.json").read_text())["cells"]
-    return {"prefetch_at": prefetch_at} | {k: v for k, v in cell.items() if k != "episodes"}
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One row. `latency` in control steps; None: that of the sidecar, in real time."""
+
+    latency: int | None
+    prefetch_at: int
+    keep: int
+
+    def played(self, endpoint: str, seeds: range) -> CellSummary:
+        """Return the summary of the benchmark. Raises RuntimeError without a verdict."""
+        raw = yaml.safe_load(MANIFEST.read_text(encoding="utf-8"))
+        raw["policy_extras"]["prefetch_at"] = self.prefetch_at
+        raw["n_action_steps"] = self.keep
+        told = ["--real-time"] if self.latency is None else ["--latency-steps", str(self.latency)]
+        with tempfile.TemporaryDirectory() as name:
+            manifest = Path(name) / "rskill.yaml"
+            manifest.write_text(yaml.safe_dump(raw), encoding="utf-8")
+            args = benchmark_arguments(endpoint, manifest, *told)
+            (entry,) = entries_of(args, None)
+        cell = asyncio.run(benchmark_of(entry, args).run(entry.contestant(), seeds))
+        if cell.errors or not cell.complete:
+            raise RuntimeError(f"{self}: {cell.why or cell.episodes[-1].message}")
+        return cell.summary()
+
+    def row(self, summary: CellSummary) -> str:
+        """Return the line of the table."""
+        latency = "real time" if self.latency is None else self.latency
+        return (
+            f"| {latency} | {self.prefetch_at} | {self.keep} | {summary['mean_steps']:.1f} | "
+            f"{summary['mean_standing_steps']:.1f} | {summary['successes']}/{summary['judged']} |"
+        )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--prefetch", type=int, nargs="+", default=[0, 2, 5])
+    parser.add_argument("--cells", nargs="+", default=["0/6", "2/6", "2/4", "5/6"])
+    parser.add_argument("--latency", type=int, nargs="*", default=[0, 1, 2, 3, 5])
+    parser.add_argument("--real-time", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("out/bench/prefetch.json"))
     options = parser.parse_args()
-    more = ["--episodes", str(options.episodes), "--seed", str(options.seed)]
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        socket = folder / "grab.sock"
-        sidecar = subprocess.Popen(
-            [
-                sys.executable, "-m", "vram_arbiter.sidecars", "--name", "grab", "--rskill",
-                str(MANIFEST), "--no-arbiter", "--device", "none", "--endpoint", f"ipc://{socket}",
-            ]
-        )  # fmt: skip
-        try:
-            boots_until = time.monotonic() + BOOT_S
-            while not socket.exists():
-                if sidecar.poll() is not None or time.monotonic() > boots_until:
-                    raise RuntimeError("the sidecar did not start")
-                time.sleep(0.1)
-            cells = [played(n, f"ipc://{socket}", folder, more) for n in options.prefetch]
-        finally:
-            sidecar.terminate()
-            sidecar.wait()
+    seeds = range(options.seed, options.seed + options.episodes)
+    rows: list[dict[str, object]] = []
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(cells, indent=1) + "\n", encoding="utf-8")
-    print("| prefetch_at | mean steps | success |\n| --- | --- | --- |")
-    for cell in cells:
-        print(
-            f"| {cell['prefetch_at']} | {cell['mean_steps']:.1f} | "
-            f"{cell['successes']}/{cell['judged']} |"
-        )
+    with grab_sidecar() as endpoint:
+        print(HEAD, flush=True)
+        for latency in [*options.latency, *([None] if options.real_time else [])]:
+            for name in options.cells:
+                prefetch_at, keep = (int(number) for number in name.split("/"))
+                cell = Cell(latency, prefetch_at, keep)
+                summary = cell.played(endpoint, seeds)
+                print(cell.row(summary), flush=True)
+                rows.append(
+                    {"latency": latency, "prefetch_at": prefetch_at, "keep": keep, **summary}
+                )
+                options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -21,6 +21,7 @@ ROOT = HERE.parents[1]
 HAND = "tests.runner.gym_worlds:test/Hand-v0"
 POINT = "tests.runner.gym_worlds:test/Point-v0"
 SEED = 5
+TASK = "close the hand"
 DEAF = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"}  # spans are made; nobody takes them
 WAIT_S = 280.0
 ACTIONS = ["arm.0", "arm.1", "gripper", "lamps.0", "lamps.1", "walk.0.0", "walk.0.1", "walk.1"]
@@ -63,7 +64,9 @@ def recorded_world(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict
     kinds; and the run's result.
     """
     folder = tmp_path_factory.mktemp("worlds")
+    (folder / "hand.yaml").write_text(f"instruction: {TASK}\n")
     flags = ("--env", f"gym:{HAND}", "--policy", "random", "--episodes", "3", "--seed", str(SEED))
+    flags += ("--env-config", str(folder / "hand.yaml"))
     ran = record(folder / "set", folder, *flags, **DEAF)
     assert ran.returncode == 0, ran.stderr
     return folder / "set", json.loads(ran.stdout.splitlines()[-1])
@@ -120,7 +123,7 @@ def test_lerobot_reads_what_the_world_showed_and_was_sent(
         assert float(row["observation.images.render"].mean()) * 255 == pytest.approx(
             10 * (index + 1), abs=4
         )
-        assert row["task"] == "random"
+        assert row["task"] == TASK, "a policy that reads words would learn the other one's name"
         spans.add((row["trace_id"], row["span_id"]))
     assert len(spans) == frames
     assert all(trace_id and span_id for trace_id, span_id in spans)

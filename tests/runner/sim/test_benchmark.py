@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.runner.manual_clock import ManualClock
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.cli.benchmark import add_parser, entries_of, remembers, worlds_of
 from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, PolicyContestant, file_name, wilson
@@ -107,6 +109,40 @@ def test_one_reset_a_seed_and_the_same_seeds_play_the_same(run_async: Run) -> No
     ]
     assert [e.total_reward for e in first.episodes] == [e.total_reward for e in second.episodes]
     assert (first.complete, first.success_rate, first.errors) == (True, 1.0, 0)
+
+
+@pytest.mark.heavy
+def test_a_rate_paces_the_ticks_and_standing_is_counted(run_async: Run) -> None:
+    """In real time a policy's latency costs what it costs on a robot."""
+    from vram_arbiter.runner.protocols import ChunkStart, Hold
+    from vram_arbiter.runner.sim.policies import PolicyPlayer
+
+    class Thinks(PolicyPlayer):
+        thought = 0
+
+        def step(self, world: Any) -> Any:
+            self.thought += 1
+            if self.thought in (2, 3):
+                return Hold("thinks", standing=True)
+            outcome = super().step(world)
+            return replace(outcome, chunk=ChunkStart(0.1, None)) if self.thought == 1 else outcome
+
+    class Thinker(PolicyContestant):
+        def player(self, env: Any, seed: int) -> Any:
+            played = self._policy.play(env, seed)
+            return Thinks(self.name, env, played._act)
+
+    one, clock = Counted(), ManualClock()
+    one.runner = sim_runner(
+        lambda: one.env, rate_hz=20, ends_with_skill=True, max_steps=50, clock=clock
+    )
+    cell: Cell = run_async(
+        Benchmark(one.runner, world="point").run(Thinker(policy_of(SEEK)), (20,))
+    )
+    (played,) = cell.episodes
+    assert (played.success, played.standing_steps) == (True, 2)
+    assert cell.summary()["mean_standing_steps"] == 2
+    assert clock.slept == pytest.approx([1 / 20] * 5)  # two of standing, three of acting
 
 
 @pytest.mark.heavy
@@ -327,6 +363,7 @@ def test_a_skill_and_the_expert_in_our_own_scene(tmp_path: Path) -> None:
         (["--skill", "vram-arbiter/so101-detector"], "cannot be executed"),
         (["--policy", "random", "--env", "gym:NoSuch-v0"], "NoSuch"),
         (["--policy", "random", "--task", "cook"], "cook"),
+        (["--policy", "random", "--real-time", "--parallel", "2"], "--parallel 2"),
         (["--policy", "expert", "--env", "gym:CartPole-v1"], "expert"),
         (
             ["--policy", "random", "--env", "gym:A-v0", "--env", "gym:B-v0", "--success", "info:x"],

@@ -77,6 +77,50 @@ def test_a_world_that_waits_is_the_same_whenever_answers_come() -> None:
     assert played[0] == played[1] == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 3), (1, 4)]
 
 
+@pytest.mark.parametrize(
+    ("prefetch_at", "latency", "rows"),
+    [
+        (2, 0, "00 10 20 30"),  # at once: each row is the first of its own chunk
+        (2, 1, "-- 00 01 11 12 21 22"),  # skips what was played since, and no more
+        (2, 2, "-- -- 00 01 02 12 13 14 22"),
+        (
+            2,
+            4,
+            "-- -- -- -- 00 01 02 -- -- 12 13 14 -- -- 22",
+        ),  # longer than the rows that are left
+        (0, 1, "-- 00 01 02 -- 10 11 12 -- 20"),
+    ],
+)
+def test_an_answer_of_the_simulator_takes_as_long_as_it_is_told(
+    prefetch_at: int, latency: int, rows: str
+) -> None:
+    """A benchmark has to show what a slow policy costs; the world stood for none of its time."""
+    expected = [None if text == "--" else (float(text[0]), float(text[1])) for text in rows.split()]
+    for slow in (False, True):  # the answer's real time has no part in it
+        policy = Policy(6)
+
+        def fetch(observation: Any, policy: Policy = policy, slow: bool = slow) -> Any:
+            future = policy.fetch(observation)
+            if not slow:
+                policy.answer()
+            return future
+
+        player = ChunkPlayer(
+            fetch, prefetch_at=prefetch_at, keep=3, wait_s=1e-9, latency_steps=latency
+        )
+        played, hits = [], []
+        for step in range(len(expected)):
+            if slow and policy.futures and not policy.futures[-1].done() and latency:
+                policy.answer()
+            row = player.next_row(step)
+            played.append(None if row is None else row.row)
+            if row is not None and row.prefetched is not None:
+                hits.append(row.prefetched)
+        if latency or not slow:  # an answer that takes no step cannot come a step later
+            assert played == expected
+            assert set(hits) == {0 < latency <= prefetch_at or not latency}
+
+
 def test_a_robot_that_stood_still_misses_no_row() -> None:
     """The chunk still begins where the robot is: rows are skipped for steps that were played."""
     policy = Policy(6)

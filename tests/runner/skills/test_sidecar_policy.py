@@ -393,16 +393,23 @@ def test_a_lost_use_fails_the_goal(policy_bench: Callable[..., Bench], run_async
     scenario(run_async, policy_bench(Arbiter()), play)
 
 
-@pytest.mark.parametrize("answered", [0, 1])
+@pytest.mark.parametrize(
+    ("answered", "waiting_s", "limit_s"), [(0, 0.0, 0.05), (1, 0.0, 0.05), (1, 0.08, 0.08)]
+)
 def test_a_policy_that_hangs_is_noticed_by_its_latency_budget(
     policy_bench: Callable[..., Bench],
     run_async: Run,
     answered: int,
+    waiting_s: float,
+    limit_s: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Regression: every policy was given 30 s for a chunk."""
-    for name in ("HUNG_MIN_S", "HUNG_FIRST_MIN_S"):
-        monkeypatch.setattr(f"vram_arbiter.runner.skills.sidecar_policy.{name}", 0.0)
+    """Regression: every policy was given 30 s for a chunk. Then 2 s were too few where the world
+    waits: on a machine with other work an episode of a benchmark had no verdict.
+    """
+    for name in ("HUNG_MIN_S", "HUNG_FIRST_MIN_S", "HUNG_WAITING_MIN_S"):
+        least_s = waiting_s if name == "HUNG_WAITING_MIN_S" else 0.0
+        monkeypatch.setattr(f"vram_arbiter.runner.skills.sidecar_policy.{name}", least_s)
     # the manifest's 100 ms; the first chunk waits for the server's own loop, too
     monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.HUNG_AFTER", 20.0)
 
@@ -416,7 +423,7 @@ def test_a_policy_that_hangs_is_noticed_by_its_latency_budget(
         monkeypatch.setattr("vram_arbiter.runner.skills.sidecar_policy.HUNG_AFTER", 0.5)
         with pytest.raises(SidecarUnavailable, match="hangs: no chunk within") as raised:
             await b.step()
-        assert raised.value.details["limit_s"] == pytest.approx(0.05)
+        assert raised.value.details["limit_s"] == pytest.approx(limit_s)
 
     scenario(run_async, policy_bench(Arbiter()), play)
 
