@@ -11,6 +11,7 @@ import argparse
 import asyncio
 import logging
 import sys
+from collections.abc import Sequence
 from contextlib import nullcontext
 from importlib import import_module
 
@@ -22,20 +23,19 @@ from vram_arbiter.schemas.runtime.version import add_version
 
 COMMANDS = (
     "sim", "benchmark", "deploy", "estop", "goal", "state", "frame", "reset", "mark", "episodes",
-    "export", "replay",
+    "export", "replay", "ros2",
 )  # fmt: skip
 URGENT = "estop"  # it imports nothing of the others: a second of imports is a second of motion
 
 
-def parse(argv: list[str] | None) -> argparse.Namespace:
-    """Return the parser of `vram-runner`; `args.run` is the command."""
-    parser = argparse.ArgumentParser(
+def parser(names: Sequence[str] = COMMANDS) -> argparse.ArgumentParser:
+    """Return the parser of `vram-runner` with these commands; `args.run` is the command."""
+    made = argparse.ArgumentParser(
         prog="vram-runner", description="Runs a robot's skills and serves goals and frames."
     )
-    add_version(parser)
-    commands = parser.add_subparsers(dest="command", required=True)
-    given = sys.argv[1:] if argv is None else argv
-    for name in [URGENT] if given[:1] == [URGENT] else COMMANDS:
+    add_version(made)
+    commands = made.add_subparsers(dest="command", required=True)
+    for name in names:
         module = import_module(f"vram_arbiter.runner.cli.{name}")
         flags = module.add_parser(commands)
         add_version(flags)
@@ -46,7 +46,13 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
             "--log-format", default="human", choices=logs.FORMS, help="json: one object a line"
         )
         flags.set_defaults(run=module.run, serves=getattr(module, "SERVES", False))
-    return parser.parse_args(argv)
+    return made
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    """Parse the command line; only the modules that it needs are imported."""
+    given = sys.argv[1:] if argv is None else argv
+    return parser([URGENT] if given[:1] == [URGENT] else COMMANDS).parse_args(argv)
 
 
 @terminal.program

@@ -83,7 +83,7 @@ def add_parser(
         "--config",
         type=Path,
         required=True,
-        help="deployment file (docs/runner.md), or the name of a shipped one",
+        help="deployment file (docs/reference/deployment-file.md), or the name of a shipped one",
     )
     deploy.add_argument(
         "--dry-run",

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -113,6 +113,7 @@ class ControlLoop[R: Robot]:
     # -- life
     def activate(self) -> None:
         """Acquire what a run needs. Raises what the robot raises."""
+        meters.count(telemetry.METRIC_ESTOPS, times=0)  # so that `increase` sees the first one
         self.robot.open(self._stopping)
 
     def deactivate(self) -> None:
@@ -130,14 +131,20 @@ class ControlLoop[R: Robot]:
             self.timings.clear()
             self.deadline_misses = self.late_actions_withheld = 0
         first = self.tick_idx
-        self._pacing.start()
-        try:
+        with self.paced() as wait:
             while not self._finished() and (max_ticks is None or self.tick_idx - first < max_ticks):
                 self.tick()
-                self._pacing.wait()
+                wait()
+        return self.result()
+
+    @contextmanager
+    def paced(self) -> Iterator[Callable[[], None]]:
+        """Begin a grid of slots for ticks; yield what sleeps until the next slot."""
+        self._pacing.start()
+        try:
+            yield self._pacing.wait
         finally:
             self._pacing.stop()
-        return self.result()
 
     def request_stop(self) -> None:
         """End the run before its next tick. Any thread."""

@@ -223,12 +223,18 @@ class OneGoal:
             attributes[telemetry.ATTR_REVISION] = goal.revision
         with tracing.span(telemetry.SPAN_GOAL, goal.traceparent, attributes) as span:
             running.goal = replace(goal, traceparent=tracing.traceparent())
-            status = await self._carry_out(running, make)
-            span.set_attribute(telemetry.ATTR_OUTCOME, status)
+            status, error = await self._carry_out(running, make)
             labels = {telemetry.ATTR_SKILL: goal.rskill_id, telemetry.ATTR_OUTCOME: status}
+            if error is not None or status == "deadline":
+                code = "deadline" if error is None else error.code
+                labels[telemetry.ATTR_ERROR_TYPE] = code
+                tracing.failed(span, code)
+            tracing.note(labels)
             meters.count(telemetry.METRIC_GOALS, labels)
 
-    async def _carry_out(self, running: _Running, make: Callable[[], Skill]) -> Status:
+    async def _carry_out(
+        self, running: _Running, make: Callable[[], Skill]
+    ) -> tuple[Status, VramError | None]:
         goal = running.goal
         log.info("goal %s: %s %s", goal.goal_id, goal.rskill_id, goal.prompt)
         telling = asyncio.create_task(self._tell(running))
@@ -262,7 +268,7 @@ class OneGoal:
         telling.cancel()
         await asyncio.gather(telling, return_exceptions=True)
         await self._conclude(running, status, error, data)
-        return status
+        return status, error
 
     @staticmethod
     async def _finish(skill: Skill) -> None:

@@ -109,6 +109,8 @@ class HardwareRobot:
         Returns when all of them have given data. Raises FrameStale and StateStale for what stays
         silent, Cancelled once `stopping` is set.
         """
+        for sensor in (*self._readers, JOINT_STATE):  # so that `increase` sees the first one
+            meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: sensor}, 0)
         for reader in self._readers.values():
             reader.start()
         deadline_ns = self._clock.now_ns() + round(self._first_data_s * 1e9)

@@ -11,10 +11,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-import threading
 from typing import Any, Self
 
 from vram_arbiter.runner.ros2 import messages
+from vram_arbiter.runner.ros2.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
     cdr_of,
     dds_problems,
@@ -27,8 +27,6 @@ from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 log = logging.getLogger(__name__)
 
-WAIT_S = 1.0  # the longest that the thread sleeps in DDS; a reply wakes it
-STOP_S = 2.0
 REPLIES_KEPT = 16
 SERVICES = ("send_goal", "get_result", "cancel_goal")
 CANCEL = "action_msgs/CancelGoal"
@@ -54,22 +52,15 @@ class ActionClient:
         self._writers: dict[str, Any] = {}
         self._readers: dict[str, Any] = {}
         self._served = asyncio.Event()
-        self._thread: threading.Thread | None = None
 
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
         with dds_problems(self._domain):
-            waitset = self._open()
-        self._thread = threading.Thread(
-            target=self._run, args=(waitset,), name="ros2-action", daemon=True
-        )
-        self._thread.start()
+            self._thread = self._open()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._guard.set(True)
-        if self._thread is not None:
-            await asyncio.to_thread(self._thread.join, STOP_S)
+        await self._thread.stop()
         self._writers.clear()
         self._readers.clear()
 
@@ -100,16 +91,8 @@ class ActionClient:
             del self._waiting[service, number]
 
     # -- DDS
-    def _open(self) -> Any:
-        from cyclonedds.core import (
-            DDSStatus,
-            GuardCondition,
-            InstanceState,
-            ReadCondition,
-            SampleState,
-            ViewState,
-            WaitSet,
-        )
+    def _open(self) -> DdsThread:
+        from cyclonedds.core import DDSStatus
         from cyclonedds.domain import DomainParticipant
         from cyclonedds.pub import DataWriter
         from cyclonedds.sub import DataReader
@@ -117,9 +100,6 @@ class ActionClient:
 
         quality = qos_of("reliable", writer=True, kept=REPLIES_KEPT, wait_s=1)
         participant = DomainParticipant(self._domain)
-        self._guard: Any = GuardCondition(participant)
-        waitset = WaitSet(participant)
-        waitset.attach(self._guard)
         for service, kind in self._kinds.items():
             path = f"{self.name}/_action/{service}"
             asked = Topic(participant, f"rq{path}Request", messages.dds_type(kind + "_Request"))
@@ -128,28 +108,21 @@ class ActionClient:
             reader = self._readers[service] = DataReader(participant, told, qos=quality)
             writer.set_status_mask(DDSStatus.PublicationMatched)
             reader.set_status_mask(DDSStatus.SubscriptionMatched)
-            waitset.attach(writer)
-            waitset.attach(reader)
-            state = SampleState.Any | ViewState.Any | InstanceState.Any
-            waitset.attach(ReadCondition(reader, state))
-        return waitset
+        readers, writers = self._readers.values(), self._writers.values()
+        return DdsThread(
+            "ros2-action", participant, readers, [*writers, *readers], self._woken, self._failed
+        )
 
     # -- on its thread
-    def _run(self, waitset: Any) -> None:
-        from cyclonedds.core import DDSException
-        from cyclonedds.util import duration
+    def _woken(self) -> None:
+        self._loop.call_soon_threadsafe(self._found, self._matched())
+        for service, reader in self._readers.items():
+            for sample in reader.take(N=REPLIES_KEPT):
+                if sample.sample_info.valid_data:
+                    self._took(service, cdr_of(sample))
 
-        try:
-            while not self._guard.read():
-                waitset.wait(duration(seconds=WAIT_S))
-                self._loop.call_soon_threadsafe(self._found, self._matched())
-                for service, reader in self._readers.items():
-                    for sample in reader.take(N=REPLIES_KEPT):
-                        if sample.sample_info.valid_data:
-                            self._took(service, cdr_of(sample))
-        except DDSException as error:
-            log.error("the client of %s failed: %s", self.name, error)
-            self._loop.call_soon_threadsafe(self._fail, str(error))
+    def _failed(self, problem: str) -> None:
+        self._loop.call_soon_threadsafe(self._fail, problem)
 
     def _matched(self) -> bool:
         """Return whether a server has all three services."""

@@ -1,4 +1,4 @@
-"""ROS 2 messages of the actions that this runner asks for: their fields, CDR and DDS types.
+"""ROS 2 messages of the actions that are asked for and served: fields, CDR and DDS types.
 
 A message is a map, as in a goal's `goal_params`: missing fields have ROS's defaults, unknown ones
 are refused. Pure but for `dds_type`, which imports Cyclone DDS.
@@ -92,10 +92,31 @@ MESSAGES: Final[Mapping[str, Fields]] = {
         ("behavior_tree", "string"),
     ),
     "nav2_msgs/NavigateToPose_Result": (("error_code", "uint16"), ("error_msg", "string")),
+    "openral_msgs/ExecuteRskill_Goal": (
+        ("rskill_id", "string"),
+        ("revision", "string"),
+        ("prompt", "string"),
+        ("prompt_metadata_json", "string"),
+        ("goal_params_json", "string"),
+        ("deadline_s", "float64"),
+    ),
+    "openral_msgs/ExecuteRskill_Result": (
+        ("success", "bool"),
+        ("failure_reason", "string"),
+        ("trace_id", "string"),
+    ),
+    "openral_msgs/ExecuteRskill_Feedback": (
+        ("progress", "float32"),
+        ("state", "string"),
+        ("chunk_index", "uint32"),
+        ("chunks_total", "uint32"),
+    ),
     "action_msgs/GoalInfo": (
         ("goal_id", "unique_identifier_msgs/UUID"),
         ("stamp", "builtin_interfaces/Time"),
     ),
+    "action_msgs/GoalStatus": (("goal_info", "action_msgs/GoalInfo"), ("status", "int8")),
+    "action_msgs/GoalStatusArray": (("status_list", "action_msgs/GoalStatus[]"),),
     "action_msgs/CancelGoal_Request": (*_CALL, ("goal_info", "action_msgs/GoalInfo")),
     "action_msgs/CancelGoal_Response": (
         *_CALL,
@@ -105,13 +126,14 @@ MESSAGES: Final[Mapping[str, Fields]] = {
 }
 _NUMBERS: Final[Mapping[str, str]] = {
     "bool": "?", "int8": "b", "uint8": "B", "uint16": "H", "int32": "i", "uint32": "I",
-    "int64": "q", "uint64": "Q", "float64": "d",
+    "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
+ACTION_PARTS: Final = ("Goal", "Result", "Feedback", "FeedbackMessage", "SendGoal", "GetResult")
 ITEMS_MAX: Final = 100_000  # of one sequence
 
 
 def fields_of(kind: str) -> Fields:
-    """Return the fields of a message, or of a service that an action consists of."""
+    """Return the fields of a message, or of a service or topic that an action consists of."""
     if kind in MESSAGES:
         return MESSAGES[kind]
     package, _, name = kind.partition("/")
@@ -125,6 +147,7 @@ def fields_of(kind: str) -> Fields:
             ("accepted", "bool"),
             ("stamp", "builtin_interfaces/Time"),
         ),
+        "FeedbackMessage": (goal_id, ("feedback", f"{action}_Feedback")),
         "GetResult_Request": (*_CALL, goal_id),
         "GetResult_Response": (*_CALL, ("status", "int8"), ("result", f"{action}_Result")),
     }[part]
@@ -190,7 +213,7 @@ def _put(out: bytearray, kind: str, value: Any, at: str) -> None:
 def _number(out: bytearray, code: str, value: Any, at: str) -> None:
     out += b"\x00" * (-len(out) % struct.calcsize(code))
     try:
-        whole = value if code in "d?" else int(value)
+        whole = value if code in "fd?" else int(value)
         if isinstance(value, bool) != (code == "?") or whole != value:
             raise ValueError
         out += struct.pack("<" + code, whole)
@@ -236,7 +259,8 @@ def dds_name(kind: str) -> str:
     """Return the name of the DDS type: `nav2_msgs::action::dds_::NavigateToPose_Goal_`."""
     package, _, name = kind.partition("/")
     folder = "msg"
-    if name.endswith(("_Goal", "_Result")) or "_SendGoal_" in name or "_GetResult_" in name:
+    _, action, part = name.partition("_")
+    if action and part.partition("_")[0] in ACTION_PARTS:
         folder = "action"
     elif name.startswith("CancelGoal_"):
         folder = "srv"

@@ -79,7 +79,7 @@ def load() -> Libraries:
     ) as error:  # ValueError: its word for a description that is not installed
         raise ConfigError(
             f"GStreamer cannot be used here: {error}",
-            hint="Debian, Ubuntu: install the system's packages that docs/runner.md names,"
+            hint="Debian, Ubuntu: install the system's packages that docs/how-to/cameras.md names,"
             " then pip install 'vram-arbiter[gstreamer]'",
         ) from error
     if not Gst.is_initialized():

@@ -98,10 +98,13 @@ def cdr_of(sample: Any) -> bytes:
     return cdr
 
 
-def qos_of(reliability: str, *, writer: bool, kept: int = 1, wait_s: int = 0) -> Any:
-    """Return ROS's quality of service: volatile, the newest `kept` samples, plain CDR.
+def qos_of(
+    reliability: str, *, writer: bool, kept: int = 1, wait_s: int = 0, latched: bool = False
+) -> Any:
+    """Return ROS's quality of service: the newest `kept` samples, plain CDR.
 
-    A writer waits `wait_s` for a slow reader at most; then it drops.
+    A writer waits `wait_s` for a slow reader at most; then it drops. `latched`: readers that come
+    later get what was kept; otherwise nothing is.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration
@@ -109,7 +112,7 @@ def qos_of(reliability: str, *, writer: bool, kept: int = 1, wait_s: int = 0) ->
     reliable = Policy.Reliability.Reliable(duration(seconds=wait_s))
     return Qos(
         reliable if reliability == "reliable" else Policy.Reliability.BestEffort,
-        Policy.Durability.Volatile,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
         Policy.History.KeepLast(kept),
         Policy.DataRepresentation(use_cdrv0_representation=True),
         *(

@@ -1,31 +1,49 @@
-"""Prints the spans and metrics of some ticks on a robot as JSON.
+"""Prints the spans and metrics of some ticks on a robot as JSON, and the pages that Prometheus
+would read: when the robot is ready, after its first ticks, and at the end.
 
 A program of its own, because a process has one tracer provider for good.
 """
 
+import asyncio
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from opentelemetry import metrics, trace
+from opentelemetry.exporter.prometheus import PrometheusMetricReader
 from opentelemetry.sdk.metrics import MeterProvider
 from opentelemetry.sdk.metrics.export import InMemoryMetricReader
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import generate_latest
 
 from tests.runner.manual_clock import ManualClock
 from tests.runner.small_robots import FedCamera, Nod, Twin
-from vram_arbiter.runner.protocols import Goal
+from vram_arbiter.runner.protocols import Act, ChunkStart, Goal, Hold, StepOutcome
 from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.sensors.detections import DetectionSlot
+from vram_arbiter.runner.sensors.detector import ContinuousDetector
 from vram_arbiter.runner.skills.base import SkillState
+from vram_arbiter.schemas.config.robot import DetectorConfig
+from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.runtime.telemetry import process
-from vram_arbiter.schemas.world import Action, JointState
+from vram_arbiter.schemas.world import Action, JointState, WorldState
 
 READ_S, SEND_S = 0.004, 0.008
+
+
+class BrokenDetector:
+    async def ping(self) -> None:
+        raise ModelError("no memory left")
+
+    def picture(self, sensor_id: str, max_age_s: float) -> None:
+        raise AssertionError("a detector that is not loaded looks at no picture")
 
 
 class SlowTwin(Twin):
@@ -49,7 +67,9 @@ def main() -> None:
     provider.add_span_processor(SimpleSpanProcessor(exporter))
     trace.set_tracer_provider(provider)
     reader = InMemoryMetricReader()
-    metrics.set_meter_provider(MeterProvider([reader]))
+    registry = CollectorRegistry()
+    pages = PrometheusMetricReader(scope_info_enabled=False, registry=registry)
+    metrics.set_meter_provider(MeterProvider([reader, pages]))
     process.observe()
     clock = ManualClock()
     twin, camera = SlowTwin(clock), FedCamera("front", clock)
@@ -58,10 +78,12 @@ def main() -> None:
         twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
     )
     runner.activate()
+    ready = generate_latest(registry).decode()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
     skill.state = SkillState.ACTIVE
     runner.begin_skill(skill, Goal("g", "a/nod", traceparent=sys.argv[2]), lambda ended: None)
     result = runner.tick()
+    moving = generate_latest(registry).decode()
     camera.stop()
     runner.run(3)
     twin.silent = True
@@ -82,7 +104,51 @@ def main() -> None:
         for span in exporter.get_finished_spans()
     ]
     said = {"spans": spans, "tick": result.trace_context, "run": runner.result().trace_id}
-    print(json.dumps(said | {"metrics": collected(reader)}))
+    said["metrics"] = collected(reader)
+    said["pages"] = [ready, moving, generate_latest(registry).decode()]
+    fall_behind(clock)
+    look_in_vain(clock)
+    said["pages"].append(generate_latest(registry).decode())
+    print(json.dumps(said))
+
+
+class Slow(Nod):
+    """Waits for a chunk, then takes too long, then goes where the robot may not."""
+
+    def _step(self, world: WorldState) -> StepOutcome:
+        outcome = super()._step(world)
+        assert isinstance(outcome, Act)
+        match self.taken:
+            case 1:
+                return Hold("no chunk yet", standing=True)
+            case 2:
+                return replace(outcome, chunk=ChunkStart(0.05, in_time=False))
+            case _:
+                far = outcome.action.model_copy(update={"joint_targets": ((9.0,),)})
+                return replace(outcome, action=far)
+
+
+def fall_behind(clock: ManualClock) -> None:
+    twin, camera = Twin(clock), FedCamera("wrist", clock)
+    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
+    runner = hardware_runner(
+        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
+    )
+    runner.activate()
+    skill = Slow(load_manifest(Path(sys.argv[1])), on_step=lambda world: clock.advance(0.05))
+    skill.state = SkillState.ACTIVE
+    runner.begin_skill(skill, Goal("h", "a/slow"), lambda ended: None)
+    runner.run(4)
+    runner.deactivate()
+
+
+def look_in_vain(clock: ManualClock) -> None:
+    """A detector that does not load, after an answer that came too late."""
+    slot = DetectionSlot("front", 1000.0)
+    slot.put([], clock.now_ns() - 2_000_000_000, clock.now_ns())
+    config = DetectorConfig(id="lab/detector", sensor_id="front")
+    broken: Any = BrokenDetector()
+    asyncio.run(ContinuousDetector(config, ("cube",), broken, broken.picture, slot, clock).look())
 
 
 def collected(reader: InMemoryMetricReader) -> dict[str, Any]:

@@ -11,13 +11,11 @@ import pytest
 
 pytest.importorskip("cv2", reason="needs the runner extra")
 
+from tests.runner.goal_bench import goals_served
 from tests.runner.small_robots import Nod
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.__main__ import parse
-from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
-from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Hold
 from vram_arbiter.schemas.errors import BadState, ConfigError, RunnerUnreachable, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
@@ -43,24 +41,9 @@ def serving(
     async def serve() -> AsyncIterator[Any]:
         runner = make_runner(rate_hz=200.0, cameras=("front",), seed=4)
         catalogue = Catalogue([load_manifest(navigate_manifest)], {Kind.ROS_ACTION: make})
-        async with ControlThread(runner) as control:
-            await control.call(lambda: None)
-            server = GoalServer(
-                endpoint,
-                control,
-                runner,
-                catalogue,
-                SystemClock(),
-                reset=runner.robot.begin_episode_of,
-                estop_s=60.0,
-            )
-            task = asyncio.create_task(server.serve())
-            await server.bound.wait()
-            try:
-                yield runner
-            finally:
-                server.stopping.set()
-                await task
+        reset = runner.robot.begin_episode_of
+        async with goals_served(endpoint, runner, catalogue, reset=reset):
+            yield runner
 
     return serve
 

@@ -10,6 +10,9 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
+
+from tests.support import promql
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
@@ -43,6 +46,38 @@ def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(navigate_manifest: Pa
     assert events[:2] == [telemetry.EVENT_STALE, telemetry.EVENT_ACTION_WITHHELD]
     assert events.count(telemetry.EVENT_STALE) == 1
     check_metrics(said["metrics"])
+    check_dashboard(*(promql.scrape(page) for page in said["pages"]))
+
+
+def check_dashboard(*pages: promql.Scrape) -> None:
+    """Curves and alerts of the runner; those of a policy's chunks, goals, sidecars and the reasoner
+    are in tests/e2e/test_trace.py, that of GPU memory in arbiter/host/gpu/test_nvml_library.py."""
+    ready, moving, stopped, _ = pages
+    drawn = promql.panels("runner.json").values()
+    elsewhere = (
+        "vram_runner_chunk_duration_",
+        "vram_runner_goals_",
+        "vram_sidecar_",
+        "vram_reasoner_",
+    )
+    shown = {str(one.name) for expression in drawn for one in promql.selectors(expression)}
+    own = {name for name in shown if not name.startswith((*elsewhere, "vram_runner_gpu_memory"))}
+    for expression in drawn:
+        if {str(one.name) for one in promql.selectors(expression)} <= own:
+            assert promql.unknown(expression, pages) == set()
+            for selector in promql.selectors(expression):
+                seen = [promql.matched(selector, page) for page in pages]
+                assert any(one != seen[0] for one in seen), f"{selector} never moves"
+    exported = {name for page in pages for name in promql.metrics_of(page, "vram_runner_")}
+    assert {name for name in exported if not {name, f"{name}_bucket"} & own} == set()
+    unnamed = promql.named_without_series("runner.json", pages)
+    assert [one for one in unnamed if "gpu_memory" not in one] == []
+    for name, alert in promql.alerts("vram-runner").items():
+        assert not promql.fires(alert, ready, moving), f"{name} is silent while the robot works"
+        assert promql.fires(alert, moving, stopped), name
+        seen = [key for one in promql.selectors(alert) for key in promql.matched(one, stopped)]
+        labels = {label for key in seen for label, _ in key}
+        assert promql.described("vram-runner")[name] <= labels | promql.TARGET_LABELS
 
 
 def check_metrics(metrics: dict[str, Any]) -> None:

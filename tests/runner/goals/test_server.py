@@ -4,8 +4,8 @@ whatever happens.
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import Callable
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,134 +14,35 @@ import pytest
 import zmq
 import zmq.asyncio
 
+from tests.runner.goal_bench import RSKILL, Bench, Told, goal_bench
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
 from vram_arbiter.runner.goals.one_goal import LISTENERS_MAX
 from vram_arbiter.runner.goals.server import GoalServer
-from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from vram_arbiter.runner.sim.robot import SimRunner
-from vram_arbiter.runner.skills.base import SkillBase
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,
     BadRequest,
     BadState,
     EstopRequested,
-    Evicted,
     GoalRejected,
     ManifestInvalid,
-    SidecarUnavailable,
     UnknownOp,
     UnknownSkill,
 )
-from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
-from vram_arbiter.schemas.world import Action, WorldState
+from vram_arbiter.schemas.manifest import Kind, load_manifest
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 Run = Callable[[Any], Any]
-RSKILL = "vram-arbiter/so101-navigate"
-
-
-class Told(SkillBase):
-    """Does what the goal's prompt says: ends, waits, fails, or hangs in its start."""
-
-    def __init__(self, manifest: RSkillManifest) -> None:
-        super().__init__(manifest)
-        self.story: list[str] = []
-        self.begun = asyncio.Event()
-        self.finishing, self.finished = asyncio.Event(), asyncio.Event()
-        self.loop = asyncio.get_running_loop()
-
-    async def _start(self, goal: Goal) -> None:
-        self.story.append(f"start {goal.prompt}")
-        self.todo = goal.prompt
-        self.steps = 0
-        self.begun.clear()
-        if goal.prompt == "hang":
-            self.begun.set()
-            await asyncio.Event().wait()
-        if goal.prompt in ("unavailable", "unavailable for ever"):
-            raise SidecarUnavailable("no process", hint="start it")
-
-    def _step(self, world: WorldState) -> StepOutcome:
-        self.steps += 1
-        self.loop.call_soon_threadsafe(self.begun.set)
-        match self.todo:
-            case "end with a set":
-                return Done({"seen": {1, 2}})
-            case "end with a large number":
-                return Done({"seen": 2**70})
-            case "end" | "end, and leave slowly" | "end slowly" | "end badly" if self.steps > 3:
-                return Done({"steps": self.steps})
-            case "evicted" if self.steps > 2:
-                raise Evicted("another model is there")
-            case "defect":
-                raise ZeroDivisionError("oops")
-        row = (
-            0.01 * (self.steps % 20),
-        ) * 2  # to and fro within the joints' ranges: "forever" is as long as a test is
-        names = ("shoulder_pan", "wrist_roll")
-        if self.steps % 2:
-            return Hold("thinking")
-        return Act(
-            Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=(row,), joint_names=names)
-        )
-
-    async def _finish(self) -> None:
-        self.story.append("finish")
-        if self.todo == "end slowly":
-            self.finishing.set()
-            await self.finished.wait()
-        if self.todo in ("end badly", "unavailable for ever"):
-            raise ZeroDivisionError("oops")
-
-    async def _release(self) -> None:
-        self.story.append("release")
-        if self.todo == "end, and leave slowly":
-            self.finishing.set()
-            await self.finished.wait()
-
-
-class Bench:
-    def __init__(self, runner: SimRunner, server: GoalServer, env: Any, made: list[Told]) -> None:
-        self.runner, self.server, self.env, self.made = runner, server, env, made
 
 
 @pytest.fixture
 def bench(
     make_runner: Callable[..., SimRunner], env: Any, endpoint: str, navigate_manifest: Path
 ) -> Callable[..., Any]:
-    @asynccontextmanager
-    async def serving() -> AsyncIterator[Bench]:
-        made: list[Told] = []
-
-        def make(manifest: RSkillManifest) -> Told:
-            made.append(Told(manifest))
-            return made[-1]
-
-        runner = make_runner(rate_hz=200.0)
-        catalogue = Catalogue([load_manifest(navigate_manifest)], {Kind.ROS_ACTION: make})
-        async with ControlThread(runner) as control:
-            await control.call(lambda: None)
-            server = GoalServer(
-                endpoint,
-                control,
-                runner,
-                catalogue,
-                SystemClock(),
-                ground_truth=lambda: {"target": "red cube"},
-                estop_s=60.0,  # a machine that stands still for a second is no loop that hangs
-            )
-            task = asyncio.create_task(server.serve())
-            await server.bound.wait()
-            try:
-                yield Bench(runner, server, env, made)
-            finally:
-                server.stopping.set()
-                await task
-
-    return serving
+    return lambda: goal_bench(make_runner, env, endpoint, navigate_manifest)
 
 
 def on_bench(
@@ -349,13 +250,29 @@ def test_a_deadline_is_no_success(bench: Any, endpoint: str, run_async: Run, pro
     [("evicted", "evicted"), ("unavailable", "sidecar_unavailable"), ("defect", "internal")],
 )
 def test_failures_are_typed(
-    bench: Any, endpoint: str, run_async: Run, prompt: str, code: str
+    bench: Any,
+    endpoint: str,
+    run_async: Run,
+    prompt: str,
+    code: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Regression: the metric of failed goals did not say why they failed."""
+    counted: list[tuple[str | None, str | None]] = []
+
+    def count(name: str, labels: dict[str, str] | None = None, times: int = 1) -> None:
+        if name == telemetry.METRIC_GOALS and labels is not None:
+            told = labels.get(telemetry.ATTR_OUTCOME), labels.get(telemetry.ATTR_ERROR_TYPE)
+            counted.append(told)
+
+    monkeypatch.setattr(meters, "count", count)
+
     async def body(b: Bench, client: RunnerClient) -> None:
         result = await (await client.send_goal(RSKILL, prompt=prompt)).result(60)
         assert (result["status"], result["success"], result["code"]) == ("failed", False, code)
         assert result["message"]
         assert (await (await client.send_goal(RSKILL, prompt="end")).result(60))["success"]
+        assert counted[0] == ("failed", code)
 
     on_bench(run_async, bench, endpoint, body)
 

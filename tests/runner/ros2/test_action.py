@@ -22,43 +22,23 @@ from vram_arbiter.schemas.world import JointState, WorldState
 pytestmark = [pytest.mark.heavy, pytest.mark.anyio]
 pytest.importorskip("cyclonedds")
 
-from cyclonedds.core import Policy, Qos  # noqa: E402
 from cyclonedds.domain import DomainParticipant  # noqa: E402
 from cyclonedds.idl import IdlStruct  # noqa: E402
 from cyclonedds.idl.annotations import final  # noqa: E402
-from cyclonedds.idl.types import (  # noqa: E402
-    array,
-    float64,
-    int8,
-    int32,
-    int64,
-    sequence,
-    uint8,
-    uint16,
-    uint32,
-    uint64,
+from cyclonedds.idl.types import float64, int8, int64, uint16, uint64  # noqa: E402
+
+from tests.runner.ros2.independent import (  # noqa: E402
+    UUID_,
+    CancelRequest_,
+    CancelResponse_,
+    Time_,
+    server_of,
+    valid,
 )
-from cyclonedds.pub import DataWriter  # noqa: E402
-from cyclonedds.sub import DataReader  # noqa: E402
-from cyclonedds.topic import Topic  # noqa: E402
-from cyclonedds.util import duration  # noqa: E402
 
 DOMAIN = 80
 WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
 PATIENCE_S = 60.0
-
-
-@dataclass
-@final
-class Time_(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-@final
-class UUID_(IdlStruct, typename="unique_identifier_msgs.msg.dds_.UUID_"):
-    uuid: array[uint8, 16]
 
 
 @dataclass
@@ -151,30 +131,6 @@ class ResultResponse_(
 
 
 @dataclass
-@final
-class GoalInfo_(IdlStruct, typename="action_msgs.msg.dds_.GoalInfo_"):
-    goal_id: UUID_
-    stamp: Time_
-
-
-@dataclass
-@final
-class CancelRequest_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Request_"):
-    guid: uint64
-    seq: int64
-    goal_info: GoalInfo_
-
-
-@dataclass
-@final
-class CancelResponse_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Response_"):
-    guid: uint64
-    seq: int64
-    return_code: int8
-    goals_canceling: sequence[GoalInfo_]
-
-
-@dataclass
 class Navigator:
     """Accepts goals ahead of the robot (x >= 0); x = 1 succeeds, x = 2 aborts, others drive on
     until they are canceled."""
@@ -184,10 +140,10 @@ class Navigator:
     canceled: list[bytes] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._participant = DomainParticipant(DOMAIN)
-        self._send = self._service("send_goal", SendRequest_, SendResponse_)
-        self._result = self._service("get_result", ResultRequest_, ResultResponse_)
-        self._cancel = self._service("cancel_goal", CancelRequest_, CancelResponse_)
+        participant, path = DomainParticipant(DOMAIN), f"{self.name}/_action/"
+        self._send = server_of(participant, path + "send_goal", SendRequest_, SendResponse_)
+        self._result = server_of(participant, path + "get_result", ResultRequest_, ResultResponse_)
+        self._cancel = server_of(participant, path + "cancel_goal", CancelRequest_, CancelResponse_)
         self._pending: dict[bytes, Any] = {}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -196,20 +152,6 @@ class Navigator:
     def close(self) -> None:
         self._over.set()
         self._thread.join()
-
-    def _service(self, name: str, request: type, response: type) -> tuple[Any, Any]:
-        qos = Qos(
-            Policy.Reliability.Reliable(duration(seconds=10)),
-            Policy.History.KeepLast(10),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-        )
-        path = f"{self.name}/_action/{name}"
-        asked = Topic(self._participant, f"rq{path}Request", request)
-        told = Topic(self._participant, f"rr{path}Reply", response)
-        return (
-            DataReader(self._participant, asked, qos=qos),
-            DataWriter(self._participant, told, qos=qos),
-        )
 
     def _run(self) -> None:
         while not self._over.wait(0.01):
@@ -235,10 +177,6 @@ class Navigator:
 
     def _answer(self, asked: Any, status: int, result: Result_) -> None:
         self._result[1].write(ResultResponse_(asked.guid, asked.seq, status, result))
-
-
-def valid(reader: Any) -> list[Any]:
-    return [sample for sample in reader.take(N=10) if sample.sample_info.valid_data]
 
 
 @pytest.fixture

@@ -1,0 +1,55 @@
+"""`vram-runner ros2`: serve a running runner's goals as a ROS 2 action."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import importlib.util
+
+from vram_arbiter.runner.cli.client import add_client_flags, client_of, note
+from vram_arbiter.runner.cli.common import install_signals
+from vram_arbiter.runner.ros2.goal_action import INTERFACE, NAME, RunnerGoals
+from vram_arbiter.runner.sensors.ros2_dds import domain_of
+from vram_arbiter.schemas.errors import ConfigError, InternalError
+
+SERVES = True
+
+
+def add_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
+    """Add the parser of `vram-runner ros2`."""
+    ros2 = commands.add_parser(
+        "ros2",
+        help="serve a running runner's goals as a ROS 2 action",
+        description=f"Serves {INTERFACE} on ROS_DOMAIN_ID. Every participant of that DDS"
+        " domain may move the robot: CYCLONEDDS_URI chooses its network.",
+    )
+    ros2.add_argument("--action", default=NAME, metavar="NAME", help="default %(default)s")
+    add_client_flags(ros2)
+    return ros2
+
+
+async def run(args: argparse.Namespace) -> int:
+    """Serve until a signal; goals that run are canceled then. Raises ConfigError: DDS is missing or
+    cannot be started; InternalError: it failed later; and what the client raises."""
+    if importlib.util.find_spec("cyclonedds") is None:
+        raise ConfigError("Cyclone DDS is not installed", hint="pip install 'vram-arbiter[ros2]'")
+    from vram_arbiter.runner.ros2.action_server import ActionServer
+
+    try:
+        domain = domain_of()
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    stopping = asyncio.Event()
+    install_signals(stopping)
+    async with client_of(args) as client:
+        await client.state()  # a runner answers
+        accept = RunnerGoals(client).accept
+        async with ActionServer(INTERFACE, args.action, domain, accept) as server:
+            note(f"serving goals of {client.endpoint} as {server.name} on DDS domain {domain}")
+            server.failed.add_done_callback(lambda _: stopping.set())
+            await stopping.wait()
+            if server.failed.done():
+                raise InternalError(f"DDS failed: {server.failed.result()}", hint="see the log")
+    return 0

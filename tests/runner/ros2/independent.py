@@ -1,0 +1,82 @@
+"""An independent participant's side of a ROS 2 action: types and codec of Cyclone DDS alone."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.annotations import final
+from cyclonedds.idl.types import array, int8, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+QUALITY = Qos(
+    Policy.Reliability.Reliable(duration(seconds=10)),
+    Policy.History.KeepLast(10),
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
+"""ROS 2's of services."""
+
+
+@dataclass
+@final
+class Time_(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+@final
+class UUID_(IdlStruct, typename="unique_identifier_msgs.msg.dds_.UUID_"):
+    uuid: array[uint8, 16]
+
+
+@dataclass
+@final
+class GoalInfo_(IdlStruct, typename="action_msgs.msg.dds_.GoalInfo_"):
+    goal_id: UUID_
+    stamp: Time_
+
+
+@dataclass
+@final
+class CancelRequest_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Request_"):
+    guid: uint64
+    seq: int64
+    goal_info: GoalInfo_
+
+
+@dataclass
+@final
+class CancelResponse_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Response_"):
+    guid: uint64
+    seq: int64
+    return_code: int8
+    goals_canceling: sequence[GoalInfo_]
+
+
+def topics(participant: DomainParticipant, path: str, request: type, response: type) -> list[Topic]:
+    """The topics of a service: of its requests, and of its replies."""
+    return [
+        Topic(participant, f"rq{path}Request", request),
+        Topic(participant, f"rr{path}Reply", response),
+    ]
+
+
+def server_of(participant: DomainParticipant, path: str, *types: type) -> tuple[Any, Any]:
+    """A service's server: what reads requests, and what writes replies."""
+    asked, told = topics(participant, path, *types)
+    return DataReader(participant, asked, qos=QUALITY), DataWriter(participant, told, qos=QUALITY)
+
+
+def client_of(participant: DomainParticipant, path: str, *types: type) -> tuple[Any, Any]:
+    """A service's client: what reads replies, and what writes requests."""
+    asked, told = topics(participant, path, *types)
+    return DataReader(participant, told, qos=QUALITY), DataWriter(participant, asked, qos=QUALITY)
+
+
+def valid(reader: Any) -> list[Any]:
+    return [sample for sample in reader.take(N=10) if sample.sample_info.valid_data]

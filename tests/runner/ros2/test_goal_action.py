@@ -1,0 +1,316 @@
+"""A runner's goals as a ROS 2 action: an independent participant, with types and codec of Cyclone
+DDS alone, sends goals, hears feedback and status, cancels, and asks for results.
+"""
+
+import asyncio
+import uuid
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.runner.goal_bench import RSKILL, Bench, goal_bench
+from tests.support.dds import NETWORK
+from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.ros2 import action_server
+from vram_arbiter.runner.ros2.action_server import ActionServer
+from vram_arbiter.runner.ros2.goal_action import INTERFACE, RunnerGoals
+
+pytestmark = pytest.mark.heavy
+pytest.importorskip("cyclonedds")
+
+from cyclonedds.core import Policy, Qos  # noqa: E402
+from cyclonedds.domain import DomainParticipant  # noqa: E402
+from cyclonedds.idl import IdlStruct  # noqa: E402
+from cyclonedds.idl.annotations import final  # noqa: E402
+from cyclonedds.idl.types import (  # noqa: E402
+    float32,
+    float64,
+    int8,
+    int64,
+    sequence,
+    uint32,
+    uint64,
+)
+from cyclonedds.sub import DataReader  # noqa: E402
+from cyclonedds.topic import Topic  # noqa: E402
+from cyclonedds.util import duration  # noqa: E402
+
+from tests.runner.ros2.independent import (  # noqa: E402
+    QUALITY,
+    UUID_,
+    CancelRequest_,
+    CancelResponse_,
+    GoalInfo_,
+    Time_,
+    client_of,
+    valid,
+)
+
+DOMAIN = 81
+PATIENCE_S = 60.0
+LATCHED = Qos(
+    Policy.Reliability.Reliable(duration(seconds=10)),
+    Policy.Durability.TransientLocal,
+    Policy.History.KeepLast(1),
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
+PREFIX = "openral_msgs.action.dds_.ExecuteRskill_"
+
+
+@dataclass
+@final
+class Goal_(IdlStruct, typename=PREFIX + "Goal_"):
+    rskill_id: str
+    revision: str
+    prompt: str
+    prompt_metadata_json: str
+    goal_params_json: str
+    deadline_s: float64
+
+
+@dataclass
+@final
+class Result_(IdlStruct, typename=PREFIX + "Result_"):
+    success: bool
+    failure_reason: str
+    trace_id: str
+
+
+@dataclass
+@final
+class Feedback_(IdlStruct, typename=PREFIX + "Feedback_"):
+    progress: float32
+    state: str
+    chunk_index: uint32
+    chunks_total: uint32
+
+
+@dataclass
+@final
+class FeedbackMessage_(IdlStruct, typename=PREFIX + "FeedbackMessage_"):
+    goal_id: UUID_
+    feedback: Feedback_
+
+
+@dataclass
+@final
+class SendRequest_(IdlStruct, typename=PREFIX + "SendGoal_Request_"):
+    guid: uint64
+    seq: int64
+    goal_id: UUID_
+    goal: Goal_
+
+
+@dataclass
+@final
+class SendResponse_(IdlStruct, typename=PREFIX + "SendGoal_Response_"):
+    guid: uint64
+    seq: int64
+    accepted: bool
+    stamp: Time_
+
+
+@dataclass
+@final
+class ResultRequest_(IdlStruct, typename=PREFIX + "GetResult_Request_"):
+    guid: uint64
+    seq: int64
+    goal_id: UUID_
+
+
+@dataclass
+@final
+class ResultResponse_(IdlStruct, typename=PREFIX + "GetResult_Response_"):
+    guid: uint64
+    seq: int64
+    status: int8
+    result: Result_
+
+
+@dataclass
+@final
+class GoalStatus_(IdlStruct, typename="action_msgs.msg.dds_.GoalStatus_"):
+    goal_info: GoalInfo_
+    status: int8
+
+
+@dataclass
+@final
+class GoalStatusArray_(IdlStruct, typename="action_msgs.msg.dds_.GoalStatusArray_"):
+    status_list: sequence[GoalStatus_]
+
+
+class Commander:
+    """The client's side of the action."""
+
+    def __init__(self, name: str) -> None:
+        participant, path = DomainParticipant(DOMAIN), f"{name}/_action/"
+        self.send = client_of(participant, path + "send_goal", SendRequest_, SendResponse_)
+        self.result = client_of(participant, path + "get_result", ResultRequest_, ResultResponse_)
+        self.cancel = client_of(participant, path + "cancel_goal", CancelRequest_, CancelResponse_)
+        feedback = Topic(participant, f"rt{path}feedback", FeedbackMessage_)
+        self._feedback = DataReader(participant, feedback, qos=QUALITY)
+        status = Topic(participant, f"rt{path}status", GoalStatusArray_)
+        self._status = DataReader(participant, status, qos=LATCHED)
+        self._asked = 0
+
+    async def call(self, service: tuple[Any, Any], request: type, *fields: Any) -> Any:
+        """Ask once server and client see each other, and wait for the reply."""
+        reader, writer = service
+        async with asyncio.timeout(PATIENCE_S):
+            while not (
+                writer.get_publication_matched_status().current_count
+                and reader.get_subscription_matched_status().current_count
+            ):
+                await asyncio.sleep(0.01)
+            self._asked += 1
+            number = self._asked
+            writer.write(request(7, number, *fields))
+            while True:
+                for reply in valid(reader):
+                    if (reply.guid, reply.seq) == (7, number):
+                        return reply
+                await asyncio.sleep(0.01)
+
+    async def goal(self, prompt: str, *, rskill: str = RSKILL, params: str = "") -> UUID_ | None:
+        """Send a goal; None: it was rejected."""
+        goal_id = UUID_(uuid.uuid4().bytes)
+        goal = Goal_(rskill, "", prompt, "", params, 0.0)
+        told = await self.call(self.send, SendRequest_, goal_id, goal)
+        return goal_id if told.accepted else None
+
+    async def ended(self, goal_id: UUID_) -> Any:
+        return await self.call(self.result, ResultRequest_, goal_id)
+
+    async def canceled(self, goal_id: UUID_) -> Any:
+        return await self.call(self.cancel, CancelRequest_, GoalInfo_(goal_id, Time_(0, 0)))
+
+    async def heard(self, goal_id: UUID_) -> Any:
+        """Feedback on a goal, as it comes."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                for message in valid(self._feedback):
+                    if message.goal_id == goal_id:
+                        return message.feedback
+                await asyncio.sleep(0.01)
+
+    async def status(self, goal_id: UUID_, expected: int) -> None:
+        """Wait until the status topic says so."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                for message in valid(self._status):
+                    found = {bytes(s.goal_info.goal_id.uuid): s.status for s in message.status_list}
+                    if found.get(bytes(goal_id.uuid)) == expected:
+                        return
+                await asyncio.sleep(0.01)
+
+
+NO_ID = UUID_(bytes(16))
+Serving = Callable[[], Any]
+
+
+@pytest.fixture
+def served_action(
+    make_runner: Any,
+    env: Any,
+    endpoint: str,
+    navigate_manifest: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Serving:
+    monkeypatch.setenv("CYCLONEDDS_URI", NETWORK)
+    name = f"/n{uuid.uuid4().hex}/execute_rskill"
+
+    @asynccontextmanager
+    async def both() -> AsyncIterator[tuple[Bench, Commander]]:
+        async with (
+            goal_bench(make_runner, env, endpoint, navigate_manifest) as bench,
+            RunnerClient(endpoint) as client,
+            ActionServer(INTERFACE, name, DOMAIN, RunnerGoals(client).accept),
+        ):
+            yield bench, Commander(name)
+
+    return both
+
+
+def test_goals_are_served_with_feedback_status_and_result(
+    served_action: Serving, run_async: Any
+) -> None:
+    async def scenario() -> None:
+        async with served_action() as (bench, commander):
+            goal_id = await commander.goal("end", params='{"deep": {"er": [1]}}')
+            assert goal_id is not None
+            told = await commander.ended(goal_id)
+            assert (told.status, told.result.success, told.result.failure_reason) == (4, True, "")
+            assert len(told.result.trace_id) == 32
+            await commander.status(goal_id, 4)
+
+            failing = await commander.goal("defect")
+            assert failing is not None
+            told = await commander.ended(failing)
+            assert (told.status, told.result.success) == (6, False)
+            assert "oops" in told.result.failure_reason
+
+            assert await commander.goal("end", rskill="a/unknown") is None
+            assert await commander.goal("end", params="[1]") is None
+            assert await commander.goal("end", params="{") is None
+            assert (await commander.ended(UUID_(uuid.uuid4().bytes))).status == 0
+            assert bench.made[0].story.count("finish") == 2
+
+    run_async(scenario())
+
+
+def test_a_goal_is_canceled_alone_with_all_others_and_when_the_server_ends(
+    served_action: Serving, run_async: Any
+) -> None:
+    async def scenario() -> None:
+        async with served_action() as (bench, commander):
+            first = await commander.goal("forever")
+            assert first is not None
+            assert (await commander.heard(first)).state in ("loading", "warming", "executing")
+            assert await commander.goal("end") is None, "the runner has one goal at a time"
+            unknown = await commander.canceled(UUID_(uuid.uuid4().bytes))
+            assert (unknown.return_code, unknown.goals_canceling) == (2, [])
+            told = await commander.canceled(first)
+            assert (told.return_code, [g.goal_id for g in told.goals_canceling]) == (0, [first])
+            assert (await commander.ended(first)).status == 5
+            assert (await commander.canceled(first)).return_code == 3
+
+            second = await commander.goal("forever")
+            assert second is not None
+            told = await commander.canceled(NO_ID)
+            assert [goal.goal_id for goal in told.goals_canceling] == [second]
+            assert (await commander.ended(second)).status == 5
+
+            third = await commander.goal("forever")
+            assert third is not None
+            await bench.made[0].begun.wait()
+            asked = asyncio.create_task(commander.ended(third))
+            await commander.status(third, 2)
+        told = await asked
+        assert told.status == 5, "whoever leaves does not leave a robot that moves"
+        assert bench.made[0].story.count("finish") == 3
+
+    run_async(scenario())
+
+
+def test_goals_that_ended_are_forgotten_in_the_end(
+    served_action: Serving, run_async: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(action_server, "GOALS_KEPT", 2)
+
+    async def scenario() -> None:
+        async with served_action() as (_, commander):
+            first = await commander.goal("end")
+            assert first is not None
+            await commander.ended(first)
+            for _ in range(2):
+                goal_id = await commander.goal("end")
+                assert goal_id is not None
+                assert (await commander.ended(goal_id)).status == 4
+            assert (await commander.ended(first)).status == 0
+
+    run_async(scenario())
