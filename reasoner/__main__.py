@@ -18,7 +18,6 @@ from contextlib import AbstractContextManager, nullcontext
 
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.json_lines import JsonLines
-from vram_arbiter.reasoner.loop import nothing_done
 from vram_arbiter.reasoner.options import (
     check_files,
     check_task,
@@ -26,6 +25,7 @@ from vram_arbiter.reasoner.options import (
     language_model,
     parser,
 )
+from vram_arbiter.reasoner.results import nothing_done
 from vram_arbiter.reasoner.server import OperatorServer, send
 from vram_arbiter.reasoner.service import serve
 from vram_arbiter.reasoner.task_queue import Task, TaskQueue

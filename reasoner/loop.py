@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
+from vram_arbiter.reasoner.results import result_of
 from vram_arbiter.schemas.errors import EstopRequested, VramError
 from vram_arbiter.schemas.reasoner import Result
 from vram_arbiter.schemas.runtime.telemetry import meters
@@ -59,6 +60,10 @@ class _NoDecision(Finish):
     """The planner gave none: ends an episode, but no goal that runs."""
 
 
+class _Stopped(Finish):
+    """A danger ended the episode."""
+
+
 async def run_episode(
     task: str,
     planner: Planner,
@@ -78,7 +83,8 @@ async def run_episode(
     )
     finish = await loop.run()
     log.info("%s: %s", "success" if finish.success else "failure", finish.reason)
-    return _result(loop.episode, finish, palette)
+    stopped = isinstance(finish, _Stopped)
+    return result_of(loop.episode, finish, palette.manipulation, stopped=stopped)
 
 
 class _Loop:
@@ -195,26 +201,29 @@ class _Loop:
         for item in self._inbox.take():
             match item:
                 case Cancel():
-                    self._end(f"canceled: {item.reason}")
+                    self._end(Finish(False, f"canceled: {item.reason}"))
                 case Danger(stop=True):
-                    self._end(f"stopped: {item.text}")
+                    self._end(_Stopped(False, f"stopped: {item.text}"))
                 case Danger():
                     self._note(Note("safety", item.text, len(self.episode.steps)))
                 case Said():
                     self._note(Note("operator", item.text, len(self.episode.steps)))
 
-    def _end(self, reason: str) -> None:
-        log.warning("%s", reason)
-        self._finish = self._finish or Finish(False, reason)
+    def _end(self, finish: Finish) -> None:
+        log.warning("%s", finish.reason)
+        self._finish = self._finish or finish
 
     def _note(self, note: Note) -> None:
         log.info("%s: %s", note.source, note.text)
-        self.episode.notes.append(note)
-        del self.episode.notes[:-NOTES_MAX]
+        self._add_note(note)
         if self._superseded < SUPERSEDED_MAX:
             self._superseded += self._thinking is not None
             self._forget_decision()
         self._news = isinstance(self._call, ExecuteRskill)
+
+    def _add_note(self, note: Note) -> None:
+        self.episode.notes.append(note)
+        del self.episode.notes[:-NOTES_MAX]
 
     def _take_outcome(self) -> None:
         assert self._acting is not None, "only called when it is done"
@@ -230,11 +239,16 @@ class _Loop:
         self._news = False
         self._forget_decision()  # it was made without this outcome
         if outcome.code == EstopRequested.code:
-            self._end(f"stopped: {outcome.text}")
+            self._end(_Stopped(False, f"stopped: {outcome.text}"))
 
     def _remember(self, call: ToolCall, outcome: Outcome) -> None:
         log.info("%s: %s%s", call.tool, outcome.status, f", {outcome.text}" if outcome.text else "")
-        labels = {telemetry.ATTR_TOOL: call.tool, telemetry.ATTR_OUTCOME: outcome.status}
+        labels: dict[str, str] = {
+            telemetry.ATTR_TOOL: call.tool,
+            telemetry.ATTR_OUTCOME: outcome.status,
+        }
+        if outcome.code and outcome.status != "canceled":
+            labels[telemetry.ATTR_ERROR_TYPE] = outcome.code
         meters.count(telemetry.METRIC_TOOL_CALLS, labels)
         self.episode.steps.append(Step(call, outcome))
 
@@ -249,12 +263,28 @@ class _Loop:
             self._decided_beside(decision)
         elif isinstance(decision, Finish):
             self._finish = decision
-        elif _stuck(self.episode, decision):
+        elif _stuck(self.episode, decision := self._with_known_follower(decision)):
             self._finish = Finish(
                 False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}"
             )
         else:
             self._begin(decision)
+
+    def _with_known_follower(self, call: ToolCall) -> ToolCall:
+        """Return the call, without `next_rskill_id` where no such skill can follow.
+
+        A hint is not worth a refusal: the call is performed, and a note tells the planner.
+        """
+        if not isinstance(call, ExecuteRskill) or not call.next_rskill_id:
+            return call
+        known = self._allowed().followers(call.rskill_id)
+        if call.next_rskill_id in known:
+            return call
+        choose = f"choose from {', '.join(known)}" if known else "no other skill has a model"
+        text = f"next_rskill_id {call.next_rskill_id!r} was ignored: {choose}"
+        log.warning("%s", text)
+        self._add_note(Note("reasoner", text, len(self.episode.steps)))
+        return call.model_copy(update={"next_rskill_id": ""})
 
     def _decided_beside(self, decision: ToolCall | Finish) -> None:
         """Continue the goal unless the decision clearly ends it. A failed planner decides
@@ -285,9 +315,11 @@ class _Loop:
         with tracing.inside(self._tick) if self._tick is not None else contextlib.nullcontext():
             self._acting = asyncio.create_task(self._act(call), name=call.tool)
 
+    def _allowed(self) -> Palette:
+        return self._palette.without(benched(self.episode.steps))
+
     def _refusal(self, call: ToolCall) -> Outcome | None:
-        palette = self._palette.without(benched(self.episode.steps))
-        if (error := palette.check(call)) is not None:
+        if (error := self._allowed().check(call)) is not None:
             return Outcome("refused", str(error), error.code)
         if _is_look(call) and _looks_in_a_row(self.episode) >= LOOKS_IN_A_ROW_MAX:
             return Outcome(
@@ -360,46 +392,3 @@ def describe(call: ToolCall) -> str:
     fields = call.model_dump(exclude={"tool", "rationale"}, exclude_defaults=True)
     text = ", ".join(f"{key}={value!r}" for key, value in fields.items())
     return f"({text})" + (f": {call.rationale}" if call.rationale else "")
-
-
-def nothing_done(task: str, reason: str) -> Result:
-    """Return the result of a task that ended without an episode, or broke one off."""
-    return {
-        "task": task,
-        "status": "failure",
-        "reason": reason,
-        "attempts": 0,
-        "vlm_confirmed": False,
-        "vlm_answers": [],
-        "steps": [],
-        "notes": [],
-    }
-
-
-def _result(episode: Episode, finish: Finish, palette: Palette) -> Result:
-    answers = [
-        step.outcome.text
-        for step in episode.steps
-        if isinstance(step.call, QueryScene) and step.outcome.status == "answered"
-    ]
-    return {
-        "task": episode.task,
-        "status": "success" if finish.success else "failure",
-        "reason": finish.reason,
-        "attempts": episode.attempts(palette.manipulation),
-        "vlm_confirmed": episode.confirmed(palette.manipulation),
-        "vlm_answers": answers,
-        "steps": [
-            {
-                "call": step.call.model_dump(exclude_defaults=True) | {"tool": step.call.tool},
-                "status": step.outcome.status,
-                "code": step.outcome.code,
-                "text": step.outcome.text,
-            }
-            for step in episode.steps
-        ],
-        "notes": [
-            {"source": note.source, "text": note.text, "after": note.after}
-            for note in episode.notes
-        ],
-    }

@@ -38,7 +38,8 @@ from vram_arbiter.schemas.tools import (
 )
 
 EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
-PROMPTED_KINDS = frozenset({"vla"})  # the others have their goal in its parameters
+# they have a model and read words; the others have their goal in its parameters
+PROMPTED_KINDS = frozenset({"vla"})
 WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
 ASKED = ("locate_in_view", "query_scene", "look", "query_task_progress")
 OPERATOR = "/operator"
@@ -112,6 +113,14 @@ class Palette:
             for skill in self.skills
             if skill.kind in EXECUTABLE_KINDS and not skill.barred and skill.id not in self.benched
         }
+
+    def followers(self, rskill_id: str) -> tuple[str, ...]:
+        """Return the skills that `next_rskill_id` may name: the other ones with a model."""
+        return tuple(
+            skill.id
+            for skill in self.executable.values()
+            if skill.kind in PROMPTED_KINDS and skill.id != rskill_id
+        )
 
     @property
     def manipulation(self) -> frozenset[str]:
@@ -263,6 +272,7 @@ class Palette:
                     skill.description,
                     skill.goal_params_schema,
                     prompted=skill.kind in PROMPTED_KINDS,
+                    followers=self.followers(skill.id),
                 )
                 for skill in self.executable.values()
             ]

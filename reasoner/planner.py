@@ -52,11 +52,11 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A message from outside during the episode. `after` counts the steps that were over by
-    then.
+    """A message during the episode that answers no call. `after` counts the steps that were over
+    by then.
     """
 
-    source: Literal["operator", "safety"]
+    source: Literal["operator", "safety", "reasoner"]
     text: str
     after: int
 

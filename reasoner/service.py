@@ -2,7 +2,7 @@
 
 import logging
 
-from vram_arbiter.reasoner.loop import nothing_done
+from vram_arbiter.reasoner.results import nothing_done
 from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.reasoner.workplace import Workplace
 from vram_arbiter.schemas.errors import VramError

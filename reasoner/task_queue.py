@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Self
 
 from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
-from vram_arbiter.reasoner.loop import nothing_done
+from vram_arbiter.reasoner.results import nothing_done
 from vram_arbiter.schemas.errors import BadRequest, BadState, LimitExceeded
 from vram_arbiter.schemas.reasoner import Result, TaskState, TaskView
 
@@ -160,7 +160,7 @@ class TaskQueue:
         assert self.running is not None, "only a running task has a result"
         task, self.running = self.running, None
         self._close(task, result, "canceled" if task.canceled else result["status"])
-        if result["reason"].startswith("stopped: "):
+        if result["stopped"]:
             self._drop_all(f"canceled: task {task.number} was {result['reason']}")
 
     def stop(self, reason: str) -> None:

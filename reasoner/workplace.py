@@ -20,9 +20,10 @@ from vram_arbiter.reasoner.llm.transcript import Transcript
 from vram_arbiter.reasoner.loop import STEPS_MAX, THINK_MAX_S, run_episode
 from vram_arbiter.reasoner.options import LLM_PLANNERS, endpoint
 from vram_arbiter.reasoner.palette import OPERATOR, Palette, palette_of
+from vram_arbiter.reasoner.perception import FRAME_MAX_AGE_MS, Judge
 from vram_arbiter.reasoner.planner import Planner
 from vram_arbiter.reasoner.playbooks import Playbook
-from vram_arbiter.reasoner.tools import FRAME_MAX_AGE_MS, Judge, Tools
+from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.reasoner.watch import watch
 from vram_arbiter.schemas.body import read_body
 from vram_arbiter.schemas.manifest import RSkillManifest

@@ -155,11 +155,13 @@ class LlmUsage(TypedDict):
 
 
 class Result(TypedDict):
-    """What a task came to; the shape of the result file."""
+    """What a task came to; the shape of the result file. `stopped`: an emergency stop or a lost
+    runner ended it, not the planner."""
 
     task: str
     status: Literal["success", "failure"]
     reason: str
+    stopped: bool
     attempts: int
     vlm_confirmed: bool
     vlm_answers: list[str]

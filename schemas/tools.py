@@ -13,7 +13,7 @@ import copy
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Literal, TypedDict
 
 from pydantic import (
@@ -92,7 +92,8 @@ class ExecuteRskill(_Tool):
         str,
         Field(
             max_length=256,
-            description="The skill that follows, so that its model is made ready meanwhile.",
+            description="The skill that follows, so that its model is made ready meanwhile."
+            " It starts nothing.",
         ),
     ] = ""
 
@@ -308,12 +309,14 @@ def skill_function(
     goal_params_schema: JsonMap | None,
     *,
     prompted: bool = True,
+    followers: Sequence[str] = (),
 ) -> FunctionTool:
     """The function description of one skill: `execute_rskill` without `rskill_id`, its parameters
     as the manifest describes them.
 
     `goal_params` takes the place of `goal_params_json` where the manifest has a schema; a skill
-    without one takes none. Only a skill that is `prompted` reads words.
+    without one takes none. Only a skill that is `prompted` reads words. `followers` are the choices
+    of `next_rskill_id`.
     """
     function = function_schema(ExecuteRskill)
     body = function["function"]
@@ -326,6 +329,13 @@ def skill_function(
     )
     if not prompted:
         del parameters["properties"]["prompt"]
+    following = parameters["properties"].pop("next_rskill_id")
+    if followers:
+        parameters["properties"]["next_rskill_id"] = {
+            "type": "string",
+            "enum": [*followers],
+            "description": following["description"],
+        }
     if goal_params_schema:
         parameters["properties"]["goal_params"] = copy.deepcopy(dict(goal_params_schema))
     return function

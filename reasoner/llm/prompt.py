@@ -60,6 +60,11 @@ def _moving(palette: Palette) -> list[str]:
             f"Grab with {skill_tool_name(grasp.id)}. After a failed grasp look again and retry, at"
             " most three attempts."
         )
+    if any(palette.followers(skill_id) for skill_id in palette.executable):
+        lines.append(
+            "If you know which skill comes after the one that you call, name it as next_rskill_id:"
+            " its model is made ready meanwhile."
+        )
     return lines
 
 

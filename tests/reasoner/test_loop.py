@@ -102,7 +102,7 @@ def test_a_danger_ends_the_goal_and_the_episode_while_the_planner_hangs() -> Non
         return await episode, robot
 
     result, robot = play(story)
-    assert result["reason"] == "stopped: emergency stop: by hand"
+    assert (result["reason"], result["stopped"]) == ("stopped: emergency stop: by hand", True)
     assert robot.cancelled
     assert result["steps"][0]["status"] == "canceled"
 
@@ -292,7 +292,7 @@ def test_an_emergency_stop_is_not_discussed_with_the_planner() -> None:
         return await run_episode("x", planner, PALETTE, stopped), planner
 
     result, planner = play(story)
-    assert result["reason"] == "stopped: the stop is latched"
+    assert (result["reason"], result["stopped"]) == ("stopped: the stop is latched", True)
     assert len(planner.asked) == 1
 
 

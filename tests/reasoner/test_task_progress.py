@@ -15,8 +15,9 @@ from vram_arbiter.clients.sidecar.perception import RewardClient
 from vram_arbiter.reasoner.history import KEPT_MAX, SHOWN_MAX, Past, Taken, spread
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.perception import LOOKED_AT_MAX_S, Judge
 from vram_arbiter.reasoner.planner import Episode, Finish
-from vram_arbiter.reasoner.tools import LOOKED_AT_MAX_S, Judge, Tools
+from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.schemas.errors import (
     BadRequest,
     Evicted,

@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.waiting import play
 from vram_arbiter.reasoner.inbox import Cancel, Said
-from vram_arbiter.reasoner.loop import nothing_done
+from vram_arbiter.reasoner.results import nothing_done
 from vram_arbiter.reasoner.task_queue import HISTORY_MAX, QUEUED_MAX, Task, TaskQueue
 from vram_arbiter.schemas.errors import BadRequest, BadState, LimitExceeded
 from vram_arbiter.schemas.reasoner import Result
@@ -76,11 +76,26 @@ def test_an_emergency_stop_clears_the_queue() -> None:
         queue.submit("a")
         queue.submit("b")
         await queue.next()
-        queue.end(nothing_done("a", "stopped: emergency stop: by hand"))
+        queue.end(nothing_done("a", "stopped: emergency stop: by hand") | {"stopped": True})
         assert "task 1 was stopped: emergency stop" in queue.find(2).view()["reason"]
         return states(queue)
 
     assert play(story) == [(1, "failure"), (2, "canceled")]
+
+
+def test_a_planner_that_says_stopped_clears_no_queue() -> None:
+    """Regression: a language model that ended its task with "stopped: …" canceled those that
+    waited, as an emergency stop does."""
+
+    async def story() -> list[tuple[int, str]]:
+        queue = TaskQueue()
+        queue.submit("a")
+        queue.submit("b")
+        await queue.next()
+        queue.end(nothing_done("a", "stopped: the shelf is empty"))
+        return states(queue)
+
+    assert play(story) == [(1, "failure"), (2, "queued")]
 
 
 def test_queue_and_history_have_limits_and_a_task_is_checked_first() -> None:

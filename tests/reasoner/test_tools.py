@@ -14,20 +14,14 @@ from tests.support.field_server import FieldServer
 from tests.support.waiting import play
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
+from vram_arbiter.reasoner.execution import GOAL_MAX_S, _stands_still, waits_s
 from vram_arbiter.reasoner.hints import Hints
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
+from vram_arbiter.reasoner.perception import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
-from vram_arbiter.reasoner.tools import (
-    GOAL_MAX_S,
-    LOOKED_AT_MAX_S,
-    LOOKS_MAX,
-    PLACE_MAX_S,
-    Tools,
-    _stands_still,
-    waits_s,
-)
+from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.reasoner.watch import watch
 from vram_arbiter.schemas.errors import (
     BadState,
@@ -337,7 +331,7 @@ def test_a_place_that_is_always_of_long_ago_is_none(
 ) -> None:
     """Regression: the second answer was taken for one of now, however long it had taken."""
     now = [100.0]
-    monkeypatch.setattr("vram_arbiter.reasoner.tools.monotonic", lambda: now[0])
+    monkeypatch.setattr("vram_arbiter.reasoner.perception.monotonic", lambda: now[0])
 
     async def story() -> tuple[Any, list[str]]:
         async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
@@ -388,7 +382,7 @@ def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     when it was asked.
     """
     now = [100.0]
-    monkeypatch.setattr("vram_arbiter.reasoner.tools.monotonic", lambda: now[0])
+    monkeypatch.setattr("vram_arbiter.reasoner.perception.monotonic", lambda: now[0])
 
     async def story() -> tuple[str, list[str]]:
         async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
@@ -551,7 +545,7 @@ def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
     a_runner: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: lost contact and a missing result were one case, reported as canceled."""
-    monkeypatch.setattr("vram_arbiter.reasoner.tools.CANCEL_S", 0.3)
+    monkeypatch.setattr("vram_arbiter.reasoner.execution.CANCEL_S", 0.3)
 
     async def story() -> Any:
         async with contextlib.AsyncExitStack() as stack:

@@ -14,12 +14,13 @@ from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
 from vram_arbiter.reasoner.llm.prompt import instructions
 from vram_arbiter.reasoner.llm.transcript import Transcript
+from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
 from vram_arbiter.reasoner.planner import Episode, Outcome, Step
 from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.errors import LlmError
-from vram_arbiter.schemas.reasoner import TranscriptLine
-from vram_arbiter.schemas.tools import ExecuteRskill, Look, QueryScene
+from vram_arbiter.schemas.reasoner import Result, TranscriptLine
+from vram_arbiter.schemas.tools import ExecuteRskill, Look, QueryScene, ToolCall
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -176,3 +177,34 @@ def test_only_what_is_there_is_named_in_the_instructions() -> None:
     for name in ("execute_rskill__", "locate_in_view", "query_scene", "look,", "camera"):
         assert name not in bare
     assert "Nothing here moves the robot" in bare
+
+
+def test_the_next_skill_is_a_choice_and_another_one_is_ignored_with_a_note(
+    api: Any, stand_in: Any
+) -> None:
+    """A hint is not worth a refused motion: the drive begins without it."""
+    drive = "execute_rskill__lab__navigate"
+    stand_in.json(api.says((drive, '{"next_rskill_id": "lab/grab"}')))
+    stand_in.json(api.says((drive, '{"next_rskill_id": "lab/arm"}')))
+    stand_in.json(api.says(("finish", '{"success": true, "reason": "done"}')))
+    called: list[ToolCall] = []
+
+    async def driven(call: ToolCall) -> Outcome:
+        called.append(call)
+        return Outcome("succeeded", "there")
+
+    async def episode() -> Result:
+        config = LlmConfig(stand_in.url + api.base, "m", KEY)
+        async with api.planner(config, PALETTE) as planner:
+            return await run_episode("grab the red cube", planner, PALETTE, driven)
+
+    result = asyncio.run(episode())
+    go = ExecuteRskill(rskill_id="lab/navigate")
+    assert called == [go.model_copy(update={"next_rskill_id": "lab/grab"}), go]
+    offered = api.offered(stand_in.asked[0])
+    assert offered[drive]["properties"]["next_rskill_id"]["enum"] == ["lab/grab"]
+    assert "next_rskill_id" not in offered["execute_rskill__lab__grab"]["properties"]
+    assert "name it as next_rskill_id" in api.system(stand_in.asked[0])
+    note = "next_rskill_id 'lab/arm' was ignored: choose from lab/grab"
+    assert result["notes"] == [{"source": "reasoner", "text": note, "after": 1}]
+    assert f"reasoner: {note}" in api.told(stand_in.asked[2])
