@@ -1,5 +1,5 @@
-"""docs/neighbours.md names tests: each of them exists, every complaint has one, and every test that
-carries a complaint's number is there or has a sibling."""
+"""docs/explanation/neighbours.md names tests: each exists, every complaint has one, and every
+test that carries a complaint's number is there or has a sibling."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parents[1]
-PAGE = TESTS.parent / "docs" / "neighbours.md"
+PAGE = TESTS.parent / "docs/explanation/neighbours.md"
 COMPLAINTS = 22
 
 

@@ -9,6 +9,7 @@ TREE = Path(__file__).parents[2]
 FOLDERS = "arbiter|clients|schemas|sidecars|runner|reasoner|configs|examples|docs|tests|src"
 PATH = re.compile(rf"`((?:{FOLDERS})/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::(\w+))?`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#([\w-]+))?\)")
+CODE = {".conf", ".example", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"}
 PAGES = sorted([*TREE.glob("*.md"), *(TREE / "docs").rglob("*.md")])
 
 
@@ -47,12 +48,39 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not broken
 
 
+def test_pages_that_code_names_exist() -> None:
+    """Error texts, comments and configuration files name pages, which move."""
+    missing = []
+    for folder in FOLDERS.split("|"):
+        for path in (TREE / folder).rglob("*"):
+            if path.suffix in CODE and path.is_file() and not path.is_symlink():
+                named = re.findall(r"(?<![\w/])docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+                missing += [f"{path}: {name}" for name in named if not (TREE / name).exists()]
+    assert missing == []
+
+
 def test_the_map_is_short() -> None:
     assert len((TREE / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()) <= 200
 
 
 def test_every_decision_is_listed() -> None:
-    listed = (TREE / "docs/adr/README.md").read_text(encoding="utf-8")
+    listed = (TREE / "docs/explanation/adr/README.md").read_text(encoding="utf-8")
     assert [
-        path.name for path in (TREE / "docs/adr").glob("0*.md") if path.name not in listed
+        path.name
+        for path in (TREE / "docs/explanation/adr").glob("0*.md")
+        if path.name not in listed
     ] == []
+
+
+def test_every_page_is_on_the_site() -> None:
+    """A page that mkdocs.yml does not name fails `make docs`; decisions are listed by their own
+    page."""
+    nav = (TREE / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")[1]
+    named = set(re.findall(r"[\w/.-]+\.md", nav))
+    pages = {
+        page.relative_to(TREE / "docs").as_posix()
+        for page in PAGES
+        if page.is_relative_to(TREE / "docs")
+    }
+    decisions = {page for page in pages if re.search(r"adr/\d", page)}
+    assert pages - decisions - named == set()

@@ -90,7 +90,7 @@ def test_the_commands_of_the_base_install_work(reader: Reader) -> None:
 
 
 def test_the_commands_of_the_tutorial_work(reader: Reader) -> None:
-    printed = reader.types(skip=INSTALLS, page="docs/tutorial.md")
+    printed = reader.types(skip=INSTALLS, page="docs/tutorial/first-leases.md")
     assert "detector is held again, with 1 weights" in printed
     assert printed.count("verdict=verified") >= 2, "each model left at least once"
     assert "Traceback" not in printed
@@ -124,10 +124,24 @@ def test_a_command_that_fails_fails_the_script(reader: Reader, tmp_path: Path) -
     assert (done.returncode, done.stderr) == (1, "readme.sh: exit code 1 of: false\n")
 
 
-def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("page", "consumer", "printed"),
+    [
+        ("README.md", "detector", "detecting\n"),
+        (
+            "docs/how-to/write-a-consumer.md",
+            "my-model",
+            "first: ['on the GPU']\nsecond: ['on the GPU']\n",
+        ),
+    ],
+)
+def test_the_example_runs_as_printed(
+    arbiter_daemon: ArbiterProcess, tmp_path: Path, page: str, consumer: str, printed: str
+) -> None:
     """It ended in a traceback: its `unload` is a plain function, and only coroutine functions were
     taken."""
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    text = (TREE / page).read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     path = tmp_path / "example.py"
     path.write_text(example)
     done = subprocess.run(
@@ -137,11 +151,9 @@ def test_the_example_runs_as_printed(arbiter_daemon: ArbiterProcess, tmp_path: P
         text=True,
         timeout=LIMIT_S,
     )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "detecting\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, printed, "")
     with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         kinds = [
-            event["kind"]
-            for event in client.history().events
-            if event.get("consumer") == "detector"
+            event["kind"] for event in client.history().events if event.get("consumer") == consumer
         ]
     assert {"granted", "ready", "use_began", "use_ended", "released"} <= set(kinds)
