@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.waiting import until
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER
 
@@ -21,9 +22,17 @@ def lease_something(arbiter: ArbiterProcess) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def recorded(arbiter: ArbiterProcess, event: str) -> bool:
+    """Whether the log on the disk holds an event of this kind."""
+    files = (arbiter.state / FOLDER).glob("*")
+    return any(f'"event":"{event}"' in file.read_text() for file in files)
+
+
 def test_a_daemon_replays_identically_also_after_kill_9_and_a_restart(make_arbiter: Make) -> None:
+    """The log goes to the disk in batches: a kill before the first of them leaves no file."""
     arbiter = make_arbiter().start()
     lease_something(arbiter)
+    until(lambda: recorded(arbiter, "AcquireRequested"))
     arbiter.kill()
     arbiter.start()
     lease_something(arbiter)
