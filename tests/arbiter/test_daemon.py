@@ -71,7 +71,7 @@ def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) 
         (["--gpu", "cuda"], "write auto, nvml, unified, fake:8GiB"),
         (["--gpu", "fake:lots"], "not a size"),
         (["--gpu", "fake:100MiB"], "leaves nothing of"),
-        (["--gpu", "fake:0"], "a card without memory"),
+        (["--gpu", "fake:0"], "a GPU without memory"),
         (["--gpu", "fake:/dev/null"], "the simulated GPU in /dev/null cannot be used"),
         (["--gpu", "fake:8GX", "--check-config"], "not a size"),
         (["--endpoint", "tcp://127.0.0.1:5555"], "without CURVE keys"),

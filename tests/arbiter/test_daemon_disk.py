@@ -148,7 +148,7 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
             check=False,
         )  # fmt: skip
         assert doctor.returncode == 1, "a daemon that can grant nothing is not healthy"
-        assert "BAD  files" in doctor.stdout
+        assert "ERROR    daemon.files" in doctor.stdout
         assert sorted(consumers(client)) == ["goes", "stays"]
         assert client.ask("renew", leases=[on])["ok"]
 

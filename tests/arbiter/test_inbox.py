@@ -47,7 +47,7 @@ class ScriptedCore:
     def next_deadline(self) -> float | None:
         return self.deadline
 
-    def status(self, now: float, *page: object) -> StatusReply:
+    def status(self, now: float, *page: object, details: bool = False) -> StatusReply:
         if self.broken:
             raise KeyError("state")
         return replace(IDLE_STATUS, uptime_s=now)

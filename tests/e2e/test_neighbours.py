@@ -1,6 +1,6 @@
 """What users of the neighbours complain about, where the complaint is about processes, cards and
 what an operator is shown: a real daemon, real programs, a simulated card. Numbers are those of the
-list of complaints; docs/neighbours.md is the table.
+list of complaints; docs/explanation/neighbours.md is the table.
 """
 
 import json

@@ -9,6 +9,7 @@ SIGTERM, which has to lose nothing.
 
 import asyncio
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,9 @@ from typing import Any
 import pytest
 import yaml
 
+pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
+
+from tests.support import promql
 from tests.support.collector import Collector, ReceivedSpan
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.runner import RunnerClient
@@ -317,9 +321,29 @@ def judge(trace: Trace, collector: Collector) -> None:
     for service, metric in (
         (RUNNER, telemetry.METRIC_TICK),
         (RUNNER, telemetry.METRIC_GOALS),
+        (RUNNER, telemetry.METRIC_CHUNK),
         (POLICY, telemetry.METRIC_SIDECAR_LOAD),
+        (POLICY, telemetry.METRIC_SIDECAR_REQUEST),
         (REASONER, telemetry.METRIC_TOOL_CALLS),
         (REASONER, telemetry.GEN_AI_TOKENS),
         (ARBITER, telemetry.METRIC_GRANTS),
     ):
         assert service in {point.service for point in collector.points(metric)}
+    check_dashboard(collector)
+
+
+def check_dashboard(collector: Collector) -> None:
+    """Curves of chunks, goals, sidecars and the reasoner: the others are in
+    tests/runner/control/test_hardware_spans.py."""
+    elsewhere = (telemetry.METRIC_CHUNK, telemetry.METRIC_GOALS, telemetry.METRIC_SIDECAR_LOAD,
+    telemetry.METRIC_SIDECAR_REQUEST, telemetry.METRIC_TOOL_CALLS)  # fmt: skip
+    exported = {name.replace(".", "_"): name for name in elsewhere}
+    drawn = {}
+    for expression in promql.panels("runner.json").values():
+        for selector in promql.selectors(expression):
+            name = re.sub(r"(_seconds_bucket|_total)$", "", str(selector.name))
+            drawn[name] = promql.grouped_by(expression) - {"le"}
+    for name, metric in exported.items():
+        points = collector.points(metric)
+        labels = {label.replace(".", "_") for point in points for label in point.attributes}
+        assert drawn[name] - {"error_type"} <= labels, f"{metric} has {labels}"

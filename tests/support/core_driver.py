@@ -315,10 +315,13 @@ class CoreDriver:
         reader: ProcessKey | None = None,
         after: Sequence[Any] | None = None,
         limit: int | None = None,
+        *,
+        details: bool = False,
     ) -> dict[str, Any]:
         """The status as the wire shows it."""
         page: Any = None if after is None else tuple(after)
-        return as_wire(words.reply(self.arbiter.status(self.now, reader, page, limit)))
+        told = self.arbiter.status(self.now, reader, page, limit, details=details)
+        return as_wire(words.reply(told))
 
     def blocked(self, index: int = 0) -> str:
         """Why nothing is granted on a GPU, a code; "" if grants are possible."""

@@ -40,7 +40,7 @@ def near(value: float, wanted: float, share: float, slack: float) -> bool:
 @pytest.mark.parametrize("name", ["find-navigate-grab", "small-behind-large", "two-thrashing"])
 def test_the_simulator_reproduces_a_log_within_its_stated_error(name: str, tmp_path: Path) -> None:
     """Switches and loads within 10 %, the longest wait within 15 % or half a second.
-    docs/policies.md states this."""
+    docs/explanation/policies.md states this."""
     log, truth = record_shipped(name, tmp_path)
     found = extract(runner.load(log))
     assert found.replayed.identical
