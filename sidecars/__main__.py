@@ -15,7 +15,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from vram_arbiter.clients import cuda
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.net.server import path_of
 from vram_arbiter.schemas import defaults as d
@@ -31,7 +30,6 @@ from vram_arbiter.schemas.runtime.version import add_version
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_card
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
-from vram_arbiter.sidecars.device.capacity import FAKE, simulated
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ENVIRONMENT
 from vram_arbiter.sidecars.settings import (
@@ -125,7 +123,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         else flags.arbiter or arbiter_endpoint(os.environ, os.getuid()),
         stands_for=entry.stands_for,
         throttle_bytes_per_s=entry.throttle,
-        gpu=flags.gpu or _gpu_of(device),
+        gpu=flags.gpu,
         priority=flags.priority,
         evictable=not flags.pinned,
         min_residency_s=flags.min_residency_s,
@@ -193,16 +191,6 @@ def _device(text: str | None) -> str:
     raise ConfigError(
         f"--device {text} is not a device", hint="write fake:FOLDER, cuda, cuda:1 or none"
     )
-
-
-def _gpu_of(device: str) -> str:
-    """Return the GPU to lease: the device's own, so that lease and bytes cannot differ.
-
-    Raises NoGpu.
-    """
-    if not device.startswith(FAKE):
-        return device.partition(":")[2] or "any" if cuda.VISIBLE not in os.environ else "any"
-    return simulated(device).uuid
 
 
 def parser() -> argparse.ArgumentParser:

@@ -10,6 +10,7 @@ import logging
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import RouterServer, path_of
@@ -18,6 +19,7 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.device.capacity import leased_gpu
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ModelProcesses
 from vram_arbiter.sidecars.port import on_port
@@ -69,9 +71,11 @@ class SidecarHost:
         async with contextlib.AsyncExitStack() as stack:
             client = None
             if settings.arbiter is not None:
+                _log.info("waiting for the arbiter at %s", settings.arbiter)
                 client = await stack.enter_async_context(
                     AsyncClient(settings.name, endpoint=settings.arbiter)
                 )
+                settings = replace(settings, gpu=settings.gpu or leased_gpu(settings.device))
             server = await stack.enter_async_context(
                 RouterServer(
                     settings.endpoint, unread_reply(self._adapter.ops), work_share=WORK_SHARE

@@ -77,7 +77,7 @@ class Settings:
     inference_peak_bytes: int = 0  # most while it answers; 0: not known
     stands_for: str = ""  # the production model of the simulated footprint
     throttle_bytes_per_s: int | None = None
-    gpu: str = "any"
+    gpu: str | None = None  # to lease; None: the device's own
     priority: int = d.PRIORITY
     evictable: bool = True
     min_residency_s: float = d.MIN_RESIDENCY_S
@@ -114,7 +114,7 @@ class Settings:
             consumer=self.name,
             model_id=self.manifest.name,
             revision=self.revision,
-            gpu=self.gpu,
+            gpu=self.gpu or "any",
             footprint=footprint,
             priority=self.priority,
             evictable=self.evictable,

@@ -24,6 +24,17 @@ def simulated(device: str) -> CardConfig:
         ) from error
 
 
+def leased_gpu(device: str, environ: Mapping[str, str] = os.environ) -> str:
+    """Return the GPU to lease for `device`: its own, so that lease and bytes cannot differ.
+
+    The arbiter makes a simulated one: ask after it has answered. Raises NoGpu or ConfigError.
+    """
+    if device.startswith(FAKE):
+        return simulated(device).uuid
+    number = device.partition(":")[2]
+    return number if number and cuda.VISIBLE not in environ else "any"
+
+
 def capacities(
     device: str, environ: Mapping[str, str] = os.environ, nvml: Any = None
 ) -> dict[str, int]:

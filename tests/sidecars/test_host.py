@@ -4,6 +4,7 @@ ended."""
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 
 from tests.support.paths import SUPPORT
 from tests.support.processes import children, server_of_imports
+from tests.support.waiting import until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -333,6 +335,21 @@ def test_without_the_arbiter_that_it_needs_it_says_so_and_ends(lone_box):
     assert sidecar.process.wait(PATIENCE_S) == 1
     assert "no arbiter at" in sidecar.log
     assert "start `vram-arbiter`" in sidecar.log
+
+
+def test_on_a_simulated_gpu_it_waits_for_the_arbiter_that_makes_the_gpu(box, arbiter_daemon):
+    """Regression: the GPU's folder was read before the arbiter was asked for, so a sidecar started
+    before its arbiter ended at once."""
+    arbiter_daemon.stop()
+    shutil.rmtree(box.card)
+    sidecar = box.spawn("detector")
+    until(lambda: f"waiting for the arbiter at {arbiter_daemon.endpoint}" in sidecar.log)
+    arbiter_daemon.start()
+    assert sidecar.detect()["ok"]
+    with WireClient(arbiter_daemon.endpoint) as client:
+        (lease,) = client.hello("looker", role="observer").ask("status")["leases"]
+    uuid = json.loads((box.card / "gpu.json").read_text())["uuid"]
+    assert lease["gpu"] == uuid, "the lease is of the GPU that holds the bytes"
 
 
 def replace(path, text):
