@@ -26,7 +26,11 @@ _FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     **{
         f"/{name}.js": (f"{name}.js", "text/javascript; charset=utf-8")
-        for name in ("page", "feed", "chart", "story", "format")
+        for name in (
+            "page",
+            *("gpus", "queue", "evictions", "leases", "history"),
+            *("feed", "chart", "story", "format"),
+        )
     },
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }

@@ -1,9 +1,15 @@
 // Bars over time of one GPU on a canvas: bytes by consumer, what is measured, and the budget.
 import { bytes, partClass, partName, span } from "/format.js";
 
-const BAR = 3, GAP = 1, LEFT = 44, BOTTOM = 16, TOP = 6;
+const BAR = 3,
+  GAP = 1,
+  LEFT = 44,
+  BOTTOM = 16,
+  TOP = 6;
 
-function total(sample) { return sample.parts.reduce((sum, [, count]) => sum + count, 0); }
+function total(sample) {
+  return sample.parts.reduce((sum, [, count]) => sum + count, 0);
+}
 
 export class Chart {
   constructor(canvas, output, label) {
@@ -16,10 +22,15 @@ export class Chart {
     canvas.addEventListener("keydown", (event) => this.key(event));
   }
 
-  get columns() { return Math.max(1, Math.floor((this.canvas.clientWidth - LEFT) / (BAR + GAP))); }
+  get columns() {
+    return Math.max(1, Math.floor((this.canvas.clientWidth - LEFT) / (BAR + GAP)));
+  }
 
   point(x) {
-    this.cursor = x === null || x < LEFT ? null : Math.min(this.columns - 1, Math.floor((x - LEFT) / (BAR + GAP)));
+    this.cursor =
+      x === null || x < LEFT
+        ? null
+        : Math.min(this.columns - 1, Math.floor((x - LEFT) / (BAR + GAP)));
     this.draw();
   }
 
@@ -37,9 +48,12 @@ export class Chart {
   // For each column the sample with the most bytes: a short eviction must not fall between two.
   sampled() {
     // columns keep their instants while time moves on
-    const count = this.columns, width = this.seconds / count, begin = (Math.ceil(this.now / width) - count) * width;
+    const count = this.columns,
+      width = this.seconds / count,
+      begin = (Math.ceil(this.now / width) - count) * width;
     const found = new Array(count).fill(null);
-    let current = null, index = 0;
+    let current = null,
+      index = 0;
     for (let column = 0; column < count; column += 1) {
       const end = begin + (column + 1) * width;
       let best = current;
@@ -59,20 +73,28 @@ export class Chart {
   }
 
   draw() {
-    const { canvas, gpu } = this, ratio = window.devicePixelRatio || 1;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const { canvas, gpu } = this,
+      ratio = window.devicePixelRatio || 1;
+    const width = canvas.clientWidth,
+      height = canvas.clientHeight;
     if (!gpu || !width) return;
     if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
     if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
-    const pen = canvas.getContext("2d"), style = getComputedStyle(canvas), colors = new Map();
+    const pen = canvas.getContext("2d"),
+      style = getComputedStyle(canvas),
+      colors = new Map();
     const color = (name) => {
       if (!colors.has(name)) colors.set(name, style.getPropertyValue(`--${name}`).trim());
       return colors.get(name);
     };
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
-    const found = this.sampled(), floor = height - BOTTOM;
-    const most = Math.max(gpu.capacity_bytes, ...found.map((one) => (one ? Math.max(total(one), one.used ?? 0) : 0)));
+    const found = this.sampled(),
+      floor = height - BOTTOM;
+    const most = Math.max(
+      gpu.capacity_bytes,
+      ...found.map((one) => (one ? Math.max(total(one), one.used ?? 0) : 0)),
+    );
     const y = (count) => floor - (count / most) * (floor - TOP);
     const budget = gpu.capacity_bytes - gpu.reserve_bytes;
     pen.fillStyle = color("soft");
@@ -115,7 +137,8 @@ export class Chart {
       pen.fillText(at ? `${at} GiB` : "0", LEFT - 6, line);
     }
     pen.textBaseline = "bottom";
-    const span_s = this.columns * (this.seconds / this.columns), right = LEFT + this.columns * (BAR + GAP);
+    const span_s = this.columns * (this.seconds / this.columns),
+      right = LEFT + this.columns * (BAR + GAP);
     for (const part of [1, 0.5, 0]) {
       pen.textAlign = part === 1 ? "left" : part ? "center" : "right";
       const text = part ? `−${span(span_s * part)}` : "now";
@@ -124,13 +147,23 @@ export class Chart {
   }
 
   tell(found) {
-    const last = found[found.length - 1], column = this.cursor;
-    const of = (sample) => (sample ? [...sample.parts].reverse().map(([part, count]) => `${partName(part)} ${bytes(count)}`)
-      .concat(`measured ${bytes(sample.used)}`).join(" · ") : "not recorded");
+    const last = found[found.length - 1],
+      column = this.cursor;
+    const of = (sample) =>
+      sample
+        ? [...sample.parts]
+            .reverse()
+            .map(([part, count]) => `${partName(part)} ${bytes(count)}`)
+            .concat(`measured ${bytes(sample.used)}`)
+            .join(" · ")
+        : "not recorded";
     const ago = column === null ? 0 : (found.length - 1 - column) * (this.seconds / found.length);
-    const text = column === null ? "" : `${ago < 1 ? "now" : `${span(ago)} ago`}: ${of(found[column])}`;
+    const text =
+      column === null ? "" : `${ago < 1 ? "now" : `${span(ago)} ago`}: ${of(found[column])}`;
     if (this.output.textContent !== text) this.output.textContent = text;
-    const label = `${this.label}, the last ${span(this.seconds)}. Now: ${of(last)}. Arrow keys read earlier moments.`;
-    if (column === null && this.canvas.getAttribute("aria-label") !== label) this.canvas.setAttribute("aria-label", label);
+    const past = `${this.label}, the last ${span(this.seconds)}`;
+    const label = `${past}. Now: ${of(last)}. Arrow keys read earlier moments.`;
+    if (column === null && this.canvas.getAttribute("aria-label") !== label)
+      this.canvas.setAttribute("aria-label", label);
   }
 }

@@ -1,13 +1,36 @@
 // The live state: what the daemon sent last, merged, and how old it is.
 
-const STALE_MS = 4000, RETRY_MS = [500, 1000, 2000, 5000], HIDDEN_MS = 60000, EVENTS_KEPT = 3000, USES_KEPT = 500;
+const STALE_MS = 4000,
+  RETRY_MS = [500, 1000, 2000, 5000],
+  HIDDEN_MS = 60000,
+  EVENTS_KEPT = 3000,
+  USES_KEPT = 500;
 export const USES = new Set(["use_began", "use_ended", "use_yielded"]);
-const PROBLEMS = { 401: "the token is refused: open /?token=TOKEN once", 503: "too many pages are open", 421: "this name is refused", 403: "refused" };
+const PROBLEMS = {
+  401: "the token is refused: open /?token=TOKEN once",
+  503: "too many pages are open",
+  421: "this name is refused",
+  403: "refused",
+};
 
 export class Feed {
   constructor(changed) {
-    Object.assign(this, { changed, status: null, leases: new Map(), waits: new Map(), samples: new Map(), events: [],
-      lastSeq: 0, receivedAt: 0, heardAt: null, heardWall: null, problem: "", tries: 0, live: false, historyProblem: "" });
+    Object.assign(this, {
+      changed,
+      status: null,
+      leases: new Map(),
+      waits: new Map(),
+      samples: new Map(),
+      events: [],
+      lastSeq: 0,
+      receivedAt: 0,
+      heardAt: null,
+      heardWall: null,
+      problem: "",
+      tries: 0,
+      live: false,
+      historyProblem: "",
+    });
     document.addEventListener("visibilitychange", () => this.seen());
     setInterval(() => this.watch(), 500);
     this.connect();
@@ -16,20 +39,27 @@ export class Feed {
   connect() {
     clearTimeout(this.timer);
     this.source?.close();
-    const source = this.source = new EventSource("/events");
-    const on = (name, take) => source.addEventListener(name, (event) => {
-      if (this.source !== source) return;
-      this.heard();
-      take.call(this, JSON.parse(event.data));
-      this.changed(name);
-    });
+    const source = (this.source = new EventSource("/events"));
+    const on = (name, take) =>
+      source.addEventListener(name, (event) => {
+        if (this.source !== source) return;
+        this.heard();
+        take.call(this, JSON.parse(event.data));
+        this.changed(name);
+      });
     on("snapshot", this.snapshot);
     on("page", (page) => this.add(page.leases));
     on("change", this.change);
-    on("waits", (told) => { this.waits = new Map(told.waits.map((one) => [one.lease_id, { ...one, at: performance.now() }])); });
+    on("waits", (told) => {
+      this.waits = new Map(
+        told.waits.map((one) => [one.lease_id, { ...one, at: performance.now() }]),
+      );
+    });
     on("usage", this.usage);
     on("history", (reply) => this.history(reply));
-    source.onerror = () => { if (this.source === source) this.lost(); };
+    source.onerror = () => {
+      if (this.source === source) this.lost();
+    };
   }
 
   lost() {
@@ -41,13 +71,26 @@ export class Feed {
     this.timer = setTimeout(() => this.connect(), wait);
     // an event source does not tell why it was refused
     fetch("/events", { method: "HEAD", cache: "no-store" }).then(
-      (reply) => { this.problem = PROBLEMS[reply.status] ?? ""; this.changed("link"); },
-      () => { this.problem = ""; this.changed("link"); });
+      (reply) => {
+        this.problem = PROBLEMS[reply.status] ?? "";
+        this.changed("link");
+      },
+      () => {
+        this.problem = "";
+        this.changed("link");
+      },
+    );
     this.changed("link");
   }
 
   heard() {
-    Object.assign(this, { heardAt: performance.now(), heardWall: Date.now() / 1000, tries: 0, problem: "", live: true });
+    Object.assign(this, {
+      heardAt: performance.now(),
+      heardWall: Date.now() / 1000,
+      tries: 0,
+      problem: "",
+      live: true,
+    });
   }
 
   // A daemon that is stopped or gone says so by its silence.
@@ -62,7 +105,12 @@ export class Feed {
   seen() {
     clearTimeout(this.hiding);
     if (document.hidden) {
-      this.hiding = setTimeout(() => { clearTimeout(this.timer); this.source?.close(); this.source = null; this.live = false; }, HIDDEN_MS);
+      this.hiding = setTimeout(() => {
+        clearTimeout(this.timer);
+        this.source?.close();
+        this.source = null;
+        this.live = false;
+      }, HIDDEN_MS);
     } else if (!this.source) this.connect();
   }
 
@@ -80,7 +128,11 @@ export class Feed {
   add(leases) {
     const now = performance.now();
     for (const lease of leases) {
-      this.leases.set(lease.lease_id, { ...lease, at: now - 1000 * lease.since_s, askedAt: now - 1000 * (lease.waited_s ?? 0) });
+      this.leases.set(lease.lease_id, {
+        ...lease,
+        at: now - 1000 * lease.since_s,
+        askedAt: now - 1000 * (lease.waited_s ?? 0),
+      });
     }
   }
 
@@ -98,7 +150,11 @@ export class Feed {
       if (!this.samples.has(gpu)) this.samples.set(gpu, []);
       const list = this.samples.get(gpu);
       if (list.length && list[list.length - 1].at >= at) continue;
-      list.push({ at, used, parts: parts.map(([part, count]) => [part < 0 ? part : told.consumers[part], count]) });
+      list.push({
+        at,
+        used,
+        parts: parts.map(([part, count]) => [part < 0 ? part : told.consumers[part], count]),
+      });
     }
     for (const list of this.samples.values()) {
       while (list.length > 1 && list[1].at < this.uptime - told.kept_s) list.shift();
@@ -109,14 +165,18 @@ export class Feed {
     this.historyProblem = reply.problem ?? "";
     const arrivedAt = older || !this.events.length ? null : performance.now();
     const known = new Set(this.events.map((event) => event.seq));
-    const fresh = reply.events.filter((event) => !known.has(event.seq)).map((event) => ({ ...event, arrivedAt }));
+    const fresh = reply.events
+      .filter((event) => !known.has(event.seq))
+      .map((event) => ({ ...event, arrivedAt }));
     if (!fresh.length) return fresh;
     this.events = [...this.events, ...fresh].sort((a, b) => a.seq - b.seq);
     if (!older) this.forget();
     return fresh;
   }
 
-  get firstSeq() { return this.events.length ? this.events[0].seq : 0; }
+  get firstSeq() {
+    return this.events.length ? this.events[0].seq : 0;
+  }
 
   // Uses are many and soon of no interest.
   forget() {
@@ -132,10 +192,13 @@ export class Feed {
 
   // Pages back until some events fit; numbers have gaps, since a crash skips some.
   async loadOlder(fits) {
-    let before = this.before ?? this.firstSeq, found = 0;
+    let before = this.before ?? this.firstSeq,
+      found = 0;
     for (let pages = 0; before > 1 && pages < 20 && found < 20; pages += 1) {
       const after = Math.max(0, before - 201);
-      const reply = await fetch(`/history?after=${after}&limit=${before - after - 1}`, { cache: "no-store" });
+      const reply = await fetch(`/history?after=${after}&limit=${before - after - 1}`, {
+        cache: "no-store",
+      });
       if (!reply.ok) break;
       found += this.history(await reply.json(), true).filter(fits).length;
       before = this.before = after + 1;
@@ -150,5 +213,7 @@ export class Feed {
     return this.status.uptime_s + (this.live ? (performance.now() - this.receivedAt) / 1000 : 0);
   }
 
-  get now() { return this.live || this.heardAt === null ? performance.now() : this.heardAt; }
+  get now() {
+    return this.live || this.heardAt === null ? performance.now() : this.heardAt;
+  }
 }

@@ -1,6 +1,9 @@
 // Numbers, times and elements as the page writes them. Text only ever becomes a text node.
 
-const GIB = 2 ** 30, MIB = 2 ** 20;
+const GIB = 2 ** 30,
+  MIB = 2 ** 20;
+
+export const $ = (id) => document.getElementById(id);
 
 export function bytes(count) {
   if (count === null || count === undefined) return "unknown";
@@ -23,7 +26,12 @@ export function whole(seconds) {
 
 export function clock(wall, parts = false) {
   const at = new Date(wall * 1000);
-  const time = at.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit", hour12: false });
+  const time = at.toLocaleTimeString([], {
+    hour: "2-digit",
+    minute: "2-digit",
+    second: "2-digit",
+    hour12: false,
+  });
   if (!parts) return time;
   const day = at.toDateString() === new Date().toDateString() ? "" : `${at.toLocaleDateString()} `;
   return `${day}${time}.${String(at.getMilliseconds()).padStart(3, "0")}`;
@@ -48,7 +56,8 @@ export function setText(node, text) {
 
 // A consumer keeps its color: by its name, and the next free one where two names would share it.
 const COLORS = 12;
-const taken = new Map(), colors = new Map();
+const taken = new Map(),
+  colors = new Map();
 export function colorOf(name) {
   if (colors.has(name)) return colors.get(name);
   let hash = 2166136261;
@@ -61,9 +70,19 @@ export function colorOf(name) {
   return colors.get(name);
 }
 
-export const CODES = { [-1]: ["pending", "pending free"], [-2]: ["retained", "retained by processes"],
-  [-3]: ["stowaway", "stowaways"], [-4]: ["others", "other consumers"] };
+export const CODES = {
+  [-1]: ["pending", "pending free"],
+  [-2]: ["retained", "retained by processes"],
+  [-3]: ["stowaway", "stowaways"],
+  [-4]: ["others", "other consumers"],
+};
 
-export function partName(part) { return typeof part === "number" ? CODES[part][1] : part; }
-export function partClass(part) { return typeof part === "number" ? CODES[part][0] : colorOf(part); }
-export function chip(part) { return el(`i.chip.${partClass(part)}`); }
+export function partName(part) {
+  return typeof part === "number" ? CODES[part][1] : part;
+}
+export function partClass(part) {
+  return typeof part === "number" ? CODES[part][0] : colorOf(part);
+}
+export function chip(part) {
+  return el(`i.chip.${partClass(part)}`);
+}

@@ -3,22 +3,53 @@ import { bytes, span } from "/format.js";
 
 export const PHASES = ["revoke", "drain", "unload", "verify"];
 const RUNNING = { revoke: "revoking", drain: "draining", unload: "unloading", verify: "verifying" };
-const BEGINS = { revoke_asked: "revoke", revoke_acked: "drain", unloading: "unload", released: "verify" };
-const SHOWN_ELSEWHERE = new Set(["seq", "at_wall_s", "kind", "lease_id", "consumer", "gpu", "traceparent", "reason", "arrivedAt", "left_out", "wait", "why", "resolved"]);
+const BEGINS = {
+  revoke_asked: "revoke",
+  revoke_acked: "drain",
+  unloading: "unload",
+  released: "verify",
+};
+const SHOWN_ELSEWHERE = new Set([
+  "seq",
+  "at_wall_s",
+  "kind",
+  "lease_id",
+  "consumer",
+  "gpu",
+  "traceparent",
+  "reason",
+  "arrivedAt",
+  "left_out",
+  "wait",
+  "why",
+  "resolved",
+]);
 
 // Newest first. A phase lasts until the next one begins; a later phase may begin without the ones
 // between, such as the release of a holder that was killed.
 export function evictionsOf(events) {
-  const open = new Map(), all = [];
+  const open = new Map(),
+    all = [];
   for (const event of events) {
     const one = open.get(event.lease_id);
     if (event.kind === "revoke_asked") {
-      const made = { lease: event.lease_id, consumer: event.consumer ?? "", reason: event.reason ?? "", at: event.at_wall_s, phases: [], verdict: "", running: "" };
+      const made = {
+        lease: event.lease_id,
+        consumer: event.consumer ?? "",
+        reason: event.reason ?? "",
+        at: event.at_wall_s,
+        phases: [],
+        verdict: "",
+        running: "",
+      };
       open.set(event.lease_id, made);
       all.push(made);
       begin(made, "revoke", event);
     } else if (one && BEGINS[event.kind]) {
-      if (PHASES.indexOf(BEGINS[event.kind]) > PHASES.indexOf(one.phases[one.phases.length - 1].name)) begin(one, BEGINS[event.kind], event);
+      if (
+        PHASES.indexOf(BEGINS[event.kind]) > PHASES.indexOf(one.phases[one.phases.length - 1].name)
+      )
+        begin(one, BEGINS[event.kind], event);
     } else if (one && event.kind === "verified") {
       one.verdict = event.verdict;
       if (!event.resolved) continue;
@@ -46,7 +77,14 @@ function plain(key, value) {
   if (typeof value === "number" && key.endsWith("_bytes")) return bytes(value);
   if (typeof value === "number" && (key === "ms" || key.endsWith("_ms"))) return span(value / 1000);
   if (typeof value === "number" && key.endsWith("_s")) return span(value);
-  if (Array.isArray(value)) return value.map((item) => (typeof item === "object" && item ? item.consumer ?? item.name ?? item.pid ?? JSON.stringify(item) : String(item))).join(", ");
+  if (Array.isArray(value))
+    return value
+      .map((item) =>
+        typeof item === "object" && item
+          ? (item.consumer ?? item.name ?? item.pid ?? JSON.stringify(item))
+          : String(item),
+      )
+      .join(", ");
   if (typeof value === "object") return JSON.stringify(value);
   return String(value);
 }
