@@ -46,7 +46,7 @@ _log = logging.getLogger("sidecars")
 
 
 class Model(Protocol):
-    """One residency of a model, as `residency` needs it."""
+    """One residency of a model, as `gpu_copy` needs it."""
 
     ended: asyncio.Event
     """The process is gone, and its memory with it."""
@@ -79,7 +79,7 @@ class Model(Protocol):
 
 
 class Models(Protocol):
-    """The weights of a model and the processes that use them, as `residency` needs them."""
+    """The weights of a model and the processes that use them, as its host needs them."""
 
     async def prepare(self) -> None:
         """Do what needs neither weights nor a device. Repeatable. Raises ModelError or NoGpu."""

@@ -1,37 +1,26 @@
-"""Residency of one model: acquire, load, use, unload, in step with the lease.
+"""Residency of one model: what the wire asks of it, in step with its lease.
 
-States: unloaded → waiting (for the lease) → loading → resident → unloading → unloaded, or parking →
-parked: off the GPU, with the weights in host RAM. One model, one lease at a time, and one process
-for each residency (`model_process`), whose end returns all of its memory on the GPU. The lease's
-own protocol (revoke, quiesce, release, fencing) is the client library's, which calls `_unload` or
-`_park` when the bytes must go. A lease that is parked or on standby is not over: a request calls it
-back as a waiter, and the arbiter grants one on standby again when there is room (`_restore` loads
-then). Must not know sockets, wires or processes.
+A request makes the model resident: the lease is acquired, or called back from standby (`standby`),
+and the model is loaded (`gpu_copy`) from its weights in host RAM (`host_copy`). One model, one
+lease at a time. The lease's own protocol (revoke, quiesce, release, fencing) is the client
+library's, which calls `GpuCopy.unload` or `park` when the bytes must go, and `_restore` when a
+parked lease or one on standby is granted again. Must not know sockets, wires or processes.
 
-Weights are in host RAM (`host_copy`) while the model is wanted, resident or parked. The arbiter
-grants the room for parked ones (`park_bytes`).
+The arbiter grants the host RAM of parked weights (`park_bytes`).
 """
 
 import asyncio
-import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Mapping
-from typing import Final, Literal
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.errors import (
-    BadState,
     Evicted,
     FrameStale,
     LeaseExpired,
     LeaseLost,
     LeaseRevoking,
-    Loading,
-    ModelError,
-    NotResident,
-    OutOfMemory,
     SidecarUnavailable,
     StaleToken,
     UnknownLease,
@@ -39,28 +28,15 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.runtime.telemetry import meters
-from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.sidecars.gpu_copy import GpuCopy, State, unwanted
 from vram_arbiter.sidecars.host_copy import HostCopy
 from vram_arbiter.sidecars.model_process import Model, Models
 from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.standby import AWAY, Recall, left_s, still
+from vram_arbiter.sidecars.uses import Uses
 
-State = Literal["unloaded", "waiting", "loading", "resident", "parking", "parked", "unloading"]
-TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
-    "unloaded": frozenset({"waiting", "loading"}),  # loading: its lease came back by itself
-    "waiting": frozenset({"loading", "unloaded"}),
-    "loading": frozenset({"resident", "unloading", "unloaded"}),  # unloaded: its process died
-    "resident": frozenset({"parking", "unloading", "unloaded"}),
-    "parking": frozenset({"parked", "unloaded"}),
-    "parked": frozenset({"waiting", "loading", "unloading"}),
-    "unloading": frozenset({"unloaded"}),
-}
-"""State → states that may follow."""
 Token = tuple[int, int]
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
-_LEAVING = ("revoking", "unloading")
-_AWAY = ("standby", "parked")
 _log = logging.getLogger("sidecars")
 
 
@@ -70,33 +46,25 @@ class Residency:
     `client` None: no arbiter, so the model is loaded without a lease and stays.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        models: Models,
-        client: AsyncClient | None,
-    ) -> None:
+    def __init__(self, settings: Settings, models: Models, client: AsyncClient | None) -> None:
         self._settings = settings
         self._models = models
         self._client = client
         self._turn = asyncio.Lock()  # one attempt to become resident at a time
-        self._model: Model | None = None
         self._prepared: asyncio.Task[None] | None = None
         self._host = HostCopy(models, client, settings.footprint.steady_bytes)
-        self._left = asyncio.Event()  # the unload or parking in progress is over
-        self._called_off = asyncio.Event()  # the load in progress is not wanted any more
+        self._gpu = GpuCopy(settings, models, self._host, self._died)
+        self._recall = Recall(settings.name, self._host, self._gpu)
+        self._uses = Uses(client)
         self._ending = False
-        self._running = 0
-        self._last_use_s = time.monotonic()
-        self._resident_since_s = self._last_use_s
         self._obtaining: asyncio.Task[AsyncLease | None] | None = None
         self._unloads = 0  # number of unload requests: earlier waits for the model end
-        # the call that brings a standby lease back
-        self._calling: asyncio.Task[VramError | None] | None = None
-        self._watching: asyncio.Task[None] | None = None  # the process's end
         self.lease: AsyncLease | None = None
-        self.state: State = "unloaded"
         self.last_error: VramError | None = None
+
+    @property
+    def state(self) -> State:
+        return self._gpu.state
 
     # -- what the wire asks
     def prepare(self) -> None:
@@ -133,9 +101,7 @@ class Residency:
             async with asyncio.timeout(timeout_s):
                 await self._turn.acquire()
         except TimeoutError:
-            raise Loading(
-                f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
-            ) from None
+            raise still(self._settings.name, self.state) from None
         try:
             return await self._load_in_turn(deadline)
         except VramError as error:
@@ -157,10 +123,10 @@ class Residency:
             await self.lease.give_up()
         elif self._client is None:
             if self.state == "loading":
-                await self._end_model(at_once=True)  # the load undoes itself
+                await self._gpu.end_model(at_once=True)  # the load undoes itself
             async with self._turn:
                 if self.state == "resident":
-                    await self._unload()
+                    await self._gpu.unload()
 
     async def run(
         self,
@@ -188,9 +154,9 @@ class Residency:
                 await self.load(max(0.0, deadline - time.monotonic()))
             else:
                 self._check(token)
-            lease, model = self.lease, self._model
+            lease, model = self.lease, self._gpu.model
             try:
-                async with self._use(lease, label, handed=token is not None):
+                async with self._uses.use(lease, label, handed=token is not None):
                     if model is None:
                         raise self._evicted()
                     return await model.run(
@@ -203,9 +169,7 @@ class Residency:
                 if token is not None:
                     raise self._evicted() from error
                 if lease is not None:
-                    await self._until_left(
-                        lease, deadline
-                    )  # then there is a lease to ask for again
+                    await self._recall.until_left(lease, deadline)  # then it is asked for again
 
     def token(self) -> Token | None:
         """Token of the lease under which the model is resident now."""
@@ -214,13 +178,13 @@ class Residency:
     @property
     def on_standby(self) -> bool:
         """Whether the model is evicted and returns by itself."""
-        return self.lease is not None and self.lease.state in _AWAY and self._settings.standby
+        return self.lease is not None and self.lease.state in AWAY and self._settings.standby
 
     @property
     def wanted(self) -> bool:
         """Whether a request waits for the model, or its lease is being called back; `unload` ends
         both."""
-        return self._turn.locked() or (self._calling is not None and not self._calling.done())
+        return self._turn.locked() or self._recall.under_way
 
     async def leave(self) -> None:
         """End of the program: after the op in progress, free everything."""
@@ -230,7 +194,7 @@ class Residency:
             self._prepared.cancel()
             await asyncio.wait({self._prepared})
         await self._host.stop()
-        await self._unload()
+        await self._gpu.unload()
         await self._models.end()
         if lease is not None:
             await lease.release(exiting=True)
@@ -244,58 +208,45 @@ class Residency:
         arbiter is asked before the release. If it cannot be reached, the model stays.
         """
         while True:
+            since_s = self._gpu.resident_since_s
             stays_until = max(
-                self._last_use_s + idle_s, self._resident_since_s + self._settings.min_residency_s
+                max(self._uses.last_s, since_s) + idle_s,
+                since_s + self._settings.min_residency_s,
             )
             left = stays_until - time.monotonic()
-            if self.state == "resident" and not self._running and left <= 0:
-                if await self._used_by_others():
+            if self.state == "resident" and not self._uses.in_flight and left <= 0:
+                if await self._uses.by_others(self.lease):
                     _log.debug("in use by another process: not idle")
-                    self._last_use_s = time.monotonic()
+                    self._uses.last_s = time.monotonic()
                 else:
                     _log.info("idle for %.1f s: leaving the GPU", idle_s)
                     await self._leave_the_gpu()
             await asyncio.sleep(max(left, 0.05, idle_s / 10))
-
-    async def _used_by_others(self) -> bool:
-        if self._client is None or self.lease is None:
-            return False
-        try:
-            status = await self._client.status()
-        except VramError as error:
-            _log.info("uses of the lease are unknown (%s): staying", error.code)
-            return True
-        return any(view.lease_id == self.lease.lease_id and view.uses for view in status.leases)
-
-    def _to(self, state: State) -> None:
-        """Go to another state; the only place that writes it."""
-        assert state in TRANSITIONS[self.state], f"{self.state} → {state}"
-        self.state = state
 
     # -- loading
     async def _load_in_turn(self, deadline: float | None) -> bool:
         if self.state == "resident" and (self.lease is None or self.lease.state == "held"):
             return False
         unloads = self._unloads
-        if self.lease is not None and await self._brought_back(self.lease, deadline):
+        if self.lease is not None and await self._recall.until_held(self.lease, deadline):
             return True
         self._refuse_if_ending()
         if unloads != self._unloads:
-            raise self._unwanted()
-        self._to("waiting")
+            raise unwanted(self._settings.name)
+        self._gpu.to("waiting")
         self._obtaining = asyncio.create_task(self._obtain(deadline), name="obtain")
         try:
             lease = await self._obtaining
-            self._to("loading")
+            self._gpu.to("loading")
             self.lease = lease
             if unloads != self._unloads:  # an unload came in the moment of the grant
                 if lease is not None:
                     await lease.release()
-                raise self._unwanted()
+                raise unwanted(self._settings.name)
             await self._load(lease)
         except BaseException as error:
             if self.state != "unloaded":
-                self._to("unloaded")
+                self._gpu.to("unloaded")
             if not isinstance(error, WaitTimeout):  # asked again, it need not read them again
                 self._host.drop()
             if (
@@ -303,7 +254,7 @@ class Residency:
                 and unloads != self._unloads
                 and not _being_cancelled()
             ):
-                raise self._unwanted() from None
+                raise unwanted(self._settings.name) from None
             raise
         finally:
             self._obtaining = None
@@ -314,84 +265,6 @@ class Residency:
         if self._ending:
             raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
 
-    async def _until_left(self, lease: AsyncLease, deadline: float | None) -> None:
-        """Wait until a lease that is leaving has left, its bytes unloaded.
-
-        Raises Loading when the time is over.
-        """
-        try:
-            async with asyncio.timeout(_left_s(deadline)):
-                while (leaving := lease.state) in _LEAVING:
-                    await lease.wait_change(leaving)
-                if lease.state == "gone":
-                    await lease.wait_gone()
-        except TimeoutError:
-            raise Loading(
-                f"{self._settings.name} is still {self.state}", hint="ask again, or wait longer"
-            ) from None
-
-    # -- coming back from standby
-    async def _brought_back(self, lease: AsyncLease, deadline: float | None) -> bool:
-        """Follow a leaving lease until it is resident again, calling it back from standby.
-
-        Returns False if it ended, its bytes unloaded. Raises Loading or WaitTimeout when the time
-        is over, or the arbiter's refusal. A wait that ends so goes on in the background: the model
-        was wanted, and returns as soon as it may.
-        """
-        while (seen := lease.state) not in ("held", "gone"):
-            if seen == "loading":  # `_restore` loads, without a limit
-                await lease.wait_change(seen)
-                continue
-            try:
-                async with asyncio.timeout(_left_s(deadline)):
-                    if seen not in _AWAY:
-                        await lease.wait_change(seen)
-                    elif (refused := await asyncio.shield(self._called_back(lease))) is not None:
-                        raise refused
-            except TimeoutError:
-                if lease.state in _AWAY:
-                    raise WaitTimeout(
-                        f"{self._settings.name} is evicted ({lease.state}), and there was no room "
-                        "for it in time",
-                        hint=f"`vramctl why {self._settings.name}` names the holder; it returns as "
-                        "soon as it may",
-                    ) from None
-                if lease.state in _LEAVING:
-                    raise Loading(
-                        f"{self._settings.name} is still {lease.state}",
-                        hint="ask again, or wait longer",
-                    ) from None
-        if lease.state == "held":
-            return True
-        await self._until_left(lease, deadline)
-        return False
-
-    def _called_back(self, lease: AsyncLease) -> asyncio.Task[VramError | None]:
-        """Ask for the lease as a waiter, once for all requests, and without a limit.
-
-        Their own limits are shorter than a goal may be.
-        """
-        if self._calling is None or self._calling.done():
-            self._calling = asyncio.create_task(self._call_back(lease), name="call back")
-        return self._calling
-
-    async def _call_back(self, lease: AsyncLease) -> VramError | None:
-        """Wait until the lease is granted again or over.
-
-        Returns the reason why the arbiter refuses even the wait.
-        """
-        away = lease.state
-        _log.info("requested: calling the lease back from %s", away)
-        self._host.fetch()
-        try:
-            await lease.reacquire()
-        except BadState:  # it returns by itself in this moment
-            await lease.wait_change(away)
-        except VramError as error:
-            if lease.state in _AWAY:
-                return error
-        return None
-
     async def _restore(self, lease: AsyncLease) -> None:
         """Load after a grant, by itself or because it was called back.
 
@@ -400,12 +273,12 @@ class Residency:
         if self._ending:
             return  # `leave` releases it
         _log.info("back from %s: loading", "parking" if self.state == "parked" else "standby")
-        self._to("loading")
+        self._gpu.to("loading")
         try:
             await self._load(lease)
         except BaseException as error:
             if self.state != "unloaded":
-                self._to("unloaded")
+                self._gpu.to("unloaded")
             if not isinstance(error, VramError):
                 raise
             self.last_error = error
@@ -419,7 +292,7 @@ class Residency:
         machine; the lease is waited for from then on, for the time that was left before, and the
         arbiter is told how much host RAM they take. Later they are read meanwhile.
         """
-        wait_s = _left_s(deadline)
+        wait_s = left_s(deadline)
         reading = self._host.fetch()
         weights_bytes = self._host.size_bytes
         if weights_bytes is None:
@@ -433,126 +306,21 @@ class Residency:
         return await self._client.acquire(
             self._settings.lease_spec(park_bytes=weights_bytes),
             wait_s,
-            unload=self._unload,
-            park=self._park,
+            unload=self._gpu.unload,
+            park=self._gpu.park,
             restore=self._restore,
             on_lost=self._on_lost,
         )
 
-    def _unwanted(self) -> NotResident:
-        return NotResident(
-            f"{self._settings.name} was told to unload before it was resident",
-            hint="ask again if it is wanted",
-        )
-
     async def _load(self, lease: AsyncLease | None) -> None:
-        """Load the model onto the GPU; on failure everything is undone before the lease is
-        released."""
-        attributes = self._labels() | (
-            {telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {}
-        )
-        with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=attributes):
-            await self._load_measured(lease)
-
-    async def _load_measured(self, lease: AsyncLease | None) -> None:
-        began, unloads = time.monotonic(), self._unloads
-        labels = {telemetry.ATTR_MODEL: self._settings.manifest.name}
+        unloads = self._unloads
 
         def given_up() -> bool:
             return unloads != self._unloads if lease is None else lease.given_up
 
-        try:
-            reading = self._host.fetch()
-            self._called_off.clear()
-            called_off = asyncio.create_task(self._called_off.wait(), name="called off")
-            await asyncio.wait({reading, called_off}, return_when=asyncio.FIRST_COMPLETED)
-            called_off.cancel()
-            if given_up() or (lease and lease.state == "gone"):
-                raise self._unwanted()  # the weights may be read on, and are dropped then
-            await self._host.fetched(reading)
-            model = self._model = await self._models.start()
-            if given_up() or (lease and lease.state == "gone"):
-                raise self._unwanted()  # before a byte was loaded
-            measured = await model.load("" if lease is None else lease.gpu)
-            if lease is not None:
-                charge = None if measured is None else self._settings.steady_charge(measured)
-                await lease.ready(charge)
-            if model is not self._model or given_up() or (lease and lease.state == "gone"):
-                raise self._unwanted()  # it was unloaded while `ready` was sent
-        except BaseException as error:
-            await self._take_back(lease, error)
-            if given_up():
-                _log.info("the load was undone")
-                raise self._unwanted() from None
-            _log.error("loading failed: %s", error)
-            if isinstance(error, Exception):
-                labels[telemetry.ATTR_ERROR_TYPE] = tracing.error_type(error)
-                meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
-            raise
-        meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
-        if measured is not None:
-            tracing.note({telemetry.ATTR_BYTES: measured})
-        self._last_use_s = self._resident_since_s = time.monotonic()
-        self._to("resident")
-        self._watching = asyncio.create_task(self._watch(model, lease), name="watch the model")
-        self._host.drop_if_too_large(lambda: self.state == "resident")
-        _log.info("resident after %.2f s: %s bytes on the GPU", time.monotonic() - began, measured)
+        await self._gpu.load(lease, given_up)
 
-    async def _take_back(self, lease: AsyncLease | None, error: BaseException) -> None:
-        """Undo a failed load. Whatever else fails in it, the lease ends: it would be renewed for
-        ever."""
-        try:
-            await self._end_model(at_once=True)
-            self._host.drop()
-            if lease is not None and isinstance(error, OutOfMemory) and not lease.given_up:
-                requested = int(
-                    error.details.get("requested_bytes") or self._settings.footprint.load_peak_bytes
-                )
-                await lease.oom(requested, error.details.get("allocated_bytes"))
-        except VramError as failed:  # the arbiter measures what is left on the GPU
-            _log.error("a failed load was not undone in order: %s", failed)
-        finally:
-            if lease is not None:
-                try:
-                    await lease.release()
-                except VramError as refused:
-                    _log.warning("the release of %s was refused: %s", lease.lease_id, refused)
-
-    # -- unloading
-    async def _unload(self) -> None:
-        """Unload: called by the lease (revoked, lost, given up) or at the end of the program."""
-        if self.state in ("unloading", "parking"):
-            await self._left.wait()
-        if self.state not in ("loading", "resident", "parked"):
-            return
-        began, loading = time.monotonic(), self.state == "loading"
-        self._called_off.set()
-        self._to("unloading")
-        self._left.clear()
-        try:
-            with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
-                await self._end_model(at_once=loading)
-        finally:
-            self._to("unloaded")
-            self._left.set()
-        _log.info("unloaded in %.2f s", time.monotonic() - began)
-        self._host.drop()
-
-    async def _park(self) -> None:
-        """Leave the GPU and keep the weights in host RAM: called by the lease."""
-        if self.state != "resident":
-            return
-        began = time.monotonic()
-        self._to("parking")
-        self._left.clear()
-        try:
-            with tracing.span(telemetry.SPAN_SIDECAR_UNLOAD, attributes=self._labels()):
-                await self._end_model(at_once=False)
-        finally:
-            self._to("parked")
-            self._left.set()
-        _log.info("parked in %.2f s", time.monotonic() - began)
-
+    # -- leaving the GPU
     async def _leave_the_gpu(self) -> None:
         """Park where the arbiter has host RAM for the weights, else unload."""
         if self.lease is not None and self.lease.spec.park_bytes:
@@ -560,40 +328,12 @@ class Residency:
         else:
             await self.unload()
 
-    async def _end_model(self, *, at_once: bool) -> None:
-        """End the model's process. `at_once`: also in the middle of a load."""
-        model, self._model = self._model, None
-        if model is not None:
-            await model.end(at_once=at_once)
-
-    async def _watch(self, model: Model, lease: AsyncLease | None) -> None:
-        """Release the lease of a model whose process died: its bytes are free."""
-        await model.ended.wait()
-        if model is not self._model:
-            return  # it was ended by this program
-        self._model = None
-        self._to("unloaded")
-        self.last_error = ModelError(
-            f"the process of {self._settings.name} ended while it was resident",
-            hint="the next request loads it again; see the sidecar's log",
-        )
-        _log.error("%s", self.last_error)
-        self._host.drop()
-        if lease is not None:
-            try:
-                await lease.release()
-            except VramError as refused:
-                _log.warning("the release of %s was refused: %s", lease.lease_id, refused)
-
     async def _on_lost(self, lease: AsyncLease, error: VramError) -> None:
         self.last_error = error
         _log.warning("lease %s is lost: %s", lease.lease_id, error)
 
-    def _labels(self) -> dict[str, str]:
-        return {
-            telemetry.ATTR_CONSUMER: self._settings.name,
-            telemetry.ATTR_MODEL: self._settings.manifest.name,
-        }
+    def _died(self, error: VramError) -> None:
+        self.last_error = error
 
     # -- uses
     def _check(self, token: Token) -> None:
@@ -607,29 +347,9 @@ class Residency:
             details={"state": self.state},
         )
 
-    @contextlib.asynccontextmanager
-    async def _use(
-        self, lease: AsyncLease | None, label: str, *, handed: bool
-    ) -> AsyncIterator[None]:
-        """Mark a use. Under a handed-over token the caller's own use protects the model, also while
-        revoked."""
-        self._running += 1
-        try:
-            async with contextlib.AsyncExitStack() as stack:
-                if lease is not None:
-                    try:
-                        await stack.enter_async_context(lease.use(label))
-                    except LeaseRevoking:
-                        if not handed:
-                            raise
-                yield
-        finally:
-            self._running -= 1
-            self._last_use_s = time.monotonic()
-
     def _begins(self, model: Model, came_s: float, fresh_s: float | None) -> None:
         """Check that no unload came between, and that the picture is not too old."""
-        if model is not self._model or self.state != "resident":
+        if model is not self._gpu.model or self.state != "resident":
             raise self._evicted()
         waited_s = time.monotonic() - came_s
         if fresh_s is not None and waited_s > fresh_s:
@@ -644,8 +364,3 @@ class Residency:
 def _being_cancelled() -> bool:
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0
-
-
-def _left_s(deadline: float | None) -> float | None:
-    """Return the seconds until a moment of the monotonic clock; None: no limit."""
-    return None if deadline is None else max(0.0, deadline - time.monotonic())

@@ -9,7 +9,8 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import Evicted, ModelError, NotPermitted, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
-from vram_arbiter.sidecars.residency import TRANSITIONS, Residency
+from vram_arbiter.sidecars.gpu_copy import TRANSITIONS
+from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.weights import Weights
 
