@@ -298,7 +298,7 @@ class AsyncLease:
         if self._departure.asked or self._record.asleep:
             told = f": {gone.reason}" if (gone := self.evicted) else ""
             raise LeaseRevoking(
-                f"{self.lease_id} was asked to leave{told}",
+                f"{self.lease_id} was revoked{told}",
                 hint="wait until it is granted again, or acquire again",
                 details={"state": self.state},
             )

@@ -157,7 +157,7 @@ class StaleToken(CallerError):
 
 
 class LeaseRevoking(TransientError):
-    """The holder was asked to leave: no new use begins."""
+    """The holder was revoked: no new use begins."""
 
     code = "lease_revoking"
 

@@ -22,7 +22,7 @@ WAIT: Final[Mapping[Wait, str]] = {
     Wait.READING: "waits for a fresh reading of the GPU",
     Wait.NOT_FREE: "the ledger has room, the GPU does not: measured memory is not free yet",
     Wait.RESIDUE: "a dead process's memory is being measured",
-    Wait.NO_VICTIM: "no holder that could make room may be asked now",
+    Wait.NO_VICTIM: "no holder that could make room may be revoked now",
 }
 
 
@@ -52,7 +52,7 @@ def block(why: BlockView) -> str:
 
 
 _BLOCKS: Final[Mapping[Block, str]] = {
-    Block.RECOVERING: "recovering after a restart: {names} must come back first",
+    Block.RECOVERING: "recovering after a restart: {names} must reattach first",
     Block.DRAINED: "drained by {why.problem}",
     Block.UNREADABLE: "the GPU cannot be read: {why.problem}",
     Block.UNREAD: "the GPU has not been read yet",
@@ -121,7 +121,7 @@ def _in_gang(told: Explanation, gang: GangView) -> str:
         )
     why = {
         Wait.MAKING_ROOM: "room is being made for the whole gang",
-        Wait.NO_VICTIM: "no holder that could make room for the whole gang may be asked now",
+        Wait.NO_VICTIM: "no holder that could make room for the whole gang may be revoked now",
     }
     return (
         f"waits as one of gang {gang.id}: "
@@ -130,7 +130,7 @@ def _in_gang(told: Explanation, gang: GangView) -> str:
 
 
 def _leaving(one: Blocker) -> str:
-    charge, ago = gib(one.bytes), f"asked {one.seconds or 0.0:.1f} s ago"
+    charge, ago = gib(one.bytes), f"revoked {one.seconds or 0.0:.1f} s ago"
     match one.condition:
         case Condition.REVOKED if one.uses:
             uses = f"{one.uses} use{'' if one.uses == 1 else 's'}"
@@ -154,7 +154,7 @@ def condition(one: Blocker) -> str:
         case Condition.LOADING:
             return _loading(one)
         case Condition.REVOKED:
-            return f"was asked to leave {one.seconds or 0.0:.1f} s ago, {_uses(one)}"
+            return f"was revoked {one.seconds or 0.0:.1f} s ago, {_uses(one)}"
         case Condition.PINNED if one.by:
             return f"is pinned by {one.by}"
         case _:
@@ -165,16 +165,16 @@ _CONDITIONS: Final[Mapping[Condition, str]] = {
     Condition.UNLOADING: "is unloading",
     Condition.HANGING: "is unloading for {seconds:.0f} s and may hang: end its process (pid "
     "{one.pid})",
-    Condition.MEASURED: "let go, its bytes are being measured",
-    Condition.NOT_BACK: "has not come back since the restart, is given up in {seconds:.1f} s",
+    Condition.MEASURED: "released, its bytes are being measured",
+    Condition.NOT_BACK: "has not reattached since the restart, is given up in {seconds:.1f} s",
     Condition.GANG: "belongs to gang {one.by}, which is not complete",
     Condition.PINNED: "is pinned",
     Condition.RESIDENCY: "may stay {seconds:.1f} s more (minimum residency)",
-    Condition.THRASHING: "may stay {seconds:.1f} s more (they keep throwing each other out)",
+    Condition.THRASHING: "may stay {seconds:.1f} s more (they keep evicting each other)",
     Condition.PRIORITY: "is in use and has priority {one.priority}, the waiter "
     "{one.waiter_priority}",
     Condition.IN_USE: "is in use for {seconds:.0f} s",
-    Condition.IDLE: "is idle and may be asked",
+    Condition.IDLE: "is idle and may be revoked",
     Condition.CONTEXT: "keeps its context until it exits",
     Condition.RETAINED: "keeps more than its context until its process (pid {one.pid}) gives it "
     "back or ends",
@@ -219,11 +219,11 @@ def _holder(told: Explanation, holder: Blocker) -> str:
         case "loading":
             return f"it was granted and {_loading(holder)}"
         case "revoking":
-            return f"it was asked to leave for {_wanted_by(told.revoked)}, {_uses(holder)}"
+            return f"it was revoked for {_wanted_by(told.revoked)}, {_uses(holder)}"
         case "unloading":
             return f"it {condition(holder)}"
         case "verifying":
-            return "it let go; its bytes are being measured"
+            return "it released; its bytes are being measured"
         case _:
             return f"it is resident, {_uses(holder)}"
 
@@ -238,7 +238,7 @@ def _away(told: Explanation) -> str:
     where = "parked" if told.state == "parked" else "on standby"
     match told.back:
         case Return.HOLDER:
-            return f"{where}, but its holder did not come back after the restart"
+            return f"{where}, but its holder did not reattach after the restart"
         case Return.ASKED:
             return f"{where} in host RAM until its holder asks for it"
         case Return.BEHIND:
@@ -248,7 +248,7 @@ def _away(told: Explanation) -> str:
         case Return.LEFT_FOR:
             return f"{where} until {told.ahead} has left"
         case Return.NO_ROOM:
-            return f"{where} until there is room; it asks no holder to leave"
+            return f"{where} until there is room; it revokes no holder"
         case Return.QUIET:
             return f"{where}: comes back in {told.due_s or 0.0:.1f} s if the GPU stays quiet"
         case _:
@@ -261,49 +261,49 @@ def step_words(step: Step) -> str:
     when = ""
     if step.in_s is not None:
         more = step.action is NextAction.DEADLINE
-        when = f" for {step.in_s:.1f} s more" if more else f" in {step.in_s:.1f} s"
+        when = f" {step.in_s:.1f} s more" if more else f" in {step.in_s:.1f} s"
     action = _ACTIONS[step.action]
     if step.action is NextAction.WAIT:
         action = _WAITS.get(step.because, action)
-    text = f"{action}{{when}}, {_BECAUSE[step.because]}"
+    text = f"{action}, {_BECAUSE[step.because]}"
     return text.format(step=step, when=when, latest_s=step.latest_s or 0.0)
 
 
 _ACTIONS: Final[Mapping[NextAction, str]] = {
-    NextAction.ASK: "asks {step.consumer}",
-    NextAction.LOADED: "lets {step.consumer} finish loading",
-    NextAction.READ: "reads the GPU again",
-    NextAction.MEASURE: "measures {step.consumer}'s bytes again",
-    NextAction.DEADLINE: "waits for {step.consumer} to let go",
-    NextAction.WAIT: "waits for {step.consumer} to let go",
-    NextAction.SERVE: "grants again",
-    NextAction.BREAK: "gives gang {step.gang} up",
-    NextAction.GIVE_UP: "gives up",
+    NextAction.ASK: "revokes {step.consumer}{when}",
+    NextAction.LOADED: "lets {step.consumer} finish loading{when}",
+    NextAction.READ: "reads the GPU again{when}",
+    NextAction.MEASURE: "measures {step.consumer}'s bytes again{when}",
+    NextAction.DEADLINE: "waits{when} for {step.consumer} to release",
+    NextAction.WAIT: "waits for {step.consumer} to release{when}",
+    NextAction.SERVE: "grants again{when}",
+    NextAction.BREAK: "gives gang {step.gang} up{when}",
+    NextAction.GIVE_UP: "gives up{when}",
 }
 
 _WAITS: Final[Mapping[Because, str]] = {
-    Because.NO_VICTIM: "asks no holder",
-    Because.NOT_BACK: "gives {step.consumer} up",
+    Because.NO_VICTIM: "revokes no holder{when}",
+    Because.NOT_BACK: "gives {step.consumer} up{when}",
 }
 
 _BECAUSE: Final[Mapping[Because, str]] = {
-    Because.NEXT_READING: "as soon as the GPU is looked at again",
+    Because.NEXT_READING: "with the next reading of the GPU",
     Because.RESIDENCY: "when its minimum residency ends",
     Because.AGEING: "when the waiter's priority has aged to its own",
-    Because.TOGETHER: "when enough may be asked together",
+    Because.TOGETHER: "when enough may be revoked together",
     Because.ONE_LOAD: "one loads at a time",
     Because.KEPT: "its bytes are kept for it, the GPU has to show them",
     Because.UNREADABLE: "nothing is granted on a GPU that cannot be read",
     Because.MEASUREMENT: "the ledger has room, the GPU has to show it",
-    Because.ACCOUNTED: "when every holder has come back or its time is over",
+    Because.ACCOUNTED: "when every holder has reattached or its time is over",
     Because.INCOMPLETE: "if the rest has not come back",
     Because.SHORT: "if its memory is not free then",
-    Because.NOT_BACK: "unless it comes back before that",
+    Because.NOT_BACK: "unless it reattaches before that",
     Because.NO_VICTIM: "those that could make room are pinned or in use above its priority",
     Because.VERDICT: "a verdict comes in {latest_s:.1f} s at the latest",
     Because.MEASURED_GONE: "until its bytes are measured gone",
     Because.HANGING: "its unloading may hang",
-    Because.LEAVING: "it is on its way out",
+    Because.LEAVING: "it is being evicted",
     Because.DENIED: "after that {step.waiter} is denied",
     Because.WAITS_ON: "after that {step.waiter} waits on, and the holder's own rule applies",
     Because.TIMEOUT: "when its wait timeout is over",

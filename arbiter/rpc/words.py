@@ -28,7 +28,7 @@ WHY: Final[Mapping[Why, str]] = {
     Why.NOT_RENEWED: "it was not renewed",
     Why.GIVEN_UP: "it was given up by an operator",
     Why.EVICTED: "evicted by an operator",
-    Why.NOT_BACK: "its holder did not come back after the restart",
+    Why.NOT_BACK: "its holder did not reattach after the restart",
     Why.NOT_HELD: "it is no longer held",
     Why.UNKNOWN: "it is not known",
     Why.OVER: "the lease is over",
@@ -86,7 +86,7 @@ _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
     r.Impractical.NOT_RESIDENT: (
         "{no.lease_id} is {no.state}: only a resident lease can be evicted", _LOOK
     ),
-    r.Impractical.LEAVING: ("{no.lease_id} is {no.state}: it was asked to leave already", _LOOK),
+    r.Impractical.LEAVING: ("{no.lease_id} is {no.state}: it was revoked already", _LOOK),
     r.Impractical.NOT_HELD: ("{no.lease_id} is {no.state}: it has no holder", _LOOK),
     r.Impractical.IN_USE: (
         "{no.lease_id} is {no.state}: it is in use; a holder in use is never given up", _LOOK
@@ -171,7 +171,7 @@ def _revoked(no: r.Revoked) -> _Words:
     told = "" if no.revoked is None else f": {cause(no.revoked)}"
     leave = "leave; ask for the new size when it is granted again"
     hint = leave if no.wanted == "resize" else "wait until it is granted again"
-    return f"{no.consumer} was asked to leave{told}", hint
+    return f"{no.consumer} was revoked{told}", hint
 
 
 def _limit(no: r.LimitReached) -> _Words:

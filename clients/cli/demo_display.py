@@ -33,7 +33,7 @@ def describe(event: JsonMap) -> str:
     who = str(event.get("consumer", event.get("lease_id", "")))
     match event["kind"]:
         case "revoke_asked":
-            return f"{who}: asked to leave ({event.get('reason', '')})"
+            return f"{who}: revoked ({event.get('reason', '')})"
         case "verified":
             return (
                 f"{who}: memory measured back, verdict {event.get('verdict')} after "

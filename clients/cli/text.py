@@ -228,9 +228,7 @@ def by_hand_lines(action: str, reply: JsonMap) -> list[str]:
         return [f"{name} is no longer pinned by an operator"]
     uses = lease["uses"]
     wait = f"finishes {plural(uses, 'use')}, then unloads" if uses else "unloads now"
-    return [
-        f"{name} was asked to leave: it {wait}; follow it with `vramctl why {lease['consumer']}`"
-    ]
+    return [f"{name} was revoked: it {wait}; follow it with `vramctl why {lease['consumer']}`"]
 
 
 def _footprint_lines(footprint: JsonMap | None) -> list[str]:

@@ -17,7 +17,7 @@ class Condition(StrEnum):
     """When the bytes of a blocker come free, or what holds them."""
 
     LOADING = "loading"  # `seconds`: since the grant
-    REVOKED = "revoked"  # `seconds`: since it was asked to leave
+    REVOKED = "revoked"  # `seconds`: since it was revoked
     UNLOADING = "unloading"
     HANGING = "hanging"  # unloading for `seconds`, longer than a deadline
     MEASURED = "measured"  # it released; its bytes are verified

@@ -277,7 +277,7 @@ def five_gib() -> Footprint:
 async def test_a_resize_ends_with_the_stay_on_the_card(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
 ) -> None:
-    """Regression: what a lease that was asked to leave had waited for was dropped, and its `resize`
+    """Regression: what a lease that was revoked had waited for was dropped, and its `resize`
     never returned."""
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2, standby=True))

@@ -305,7 +305,7 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     exits.kill()
     stage.arbiter.start()
     stage.watch()
-    assert f"silent-14 (pid {silent.pid}) must come back first" in stage.vramctl("status")
+    assert f"silent-14 (pid {silent.pid}) must reattach first" in stage.vramctl("status")
     asked_until(
         lambda: stage.vramctl("history", "--kind", "lost", "-c", "exits-14"),
         f"process {exits.pid} died",

@@ -39,7 +39,7 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
     assert driver.state(small) == "loading", "its bytes are not waited for any more"
     told = driver.why("w")["leases"][0]
     assert "'is unloading for 31 s and may hang: end its process (pid" in str(told["blockers"])
-    assert "waits for stuck to let go, its unloading may hang" in [
+    assert "waits for stuck to release, its unloading may hang" in [
         step["text"] for step in told["plan"]
     ]
     assert driver.gpu()["charged_bytes"] >= 7 * GIB, "but they are charged until they are gone"

@@ -90,7 +90,7 @@ def test_find_navigate_grab_and_find_again() -> None:
     assert driver.state(policy) == "revoking"
     text = driver.why("detector")["leases"][0]["text"]
     assert (
-        "waits for policy to finish 1 use (asked 3.0 s ago), then it unloads and 4.00 GiB are "
+        "waits for policy to finish 1 use (revoked 3.0 s ago), then it unloads and 4.00 GiB are "
         "verified" in text
     )
 

@@ -234,7 +234,7 @@ def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
     more = " and 1 more" if count == 4 else ""
     assert (
         driver.gpu()["blocked"]["text"]
-        == f"recovering after a restart: {named}{more} must come back first"
+        == f"recovering after a restart: {named}{more} must reattach first"
     )
 
 

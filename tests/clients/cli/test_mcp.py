@@ -120,7 +120,7 @@ async def test_an_operators_agent_acts_where_it_is_allowed(
             evicted = await client.call_tool("evict", {"target": "detector", "reason": "room"})
             assert evicted.structured_content["lease"]["consumer"] == "detector"
             assert evicted.structured_content["lease"]["token"] is None, "it is the holder's"
-            assert "was asked to leave" in said(evicted)
+            assert "was revoked" in said(evicted)
             unknown = await client.call_tool("evict", {"target": "nobody", "reason": "room"})
             assert unknown.is_error
             assert "no lease or consumer" in said(unknown)

@@ -268,7 +268,7 @@ def test_fields_of_an_event_have_units(field: dict[str, Any], said: str) -> None
 
 def test_since_counts_from_the_grant() -> None:
     """It counted from the last change of state: a lease that was held for a day showed 2 s once it
-    was asked to leave."""
+    was revoked."""
     revoked = LEASE | {"state": "revoking", "since_s": 2.0, "granted_s": 90_000.0}
     away = LEASE | {
         "lease_id": "L1-2",

@@ -246,9 +246,7 @@ def test_an_operators_actions(client: Client, arbiter_daemon: ArbiterProcess, sp
     assert "press demo" in vramctl("status", "--json", environ=environ).stdout
     assert vramctl("unpin", lease.lease_id, environ=environ).returncode == 0
     evicted = vramctl("evict", lease.lease_id, "--reason", "make room", environ=environ)
-    assert evicted.stdout.startswith(
-        f"detector ({lease.lease_id}) was asked to leave: it unloads now"
-    )
+    assert evicted.stdout.startswith(f"detector ({lease.lease_id}) was revoked: it unloads now")
 
     drained = vramctl("drain", "-r", "new driver", environ=environ)
     assert (drained.returncode, "new driver" in drained.stdout) == (0, True)

@@ -27,7 +27,7 @@ def driver_with(budget_gib: float = 16, **more: Any) -> CoreDriver:
 def revoked_vlm(
     driver: CoreDriver, park_gib: float = 5, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
-    """A VLM that was asked to leave, and who asked for its room."""
+    """A VLM that was revoked, and who asked for its room."""
     vlm, lease = held(
         driver, "vlm", 5, park_bytes=int(park_gib * GIB), residue_bytes=RESIDUE, **spec
     )

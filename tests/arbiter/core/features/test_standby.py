@@ -1,4 +1,4 @@
-"""Standby: who was asked to leave comes back by itself when there is room, never at anybody's cost,
+"""Standby: who was revoked comes back by itself when there is room, never at anybody's cost,
 or as soon as its holder wants it."""
 
 from typing import Any

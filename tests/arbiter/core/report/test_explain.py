@@ -72,9 +72,9 @@ def test_why_of_a_resident_lease_says_what_it_is_doing() -> None:
     assert says == [
         "det: it was granted and is loading",
         "det: it is resident, 1 use running",
-        "det: it was asked to leave for vlm, 2 uses running",
+        "det: it was revoked for vlm, 2 uses running",
         "det: it is unloading",
-        "det: it let go; its bytes are being measured",
+        "det: it released; its bytes are being measured",
     ]
 
 
@@ -106,7 +106,7 @@ def test_why_follows_the_way_of_the_holder() -> None:
     says.append(why(driver, "vlm")["next"])
     det.use_end(lease, "u2")
     says.append(why(driver, "vlm")["next"])
-    assert why(driver, "vlm")["blockers"][0]["text"].startswith("was asked to leave 0.1 s ago")
+    assert why(driver, "vlm")["blockers"][0]["text"].startswith("was revoked 0.1 s ago")
     det.unloading(lease)
     says.append(why(driver, "vlm")["next"])
     assert [b["text"] for b in why(driver, "vlm")["blockers"]] == ["is unloading"]
@@ -114,11 +114,11 @@ def test_why_follows_the_way_of_the_holder() -> None:
     det.release(lease)
     says.append(why(driver, "vlm")["next"])
     assert says == [
-        "waits for det to finish 2 uses (asked 0.1 s ago), then it unloads and 5.30 GiB are "
+        "waits for det to finish 2 uses (revoked 0.1 s ago), then it unloads and 5.30 GiB are "
         "verified",
-        "waits for det to finish 1 use (asked 0.1 s ago), then it unloads and 5.30 GiB are "
+        "waits for det to finish 1 use (revoked 0.1 s ago), then it unloads and 5.30 GiB are "
         "verified",
-        "waits for det to unload (asked 0.1 s ago), then 5.30 GiB are verified",
+        "waits for det to unload (revoked 0.1 s ago), then 5.30 GiB are verified",
         "det unloads, then 5.30 GiB are verified",
         "5.30 GiB of det are being verified",
     ]
@@ -137,7 +137,7 @@ def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
     assert conditions == {
         "busy": "is in use and has priority 90, the waiter 50",
         "even": "is in use for 0 s",
-        "calm": "is idle and may be asked",
+        "calm": "is idle and may be revoked",
         "keeper": "is pinned",
     }
     keeper.unload(keeper_lease)
@@ -183,7 +183,7 @@ def test_why_names_relief_of_pressure_and_a_victim_of_somebody_else() -> None:
     calm, lease = held(driver, "calm", 5)
     driver.card.set(ProcessKey(9, 9), 3 * GIB, driver.now)
     driver.until(lambda: driver.state(lease) == "revoking", limit_s=2.0)
-    assert why(driver, "calm")["text"] == "calm: it was asked to leave for relief of pressure, idle"
+    assert why(driver, "calm")["text"] == "calm: it was revoked for relief of pressure, idle"
     assert calm.name == "calm"
 
 

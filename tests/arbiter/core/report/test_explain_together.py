@@ -48,10 +48,12 @@ def test_every_member_that_waits_says_what_the_gang_needs_and_who_is_in_its_way(
             "all their steady bytes and one headroom"
         )
         assert told["deficit_bytes"] == 6 * GIB - told["free_bytes"]
-        assert "no holder that could make room for the whole gang may be asked now" in told["next"]
+        assert (
+            "no holder that could make room for the whole gang may be revoked now" in told["next"]
+        )
         assert blockers(driver, member) == [
             ("busy", lease, 5.0, "held", "is in use and has priority 60, the waiter 50"),
-            ("idle", idle, 2.0, "held", "is idle and may be asked"),
+            ("idle", idle, 2.0, "held", "is idle and may be revoked"),
         ]
         assert plan(driver, member) == [("ask", "busy", 49.0), ("ask", "idle", 49.0)]
     busy.use_end(lease)

@@ -30,7 +30,9 @@ def test_it_asks_when_the_minimum_residency_ends() -> None:
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
     assert (step["action"], step["consumer"], step["lease_id"]) == ("ask", "detector", lease)
-    assert step["text"] == f"asks detector in {step['in_s']:.1f} s, when its minimum residency ends"
+    assert (
+        step["text"] == f"revokes detector in {step['in_s']:.1f} s, when its minimum residency ends"
+    )
     assert not driver.pushes("revoke", lease)
     driver.advance(step["in_s"] - 0.01)
     assert not driver.pushes("revoke", lease)
@@ -61,7 +63,7 @@ def test_several_are_asked_together_when_the_last_of_them_may_be() -> None:
         ("ask", "second"),
     ]
     assert steps[0]["in_s"] == steps[1]["in_s"]
-    assert steps[0]["text"].endswith("when enough may be asked together")
+    assert steps[0]["text"].endswith("when enough may be revoked together")
     assert steps[1]["text"].endswith("when its minimum residency ends")
 
 
@@ -80,7 +82,7 @@ def test_nobody_is_asked_where_nobody_could_make_room() -> None:
     )
     assert (
         step["text"]
-        == "asks no holder, those that could make room are pinned or in use above its priority"
+        == "revokes no holder, those that could make room are pinned or in use above its priority"
     )
 
 
@@ -96,7 +98,7 @@ def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
     assert (step["action"], step["in_s"]) == ("ask", 0.0)
-    assert step["text"] == "asks holder in 0.0 s, as soon as the GPU is looked at again"
+    assert step["text"] == "revokes holder in 0.0 s, with the next reading of the GPU"
 
 
 def test_a_holder_on_its_way_out() -> None:
@@ -110,14 +112,14 @@ def test_a_holder_on_its_way_out() -> None:
     assert step["in_s"] == pytest.approx(d.REVOKE_DEADLINE_S, abs=0.1)
     assert (
         step["text"]
-        == "waits for holder to let go for 30.0 s more, after that w waits on, and the holder's "
+        == "waits 30.0 s more for holder to release, after that w waits on, and the holder's "
         "own rule applies"
     )
     driver.advance(d.REVOKE_DEADLINE_S + 0.1)
     assert (only(driver)["action"], only(driver)["in_s"]) == ("wait", None)
     holder.use_end(lease)
     holder.unloading(lease)
-    assert only(driver)["text"] == "waits for holder to let go, it is on its way out"
+    assert only(driver)["text"] == "waits for holder to release, it is being evicted"
     driver.card.lag_s = 20.0
     holder.hold(0)
     holder.release(lease)

@@ -180,9 +180,7 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     vlm = driver.consumer("vlm")
     waiting = vlm.acquire(3 * GIB)
     assert driver.state(lease) == "revoking"
-    assert refusal(order_of(ops, "pin", lease)).code == "bad_state", (
-        "it was asked to leave before the pin"
-    )
+    assert refusal(order_of(ops, "pin", lease)).code == "bad_state", "it was revoked before the pin"
     vlm.cancel(waiting)
 
     other = CoreDriver(8 * GIB)
