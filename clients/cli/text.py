@@ -267,6 +267,7 @@ def _plain(value: object) -> bool:
 def _field(key: str, value: Any) -> str:
     """`charge=1GiB`, `waited=12.3ms`, `eta=3.5s`, `uses=2`: the unit stands behind the number, not
     in the name."""
+    key = "quiesce_ms" if key == "drain_ms" else key  # the wire's name of the phase
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if key.endswith("_bytes") and isinstance(value, int):
         return f"{key.removesuffix('_bytes')}={format_bytes(value).replace(' ', '')}"

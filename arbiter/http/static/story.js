@@ -1,11 +1,16 @@
 // What the history tells: evictions with their phases, and the facts of an event in one line.
 import { bytes, span } from "/format.js";
 
-export const PHASES = ["revoke", "drain", "unload", "verify"];
-const RUNNING = { revoke: "revoking", drain: "draining", unload: "unloading", verify: "verifying" };
+export const PHASES = ["revoke", "quiesce", "unload", "verify"];
+const RUNNING = {
+  revoke: "revoking",
+  quiesce: "quiescing",
+  unload: "unloading",
+  verify: "verifying",
+};
 const BEGINS = {
   revoke_asked: "revoke",
-  revoke_acked: "drain",
+  revoke_acked: "quiesce",
   unloading: "unload",
   released: "verify",
 };
@@ -89,13 +94,18 @@ function plain(key, value) {
   return String(value);
 }
 
+// Fields of a switch that evicted no lease.
+const LOADED = new Set(["load_ms", "total_ms"]);
+
 // "fits · charge 2.10 GiB · waited 12 ms": the reason first, then every other field.
 export function facts(event) {
   const told = event.reason ? [event.reason] : [];
   for (const [key, value] of Object.entries(event)) {
     if (SHOWN_ELSEWHERE.has(key) || value === false) continue;
+    if (event.kind === "switch" && !event.switched && !LOADED.has(key)) continue;
     const text = plain(key, value);
-    const name = key.replace(/_(bytes|ms|s)$/, "").replaceAll("_", " ");
+    const name =
+      key === "drain_ms" ? "quiesce" : key.replace(/_(bytes|ms|s)$/, "").replaceAll("_", " ");
     if (text) told.push(value === true ? name : key === "ms" ? text : `${name} ${text}`);
   }
   return told.join(" · ");

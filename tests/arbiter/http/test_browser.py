@@ -138,13 +138,13 @@ def test_a_lease_a_wait_and_an_eviction_are_shown_as_they_happen(page: Page) -> 
     eviction = f"#eviction-list [data-lease={lease['lease_id']!r}]"
     page.until(lambda: "revoking" in page.text(eviction), "the eviction has begun")
     client.ask("revoke_ack", **on)
-    page.until(lambda: "draining" in page.text(eviction), "it drains")
+    page.until(lambda: "quiescing" in page.text(eviction), "it quiesces")
     client.ask("unloading", **on)
     page.until(lambda: "unloading" in page.text(eviction), "it unloads")
     client.ask("release", **on)
     page.until(lambda: "verified" in page.text(eviction), "its memory is verified")
     told = page.text(eviction)
-    assert all(f"{phase} " in told for phase in ("revoke", "drain", "unload", "verify"))
+    assert all(f"{phase} " in told for phase in ("revoke", "quiesce", "unload", "verify"))
     assert "grab needs the room" in told
     assert len(page.run(f'document.querySelectorAll("{eviction} .track i")')) == 4
     page.until(lambda: not page.texts("#waiters li"), "no request waits")
@@ -162,6 +162,11 @@ def test_history_is_filtered(page: Page) -> None:
     assert "use_began" not in page.texts(kinds)
     pick("#kind", "use_began")
     page.until(lambda: set(page.texts(kinds)) == {"use_began"}, "one kind")
+    pick("#kind", "switch")
+    page.until(lambda: set(page.texts(kinds)) == {"switch"}, "loads and switches")
+    told = page.texts("#events .quiet")
+    assert told
+    assert not any("verif" in line for line in told), "nothing was evicted, nothing was verified"
     pick("#kind", "")
     pick("#consumer", NAME)
     page.until(lambda: set(page.texts("#events .name")) == {NAME}, "one consumer")

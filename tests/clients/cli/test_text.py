@@ -255,6 +255,7 @@ def test_an_event() -> None:
         ({"ms": 3512.4}, "took=3.5s"),  # was ms=3.51e+03
         ({"ms": 0.41}, "took=0.4ms"),
         ({"load_ms": 96_000}, "load=96.0s"),
+        ({"drain_ms": 4.0}, "quiesce=4.0ms"),  # drain is the word for an operator's order
         ({"safe_point_eta_s": 0.25}, "safe_point_eta=250.0ms"),
         ({"pressure_bytes": 0}, "pressure=0B"),
         ({"resolved": True}, "resolved=True"),
