@@ -13,44 +13,38 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
-from vram_arbiter.arbiter.core.events import ProcessDied, Recovered, Tick
-from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.arbiter.core.events import ProcessDied
+from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
 from vram_arbiter.arbiter.host.executor import Executor
-from vram_arbiter.arbiter.host.gpu.fake import open_cards
-from vram_arbiter.arbiter.host.gpu.pids import PidMap
+from vram_arbiter.arbiter.host.gpu.open import open_probe
 from vram_arbiter.arbiter.host.gpu.probe import GpuProbe
-from vram_arbiter.arbiter.host.gpu.unified import choose
+from vram_arbiter.arbiter.host.heartbeat import beat
 from vram_arbiter.arbiter.host.history import CLEAN_END, History
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.prober import Prober, within
 from vram_arbiter.arbiter.host.process import raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
-from vram_arbiter.arbiter.host.records import processes_of, record_of, records_of
+from vram_arbiter.arbiter.host.records import record_of
 from vram_arbiter.arbiter.host.systemd import Notifier
 from vram_arbiter.arbiter.inbox import NO_READER, Inbox, SuspendWatch
 from vram_arbiter.arbiter.places import Places, find_places, take_folders
+from vram_arbiter.arbiter.recovery import recover, report, try_records
 from vram_arbiter.arbiter.reload import Reload, Source
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.peer import group_id
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
-from vram_arbiter.arbiter.settings import (
-    budget,
-    core_settings,
-    router_limits,
-    session_settings,
-)
-from vram_arbiter.schemas.config.arbiter import ArbiterConfig, GpuConfig
+from vram_arbiter.arbiter.settings import budget, core_settings, router_limits, session_settings
+from vram_arbiter.schemas.config.arbiter import ArbiterConfig
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.folders import LockFile
@@ -73,19 +67,7 @@ EXIT_DEFECT = 70
 """EX_SOFTWARE: an invariant was violated or the engine raised."""
 PROBE_START_S = 30.0
 """Without persistence mode the NVIDIA driver needs seconds to initialize its GPUs."""
-STATUS_EVERY_S = 5.0
 KEEP_LEARNT_EVERY_S = 10.0
-
-
-def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
-    """(backend, its name) for `gpu.source`. Raises NoGpu or ConfigError. A simulated GPU is never
-    a fallback: it has to be asked for."""
-    kind, _, what = config.source.partition(":")
-    if kind == "fake":
-        return open_cards(what, runtime), "fake"
-    host_proc = None if config.host_proc is None else Path(config.host_proc)
-    pids = PidMap(config.pids, host_proc)
-    return choose("nvml" if kind == "nvml" else "unified" if kind == "unified" else "auto", pids)
 
 
 class Daemon:
@@ -130,10 +112,14 @@ class Daemon:
             self._loop.add_signal_handler(signal.SIGHUP, self._reload.ask)
             gc.freeze()  # modules stay: no collection has to look at them again
             notifier.ready(self._status_text())
-            beat = self._loop.create_task(self._beat(notifier))
-            undo.callback(beat.cancel)
-            reloads = self._loop.create_task(self._reload.serve(notifier, self._status_text))
-            undo.callback(reloads.cancel)
+            for serves in (
+                beat(notifier, self._inbox.pulse, self._chores(), self._status_line),
+                self._reload.serve(notifier, self._status_text),
+                self._keep_learnt_regularly(),
+            ):
+                task = self._loop.create_task(serves)
+                task.add_done_callback(self._background_ended)
+                undo.callback(task.cancel)
             await self._stop.wait()
             notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
             if self._exit_code == EXIT_OK:
@@ -212,7 +198,7 @@ class Daemon:
         self._inbox = Inbox(
             self._engine,
             _too_early,
-            self._engine_failed,
+            self._failed,
             slept_s=SuspendWatch().slept_s,
             record=None if recorder is None else recorder.record,
         )
@@ -296,11 +282,7 @@ class Daemon:
     def _tell_past(self, places: Places) -> None:
         """Tell history and log what was found, and the engine what the journal remembers."""
         found, say = self._journal.opened, self._say
-        if found.put_aside is not None:
-            facts = {"file": str(found.put_aside), "problem": found.problem}
-            say("journal_put_aside", facts)
-        if found.doubt:
-            say("journal_doubted", {"why": found.doubt})
+        report(found, say)
         listed = [
             {"gpu": g.id, "name": g.name, "capacity_bytes": g.capacity_bytes, "source": g.source}
             for g in self._gpus
@@ -315,13 +297,7 @@ class Daemon:
             "records_of_earlier_boot": found.voided,
         }
         say("started", started)
-        if found.records:
-            records = records_of(found.records)
-            self._inbox.post(Recovered(records))
-            for process in processes_of(records):
-                self._watch.add(process)
-        else:
-            self._inbox.post(Tick())  # lets the engine ask for its first readings
+        recover(found, self._inbox, self._watch)
 
     def _open_telemetry(self, undo: contextlib.AsyncExitStack) -> "Traced | None":
         """None: it was not asked for, and nothing of it is imported. Raises ConfigError."""
@@ -361,36 +337,26 @@ class Daemon:
         self._sessions.process_died(process)
         self._inbox.post(ProcessDied(process))
 
-    def _engine_failed(self, error: BaseException) -> None:
-        """Nothing is decided any more; the journal holds what was granted, and the next start
-        recovers it."""
+    def _background_ended(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._failed(error)
+
+    def _failed(self, error: BaseException) -> None:
+        """Nothing is decided anymore; the journal holds what was granted, and the next start
+        recovers it. Without its chores the daemon would decay unseen."""
         log.critical("stopping: %s: %s", type(error).__name__, error)
         self._exit_code = EXIT_DEFECT
         self._stop.set()
 
-    async def _beat(self, notifier: Notifier) -> None:
-        """Feeds the watchdog only with an event that has just passed through the engine and the
-        executor, on this very thread: whatever is stuck there starves it."""
-        period_s = min(STATUS_EVERY_S, (notifier.watchdog_s or 3 * STATUS_EVERY_S) / 3)
-        said, kept_at = "", time.monotonic()
-        while True:
-            await asyncio.sleep(period_s)
-            if notifier.watchdog_s is not None and self._inbox.pulse():
-                notifier.watchdog()
-            self._sessions.sweep()
-            self._journal.settle()
-            self._executor.settle()
-            clients = f"{len(self._sessions)} clients"
-            text = "; ".join([*self._problems(), self._status_text(), clients])
-            if text != said and notifier.status(text):
-                said = text
-            if time.monotonic() - kept_at >= KEEP_LEARNT_EVERY_S and not self._inbox.closed:
-                self._keep_learnt()
-                kept_at = time.monotonic()
-
     def _say(self, kind: str, facts: JsonMap) -> None:
         """A fact of the daemon itself, in its history and its log."""
         telemetry.log_event(self._history.append(kind, facts))
+
+    async def _keep_learnt_regularly(self) -> None:
+        while True:
+            await asyncio.sleep(KEEP_LEARNT_EVERY_S)
+            if not self._inbox.closed:
+                self._keep_learnt()
 
     def _keep_learnt(self) -> None:
         """So that a kill loses no more than the last few seconds of learning."""
@@ -401,6 +367,9 @@ class Daemon:
         """What an operator should know of the daemon's own files, in words."""
         own = (*self._journal.problems, self._history.problem, self._reload.problem)
         return [found for found in own if found]
+
+    def _chores(self) -> tuple[Callable[[], None], ...]:
+        return self._sessions.sweep, self._journal.settle, self._executor.settle
 
     def _picture(self) -> "Picture | None":
         """What telemetry shows of the present; None at the end."""
@@ -415,6 +384,10 @@ class Daemon:
             config_refused=bool(self._reload.problem),
         )
 
+    def _status_line(self) -> str:
+        clients = f"{len(self._sessions)} clients"
+        return "; ".join([*self._problems(), self._status_text(), clients])
+
     def _status_text(self) -> str:
         named = (f"{gpu.name} ({format_bytes(gpu.capacity_bytes)})" for gpu in self._gpus)
         return f"serving {', '.join(named)}"
@@ -422,16 +395,3 @@ class Daemon:
 
 def _too_early(effects: Sequence[Effect]) -> None:
     raise RuntimeError("an event came before the executor was there")
-
-
-def try_records(journal: Journal, settings: Settings) -> None:
-    """Let an engine that is thrown away read the journal's records; what it cannot read is put
-    aside instead of stopping every start."""
-    if not journal.opened.records:
-        return
-    now = time.monotonic()
-    try:
-        Arbiter(settings, now).handle(Recovered(records_of(journal.opened.records)), now)
-    except Exception as error:
-        log.exception("the engine cannot read the journal's records")
-        journal.put_aside(f"{type(error).__name__}: {error}")

@@ -54,6 +54,15 @@ LOOP = """
 
     daemon.SessionTable = Stuck
 """
+CHORE = """
+    class Failing(daemon.Journal):
+        def settle(self):
+            raise RuntimeError("the chore fails as told")
+
+    daemon.Journal = Failing
+    heartbeat.STATUS_EVERY_S = 0.05
+"""
+EXIT_DEFECT = 70
 
 
 def planted(arbiter: ArbiterProcess, defect: str) -> Path:
@@ -63,6 +72,7 @@ def planted(arbiter: ArbiterProcess, defect: str) -> Path:
     script = f"""
     import sys
     import vram_arbiter.arbiter.daemon as daemon
+    import vram_arbiter.arbiter.host.heartbeat as heartbeat
     from vram_arbiter.arbiter.__main__ import main
     from vram_arbiter.arbiter.core.events import ClientConnected
 
@@ -145,3 +155,14 @@ def test_what_was_stuck_for_a_while_feeds_it_again(make_arbiter: Make) -> None:
         os.close(writer)
         arbiter.wait_for("WATCHDOG=1", PATIENCE_S)
         assert trigger.receive() is not None
+
+
+def test_a_chore_that_fails_ends_the_daemon(make_arbiter: Make) -> None:
+    """Regression: the failure ended the chores alone and was logged nowhere: on a machine without a
+    watchdog the daemon served on, with stale sessions and a journal that it did not mend."""
+    arbiter = make_arbiter()
+    planted(arbiter, CHORE)
+    arbiter.spawn()
+    assert arbiter.process is not None
+    assert arbiter.process.wait(PATIENCE_S) == EXIT_DEFECT
+    assert "stopping: RuntimeError: the chore fails as told" in arbiter.log

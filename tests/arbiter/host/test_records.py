@@ -25,10 +25,10 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import JournalPut
 from vram_arbiter.arbiter.core.events import DOUBT_KEY, MemorySampled, Recovered, Tick
 from vram_arbiter.arbiter.core.settings import Settings
-from vram_arbiter.arbiter.daemon import try_records
 from vram_arbiter.arbiter.host.journal import Journal, Opened
 from vram_arbiter.arbiter.host.records import processes_of, record_of, records_of
 from vram_arbiter.arbiter.host.seal import digest
+from vram_arbiter.arbiter.recovery import try_records
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas import defaults as d
 

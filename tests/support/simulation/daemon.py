@@ -21,11 +21,11 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event, ProcessDied, Recovered, Tick
 from vram_arbiter.arbiter.core.settings import Settings
-from vram_arbiter.arbiter.daemon import try_records
 from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.records import processes_of, record_of, records_of
 from vram_arbiter.arbiter.inbox import Inbox
+from vram_arbiter.arbiter.recovery import try_records
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
