@@ -9,9 +9,11 @@
 Reads only, and only when asked: the plan costs a search for victims per instant.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from heapq import nlargest
+from itertools import islice
 from math import inf
 
 from vram_arbiter.arbiter.core import learning
@@ -20,7 +22,7 @@ from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseSta
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.scheduling import admission, victims
-from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.explained import (
     Because,
     Blocker,
@@ -49,6 +51,9 @@ ASK_TIMES_MAX = 16
 
 WEIGHED_MAX = 400
 """Holders weighed over all of these times: beside many holders fewer times are examined."""
+
+BEHIND_MAX = 4
+"""Places of a queue for which an estimate is made: each costs a search for victims."""
 
 _PHASES_LEFT = {
     LeaseState.REVOKING: ("drain_s", "unload_s", "verify_s"),
@@ -167,7 +172,7 @@ def _explain_waiter(
     situation = _situation(core, standing, lease, position, blocked=bool(blockers))
     leaving = _leaving(gpu) if situation is Situation.MAKING_ROOM else ()
     steps = _steps(core, standing, lease) if plan else ()
-    eta_s = _eta_s(core, standing, steps)
+    eta_s = _eta_s(core, standing, steps) if position <= 1 else _eta_behind_s(core, gpu, lease)
     return replace(
         told,
         position=position,
@@ -480,7 +485,8 @@ def _eta_s(core: Core, standing: Standing, steps: Sequence[Step]) -> float | Non
         load_s += usual_s
     emptied_s, kept = _emptied_s(core, gpu), standing.reserved_bytes
     if emptied_s or (emptied_s is not None and (kept or admission.fits(gpu, standing.request))):
-        return emptied_s + load_s
+        turn_s = 0.0 if kept else _loaded_s(core, gpu)
+        return None if turn_s is None else max(emptied_s, turn_s) + load_s
     left_s = 0.0
     asked = [step for step in steps if step.action is NextAction.ASK]
     for step in asked:
@@ -489,6 +495,42 @@ def _eta_s(core: Core, standing: Standing, steps: Sequence[Step]) -> float | Non
             return None
         left_s = max(left_s, (step.in_s or 0.0) + usual_s)
     return load_s + left_s if asked else None
+
+
+def _eta_behind_s(core: Core, gpu: Gpu, lease: Lease) -> float | None:
+    """Return the seconds until a request behind others is loaded: they load first, one by one.
+
+    None: as for `_eta_s`, or one of those ahead has to leave for it, at a time that nothing tells.
+    """
+    queued = list(islice(gpu.queue, BEHIND_MAX))
+    if lease not in queued:
+        return None
+    head, *others = queued[: queued.index(lease) + 1]
+    together = [standing_of(core, one) for one in (head, *others)]
+    if any(len(one.fellows) > 1 or one.request.spec.exclusive for one in together):
+        return None
+    steps = _steps(core, together[0], head)
+    going = admission.leaving(gpu)
+    going |= {one: core.leases[one].residue_bytes for one in _asked(steps)}
+    joining: Counter[ProcessKey] = Counter()
+    for one in together:
+        joining.update(dict(admission.joining(one.request)))
+    if gpu.ledger.total_if(going, joining.items()) > gpu.ledger.budget_bytes:
+        return None
+    loads = [core.costs.learnt_s(one.spec.consumer, "load_s") for one in others]
+    known = [_eta_s(core, together[0], steps), *loads]
+    return sum(one for one in known if one is not None) if None not in known else None
+
+
+def _asked(steps: Sequence[Step]) -> list[LeaseId]:
+    return [LeaseId(one.lease_id) for one in steps if one.action is NextAction.ASK and one.lease_id]
+
+
+def _loaded_s(core: Core, gpu: Gpu) -> float | None:
+    """Return the seconds until the loads in progress are over; None: one was never seen, or takes
+    longer than usual."""
+    times = [step.in_s for step in _ends_of_loads(core, gpu)]
+    return None if None in times else max((one for one in times if one is not None), default=0.0)
 
 
 def _emptied_s(core: Core, gpu: Gpu) -> float | None:

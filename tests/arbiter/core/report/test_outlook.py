@@ -229,3 +229,43 @@ def test_a_resident_lease_has_no_plan() -> None:
     driver = CoreDriver()
     held(driver, "w", 3)
     assert plan(driver) == []
+
+
+LOADS = {name: {"load_s": 3.0} for name in ("head", "second", "third")}
+
+
+def eta(driver: CoreDriver, name: str) -> float | None:
+    (entry,) = driver.why(name)["leases"]
+    return entry["eta_s"]
+
+
+def test_the_estimate_behind_others_counts_their_loads() -> None:
+    """Regression: a request behind others was estimated as if it were the head, and one that only
+    fits once those ahead of it have left was too."""
+    learnt = {"detector": {"drain_s": 1.0, "unload_s": 0.5, "verify_s": 0.5}, **LOADS}
+    driver = CoreDriver(8 * GIB, settings={"learnt": learnt})
+    detector, lease = held(driver, "detector", 7)
+    detector.use_begin(lease)
+    driver.consumer("head").acquire(4 * GIB)
+    driver.consumer("second").acquire(2 * GIB)
+    driver.consumer("third").acquire(3 * GIB)
+    assert driver.state(lease) == "revoking"
+    assert eta(driver, "head") == pytest.approx(2.0 + 3.0)
+    assert eta(driver, "second") == pytest.approx(2.0 + 3.0 + 3.0), "one loads at a time"
+    assert eta(driver, "third") is None, "head and second have to leave for it; nobody knows when"
+
+
+def test_the_estimate_behind_a_load_counts_what_is_left_of_it() -> None:
+    """Regression: a request that fits beside a loading lease was estimated as if it loaded now."""
+    driver = CoreDriver(8 * GIB, settings={"learnt": LOADS})
+    driver.consumer("head").acquire(4 * GIB)
+    driver.consumer("second").acquire(2 * GIB)
+    driver.advance(1.0)
+    assert eta(driver, "second") == pytest.approx(2.0 + 3.0)
+
+
+def test_an_estimate_behind_an_unknown_load_is_unknown() -> None:
+    driver = CoreDriver(8 * GIB, settings={"learnt": {"second": {"load_s": 3.0}}})
+    driver.consumer("head").acquire(4 * GIB)
+    driver.consumer("second").acquire(2 * GIB)
+    assert eta(driver, "second") is None

@@ -98,14 +98,16 @@ def test_why_of_a_resident_lease_asks_for_nothing() -> None:
 
 
 def test_an_estimate_says_that_it_was_learnt() -> None:
-    driver = CoreDriver(8 * GIB, settings={"learnt": {"vlm": {"load_s": 2.0}}})
+    driver = CoreDriver(
+        8 * GIB, settings={"learnt": {"loader": {"load_s": 1.0}, "vlm": {"load_s": 2.0}}}
+    )
     loader = driver.consumer("loader")
     loader.acquire(2 * GIB)
     vlm = driver.consumer("vlm")
     waiting = vlm.acquire(2 * GIB)  # fits; only the other one's load is in the way
     assert driver.state(waiting) == "queued"
     told = only(driver.why("vlm")["leases"])
-    assert (told["eta_s"], told["eta_source"]) == (2.0, "learnt")
+    assert (told["eta_s"], told["eta_source"]) == (3.0, "learnt"), "after the other's"
 
 
 def test_a_circle_names_its_leases_with_their_states() -> None:
