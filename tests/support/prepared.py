@@ -1,30 +1,44 @@
 """Programs forked from an interpreter that has imported them already.
 
 Importing the daemon, `vramctl` or a sidecar for each test is most of what `make test` computes: an
-import takes 0.3 to 0.6 s of a core, a fork some milliseconds. `start` returns what
+import takes 0.3 to 9 s of a core, a fork some milliseconds. `start` returns what
 `subprocess.Popen` would. A program whose imports matter is started afresh (`as_here`).
+
+A server imports once for the whole run: it listens on an abstract socket that all processes of the
+run know, the workers of pytest and programs that start programs, and ends with its last connection.
 """
 
-import atexit
 import contextlib
+import errno
+import fcntl
 import gc
+import hashlib
 import json
 import os
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 from tests.support import fork_server
 from tests.support.paths import ROOT
 
 MESSAGE_MAX = 1 << 17
+DESCRIPTORS_MAX = 8
+HELLO = b"ready"
+ABOVE = 512
+"""Numbers of descriptors that none of the passed ones has."""
 PATIENCE_S = 240.0  # imports on a machine with other work take minutes
 INTERPRETER = ("PYTHON", "LANG", "LC_")
 """Variables that an interpreter reads when it starts."""
@@ -32,12 +46,16 @@ INTERPRETER = ("PYTHON", "LANG", "LC_")
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A program of the product: its `main` takes the arguments from `sys.argv` and may return the
-    exit code. `imports`: what it would import later. `forks`: it starts a server of imports."""
+    """A program: its `main` takes the arguments from `sys.argv` and may return the exit code.
+
+    `imports`: what it would import later. `forks`: it starts a server of imports. `server`: the
+    program whose server runs this one too, where both import the same.
+    """
 
     module: str
     imports: Sequence[str] = ()
     forks: bool = False
+    server: str = ""
 
 
 SIDECAR = (
@@ -76,6 +94,18 @@ PROGRAMS: Mapping[str, Program] = {
         (*SIDECAR, "transformers", "vram_arbiter.sidecars.preload_lerobot"),
         forks=True,
     ),
+    "vram-runner": Program(
+        "tests.support.runner_program",
+        (
+            "anyio._backends._asyncio",
+            "cv2",
+            "numpy",
+            *(f"vram_arbiter.runner.cli.{name}" for name in ("deploy", "deployment", "sim")),
+            "vram_arbiter.runner.sim.env",
+        ),
+    ),
+    "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),
+    "lerobot-train": Program("lerobot.scripts.lerobot_train", server="vram-sidecar"),
 }
 
 
@@ -99,6 +129,7 @@ class Forked:
         self.returncode: int | None = None
         self._pidfd = pidfd
         self._status = status
+        self._ending = threading.Lock()
 
     def poll(self) -> int | None:
         """Return the exit code, -n after signal n; None while it runs."""
@@ -122,10 +153,14 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
     def _wait(self, timeout: float | None) -> int | None:
-        if self.returncode is None and select.select([self._status], [], [], timeout)[0]:
-            self.returncode = int(self._status.recv(16))
-            self._status.close()
-            os.close(self._pidfd)
+        with contextlib.suppress(ValueError, OSError):  # closed: another thread has its status
+            if not select.select([self._status], [], [], timeout)[0]:
+                return self.returncode
+        with self._ending:
+            if self.returncode is None:
+                self.returncode = int(self._status.recv(16))
+                self._status.close()
+                os.close(self._pidfd)
         return self.returncode
 
 
@@ -136,91 +171,196 @@ def start(
     output: int,
     errors: int,
     *,
+    cwd: Path | None = None,
     user: int | None = None,
+    passed: Sequence[int] = (),
+    session: bool = False,
 ) -> Forked:
-    """Start one of PROGRAMS with its outputs in two open files, as another user if one is given."""
-    order = {"arguments": arguments, "environ": dict(environ), "cwd": os.getcwd(), "user": user}
+    """Start one of PROGRAMS with its outputs in two open files; as another user if one is given, in
+    a session of its own if `session`. It gets the descriptors `passed` under the same numbers."""
+    order = {
+        "program": program, "arguments": list(arguments), "environ": dict(environ),
+        "cwd": str(cwd or os.getcwd()), "user": user, "session": session,
+        "numbers": [1, 2, *passed],
+    }  # fmt: skip
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with _ORDERING:
-        orders = _server(program)
     with there, _ORDERING:
-        descriptors = [output, errors, there.fileno()]
+        orders = _server(PROGRAMS[program].server or program)
+        descriptors = [there.fileno(), output, errors, *passed]
         socket.send_fds(orders, [json.dumps(order).encode()], descriptors)
         pid, (pidfd, *_), _, _ = socket.recv_fds(orders, 16, 1)
     return Forked(int(pid), pidfd, here)
+
+
+def run(
+    program: str,
+    arguments: Sequence[str],
+    environ: Mapping[str, str],
+    timeout_s: float,
+    *,
+    cwd: Path | None = None,
+    user: int | None = None,
+) -> subprocess.CompletedProcess[str]:
+    """Run one of PROGRAMS to its end and return what it printed."""
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        process = start(
+            program, arguments, environ, output.fileno(), errors.fileno(), cwd=cwd, user=user
+        )
+        try:
+            code = process.wait(timeout_s)
+        finally:
+            process.kill()
+        output.seek(0)
+        errors.seek(0)
+        return subprocess.CompletedProcess([*arguments], code, output.read(), errors.read())
 
 
 _ORDERING = threading.Lock()
 
 
 @cache
-def _server(program: str) -> socket.socket:
-    """Start the server of a program, once in this process."""
-    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    here.settimeout(PATIENCE_S)
-    environ = {**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"}
-    if PROGRAMS[program].forks:
-        environ |= fork_server.importing()
-    with there:
-        process = subprocess.Popen(
-            [sys.executable, "-u", "-m", "tests.support.prepared", program, str(there.fileno())],
-            pass_fds=(there.fileno(),),
+def _server(name: str) -> socket.socket:
+    """Connect to the server of a program; start it where no process of the run has done so."""
+    folder = os.environ.get("TMPDIR", "")  # of this run alone (`leftovers`)
+    told = hashlib.sha256(f"{ROOT} {folder} {name}".encode()).hexdigest()
+    address = f"\0vram-prepared-{told[:32]}"
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        orders = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        orders.settimeout(PATIENCE_S)
+        # refused: there is none yet, or no longer; reset: it was about to end
+        with contextlib.suppress(ConnectionRefusedError, ConnectionResetError):
+            orders.connect(address)
+            if orders.recv(len(HELLO)) == HELLO:
+                return orders
+        orders.close()
+        _begin(name, address)
+    raise TimeoutError(f"the server of {name} did not come up")
+
+
+def _begin(name: str, address: str) -> None:
+    """Start a server; nothing if another process is just doing so."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        try:
+            listener.bind(address)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            threading.Event().wait(0.01)
+            return
+        listener.listen(64)
+        environ = {**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"}
+        if PROGRAMS[name].forks:
+            environ |= fork_server.importing()
+        command = [sys.executable, "-u", "-m", "tests.support.prepared", name]
+        server = subprocess.Popen(
+            [*command, str(listener.fileno())],
+            pass_fds=(listener.fileno(),),
             stdin=subprocess.DEVNULL,
             env=environ,
             cwd=ROOT,
         )
+        _STARTED.append(server)
 
-    def end() -> None:
-        here.close()  # the server ends with its orders
-        process.wait(PATIENCE_S)
 
-    atexit.register(end)
-    return here
+_STARTED: list[subprocess.Popen[bytes]] = []
+"""Servers that this process started. Others of the run may need them longer: nobody waits."""
 
 
 # -- the server's side
-def serve(orders: socket.socket) -> list[str] | None:
-    """Fork a program for each order. Returns its arguments in the child, None when orders end."""
-    running: dict[int, tuple[int, socket.socket]] = {}  # pidfd → pid, where its status goes
-    while True:
-        for ready in select.select([orders, *running], [], [])[0]:
-            if ready is not orders:
-                pid, told = running.pop(ready)
-                code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-                with told, contextlib.suppress(OSError):  # the test may have ended
-                    told.send(str(code).encode())
-                os.close(ready)
-                continue
-            text, descriptors, _, _ = socket.recv_fds(orders, MESSAGE_MAX, 3)
-            if not text:
+type Order = dict[str, Any]
+
+
+class _Server:
+    """Forks a program for each order."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        self._listener = listener
+        self._clients: set[socket.socket] = set()
+        self._running: dict[int, tuple[int, socket.socket]] = {}  # pidfd → pid, where status goes
+
+    def serve(self) -> Order | None:
+        """Return the order in the child, None when the last client has gone."""
+        while True:
+            waited = [self._listener, *self._clients, *self._running]
+            found = select.select(waited, [], [], None if self._clients else PATIENCE_S)[0]
+            if not found and not self._clients:
                 return None
-            output, errors, status = descriptors
-            order = json.loads(text)
-            pid = os.fork()
-            if pid == 0:
-                orders.close()
-                os.close(status)
-                for pidfd, (_, told) in running.items():
-                    os.close(pidfd)
-                    told.close()
-                os.dup2(output, 1)
-                os.dup2(errors, 2)
-                os.close(output)
-                os.close(errors)
-                _become(order["environ"], order["cwd"], order["user"])
-                return list(order["arguments"])
-            os.close(output)
-            os.close(errors)
-            pidfd = os.pidfd_open(pid)
-            running[pidfd] = (pid, socket.socket(fileno=status))
-            socket.send_fds(orders, [str(pid).encode()], [pidfd])
+            for ready in found:
+                if isinstance(ready, int):
+                    self._bury(ready)
+                elif ready is self._listener:
+                    self._accept()
+                elif (order := self._obey(ready)) is not None:
+                    return order
+            if not self._clients and not select.select([self._listener], [], [], 0)[0]:
+                return None
+
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        peer = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        if struct.unpack("3i", peer)[1] != os.getuid():  # anyone may connect: it has no file
+            client.close()
+            return
+        client.send(HELLO)
+        self._clients.add(client)
+
+    def _bury(self, pidfd: int) -> None:
+        pid, told = self._running.pop(pidfd)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        with told, contextlib.suppress(OSError):  # the test may have ended
+            told.send(str(code).encode())
+        os.close(pidfd)
+
+    def _obey(self, client: socket.socket) -> Order | None:
+        """Fork the program. Return its order in the child."""
+        try:
+            text, descriptors, _, _ = socket.recv_fds(client, MESSAGE_MAX, DESCRIPTORS_MAX)
+        except ConnectionResetError:
+            text, descriptors = b"", []
+        if not text:
+            client.close()
+            self._clients.remove(client)
+            return None
+        order: Order = json.loads(text)
+        status, *given = descriptors
+        pid = os.fork()
+        if pid == 0:
+            os.close(status)
+            self._leave()
+            _become(order, given)
+            return order
+        for descriptor in given:
+            os.close(descriptor)
+        pidfd = os.pidfd_open(pid)
+        self._running[pidfd] = (pid, socket.socket(fileno=status))
+        with contextlib.suppress(OSError):  # the test may have ended
+            socket.send_fds(client, [str(pid).encode()], [pidfd])
+        return None
+
+    def _leave(self) -> None:
+        """Close the server's descriptors in the child."""
+        self._listener.close()
+        for client in self._clients:
+            client.close()
+        for pidfd, (_, told) in self._running.items():
+            os.close(pidfd)
+            told.close()
 
 
-def _become(environ: Mapping[str, str], cwd: str, user: int | None) -> None:
+def _become(order: Order, given: Sequence[int]) -> None:
+    aside = [fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, ABOVE) for one in given]
+    for one in given:
+        os.close(one)
+    for number, one in zip(order["numbers"], aside, strict=True):
+        os.dup2(one, number)
+        os.close(one)
+    if order["session"]:
+        os.setsid()
     os.environ.clear()
-    os.environ.update(environ)
-    os.chdir(cwd)
-    if user is not None:
+    os.environ.update(order["environ"])
+    os.chdir(order["cwd"])
+    if (user := order["user"]) is not None:
         os.setgroups([])
         os.setresgid(user, user, user)
         os.setresuid(user, user, user)
@@ -228,13 +368,13 @@ def _become(environ: Mapping[str, str], cwd: str, user: int | None) -> None:
 
 if __name__ == "__main__":
     name, descriptor = sys.argv[1:]
-    for imported in PROGRAMS[name].imports:
+    for imported in (*PROGRAMS[name].imports, PROGRAMS[name].module):
         import_module(imported)
-    main = import_module(PROGRAMS[name].module).main
     gc.freeze()  # collections in the children need not copy these pages
-    given = serve(socket.socket(fileno=int(descriptor)))
-    if given is not None:
-        sys.argv = [name, *given]
-        if PROGRAMS[name].forks:
+    ordered = _Server(socket.socket(fileno=int(descriptor))).serve()
+    if ordered is not None:
+        program = PROGRAMS[ordered["program"]]
+        sys.argv = [ordered["program"], *ordered["arguments"]]
+        if program.forks:
             fork_server.lend()
-        sys.exit(main())
+        sys.exit(import_module(program.module).main())

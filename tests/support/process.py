@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.support.prepared import Forked, as_here, start
+from tests.support.prepared import Forked, as_here, run, start
 
 START_S = 60.0
 STOP_S = 60.0
@@ -213,15 +213,7 @@ def vramctl(
             check=False,
         )
     words = [os.fsdecode(word) for word in arguments]
-    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
-        process = start("vramctl", words, environ, output.fileno(), errors.fileno(), user=user)
-        try:
-            code = process.wait(STOP_S)
-        finally:
-            process.kill()
-        output.seek(0)
-        errors.seek(0)
-        return subprocess.CompletedProcess(words, code, output.read(), errors.read())
+    return run("vramctl", words, environ, STOP_S, user=user)
 
 
 def vramctl_at_once(

@@ -5,19 +5,18 @@ frame; by policies and for goals.
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.prepared import run
 from vram_arbiter.runner import __main__ as program
 from vram_arbiter.runner.recording import commit
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
 
-HERE = Path(__file__).parents[1]
-ROOT = HERE.parents[1]
+ROOT = Path(__file__).parents[3]
 HAND = "tests.runner.gym_worlds:test/Hand-v0"
 POINT = "tests.runner.gym_worlds:test/Point-v0"
 SEED = 5
@@ -35,27 +34,9 @@ def record(
     given = {
         "VRAM_ARBITER_RUNTIME": str(runtime),
         "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": f"{ROOT}/src:{ROOT}:{HERE}",
     }
-    argv = [
-        sys.executable,
-        "-m",
-        "vram_arbiter.runner",
-        "sim",
-        "--record",
-        str(root),
-        "--rate",
-        "0",
-        *flags,
-    ]
-    return subprocess.run(
-        argv,
-        cwd=ROOT,
-        env=os.environ | given | environ,
-        capture_output=True,
-        text=True,
-        timeout=WAIT_S,
-    )
+    flags = ("sim", "--record", str(root), "--rate", "0", *flags)
+    return run("vram-runner", flags, os.environ | given | environ, WAIT_S, cwd=ROOT)
 
 
 @pytest.fixture(scope="module")

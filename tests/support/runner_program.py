@@ -1,0 +1,10 @@
+"""`vram-runner` whose recorder forks its writers (`dataset_writer`)."""
+
+from tests.support.dataset_writer import FORKING
+from vram_arbiter.runner import __main__ as runner
+from vram_arbiter.runner.recording import writer_process
+
+
+def main() -> int:
+    vars(writer_process)["subprocess"] = FORKING
+    return runner.main()
