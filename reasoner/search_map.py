@@ -58,6 +58,8 @@ class Places:
     """
 
     known: list[Place] = field(default_factory=list)
+    doubted: Sequence[Place] = ()
+    """Places whose thing was in the hand and was called something else: they come last."""
     base_pose: Pose = UNMOVED
     joined: bool = False
     """Whether odometry joins the newest look to the ones before."""
@@ -100,8 +102,14 @@ class Places:
             same.x, same.y, same.z, same.seen_from_m = seen.x, seen.y, seen.z, seen.seen_from_m
 
     def best(self) -> Place | None:
-        """Return the likeliest place; None before anything was seen."""
-        return max(self.known, key=lambda place: place.score, default=None)
+        """Return the likeliest place, doubted ones last; None before anything was seen."""
+        return max(
+            self.known, key=lambda place: (not self.doubts(place), place.score), default=None
+        )
+
+    def doubts(self, place: Place) -> bool:
+        """Return whether a place is a doubted one. Without odometry none can be told."""
+        return self.joined and any(_apart_m(place, other) <= SAME_M for other in self.doubted)
 
     def from_base(self, place: Place) -> Point:
         """Return its position relative to the base at the newest look."""
@@ -123,6 +131,8 @@ class Search:
 
     others: dict[str, Place] = field(default_factory=dict)
     """Things that were in the hand and are not wanted, by name, where they were put down."""
+    doubted: list[Place] = field(default_factory=list)
+    """Where things stood that were in the hand and that the scene VLM called something else."""
     began: bool = False
     _views: list[Pose] = field(default_factory=list)
     _given: int = 0

@@ -127,10 +127,12 @@ def _script(thing: str, robot: _Robot) -> Script:
     ended = (yield from _empty_hand(thing, robot, search)) if robot.can_query else None
     if ended is not None:
         return ended
+    folded = True
     for attempt in range(1, ATTEMPTS_MAX + 1):
-        if attempt > 1:
-            yield _turn(robot, 0.0, "fold the arm, which hides the table after a grab")
-        places = Places()
+        if not folded:
+            yield _fold(robot)
+        folded = False
+        places = Places(doubted=search.doubted)
         lost = yield from _find(thing, robot, places, search)
         if lost:
             return Finish(False, lost)
@@ -154,10 +156,23 @@ def _script(thing: str, robot: _Robot) -> Script:
         if held:
             return Finish(True, f"the scene VLM confirms: {answer}")
         reason = f"not grasped after attempt {attempt}: {failed + '; ' if failed else ''}{answer}"
-        if robot.place is not None and attempt < ATTEMPTS_MAX and _HOLDS.search(answer):
+        if not _HOLDS.search(answer):
+            continue
+        place = places.best()
+        assert place is not None, "it stood before one"
+        if places.doubts(place) and (yield from _holds_anything(robot, answer)):
+            seen = f"the detector sees the {thing} there, before the first grasp and after it"
+            return Finish(True, f"{seen}; the scene VLM calls it something else: {answer}")
+        if robot.place is not None and attempt < ATTEMPTS_MAX:
+            search.doubted.append(place)
             why = "a held thing would be looked at, and dropped before the next grasp"
-            yield from _put_down(robot.place, answer, why, search)
+            folded = (yield from _put_down(robot, answer, why, search)).status == "succeeded"
     return Finish(False, reason)
+
+
+def _holds_anything(robot: _Robot, answer: str) -> Generator[ToolCall, Outcome, bool]:
+    """Return whether the scene VLM says a second time that the gripper holds something."""
+    return says_yes((yield from _ask(robot, ANYTHING, f"make sure: {answer}")) or "")
 
 
 def _empty_hand(
@@ -174,13 +189,12 @@ def _empty_hand(
         return Finish(True, f"it is held already: {confirmed}") if held else None
     if not _HOLDS.search(answer):
         return None
-    again = (yield from _ask(robot, ANYTHING, f"make sure: {answer}")) or ""
-    if not says_yes(again):
+    if not (yield from _holds_anything(robot, answer)):
         return None
     if robot.place is None:
         return Finish(False, f"{answer} No installed skill can put it down")
     why = f"{answer} The gripper has to be empty for a grasp"
-    outcome = yield from _put_down(robot.place, answer, why, search)
+    outcome = yield from _put_down(robot, answer, why, search)
     if outcome.status != "succeeded":
         return Finish(False, f"{answer} It could not be put down: {outcome.text}")
     return None
@@ -291,15 +305,20 @@ def _ask(robot: _Robot, question: str, why: str = "") -> Generator[ToolCall, Out
 
 
 def _put_down(
-    place: str, answer: str, why: str, search: Search
+    robot: _Robot, answer: str, why: str, search: Search
 ) -> Generator[ToolCall, Outcome, Outcome]:
-    """Put down what the scene VLM says is held, and note where it stands by its own name.
-
-    A detector may take it for the wanted thing.
+    """Put down what the scene VLM says is held, fold the arm, and note where the thing stands by
+    its own name: a detector may take it for the wanted one.
     """
-    outcome = yield ExecuteRskill(rskill_id=place, deadline_s=NAVIGATE_DEADLINE_S, rationale=why)
+    assert robot.place is not None, "only called where something can be put down"
+    outcome = yield ExecuteRskill(
+        rskill_id=robot.place, deadline_s=NAVIGATE_DEADLINE_S, rationale=why
+    )
+    if outcome.status != "succeeded":
+        return outcome
+    yield _fold(robot)
     named = _NAMED.search(answer)
-    if outcome.status == "succeeded" and named is not None:
+    if named is not None:
         name = named[1].lower()
         looked = yield LocateInView(query=name, rationale=f"where does the {name} stand now?")
         there = Places()
@@ -307,6 +326,10 @@ def _put_down(
             # the nearest: it stands before the arm, and another one of its kind may be better seen
             search.others[name] = min(there.known, key=lambda place: place.seen_from_m)
     return outcome
+
+
+def _fold(robot: _Robot) -> ExecuteRskill:
+    return _turn(robot, 0.0, "fold the arm, which hides the table after a grab")
 
 
 def _turn(robot: _Robot, angle_rad: float, why: str) -> ExecuteRskill:
