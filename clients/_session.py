@@ -33,7 +33,7 @@ from vram_arbiter.clients.net.diagnose import START, obstacle
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
-from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)

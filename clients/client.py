@@ -34,9 +34,14 @@ from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
-from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.explained import WhyReply
-from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, PrepareReply, StatusReply
+from vram_arbiter.schemas.wire.replies import (
+    AnyReply,
+    HistoryReply,
+    PingReply,
+    PrepareReply,
+    StatusReply,
+)
 from vram_arbiter.schemas.wire.spec import Gang, LeaseSpec
 
 CONNECT_TIMEOUT_S: Final = 5.0

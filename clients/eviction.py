@@ -17,7 +17,7 @@ from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._protocol.records import LeaseRecord
 from vram_arbiter.clients.handlers import Handler, call
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
-from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)

@@ -31,9 +31,14 @@ from vram_arbiter.clients.handlers import Handler, Handlers, with_signature_of
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease, AsyncUse, LeaseState
 from vram_arbiter.schemas.errors import BadState, VramError
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.explained import WhyReply
-from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, PrepareReply, StatusReply
+from vram_arbiter.schemas.wire.replies import (
+    AnyReply,
+    HistoryReply,
+    PingReply,
+    PrepareReply,
+    StatusReply,
+)
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 

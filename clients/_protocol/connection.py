@@ -35,9 +35,8 @@ from vram_arbiter.schemas.errors import (
     from_wire,
 )
 from vram_arbiter.schemas.plain import JsonMap, Message
-from vram_arbiter.schemas.wire.decode import decode_push, decode_reply
-from vram_arbiter.schemas.wire.pushes import AnyPush
-from vram_arbiter.schemas.wire.replies import ReattachReply, WelcomeReply
+from vram_arbiter.schemas.wire.pushes import PUSHES, AnyPush
+from vram_arbiter.schemas.wire.replies import REPLIES, ReattachReply, WelcomeReply
 
 HELLO_TIMEOUT_S = 2.0  # an unanswered hello is said again on a fresh socket
 REFUSED_RETRY_S = 1.0  # after a refused hello (a full server may have room later)
@@ -122,8 +121,8 @@ class Connection:
             return
         self._heard_at, self._pinged = now, False
         if "push" in message:
-            if (push := decode_push(message)) is not None:  # else a newer arbiter's
-                self._above.pushed(push, now)
+            if (cls := PUSHES.get(str(message["push"]))) is not None:  # else a newer arbiter's
+                self._above.pushed(from_map(cls, message), now)
         elif message.get("re") == self._handshake_id and self.phase != "up":
             self.asked_at = self._handshake_at
             self._handshake_reply(message, now)
@@ -299,7 +298,7 @@ class Connection:
     def _succeed(self, request_id: int, request: Pending, message: Message, now: float) -> None:
         op = request.message["op"]
         try:
-            reply = decode_reply(op, message)
+            reply = from_map(REPLIES[op], message)
         except CodecError as error:
             wrong = f"the arbiter's answer to {op} is not understood: {error}"
             self._fail(request_id, InternalError(wrong, hint="are both of one version?"), now)

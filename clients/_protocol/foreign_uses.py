@@ -8,7 +8,7 @@ what is reattached (`clients._protocol.leases`).
 from vram_arbiter.clients._protocol.connection import Connection
 from vram_arbiter.clients._protocol.records import ForeignUseRecord, TokenPair, UseLost
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.wire.decode import AnyReply
+from vram_arbiter.schemas.wire.replies import AnyReply
 
 
 class ForeignUses:

@@ -22,7 +22,6 @@ from vram_arbiter.clients._protocol.records import (
     Returned,
     RevokeAsked,
     error_of,
-    token_of,
 )
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import (
@@ -33,10 +32,10 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.pushes import LostPush, RevokePush
 from vram_arbiter.schemas.wire.replies import (
     AcquireReply,
+    AnyReply,
     ReattachReply,
     ReleaseReply,
     RenewReply,
@@ -176,11 +175,10 @@ class Holdings:
         record = self.asleep.get(view.lease_id)
         if record is None or view.token is None or view.state != "loading":
             return
-        token = token_of(view.token)
-        if token <= record.token:
+        if view.token <= record.token:
             return
         self._wake(record)
-        record.token, record.view = token, view
+        record.token, record.view = view.token, view
         record.confirmed_at = record.renewed_at = (
             self._connection.asked_at
         )  # as for the first grant
@@ -202,13 +200,13 @@ class Holdings:
 
     def revoked(self, push: RevokePush) -> None:
         record = self.held.get(push.lease_id)
-        if record is not None and record.token == token_of(push.token):
+        if record is not None and record.token == push.token:
             first, record.revoke = record.revoke is None, push
             self._connection.events.append(RevokeAsked(record, push, first))
 
     def lost(self, push: LostPush) -> None:
         record = self._record(push.lease_id)
-        if record is not None and record.token == token_of(push.token):
+        if record is not None and record.token == push.token:
             self._gone(record, error_of(push.error))
 
     # -- contact -----------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from vram_arbiter.clients._protocol.leases import Holdings
 from vram_arbiter.clients._protocol.records import HistoryEvent, PrepareAsked, error_of
 from vram_arbiter.clients._protocol.waits import Waits
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.pushes import (
     AnyPush,
     DeniedPush,
@@ -28,7 +27,7 @@ from vram_arbiter.schemas.wire.pushes import (
     ResizedPush,
     RevokePush,
 )
-from vram_arbiter.schemas.wire.replies import ReattachReply
+from vram_arbiter.schemas.wire.replies import AnyReply, ReattachReply
 
 
 class ClientProtocol:

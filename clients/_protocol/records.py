@@ -7,23 +7,15 @@ from dataclasses import dataclass, field
 
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError, from_wire
-from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.plain import JsonMap, Message
-from vram_arbiter.schemas.wire.decode import AnyReply
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.pushes import RevokePush
+from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.views import LeaseView
 
 TokenPair = tuple[int, int]
 OnReply = Callable[[AnyReply, float], None]
 OnError = Callable[[VramError, float], None]
-
-
-def token_of(token: Token | None) -> TokenPair:
-    """Return the token of a view or a push as a pair. Raises ValueError where it is not shown."""
-    if token is None:
-        raise ValueError("a grant without a token")
-    return token.epoch, token.serial
 
 
 def error_of(view: ErrorView | None) -> VramError:

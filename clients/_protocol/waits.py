@@ -19,13 +19,11 @@ from vram_arbiter.clients._protocol.records import (
     Granted,
     LeaseRecord,
     Waiter,
-    token_of,
 )
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.wire.decode import AnyReply
-from vram_arbiter.schemas.wire.replies import AcquireReply
+from vram_arbiter.schemas.wire.replies import AcquireReply, AnyReply
 from vram_arbiter.schemas.wire.views import LeaseView
 
 
@@ -138,10 +136,12 @@ class Waits:
         """Keep a grant. The message may have waited longer than the TTL: it is known only that it
         was sent after the newest request that the arbiter has answered."""
         self.waiters.pop(waiter.nonce, None)
+        if view.token is None:
+            raise ValueError("a grant without a token")
         heard_at = self._connection.asked_at
         record = LeaseRecord(
             lease_id=view.lease_id,
-            token=token_of(view.token),
+            token=view.token,
             nonce=waiter.nonce,
             spec=waiter.spec,
             ttl_s=float(waiter.spec.get("ttl_s", d.LEASE_TTL_S)),

@@ -1,8 +1,10 @@
 """What the arbiter sends unasked: `{"push": kind, "seq": n, "epoch": e, …}`. Standard
 library only."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, get_args
 
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.plain import JsonMap
@@ -96,3 +98,8 @@ class PreparePush:
 type AnyPush = (
     RevokePush | GrantedPush | DeniedPush | ResizedPush | LostPush | EventPush | PreparePush
 )
+
+PUSHES: Final[Mapping[str, type[Any]]] = MappingProxyType(
+    {cls.TAG[1]: cls for cls in get_args(AnyPush.__value__)}
+)
+"""Kind → type of the push."""

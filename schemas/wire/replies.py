@@ -1,8 +1,10 @@
 """Answers to requests: `{"re": n, "epoch": e, "ok": true, …}`, one class per shape. Standard
 library only."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Final, Literal
 
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
@@ -178,3 +180,37 @@ type AnyReply = (
     | PrepareReply
     | WhyReply
 )
+
+REPLIES: Final[Mapping[str, type[Any]]] = MappingProxyType(
+    {
+        "hello": WelcomeReply,
+        "ping": PingReply,
+        "prepare": PrepareReply,
+        "bye": DoneReply,
+        "subscribe": DoneReply,
+        "acquire": AcquireReply,
+        "reacquire": AcquireReply,
+        "resize": AcquireReply,
+        "ready": ReadyReply,
+        "use_begin": UsesReply,
+        "use_end": UsesReply,
+        "yield": UsesReply,
+        "revoke_ack": StateReply,
+        "unloading": StateReply,
+        "cancel": StateReply,
+        "release": ReleaseReply,
+        "renew": RenewReply,
+        "reattach": ReattachReply,
+        "oom": OomReply,
+        "status": StatusReply,
+        "why": WhyReply,
+        "history": HistoryReply,
+        "evict": OperatorReply,
+        "pin": OperatorReply,
+        "unpin": OperatorReply,
+        "release_dead": OperatorReply,
+        "drain": DrainReply,
+        "resume": DrainReply,
+    }
+)
+"""Op → type of its reply."""

@@ -32,8 +32,7 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WaitTimeout,
 )
-from vram_arbiter.schemas.wire.decode import AnyReply
-from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.replies import AnyReply, StatusReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import Totals
 from vram_arbiter.sidecars.device.fake import FakeMemory

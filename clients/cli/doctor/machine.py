@@ -19,12 +19,11 @@ from typing import Final
 
 from vram_arbiter.clients.cli.doctor.findings import CouldNotLook
 from vram_arbiter.clients.net import request
-from vram_arbiter.schemas.codec import CodecError
+from vram_arbiter.schemas.codec import CodecError, from_map
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
-from vram_arbiter.schemas.wire.decode import decode_reply
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
 
@@ -238,12 +237,8 @@ def ask_arbiter(endpoint: str) -> Arbiter:
         last = request.ask("history", {"after": 1 << 62, "limit": 1}, endpoint)
         after = max(0, int(last.get("last_seq", 0)) - EVENTS)
         events = request.ask("history", {"after": after, "limit": EVENTS}, endpoint)
-        told, name = decode_reply("history", events), decode_reply("ping", ping)
-        assert isinstance(told, HistoryReply)
-        assert isinstance(name, PingReply)
-        body = decode_reply("status", status)
-        assert isinstance(body, StatusReply)
-        return Arbiter(body, told.events, name.server, pid, uid)
+        told, name = from_map(HistoryReply, events), from_map(PingReply, ping)
+        return Arbiter(from_map(StatusReply, status), told.events, name.server, pid, uid)
     except request.Unreachable as error:
         return Arbiter(problem=error)
     except (CodecError, KeyError) as error:

@@ -15,7 +15,8 @@ from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 from vram_arbiter import schemas
 from vram_arbiter.schemas.wire import requests
-from vram_arbiter.schemas.wire.decode import PUSHES, REPLIES
+from vram_arbiter.schemas.wire.pushes import PUSHES
+from vram_arbiter.schemas.wire.replies import REPLIES
 
 jsonschema = pytest.importorskip("jsonschema")
 pytestmark = pytest.mark.e2e
