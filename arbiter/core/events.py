@@ -218,7 +218,7 @@ class ProcessUse:
 class MemorySampled:
     """One reading of one GPU. `taken_at` is the monotonic time at which the reading *began*.
 
-    Every source tells the total. What else a reading tells is derived here and nowhere else
+    Every source tells the total. What else a reading tells is derived in `ledger` and nowhere else
     (`host.gpu.probe` has the table of sources).
     """
 
@@ -227,32 +227,6 @@ class MemorySampled:
     used_bytes: int
     total_bytes: int
     processes: tuple[ProcessUse, ...] | None  # None: this source cannot list processes
-
-    def listed_bytes(self) -> int | None:
-        """Return the bytes of all listed processes; None: there is no list with all their bytes."""
-        if self.processes is None:
-            return None
-        total = 0
-        for use in self.processes:
-            if use.used_bytes is None:
-                return None
-            total += use.used_bytes
-        return total
-
-    def bytes_of(self, process: ProcessKey, *, omitted: int | None = 0) -> int | None:
-        """Return the bytes of a process; None: the reading cannot tell.
-
-        An omitted process may hold bytes: it may live in a container that the driver cannot name,
-        or be dying.
-
-        Args:
-            omitted: What to return for a process that the list omits.
-        """
-        for use in self.processes or ():
-            listed = use.process
-            if listed == process or (listed.start_ticks == 0 and listed.pid == process.pid):
-                return use.used_bytes
-        return None if self.processes is None else omitted
 
 
 @dataclass(frozen=True, slots=True)

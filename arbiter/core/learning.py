@@ -225,10 +225,9 @@ def on_leaving(core: "Core", lease: Lease) -> None:
 def on_verdict(core: "Core", gpu: "Gpu", verification: Verification) -> None:
     """Learn what a living process retains. Called before the charge of its lease is dropped."""
     account = gpu.ledger.accounts[verification.process]
-    if verification.vanishes or gpu.sample is None or len(account.charges) > 1:
+    if verification.vanishes or len(account.charges) > 1:
         return
-    held = gpu.sample.bytes_of(verification.process)
-    if held:
+    if held := gpu.shown_bytes(verification.process):
         core.footprints.measured(verification.model, "residue", held)
 
 

@@ -1,4 +1,5 @@
-"""The bytes of one GPU: charges, bytes that live processes retain, stowaways, memory pending free.
+"""The bytes of one GPU: charges, bytes that live processes retain, stowaways; and what a reading
+tells beside its total (`bytes_of`, `bytes_by_process`).
 
 Ledger and measurement are two gates. A charge is what was granted; evidence (readings per process)
 is only added on top where a process holds more than it is charged. Knows nothing of states, order
@@ -12,7 +13,7 @@ Sums are kept as accounts change, never counted again: a decision must not cost 
 have leases.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
@@ -95,9 +96,9 @@ class GpuLedger:
 
         That is the total less what the list shows and what is known to be the driver's.
         """
-        listed_bytes = reading.listed_bytes()
-        if listed_bytes is None:
+        if reading.processes is None or any(use.used_bytes is None for use in reading.processes):
             return None
+        listed_bytes = sum(bytes_by_process(reading).values())
         driver_bytes = self.driver_bytes if self.driver_seen else 0
         return max(0, reading.used_bytes - listed_bytes - driver_bytes)
 
@@ -349,55 +350,23 @@ class GpuLedger:
             del self.accounts[account.process]
 
 
-class PendingFree:
-    """What each process gave up lately on one GPU, outside any verification, that the driver may
-    not have returned yet.
+# -- what a reading tells
+def bytes_by_process(reading: MemorySampled) -> dict[ProcessKey, int]:
+    """Return the bytes of the listed processes; 0 where the driver does not say."""
+    return {use.process: use.used_bytes or 0 for use in reading.processes or ()}
 
-    A load's peak and the bytes of a stowaway leave the GPU as slowly as any others. If they counted
-    as unattributed bytes, the next verdict would allow for bytes that are gone by then.
+
+def bytes_of(reading: MemorySampled, process: ProcessKey, *, omitted: int | None = 0) -> int | None:
+    """Return the bytes of a process; None: the reading cannot tell.
+
+    An omitted process may hold bytes: it may live in a container that the driver cannot name, or be
+    dying.
+
+    Args:
+        omitted: What to return for a process that the list omits.
     """
-
-    def __init__(self) -> None:
-        self._parts: dict[ProcessKey, tuple[float, int]] = {}  # (when last, bytes)
-
-    def give_up(self, process: ProcessKey, count: int, now: float) -> None:
-        """Add `count` bytes; a negative count takes the same memory again."""
-        at, before = self._parts.get(process, (now, 0))
-        if before + count > 0:
-            self._parts[process] = (now if count > 0 else at, before + count)
-        else:
-            self._parts.pop(process, None)
-
-    def watch(
-        self,
-        before: MemorySampled | None,
-        reading: MemorySampled,
-        leaving: Collection[ProcessKey],
-        charged_to: Callable[[ProcessKey], int],
-    ) -> None:
-        """Compare two consecutive readings. Processes in `leaving` are under verification anyway.
-
-        A process that is no longer listed may still hold its charge. The first reading of a daemon
-        is compared with the charges: a holder may have freed bytes before the restart.
-        """
-        if reading.processes is None:
-            return
-        if before is None:
-            for use in reading.processes:
-                freed_bytes = charged_to(use.process) - use.held_bytes
-                if use.used_bytes is not None and freed_bytes > 0:
-                    self.give_up(use.process, freed_bytes, reading.taken_at)
-            return
-        if before.processes == reading.processes:
-            return
-        now = {use.process: use.held_bytes for use in reading.processes}
-        for use in before.processes or ():
-            held = now.get(use.process)
-            if held != use.held_bytes and use.process not in leaving:
-                freed_bytes = use.held_bytes - (charged_to(use.process) if held is None else held)
-                self.give_up(use.process, freed_bytes, reading.taken_at)
-
-    def since(self, at: float) -> int:
-        """Return the most that may be pending of what was given up after `at`; forget the rest."""
-        self._parts = {process: part for process, part in self._parts.items() if part[0] > at}
-        return sum(count for _, count in self._parts.values())
+    for use in reading.processes or ():
+        listed = use.process
+        if listed == process or (listed.start_ticks == 0 and listed.pid == process.pid):
+            return use.used_bytes
+    return None if reading.processes is None else omitted

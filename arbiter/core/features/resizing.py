@@ -226,7 +226,7 @@ def _is_freed(core: Core, gpu: Gpu, lease: Lease, less: int, sample: MemorySampl
     On the GPU, and for the process if the reading lists it.
     """
     ledger, tolerance = gpu.ledger, core.settings.verify_tolerance_bytes
-    held = sample.bytes_of(lease.process)
+    held = gpu.shown_bytes(lease.process)
     if held is not None and held > ledger.charged_to(lease.process) - less + tolerance:
         return False
     unattributed = ledger.stowaway_bytes + ledger.driver_bytes

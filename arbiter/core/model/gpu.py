@@ -1,5 +1,5 @@
 """One GPU: its leases by state (`Residents`), its requests by effective priority (`WaitQueue`), and
-its ledger, readings and verifications (`Gpu`).
+its ledger, readings, verifications and bytes pending free (`Gpu`, `PendingFree`).
 
 Effective priority is priority + waited/ageing. All requests age at the same rate, so the order of
 two is fixed when they arrive: `arrival time − priority × ageing` (smaller first), then arrival. The
@@ -9,17 +9,17 @@ order of arrival.
 
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
 
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.hooks import Group
-from vram_arbiter.arbiter.core.ledger import GpuLedger, PendingFree
+from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_by_process, bytes_of
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Eviction, Lease, LeaseState, Verification
 from vram_arbiter.arbiter.core.settings import GpuInfo
-from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 
 LEFT_KEPT = 64
@@ -171,6 +171,61 @@ class WaitQueue:
         )
 
 
+class PendingFree:
+    """What each process gave up lately on one GPU, outside any verification, that the driver may
+    not have returned yet.
+
+    A load's peak and the bytes of a stowaway leave the GPU as slowly as any others. If they counted
+    as unattributed bytes, the next verdict would allow for bytes that are gone by then.
+    """
+
+    def __init__(self) -> None:
+        self._parts: dict[ProcessKey, tuple[float, int]] = {}  # (when last, bytes)
+
+    def give_up(self, process: ProcessKey, count: int, now: float) -> None:
+        """Add `count` bytes; a negative count takes the same memory again."""
+        at, before = self._parts.get(process, (now, 0))
+        if before + count > 0:
+            self._parts[process] = (now if count > 0 else at, before + count)
+        else:
+            self._parts.pop(process, None)
+
+    def watch(
+        self,
+        before: MemorySampled | None,
+        reading: MemorySampled,
+        leaving: Collection[ProcessKey],
+        charged_to: Callable[[ProcessKey], int],
+    ) -> None:
+        """Compare two consecutive readings. Processes in `leaving` are under verification anyway.
+
+        A process that is no longer listed may still hold its charge. The first reading of a daemon
+        is compared with the charges: a holder may have freed bytes before the restart.
+        """
+        if reading.processes is None:
+            return
+        if before is None:
+            for use in reading.processes:
+                if use.used_bytes is not None:
+                    freed_bytes = charged_to(use.process) - use.used_bytes
+                    if freed_bytes > 0:
+                        self.give_up(use.process, freed_bytes, reading.taken_at)
+            return
+        if before.processes == reading.processes:
+            return
+        now = bytes_by_process(reading)
+        for process, held_before in bytes_by_process(before).items():
+            held = now.get(process)
+            if held != held_before and process not in leaving:
+                freed_bytes = held_before - (charged_to(process) if held is None else held)
+                self.give_up(process, freed_bytes, reading.taken_at)
+
+    def since(self, at: float) -> int:
+        """Return the most that may be pending of what was given up after `at`; forget the rest."""
+        self._parts = {process: part for process, part in self._parts.items() if part[0] > at}
+        return sum(count for _, count in self._parts.values())
+
+
 @dataclass(slots=True)
 class Gpu:
     """One GPU: its ledger, residents, queue and readings."""
@@ -201,3 +256,8 @@ class Gpu:
         """Return its leases in these states, in the order in which they came to them."""
         by_state = self.residents.by_state
         return [lease for state in states for lease in by_state[state].values()]
+
+    def shown_bytes(self, process: ProcessKey) -> int | None:
+        """Return the bytes of a process by the newest reading, 0 where that omits it; None: it
+        cannot tell."""
+        return None if self.sample is None else bytes_of(self.sample, process)

@@ -266,7 +266,7 @@ def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     if not gpus:
         raise Refused(no.UnknownGpu(spec.gpu, tuple(core.gpus)))
     # the journal that knew its GPU is lost: it is where most of the process's bytes are seen
-    gpu = max(gpus, key=lambda gpu: (_seen_bytes(gpu, client.process), -gpu.info.index))
+    gpu = max(gpus, key=lambda gpu: (gpu.shown_bytes(client.process) or 0, -gpu.info.index))
     peak, steady = learning.expected_bytes(core, spec)
     charge = steady if item.state == "held" else peak
     if item.state == "held" and item.measured_bytes is not None:
@@ -292,10 +292,6 @@ def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     lease.request.steady_bytes = steady
     core.record_lease(lease)
     return lease
-
-
-def _seen_bytes(gpu: Gpu, process: ProcessKey) -> int:
-    return 0 if gpu.sample is None else gpu.sample.bytes_of(process) or 0
 
 
 # -- end of a recovery

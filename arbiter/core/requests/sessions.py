@@ -148,8 +148,7 @@ def _most_held_bytes(core: Core, lease: Lease) -> int:
     charge_bytes = gpu.ledger.charge_bytes(lease.id)
     if gpu.sample is None:
         return charge_bytes
-    shown_bytes = gpu.sample.bytes_of(lease.process)
-    return min(charge_bytes, shown_bytes or gpu.sample.used_bytes)
+    return min(charge_bytes, gpu.shown_bytes(lease.process) or gpu.sample.used_bytes)
 
 
 def lose(

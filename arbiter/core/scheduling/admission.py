@@ -184,7 +184,7 @@ def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
         if account is not None and not account.charges.keys() <= gpu.ledger.reserved:
             needed += count
             continue
-        own = None if gpu.sample is None else gpu.sample.bytes_of(process)
+        own = gpu.shown_bytes(process)
         if own is None:
             own = 0 if account is None else account.retained_bytes
         needed += max(0, count - own)

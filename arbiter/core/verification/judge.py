@@ -1,8 +1,7 @@
 """What a reading of a GPU says: whose bytes it shows (evidence), and whether a release is verified.
 
 Evidence names stowaways, shrinks retained bytes and shows pressure. It never frees a charge: only a
-verdict does (`schedule`). What a source can tell beside the total is derived in
-`events.MemorySampled` alone (`listed_bytes`, `bytes_of`).
+verdict does (`schedule`). What a source can tell beside the total is derived in `ledger` alone.
 
 A released lease stays charged until a verdict. A reading is on target if all that can be checked
 holds:
@@ -21,7 +20,7 @@ from dataclasses import dataclass
 
 from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.core.ledger import Account, GpuLedger
+from vram_arbiter.arbiter.core.ledger import Account, GpuLedger, bytes_by_process, bytes_of
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import LEAVING, LeaseState, Verdict, Verification
 from vram_arbiter.arbiter.core.model.state import Core
@@ -47,11 +46,9 @@ def impossible(gpu: Gpu, reading: MemorySampled, tolerance_bytes: int) -> str:
     if not 0 <= used <= total + tolerance_bytes:
         return f"impossible reading: {used} of {total} bytes are used"
     for use in reading.processes or ():
-        if not 0 <= use.held_bytes <= total + tolerance_bytes:
-            return (
-                f"impossible reading: process {use.process.pid} holds {use.held_bytes} "
-                f"of {total} bytes"
-            )
+        held = use.used_bytes
+        if held is not None and not 0 <= held <= total + tolerance_bytes:
+            return f"impossible reading: process {use.process.pid} holds {held} of {total} bytes"
     return ""
 
 
@@ -94,12 +91,12 @@ def _shrink_retained(core: Core, gpu: Gpu, account: Account, reading: MemorySamp
     """Lower retained bytes of a process without leases to the most that a list leaves it."""
     process, floor_bytes = account.process, account.retained_floor_bytes
     held_bytes = account.measured_bytes
-    if reading.bytes_of(process) is None:  # listed without its bytes
+    if bytes_of(reading, process) is None:  # listed without its bytes
         held_bytes = reading.used_bytes
     else:
         if not held_bytes and process not in core.connected and core.serving:
             floor_bytes = 0
-        if reading.bytes_of(process, omitted=None) is None:  # not listed
+        if bytes_of(reading, process, omitted=None) is None:  # not listed
             unlisted_bytes = gpu.ledger.unlisted_bytes(reading)
             held_bytes = account.retained_bytes if unlisted_bytes is None else unlisted_bytes
     retained_bytes = max(floor_bytes, held_bytes)
@@ -172,14 +169,14 @@ def _between_lists(
 ) -> tuple[int, int]:
     """Return how much the other holders grew between two lists, up to their charges, and by how
     much the other listed processes shrank."""
-    held_now = {use.process: use.held_bytes for use in reading.processes or ()}
+    held_then, held_now = bytes_by_process(baseline), bytes_by_process(reading)
     shrunk_bytes = sum(
-        max(0, use.held_bytes - held_now.get(use.process, 0))
-        for use in baseline.processes or ()
-        if use.process.pid != process.pid
+        max(0, held - held_now.get(other, 0))
+        for other, held in held_then.items()
+        if other.pid != process.pid
     )
-    then = {use.process.pid: use.held_bytes for use in baseline.processes or ()}
-    now = {use.process.pid: use.held_bytes for use in reading.processes or ()}
+    then = {other.pid: held for other, held in held_then.items()}
+    now = {other.pid: held for other, held in held_now.items()}
     grown_bytes = 0
     for other, account in ledger.accounts.items():
         if other == process:
@@ -205,7 +202,7 @@ def _loading_bytes(gpu: Gpu, reading: MemorySampled) -> int:
     for lease in (*gpu.in_state(LeaseState.LOADING), *gpu.residents.ready_since(reading.taken_at)):
         account = gpu.ledger.accounts[lease.process]
         other_charges = account.leased_bytes - gpu.ledger.charge_bytes(lease.id)
-        shown_bytes = reading.bytes_of(lease.process) or 0
+        shown_bytes = bytes_of(reading, lease.process) or 0
         held = max(other_charges, account.retained_bytes, shown_bytes)
         count += max(0, account.charged_bytes - held)
     return count
@@ -291,7 +288,7 @@ def _compare(
         )
     # 3. delta bound: the baseline's total less what the process must have freed
     over_baseline = None
-    held_before = None if baseline is None else baseline.bytes_of(process, omitted=None)
+    held_before = None if baseline is None else bytes_of(baseline, process, omitted=None)
     if baseline is not None and held_before is None and verification.baseline_comparable:
         held_before = _may_hold_bytes(verification, ledger, baseline)
     if baseline is not None and held_before is not None:
@@ -303,7 +300,7 @@ def _compare(
         reading,
         tolerance_bytes,
         allowed_bytes,
-        reading.bytes_of(process),
+        bytes_of(reading, process),
         allowed_bytes + tolerance_bytes,
         used_bytes - ledger_bound,
         over_baseline,
@@ -358,7 +355,7 @@ def _late(case: _Case) -> Judgement:
             return _residue(case, held, culprits)
         return Judgement(Verdict.CONTESTED, False, held, culprits)
     missing = case.missing_bytes(_taken_bytes(case))
-    if verification.alive and reading.bytes_of(process, omitted=None) is None:
+    if verification.alive and bytes_of(reading, process, omitted=None) is None:
         stays = _may_hold_bytes(verification, case.ledger, reading)
         if case.over_baseline_bytes is not None:
             stays = min(stays, case.allowed_bytes + missing)
@@ -394,7 +391,7 @@ def _taken_bytes(case: _Case) -> int:
         return 0
     taken = 0
     for use in case.others():
-        explained = max(baseline.bytes_of(use.process) or 0, case.ledger.charged_to(use.process))
+        explained = max(bytes_of(baseline, use.process) or 0, case.ledger.charged_to(use.process))
         taken += max(0, use.held_bytes - explained)
     return taken
 
@@ -409,7 +406,7 @@ def _grown(case: _Case) -> tuple[Culprit, ...]:
     for use in case.others():
         if baseline is None and use.process not in case.ledger.stowaways:
             continue
-        before = 0 if baseline is None else baseline.bytes_of(use.process) or 0
+        before = 0 if baseline is None else bytes_of(baseline, use.process) or 0
         if use.held_bytes > before:
             grown.append(Culprit(use.process.pid, use.name, use.held_bytes - before))
     return tuple(sorted(grown, key=lambda culprit: (-culprit.bytes, culprit.pid)))

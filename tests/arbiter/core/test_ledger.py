@@ -1,7 +1,7 @@
 """Bytes of one card: folding of residues, debts, evidence, stowaways."""
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.core.ledger import GpuLedger
+from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_of
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
@@ -181,5 +181,5 @@ def test_a_backend_without_lists_gives_totals_only() -> None:
 
 def test_bytes_of_a_process_in_a_reading() -> None:
     reading = sample(1.0, 500, (A, 300), (B, None), (ProcessKey(3, 0), 9))
-    assert [reading.bytes_of(p) for p in (A, B, C, ProcessKey(4, 4))] == [300, None, 9, 0]
-    assert MemorySampled(GPU, 1.0, 5, 10, None).bytes_of(A) is None
+    assert [bytes_of(reading, p) for p in (A, B, C, ProcessKey(4, 4))] == [300, None, 9, 0]
+    assert bytes_of(MemorySampled(GPU, 1.0, 5, 10, None), A) is None

@@ -6,7 +6,8 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import held, hidden_card
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.core.ledger import GpuLedger, PendingFree
+from vram_arbiter.arbiter.core.ledger import GpuLedger
+from vram_arbiter.arbiter.core.model.gpu import PendingFree
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
