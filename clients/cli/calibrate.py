@@ -22,11 +22,11 @@ from typing import Any
 
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.calibration import entry as entries
+from vram_arbiter.clients.calibration.basis import Pace
 from vram_arbiter.clients.calibration.gpu import Gpu, open_gpu
 from vram_arbiter.clients.calibration.measure import (
     Asked,
     Measured,
-    Pace,
     measure_model,
     measure_program,
 )

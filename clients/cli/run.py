@@ -25,14 +25,10 @@ from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.http import METHODS, HttpAction, Request, checked_url
 from vram_arbiter.clients.foreign.program import adopt_orphans
+from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
+from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
-from vram_arbiter.clients.foreign.supervisor import (
-    OnRevoke,
-    RunSpec,
-    Supervisor,
-    lease_spec,
-    say,
-)
+from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import ConfigError

@@ -10,12 +10,9 @@ import contextlib
 import logging
 import os
 import signal
-import sys
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
 import anyio
 import anyio.to_thread
@@ -25,75 +22,22 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
+from vram_arbiter.clients.foreign.peak import Peak
 from vram_arbiter.clients.foreign.program import ForeignProgram
+from vram_arbiter.clients.foreign.run_spec import RunSpec, lease_spec
+from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, RESIDUE_BYTES
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 log = logging.getLogger(__name__)
 
-type OnRevoke = Literal["priority", "term", "pin"]
 PATIENCE_S: Final = 1.0
 FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
 BUSY_POLL_S: Final = 0.5
 SUSPENDED_GRACE_S: Final = 5.0
 NO_LEASE: Final = "its lease is over"
-
-
-@dataclass(frozen=True, slots=True)
-class RunSpec:
-    """What to run and what it needs.
-
-    `grace_s`: from SIGTERM to SIGKILL, or for requests in progress; None waits for as long as it
-    takes. `restarts`: the program is ended to make room, and started again. `action`: it is made
-    to free instead, and keeps `park_bytes` of host RAM meanwhile. With neither, its end is the end.
-    """
-
-    command: list[str]
-    name: str | None
-    vram_bytes: int
-    gpu: str
-    priority: int
-    wait_timeout_s: float | None
-    exclusive: bool
-    on_revoke: OnRevoke
-    grace_s: float | None
-    restarts: bool = False
-    action: Action | None = None
-    park_bytes: int = 0
-
-    @property
-    def consumer(self) -> str:
-        """`--name`, or the program's, which may hold any byte and be of any length."""
-        return self.name or printable(Path(self.command[0]).name)[:NAME_MAX_CHARS] or "program"
-
-    @property
-    def comes_back(self) -> bool:
-        return self.restarts or self.action is not None
-
-
-def lease_spec(spec: RunSpec) -> LeaseSpec:
-    """Return the program's whole need for its whole life: nothing is known of phases inside it."""
-    keeps_context = spec.action is not None and spec.action.keeps_context
-    return LeaseSpec(
-        consumer=spec.consumer,
-        model_id=spec.consumer,
-        gpu=spec.gpu,
-        mode="exclusive" if spec.exclusive else "shared",
-        footprint=Footprint(
-            load_peak_bytes=spec.vram_bytes,
-            steady_bytes=spec.vram_bytes,
-            residue_bytes=min(RESIDUE_BYTES, spec.vram_bytes) if keeps_context else 0,
-        ),
-        priority=spec.priority,
-        evictable=spec.on_revoke != "pin",
-        standby=spec.comes_back,
-        park_bytes=spec.park_bytes,
-    )
 
 
 class Forwards(Protocol):
@@ -111,7 +55,7 @@ class Supervisor:
         self._path = path
         self._program: ForeignProgram | None = None
         self._lease: AsyncLease | None = None
-        self.peak_bytes = 0
+        self.peak = Peak(spec.vram_bytes)
         self._signals: Forwards | None = None
         self._over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -147,7 +91,7 @@ class Supervisor:
             await self._program.end(self._grace_s)  # where it has not ended itself
             if self._spec.comes_back:
                 await self._program.end_orphans()
-        self._say_peak()
+        say(self.peak.text())
         await self.lease.release(exiting=True)
         return code
 
@@ -366,21 +310,12 @@ class Supervisor:
             with contextlib.suppress(VramError):
                 status = await self._client.ask("status")  # its first page has all queues' heads
                 assert isinstance(status, StatusReply)
-                self._measure(status)
+                self.peak.measure(status, self.lease.lease_id)
                 self._decide(status)
             if self._program is not None and self._program.running and self._spec.comes_back:
                 # not while its successor is started, whose status it could take
                 self._program.reap()
             pause_s = LOOK_S
-
-    def _measure(self, status: StatusReply) -> None:
-        used = sum(
-            process.used_bytes or 0
-            for gpu in status.gpus
-            for process in gpu.processes
-            if self.lease.lease_id in process.lease_ids
-        )
-        self.peak_bytes = max(self.peak_bytes, used)
 
     def _decide(self, status: StatusReply | None) -> None:
         """Leave where a revoke is for a higher priority. A request that came after the revoke is
@@ -412,17 +347,6 @@ class Supervisor:
                 f"{consumer} waits for its room (priority {priority}): it gets it when the program "
                 "ends"
             )
-
-    def _say_peak(self) -> None:
-        asked = self._spec.vram_bytes
-        if self.peak_bytes:
-            more = ", more than was asked for" if self.peak_bytes > asked else ""
-            say(
-                f"peak {format_bytes(self.peak_bytes)} measured of {format_bytes(asked)} "
-                f"asked{more}"
-            )
-        else:
-            say("peak not measured: no reading showed bytes of the program")
 
 
 async def _in_thread[T](work: Callable[..., T], *arguments: object) -> T:
@@ -457,8 +381,3 @@ def _environ(lease: AsyncLease) -> dict[str, str]:
         "VRAM_LEASE_TOKEN": f"{lease.token[0]}.{lease.token[1]}",
         "VRAM_LEASE_GPU": lease.gpu,
     }
-
-
-def say(text: str) -> None:
-    """Tell the user of `vramctl run`."""
-    print(f"vramctl run: {printable(text)}", file=sys.stderr)

@@ -20,17 +20,11 @@ from tests.support.paths import CONFIGS
 from tests.support.process import ArbiterProcess
 from vram_arbiter.arbiter.host.gpu.fake import make_card
 from vram_arbiter.clients.calibration import entry as entries
+from vram_arbiter.clients.calibration.basis import Basis, Pace
 from vram_arbiter.clients.calibration.gpu import FakeGpu, NvmlGpu, Reading, open_gpu
-from vram_arbiter.clients.calibration.measure import (
-    Asked,
-    Basis,
-    OwnBytes,
-    Pace,
-    Sampler,
-    measure_model,
-    measure_program,
-)
+from vram_arbiter.clients.calibration.measure import Asked, measure_model, measure_program
 from vram_arbiter.clients.calibration.requests import asking, noise_png, observation_of
+from vram_arbiter.clients.calibration.sampler import OwnBytes, Sampler
 from vram_arbiter.clients.calibration.series import Figures, Series, of_life
 from vram_arbiter.clients.cli.calibrate import source_of
 from vram_arbiter.clients.cli.main import run_main

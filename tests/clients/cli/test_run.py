@@ -21,7 +21,8 @@ from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.program import ForeignProgram
-from vram_arbiter.clients.foreign.supervisor import RunSpec, Supervisor
+from vram_arbiter.clients.foreign.run_spec import RunSpec
+from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -335,7 +336,7 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
         await run.acquire()
         await run.start(signals)
         ended = asyncio.create_task(run.until_ended())
-        while not run.peak_bytes:
+        while not run.peak.seen_bytes:
             await asyncio.sleep(0.05)
         signals.program.send_signal(signal.SIGTERM)
         assert await ended == 0

@@ -11,7 +11,8 @@ from tests.support.grants_at_once import GrantsAtOnce
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.program import ForeignProgram
-from vram_arbiter.clients.foreign.supervisor import OnRevoke, RunSpec, Supervisor
+from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec
+from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]

@@ -1,0 +1,64 @@
+"""What `vramctl run` is told of a program, and the lease that it means."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from vram_arbiter.clients.foreign.actions import Action
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, RESIDUE_BYTES
+from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+
+type OnRevoke = Literal["priority", "term", "pin"]
+
+
+@dataclass(frozen=True, slots=True)
+class RunSpec:
+    """What to run and what it needs.
+
+    `grace_s`: from SIGTERM to SIGKILL, or for requests in progress; None waits for as long as it
+    takes. `restarts`: the program is ended to make room, and started again. `action`: it is made
+    to free instead, and keeps `park_bytes` of host RAM meanwhile. With neither, its end is the end.
+    """
+
+    command: list[str]
+    name: str | None
+    vram_bytes: int
+    gpu: str
+    priority: int
+    wait_timeout_s: float | None
+    exclusive: bool
+    on_revoke: OnRevoke
+    grace_s: float | None
+    restarts: bool = False
+    action: Action | None = None
+    park_bytes: int = 0
+
+    @property
+    def consumer(self) -> str:
+        """`--name`, or the program's, which may hold any byte and be of any length."""
+        return self.name or printable(Path(self.command[0]).name)[:NAME_MAX_CHARS] or "program"
+
+    @property
+    def comes_back(self) -> bool:
+        return self.restarts or self.action is not None
+
+
+def lease_spec(spec: RunSpec) -> LeaseSpec:
+    """Return the program's whole need for its whole life: nothing is known of phases inside it."""
+    keeps_context = spec.action is not None and spec.action.keeps_context
+    return LeaseSpec(
+        consumer=spec.consumer,
+        model_id=spec.consumer,
+        gpu=spec.gpu,
+        mode="exclusive" if spec.exclusive else "shared",
+        footprint=Footprint(
+            load_peak_bytes=spec.vram_bytes,
+            steady_bytes=spec.vram_bytes,
+            residue_bytes=min(RESIDUE_BYTES, spec.vram_bytes) if keeps_context else 0,
+        ),
+        priority=spec.priority,
+        evictable=spec.on_revoke != "pin",
+        standby=spec.comes_back,
+        park_bytes=spec.park_bytes,
+    )
