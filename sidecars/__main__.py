@@ -31,7 +31,6 @@ from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_card
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
 from vram_arbiter.sidecars.model_main import AdapterFor
-from vram_arbiter.sidecars.model_process import ENVIRONMENT
 from vram_arbiter.sidecars.settings import (
     NICE,
     REQUEST_TIMEOUT_S,
@@ -43,6 +42,7 @@ from vram_arbiter.sidecars.settings import (
     read_footprints,
     read_model,
 )
+from vram_arbiter.sidecars.weights_keeper import ENVIRONMENT
 
 FOOTPRINTS = "models/footprints.yaml"
 
@@ -94,7 +94,7 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
 
 @contextlib.contextmanager
 def _temporary_files_in(folder: str) -> Iterator[None]:
-    """Let the socket of the imports' server lie beside the sidecar's own (`model_process`): a
+    """Let the socket of the imports' server lie beside the sidecar's own (`weights_keeper`): a
     killed program leaves nothing in the machine's temporary folder."""
     before = tempfile.tempdir
     tempfile.tempdir = folder

@@ -18,8 +18,9 @@ from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.sidecars.host_copy import HostCopy
-from vram_arbiter.sidecars.model_process import Model, Models
+from vram_arbiter.sidecars.model_process import Model
 from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.weights_keeper import Models
 
 State = Literal["unloaded", "waiting", "loading", "resident", "parking", "parked", "unloading"]
 TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {

@@ -21,10 +21,10 @@ from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.device.capacity import leased_gpu
 from vram_arbiter.sidecars.model_main import AdapterFor
-from vram_arbiter.sidecars.model_process import ModelProcesses
 from vram_arbiter.sidecars.port import on_port
 from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings
+from vram_arbiter.sidecars.weights_keeper import ModelProcesses
 from vram_arbiter.sidecars.wires import Wire, unread_reply
 
 _log = logging.getLogger("sidecars")

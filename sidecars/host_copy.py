@@ -11,7 +11,7 @@ from typing import Final
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.sidecars.model_process import Models
+from vram_arbiter.sidecars.weights_keeper import Models
 
 FORESEEN_S: Final = 120.0
 """How long weights that were read ahead wait for a request: longer than a drive."""

@@ -1,4 +1,4 @@
-"""First import of the server from which model processes are forked (`model_process`).
+"""First import of the server from which model processes are forked (`weights_keeper`).
 
 Everything imported behind it is shared by all of them. The server outlives signals that are meant
 for the whole group (Ctrl-C, systemd's SIGTERM): it ends with the sidecar's host, and the host ends

@@ -30,10 +30,11 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.sidecars.gpu_copy import GpuCopy, State, unwanted
 from vram_arbiter.sidecars.host_copy import HostCopy
-from vram_arbiter.sidecars.model_process import Model, Models
+from vram_arbiter.sidecars.model_process import Model
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.standby import AWAY, Recall, left_s, still
 from vram_arbiter.sidecars.uses import Uses
+from vram_arbiter.sidecars.weights_keeper import Models
 
 Token = tuple[int, int]
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)

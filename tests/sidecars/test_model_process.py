@@ -22,9 +22,10 @@ from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
 from vram_arbiter.sidecars.adapters.base import LEROBOT
 from vram_arbiter.sidecars.model_main import AdapterFor
-from vram_arbiter.sidecars.model_process import ModelProcess, ModelProcesses
+from vram_arbiter.sidecars.model_process import ModelProcess
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.weights import Weights
+from vram_arbiter.sidecars.weights_keeper import ModelProcesses
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 

@@ -1,6 +1,6 @@
 """Multiprocessing's fork server from a process that has imported its modules already.
 
-A sidecar starts a server of imports (`sidecars.model_process`), which takes 0.4 s of a core for a
+A sidecar starts a server of imports (`sidecars.weights_keeper`), which takes 0.4 s of a core for a
 model without libraries and 8 s for one with lerobot. `lend` forks a process that becomes that
 server when it is asked for, with the environment of that moment. What the server would import is
 there; everything else (its socket, its children, its end with the sidecar) is multiprocessing's
@@ -26,7 +26,7 @@ _ABOVE = 512
 def importing() -> dict[str, str]:
     """Return the variables with which a sidecar imports a model's libraries."""
     from vram_arbiter.sidecars.model_main import THREADS_VARIABLE
-    from vram_arbiter.sidecars.model_process import ENVIRONMENT
+    from vram_arbiter.sidecars.weights_keeper import ENVIRONMENT
 
     return {**ENVIRONMENT, THREADS_VARIABLE: "1"}
 
