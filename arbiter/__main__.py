@@ -20,7 +20,7 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.runtime import terminal
-from vram_arbiter.schemas.runtime.telemetry import setup as otel
+from vram_arbiter.schemas.runtime.telemetry import plan as otel
 from vram_arbiter.schemas.runtime.version import add_version, version
 from vram_arbiter.schemas.yamltext import read_text
 

@@ -6,7 +6,6 @@ quantized in host RAM, then copied. What cannot be done is refused. Must not kno
 
 import importlib.util
 import logging
-import os
 import re
 import sys
 from collections import Counter
@@ -19,7 +18,7 @@ from vram_arbiter.schemas.errors import ConfigError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype, QuantizationBackend
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.sidecars.device.capacity import visible
+from vram_arbiter.sidecars.device.capacity import capabilities
 
 if TYPE_CHECKING:
     import torch
@@ -347,24 +346,6 @@ def _capability_without_cuda() -> Iterator[None]:
         yield
     finally:
         cuda.get_device_capability = own
-
-
-def capabilities(device: str) -> list[tuple[int, int]]:
-    """Return the compute capabilities of the GPUs that `cuda` or `cuda:N` may mean, without
-    initializing CUDA; none where NVML does not tell."""
-    import pynvml
-
-    try:
-        pynvml.nvmlInit()
-        try:
-            return [
-                tuple(pynvml.nvmlDeviceGetCudaComputeCapability(handle))
-                for handle in visible(device, os.environ, pynvml)
-            ]
-        finally:
-            pynvml.nvmlShutdown()
-    except pynvml.NVMLError:
-        return []
 
 
 def check_precision(manifest: RSkillManifest, device: str) -> None:

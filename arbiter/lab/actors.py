@@ -1,4 +1,4 @@
-"""Actors of a simulation: GPUs with late returns, and consumers that behave as clients do.
+"""Actors of a simulation: consumers that behave as clients do.
 
 A consumer acquires when there is work and its model is not resident, marks a use per job, lets uses
 in progress end when it is revoked, unloads, releases. Must not know the scheduler.
@@ -6,16 +6,14 @@ in progress end when it is revoked, unloads, releases. Must not know the schedul
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     ClientConnected,
     Event,
-    MemorySampled,
     ProcessDied,
-    ProcessUse,
     ReadyReported,
     ReleaseReported,
     RevokeAcknowledged,
@@ -23,26 +21,24 @@ from vram_arbiter.arbiter.core.events import (
     UseBegan,
     UseEnded,
 )
+from vram_arbiter.arbiter.lab.card import START_S, Card
 from vram_arbiter.arbiter.lab.outcome import Tally
-from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan
+from vram_arbiter.arbiter.lab.workload import Job, Plan
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.pushes import AnyPush, DeniedPush, GrantedPush, RevokePush
 from vram_arbiter.schemas.wire.views import LeaseView
 
-START_S = 1000.0
-"""The engine's clock at the beginning."""
 OOM_RETRY_S = 1.0
 """Pause before a load that failed for lack of memory is retried."""
 FOREVER_S = 1e9
 """TTL of simulated leases: simulated consumers never forget to renew."""
-STRANGERS_PID = 900_000
 
 
 class Stage(Protocol):
     """Surroundings of an actor."""
 
     now: float
-    cards: dict[GpuId, "Card"]
+    cards: dict[GpuId, Card]
     holders_exit: bool
 
     def at(self, when: float, call: Callable[[], None]) -> None: ...
@@ -50,62 +46,6 @@ class Stage(Protocol):
     def post(self, event: Event) -> None: ...
 
     def next_request(self) -> RequestId: ...
-
-
-@dataclass(slots=True)
-class Card:
-    """Bytes on one GPU.
-
-    Bytes that are given up show until the lag is over; an allocation that does not fit is refused.
-    """
-
-    plan: CardPlan
-    held: dict[ProcessKey, int] = field(default_factory=dict)
-    names: dict[ProcessKey, str] = field(default_factory=dict)
-    peak_bytes: int = 0
-    _late: list[tuple[float, ProcessKey, int]] = field(default_factory=list)
-
-    def set(self, process: ProcessKey, count: int, now: float) -> bool:
-        """Set the bytes of a process. Returns False, without a change, if the GPU lacks them."""
-        before = self.held.get(process, 0)
-        if count > before and self.used(now) + count - before > self.plan.total_bytes:
-            return False
-        if count < before and self.plan.release_lag_s:
-            self._late.append((now + self.plan.release_lag_s, process, before - count))
-        if count:
-            self.held[process] = count
-        else:
-            self.held.pop(process, None)
-        self.peak_bytes = max(self.peak_bytes, self.used(now))
-        return True
-
-    def others(self, now: float) -> list[tuple[str, int]]:
-        """Return the processes without a lease, by their newest entry."""
-        newest = {name: count for since, name, count in self.plan.others if since <= now - START_S}
-        return [(name, count) for name, count in newest.items() if count]
-
-    def shown(self, now: float) -> dict[ProcessKey, int]:
-        self._late = [item for item in self._late if item[0] > now]
-        seen = dict(self.held)
-        for _, process, count in self._late:
-            seen[process] = seen.get(process, 0) + count
-        return seen
-
-    def used(self, now: float) -> int:
-        others = sum(count for _, count in self.others(now))
-        return sum(self.shown(now).values()) + others + self.plan.overhead_bytes
-
-    def read(self, now: float) -> MemorySampled:
-        seen = [
-            ProcessUse(process, self.names[process], count)
-            for process, count in sorted(self.shown(now).items())
-        ]
-        seen += [
-            ProcessUse(ProcessKey(STRANGERS_PID + number, 1), name, count)
-            for number, (name, count) in enumerate(self.others(now))
-        ]
-        used = min(self.plan.total_bytes, self.used(now))
-        return MemorySampled(self.plan.info.id, now, used, self.plan.total_bytes, tuple(seen))
 
 
 @dataclass(slots=True)
@@ -277,7 +217,7 @@ class Actor:
         if lease.state == "loading":
             self._granted(lease)
 
-    def refused(self, request: RequestId, code: str) -> None:
+    def refused(self, request: RequestId) -> None:
         """Handle a refusal of the acquire, or of a use that came after the revoke."""
         if request == self._asked:
             self._asked = None

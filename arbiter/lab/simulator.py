@@ -12,7 +12,8 @@ from typing import Protocol
 
 from vram_arbiter.arbiter.core.effects import Effect, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import Event, MemorySampled, Tick
-from vram_arbiter.arbiter.lab.actors import START_S, Actor, Card
+from vram_arbiter.arbiter.lab.actors import Actor
+from vram_arbiter.arbiter.lab.card import START_S, Card
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.workload import Workload
 from vram_arbiter.schemas.ids import ClientId, GpuId, RequestId
@@ -119,8 +120,8 @@ class _World:
         match effect:
             case Reply(client, request, body):
                 self.actors[client].answered(request, getattr(body, "lease", None))
-            case Refuse(client, request, refusal):
-                self.actors[client].refused(request, refusal.code)
+            case Refuse(client, request):
+                self.actors[client].refused(request)
             case Push(client, body):
                 self.actors[client].told(body)
             case Sample(gpu) if gpu not in self._reading:

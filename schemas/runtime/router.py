@@ -8,27 +8,24 @@ input before a program sees a byte. Must not know what a message means.
 """
 
 import asyncio
-import errno
 import logging
 import os
 import resource
 import socket
-import stat
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.connection import Connection, Handler, Limits, User
 from vram_arbiter.schemas.runtime.peercred import Peer, PeerGone, identify
+from vram_arbiter.schemas.runtime.socket_file import SocketFile
 from vram_arbiter.schemas.runtime.turns import Turns
 
 log = logging.getLogger(__name__)
 
-LISTEN_BACKLOG = 512
 ACCEPT_MAX = 4
 """Connections accepted in one turn of the loop: each costs some 0.3 ms until it is read or cut, and
 others wait so long."""
@@ -63,13 +60,11 @@ class Router:
     def __init__(
         self, path: Path, handler: Handler, limits: Limits | None = None, group: int | None = None
     ) -> None:
-        self.path = path
+        self._file = SocketFile(path, group)
         self.handler = handler
         self.limits = limits or Limits()
-        self._group = group
         self._direct_share = min(DIRECT_SHARE, self.limits.work_share)
         self._listener: socket.socket | None = None
-        self._inode: tuple[int, int] | None = None
         self.loop: asyncio.AbstractEventLoop  # from `start` on
         self.receiving = False
         self._serial = 0
@@ -94,35 +89,7 @@ class Router:
     # -- life
     def bind(self) -> None:
         """Bind with mode 0660 from the first instant. Raises ConfigError."""
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            listener.setblocking(False)
-            # the socket's own mode is what its file gets, less the umask: no moment with a wider
-            # one
-            os.fchmod(listener.fileno(), 0o660)
-            self._remove_stale()
-            listener.bind(str(self.path))
-            os.chmod(self.path, 0o660)
-            if self._group is not None:
-                os.chown(self.path, -1, self._group)
-            listener.listen(LISTEN_BACKLOG)
-            found = os.lstat(self.path)
-        except OSError as error:
-            listener.close()
-            reason = error.strerror or str(error)
-            raise ConfigError(
-                f"cannot bind ipc://{self.path}: {reason}", hint="choose another endpoint"
-            ) from error
-        self._listener, self._inode = listener, (found.st_dev, found.st_ino)
-
-    def _remove_stale(self) -> None:
-        try:
-            mode = os.lstat(self.path).st_mode
-        except FileNotFoundError:
-            return
-        if not stat.S_ISSOCK(mode):
-            raise OSError(errno.EEXIST, "a file that is not a socket is in the way")
-        self.path.unlink()
+        self._listener = self._file.bind()
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         """Begin to accept and to read."""
@@ -163,15 +130,7 @@ class Router:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
-            if self._is_ours():
-                self.path.unlink(missing_ok=True)
-
-    def _is_ours(self) -> bool:
-        try:
-            found = os.lstat(self.path)
-        except OSError:
-            return False
-        return (found.st_dev, found.st_ino) == self._inode
+            self._file.remove()
 
     # -- accepting
     def _accept(self) -> None:
@@ -389,22 +348,14 @@ class Router:
         self._sweep = loop.call_later(SWEEP_S, self._sweep_once)
 
     def _restore_file(self) -> None:
-        """Bind again where the socket's file was deleted: without it no client finds the server."""
-        if self._is_ours() or self._listener is None:
+        """Listen again where the socket's file was deleted: without it no client finds the
+        server."""
+        if self._listener is None or (fresh := self._file.bind_again()) is None:
             return
-        if os.path.lexists(self.path):
-            log.error("another file is at %s: clients cannot reach this server", self.path)
-            return
-        loop, old = self.loop, self._listener
-        try:
-            self.bind()
-        except ConfigError as error:
-            log.error("the socket's file was deleted and cannot be made again: %s", error)
-            return
-        log.warning("the socket's file %s was deleted; bound again", self.path)
-        loop.remove_reader(old.fileno())
-        old.close()
-        loop.add_reader(self._listener.fileno(), self._accept)
+        self.loop.remove_reader(self._listener.fileno())
+        self._listener.close()
+        self._listener = fresh
+        self.loop.add_reader(fresh.fileno(), self._accept)
 
 
 def _the(connection: Connection) -> Connection:

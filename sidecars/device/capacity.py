@@ -1,4 +1,4 @@
-"""Capacity of the GPUs that `--device` names, read without using one."""
+"""Capacity and compute capability of the GPUs that `--device` names, read without using one."""
 
 import os
 from collections.abc import Mapping
@@ -69,6 +69,24 @@ def capacities(
             f"the NVIDIA driver lists no GPU for --device {device}", hint="see nvidia-smi -L"
         )
     return found
+
+
+def capabilities(device: str) -> list[tuple[int, int]]:
+    """Return the compute capabilities of the GPUs that `cuda` or `cuda:N` may mean, without
+    initializing CUDA; none where NVML does not tell."""
+    import pynvml
+
+    try:
+        pynvml.nvmlInit()
+        try:
+            return [
+                tuple(pynvml.nvmlDeviceGetCudaComputeCapability(handle))
+                for handle in visible(device, os.environ, pynvml)
+            ]
+        finally:
+            pynvml.nvmlShutdown()
+    except pynvml.NVMLError:
+        return []
 
 
 def visible(device: str, environ: Mapping[str, str], nvml: Any) -> list[Any]:

@@ -21,15 +21,24 @@ from dataclasses import dataclass, replace
 
 from opentelemetry import trace
 from opentelemetry.context import Context
-from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core.effects import Note
-from vram_arbiter.arbiter.core.model.refusals import LimitReached
+from vram_arbiter.arbiter.host.telemetry.facts import (
+    REASON_CHARS,
+    bytes_attribute,
+    context_of,
+    end_span,
+    ids_of,
+    labels_of,
+    links_to,
+    named_by,
+    refuses_a_lease,
+    traceparent_of,
+)
 from vram_arbiter.arbiter.host.telemetry.metrics import LeaseMetrics
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.telemetry import names as names
-from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.runtime.telemetry import names
 from vram_arbiter.schemas.wire.notes import (
     About,
     AnyNote,
@@ -56,9 +65,7 @@ from vram_arbiter.schemas.wire.pushes import AnyPush, RevokePush
 OPEN_MAX = 32_768
 """Spans of acquires that are open at a time, and as many of evictions: twice the waiters that the
 default limits allow. The oldest is ended when one more begins."""
-REASON_CHARS = 300
 
-_W3C = TraceContextTextMapPropagator()
 _NONE: Mapping[str, str] = {}
 _STEPS: Mapping[type, str] = {
     RevokeAckedNote: names.EVENT_REVOKE_ACKED,
@@ -129,7 +136,7 @@ class LeaseTelemetry:
                     self._counts.refused(refusal.code)
                     if refusal.code in told:
                         told.remove(refusal.code)
-                    elif _refuses_a_lease(refusal):
+                    elif refuses_a_lease(refusal):
                         self._counts.denied(refusal.code)
 
     def revoke(self, body: AnyPush) -> AnyPush:
@@ -140,10 +147,7 @@ class LeaseTelemetry:
         leaving = self._leaving.get(body.lease_id)
         if leaving is None or leaving.evict is None:
             return body
-        own: dict[str, str] = {}
-        _W3C.inject(own, trace.set_span_in_context(leaving.evict, Context()))
-        # nothing is added where only metrics are on
-        return replace(body, traceparent=own.get("traceparent", body.traceparent))
+        return replace(body, traceparent=traceparent_of(leaving.evict) or body.traceparent)
 
     def wrote(self, seconds: float, *, failed: bool) -> None:
         """One transaction of the journal."""
@@ -166,7 +170,7 @@ class LeaseTelemetry:
             case GrantedNote() as granted:
                 span = self._granted(about, granted, str(reason), at_ns)
             case ReadyNote(measured_bytes=measured):
-                span = self._end_acquire(lease_id, at_ns, attributes=_bytes(measured))
+                span = self._end_acquire(lease_id, at_ns, attributes=bytes_attribute(measured))
             case DeniedNote(refusal):
                 self._counts.denied(refusal.code)
                 span = self._end_acquire(lease_id, at_ns, failed=f"{refusal.code}: {reason}")
@@ -188,7 +192,7 @@ class LeaseTelemetry:
                 span = self._end_acquire(self._growths[lease_id], at_ns)
             case body if type(body) in _STEPS:
                 span = self._step(lease_id, _STEPS[type(body)], body, at_ns)
-        return _named_by(about) if span is None else _ids(span)
+        return named_by(about) if span is None else ids_of(span)
 
     def close(self) -> None:
         """The daemon ends. Its leases go on; their spans are exported as far as they came."""
@@ -223,14 +227,14 @@ class LeaseTelemetry:
         if acquire.queue is None and waited_ns > 0:
             acquire.queue = self._child(names.SPAN_QUEUE, acquire.span, acquire.started_ns)
         if acquire.queue is not None:
-            _end(acquire.queue, at_ns)
+            end_span(acquire.queue, at_ns)
             acquire.queue = None
         where = {
             names.ATTR_GPU: str(about.gpu),
             names.ATTR_REASON: reason[:REASON_CHARS],
         }
         acquire.span.set_attributes(where)
-        size = _bytes(granted.charge_bytes)
+        size = bytes_attribute(granted.charge_bytes)
         acquire.load = self._child(names.SPAN_LOAD, acquire.span, at_ns, size)
         handover_s = None
         if acquire.asked_ns is not None and granted.evicted:
@@ -252,8 +256,8 @@ class LeaseTelemetry:
         acquirer's trace: it only points there."""
         if (found := self._acquires.get(lease_id)) is not None:
             return found
-        asked = _context(traceparent)
-        parent, links = (Context(), _links(asked)) if by_itself else (asked, ())
+        asked = context_of(traceparent)
+        parent, links = (Context(), links_to(asked)) if by_itself else (asked, ())
         labels = {names.ATTR_LEASE: lease_id, names.ATTR_CONSUMER: consumer}
         kind = trace.SpanKind.SERVER
         span = self._tracer.start_span(
@@ -280,8 +284,8 @@ class LeaseTelemetry:
         for child in (acquire.queue, acquire.load):
             if child is not None:
                 child.set_attributes(attributes or {})
-                _end(child, at_ns, failed)
-        _end(acquire.span, at_ns, failed)
+                end_span(child, at_ns, failed)
+        end_span(acquire.span, at_ns, failed)
         return acquire.span
 
     # -- leaving
@@ -297,7 +301,7 @@ class LeaseTelemetry:
             parent = trace.set_span_in_context(acquire.span, parent)
         why = {names.ATTR_WANTED_BY: asked.wanted_by, names.ATTR_REASON: asked.cause}
         span = self._tracer.start_span(
-            names.SPAN_EVICT, parent, attributes=_labels(about) | why, start_time=at_ns
+            names.SPAN_EVICT, parent, attributes=labels_of(about) | why, start_time=at_ns
         )
         # it was never measured: asked again, the earlier way out has no end of its own
         self._end_leaving(lease_id, at_ns)
@@ -338,13 +342,17 @@ class LeaseTelemetry:
 
     def _verifying(self, leaving: _Leaving, about: About, at_ns: int) -> trace.Span:
         if leaving.verify is None:
-            parent, links = Context(), _links(_context(about.traceparent))
+            parent, links = Context(), links_to(context_of(about.traceparent))
             if (
                 leaving.evict is not None
             ):  # else it left by itself: not part of its acquirer's trace
                 parent, links = trace.set_span_in_context(leaving.evict, parent), ()
             leaving.verify = self._tracer.start_span(
-                names.SPAN_VERIFY, parent, attributes=_labels(about), links=links, start_time=at_ns
+                names.SPAN_VERIFY,
+                parent,
+                attributes=labels_of(about),
+                links=links,
+                start_time=at_ns,
             )
         return leaving.verify
 
@@ -379,7 +387,7 @@ class LeaseTelemetry:
             if span is not None:
                 if why:
                     span.add_event(why, timestamp=at_ns)
-                _end(span, at_ns)
+                end_span(span, at_ns)
 
     def _child(
         self, name: str, parent: trace.Span, at_ns: int, attributes: Mapping[str, int] | None = None
@@ -388,51 +396,3 @@ class LeaseTelemetry:
         return self._tracer.start_span(
             name, context=context, start_time=at_ns, attributes=attributes
         )
-
-
-def _end(span: trace.Span, at_ns: int, failed: str = "") -> None:
-    """The wall clock may be set back meanwhile: nothing ends before it began."""
-    if failed:
-        span.set_status(trace.Status(trace.StatusCode.ERROR, failed[:REASON_CHARS]))
-    span.end(max(at_ns, getattr(span, "start_time", None) or 0))
-
-
-def _refuses_a_lease(refusal: Refusal) -> bool:
-    """Of what is refused at once, what is the refusal of a lease."""
-    if isinstance(refusal, LimitReached):
-        return refusal.limit in ("waiters_max", "leases_per_client_max")
-    return refusal.code in ("vram_insufficient", "load_failing", "unknown_gpu")
-
-
-def _bytes(count: int | None) -> dict[str, int]:
-    return {} if count is None else {names.ATTR_BYTES: count}
-
-
-def _labels(about: About) -> dict[str, str]:
-    return {
-        names.ATTR_LEASE: str(about.lease_id),
-        names.ATTR_CONSUMER: about.consumer,
-        names.ATTR_GPU: str(about.gpu),
-    }
-
-
-def _context(traceparent: str | None) -> Context:
-    """The span that a W3C traceparent names, as the parent of others."""
-    return _W3C.extract({"traceparent": traceparent}, Context()) if traceparent else Context()
-
-
-def _links(context: Context) -> Sequence[trace.Link]:
-    earlier = trace.get_current_span(context).get_span_context()
-    return [trace.Link(earlier)] if earlier.is_valid else ()
-
-
-def _ids(span: trace.Span) -> Mapping[str, str]:
-    context = span.get_span_context()
-    if not context.is_valid:
-        return _NONE  # only metrics are on, and no trace was named
-    return {"trace_id": f"{context.trace_id:032x}", "span_id": f"{context.span_id:016x}"}
-
-
-def _named_by(about: About) -> Mapping[str, str]:
-    """The acquirer's own span, as it was told us."""
-    return _ids(trace.get_current_span(_context(about.traceparent)))

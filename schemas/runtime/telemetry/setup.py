@@ -1,64 +1,40 @@
 """Installs the OpenTelemetry SDK where the environment or a program's configuration asks for it.
 
-Nothing of OpenTelemetry is imported, and nothing runs, unless it is asked for. The SDK and its
-exporters read the OTEL_* variables themselves; this module reads only those that say whether and
-where to export. Exporters are the installed entry points of the specification's names
-(`otlp`, `console`, ...); only `prometheus` is our own server, which limits what a local process
-may cost it and listens on loopback alone, because it does not authenticate.
+Nothing of OpenTelemetry is imported, and nothing runs, unless it is asked for (`plan`). Only
+`prometheus` is our own server, which limits what a local process may cost it and listens on
+loopback alone, because it does not authenticate.
 Names of spans and metrics are in `names`, the calls in `spans`.
 """
 
 import atexit
-import ipaddress
 import logging
 import os
 import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any
 
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.telemetry import exported
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.urls import collector_url
+from vram_arbiter.schemas.runtime.telemetry.plan import (
+    Plan,
+    Signal,
+    entry_point,
+    not_installed,
+    plan,
+)
 
 log = logging.getLogger(__name__)
 
-type Signal = Literal["traces", "metrics", "logs"]
-SIGNALS: tuple[Signal, ...] = ("traces", "metrics", "logs")
-EXTRA = "vram-arbiter[telemetry]"
-PROMETHEUS_PORT = 9464
-"""Port that OpenTelemetry's specification gives to a Prometheus endpoint."""
 FLUSH_S = 5.0
 """Longest wait for a collector at a program's end."""
 EXPORT_S = 3.0
 """Time limit of one OTLP export unless a variable sets it; the SDK's 10 s outlast FLUSH_S."""
 SAY_AGAIN_S = 300.0
 """Interval between two complaints about a collector that is away."""
-_PROTOCOLS = {"": "http", "http/protobuf": "http", "grpc": "grpc"}
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What is exported, by names of exporters. All empty: telemetry is off."""
-
-    traces: tuple[str, ...] = ()
-    metrics: tuple[str, ...] = ()
-    endpoint: str | None = None
-    """Base URL of the OTLP collector, from a configuration; None: the SDK reads the variables."""
-    prometheus: tuple[str, int] | None = None
-    """Loopback address and port; port 0 chooses a free one."""
-    ratio: float | None = None
-    """Share of traces that begin here; None: the SDK reads the variables."""
-    logs: tuple[str, ...] = ()
-
-    @property
-    def on(self) -> bool:
-        return bool(self.traces or self.metrics or self.logs) or self.prometheus is not None
 
 
 class Telemetry:
@@ -135,112 +111,6 @@ def set_up(
     return _installed
 
 
-def plan(
-    environ: Mapping[str, str],
-    *,
-    endpoint: str | None = None,
-    prometheus_port: int | None = None,
-    sample_ratio: float | None = None,
-) -> Plan:
-    """Return what is asked for; import and open nothing. Raises ConfigError."""
-    if environ.get("OTEL_SDK_DISABLED", "").strip().lower() == "true":
-        return Plan()
-    wanted = {signal: _exporters(environ, signal, endpoint) for signal in SIGNALS}
-    prometheus = None
-    if prometheus_port is not None or "prometheus" in wanted["metrics"]:
-        prometheus = _prometheus(environ, prometheus_port)
-    metrics = tuple(name for name in wanted["metrics"] if name != "prometheus")
-    return Plan(wanted["traces"], metrics, endpoint, prometheus, sample_ratio, wanted["logs"])
-
-
-def _exporters(environ: Mapping[str, str], signal: Signal, endpoint: str | None) -> tuple[str, ...]:
-    """Return the exporters' names. An OTLP endpoint alone asks for `otlp`."""
-    given = environ.get(f"OTEL_{signal.upper()}_EXPORTER", "").lower().split(",")
-    names = tuple(name.strip() for name in given if name.strip())
-    urls = [
-        variable
-        for variable in (
-            f"OTEL_EXPORTER_OTLP_{signal.upper()}_ENDPOINT",
-            "OTEL_EXPORTER_OTLP_ENDPOINT",
-        )
-        if environ.get(variable, "").strip()
-    ]
-    if not names and (urls or endpoint is not None):
-        names = ("otlp",)
-    for variable in urls if "otlp" in names else ():
-        try:
-            collector_url(environ[variable].strip())
-        except ValueError as error:
-            raise ConfigError(f"{variable}: {error}", hint="or unset it") from None
-    return tuple(name for name in names if name != "none")
-
-
-def _prometheus(environ: Mapping[str, str], port: int | None) -> tuple[str, int]:
-    host = environ.get("OTEL_EXPORTER_PROMETHEUS_HOST", "").strip() or "127.0.0.1"
-    if not _is_loopback(host):
-        raise ConfigError(
-            f"OTEL_EXPORTER_PROMETHEUS_HOST: expected a loopback address, got {host}; the endpoint"
-            " does not authenticate",
-            hint="write 127.0.0.1 and let a collector or proxy on this machine forward it",
-        )
-    if port is None:
-        text = environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or str(PROMETHEUS_PORT)
-        if not text.isascii() or not text.isdigit() or int(text) > 65_535:
-            raise ConfigError(
-                f"OTEL_EXPORTER_PROMETHEUS_PORT: expected a port, got {text!r}", hint="0 to 65535"
-            )
-        port = int(text)
-    return host, port
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def check(planned: Plan) -> None:
-    """Raise ConfigError for an exporter that `set_up` could not make; import no SDK."""
-    try:
-        for name in planned.traces:
-            _entry_point("traces", name)
-        for name in planned.metrics:
-            _entry_point("metrics", name)
-        for name in planned.logs:
-            _entry_point("logs", name)
-        if planned.prometheus is not None and find_spec("prometheus_client") is None:
-            raise ImportError("No module named 'prometheus_client'")
-    except ImportError as error:
-        raise _not_installed(error) from error
-
-
-def _not_installed(error: ImportError) -> ConfigError:
-    return ConfigError(
-        f"telemetry is asked for, but its packages are not installed: {error}",
-        hint=f"pip install '{EXTRA}', or unset the OTEL_ variables and the telemetry section",
-    )
-
-
-def _entry_point(signal: Signal, name: str) -> Any:
-    """Return an installed exporter's entry point by its name in the specification."""
-    from importlib.metadata import entry_points
-
-    entry = f"otlp_proto_{_protocol(signal)}" if name == "otlp" else name
-    found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))
-    if found:
-        return found[0]
-    if name == "otlp":
-        raise ImportError(f"no exporter {entry!r} is installed")
-    raise ConfigError(
-        f"OTEL_{signal.upper()}_EXPORTER: no exporter {name!r} is installed",
-        hint="write otlp, prometheus (metrics only) or none, or install its package",
-    )
-
-
-# -- the SDK: nothing above this line imports it ---------------------------------------------------
 def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Telemetry:
     """Install all of `planned`, or nothing."""
     ends: list[Callable[[], object]] = []
@@ -250,7 +120,7 @@ def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Tele
         for end in ends:
             end()
         if isinstance(error, ImportError):
-            raise _not_installed(error) from error
+            raise not_installed(error) from error
         if isinstance(error, ValueError):
             raise ConfigError(
                 f"OpenTelemetry refuses its settings: {error}",
@@ -327,22 +197,7 @@ def _exporter(signal: Signal, name: str, planned: Plan) -> Any:
             options["timeout"] = EXPORT_S
         if planned.endpoint is not None:
             options["endpoint"] = f"{planned.endpoint.rstrip('/')}/v1/{signal}"
-    return _entry_point(signal, name).load()(**options)
-
-
-def _protocol(signal: Signal) -> str:
-    for variable in (
-        f"OTEL_EXPORTER_OTLP_{signal.upper()}_PROTOCOL",
-        "OTEL_EXPORTER_OTLP_PROTOCOL",
-    ):
-        if given := os.environ.get(variable, "").strip().lower():
-            if given not in _PROTOCOLS:
-                raise ConfigError(
-                    f"{variable}: expected http/protobuf or grpc, got {given!r}",
-                    hint="collectors take http/protobuf on port 4318",
-                )
-            return _PROTOCOLS[given]
-    return _PROTOCOLS[""]
+    return entry_point(signal, name).load()(**options)
 
 
 def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any], int | None]:

@@ -15,7 +15,8 @@ import pytest
 from tests.support.collector import Collector
 from tests.support.paths import ROOT
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime.telemetry.setup import Plan, Telemetry, plan, set_up
+from vram_arbiter.schemas.runtime.telemetry.plan import Plan, plan
+from vram_arbiter.schemas.runtime.telemetry.setup import Telemetry, set_up
 
 needs_sdk = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in ("opentelemetry.sdk", "prometheus_client")),
