@@ -117,7 +117,8 @@ def find_config(environ: Mapping[str, str]) -> Path:
 
 def state_path(environ: Mapping[str, str]) -> Path:
     if under_systemd := environ.get("STATE_DIRECTORY"):
-        return Path(under_systemd.split(":")[0], "hooks.json")
+        # systemd's own link for a user that exists only while the unit runs
+        return Path(under_systemd.split(":")[0]).resolve() / "hooks.json"
     home = environ.get("XDG_STATE_HOME") or f"{environ.get('HOME', '/')}/.local/state"
     return Path(home, FOLDER, "hooks.json")
 

@@ -26,15 +26,15 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.skipif(OBSTACLE is not None, reason=f"no systemd can be started here: {OBSTACLE}"),
 ]
-PAGE = Path(__file__).parents[2] / "docs/how-to/systemd.md"
+HOW_TO = Path(__file__).parents[2] / "docs/how-to"
 SYSTEM = "/etc/systemd/system"
 ENDPOINT = "ipc:///run/vram-arbiter/arbiter.sock"
 ARBITER = "vram-arbiter.service"
 
 
-def steps(heading: str) -> list[str]:
+def steps(heading: str, page: str = "systemd.md") -> list[str]:
     """The commands of a section's first block, as root types them."""
-    section = PAGE.read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
+    section = (HOW_TO / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
     block = section.split("```sh\n")[1].split("```")[0].replace("\\\n", "")
     return [line.replace("sudo ", "") for line in block.splitlines()]
 
@@ -176,6 +176,43 @@ def test_a_killed_arbiter_comes_back_with_its_leases(machine: Machine) -> None:
             lambda: (leases_inside(machine) or {}).get("survivor"), lambda: machine.log(ARBITER)
         )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
+
+
+HOOKS = """
+hooks:
+  - name: seen
+    on: [granted]
+    command: [/bin/sh, -c, "cat >>$STATE_DIRECTORY/seen; vramctl drain -r no 2>>$STATE_DIRECTORY/no"]
+"""
+
+
+def test_hooks_run_as_their_page_says(machine: Machine) -> None:
+    """They hear of what happened while they were stopped, and may look, not act."""
+    copied, started, _ = (step.partition("#")[0] for step in steps("Service", "hooks.md"))
+    assert "start condition" in machine.run(
+        "sh", "-c", f"{started} && systemctl status vram-hooks; true"
+    )
+    machine.run("sh", "-c", copied)
+    machine.write("/etc/vram-arbiter/hooks.yaml", HOOKS)
+
+    def seen() -> set[str]:
+        lines = machine.run("sh", "-c", "cat /var/lib/vram-hooks/seen 2>/dev/null; true")
+        return {json.loads(line)["consumer"] for line in lines.splitlines()}
+
+    def granted_to(name: str) -> None:
+        answer_of(
+            lambda: True if name in seen() else None, lambda: machine.log("vram-hooks.service")
+        )
+
+    machine.run("sh", "-c", started)
+    with held_inside(machine, "led"):
+        granted_to("led")
+    machine.run("systemctl", "stop", "vram-hooks")
+    with held_inside(machine, "meanwhile"):
+        machine.run("systemctl", "start", "vram-hooks")
+        granted_to("meanwhile")
+    assert "operators' group may be operator" in machine.read("/var/lib/vram-hooks/no")
+    machine.run("systemctl", "disable", "--now", "vram-hooks")
 
 
 def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
