@@ -6,7 +6,7 @@ from importlib import import_module
 
 from vram_arbiter.arbiter.__main__ import parser as arbiter_parser
 from vram_arbiter.arbiter.lab.__main__ import parser as lab_parser
-from vram_arbiter.clients.cli.main import COMMANDS, DESCRIPTION, EPILOG, command_parser
+from vram_arbiter.clients.cli.installation.completion import whole_parser
 from vram_arbiter.reasoner.options import parser as reasoner_parser
 from vram_arbiter.runner.__main__ import parser as runner_parser
 from vram_arbiter.sidecars.__main__ import parser as sidecar_parser
@@ -15,14 +15,11 @@ EVERYWHERE = ("-h", "--version")  # options of every command, which its table le
 
 
 def vramctl() -> argparse.ArgumentParser:
-    """Return one parser of all commands; the program itself imports only the command that runs."""
-    made = argparse.ArgumentParser(prog="vramctl", description=DESCRIPTION, epilog=EPILOG)
-    commands = made.add_subparsers(metavar="COMMAND", required=True)
+    """Return one parser of all commands, with those that the lab parses."""
+    made = whole_parser()
+    (commands,) = (one for one in made._actions if isinstance(one, argparse._SubParsersAction))
     offline = subcommands(lab_parser())
-    for name, command in COMMANDS.items():
-        parser = offline[name] if command.passes_on else command_parser(name)
-        commands.add_parser(name, help=command.summary)
-        commands.choices[name] = parser
+    commands.choices.update({name: offline[name] for name in commands.choices if name in offline})
     return made
 
 

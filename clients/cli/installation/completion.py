@@ -4,7 +4,6 @@ The scripts are static: completing a word starts no program.
 """
 
 import argparse
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -25,14 +24,16 @@ def completions() -> dict[Path, str]:
 
 
 def whole_parser() -> argparse.ArgumentParser:
-    """Return one parser with the arguments of every command of `vramctl`."""
-    from vram_arbiter.clients.cli.main import COMMANDS
+    """Return one parser of all commands; the program itself imports only the one that runs.
 
-    parser = argparse.ArgumentParser(prog="vramctl", allow_abbrev=False)
-    commands = parser.add_subparsers(metavar="COMMAND")
+    A command that another program parses has no arguments here.
+    """
+    from vram_arbiter.clients.cli.main import COMMANDS, DESCRIPTION, EPILOG, command_parser
+
+    parser = argparse.ArgumentParser(prog="vramctl", description=DESCRIPTION, epilog=EPILOG)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
-        made = commands.add_parser(name, help=command.summary)
-        if not command.passes_on:  # another program parses these
-            module = import_module(f"vram_arbiter.clients.cli.{command.module}")
-            module.add_arguments(made, name)
+        commands.add_parser(name, help=command.summary)
+        if not command.passes_on:
+            commands.choices[name] = command_parser(name)
     return parser
