@@ -20,6 +20,8 @@ from vram_arbiter.schemas.runtime.printable import printable
 
 TICK_S = 1.0
 """Between two redraws without news: ages are shown in seconds."""
+SELECTED_LEAST, SELECTED_MOST = 2, 8
+"""Lines for the selected lease: where the list is long, and where it leaves room."""
 SAID_S = 8.0
 """For so long the outcome of an order is shown in the last line."""
 
@@ -119,12 +121,15 @@ class Top(App[None]):
 
     def _show_selected(self) -> None:
         base = self.screen_stack[0]
-        row, height = base.query_one(Leases).row, self.size.height
-        lines = gpus.selected_lines(row, self.size.width, 2 if height <= 24 else 4)
+        leases, panel = base.query_one(Leases), base.query_one("#selected", Static)
+        row = leases.row
+        spare = leases.size.height - leases.virtual_size.height + max(0, panel.size.height)
+        most = max(SELECTED_LEAST, min(SELECTED_MOST, spare))
+        lines = gpus.selected_lines(row, self.size.width, most)
         if row is None and self._feed.status is not None:
             known = self._feed.status.leases
             lines = [f"no lease matches {printable(self._wanted)!r}" if known else "no leases"]
-        base.query_one("#selected", Static).update(Text("\n".join(lines), no_wrap=True))
+        panel.update(Text("\n".join(lines), no_wrap=True))
 
     def _keys(self) -> Text:
         until, said, style = self._said
@@ -185,10 +190,15 @@ class Top(App[None]):
         self.push_screen(Help(self._feed.refusal))
 
     def action_evict(self) -> None:
-        if (row := self._selected()) is not None:
-            uses = row.lease.uses
-            then = f"It finishes {plural(uses, 'use')} first." if uses else "It is idle."
-            self._ask(Order("evict", row.lease.lease_id), f"Evict {_name(row)}? {then}", "Evict")
+        if (row := self._selected()) is None:
+            return
+        if row.lease.state == "queued":
+            said = f"{printable(row.lease.consumer)} waits: it has no bytes to evict"
+            self._say(said, "bold yellow")
+            return
+        uses = row.lease.uses
+        then = f"It finishes {plural(uses, 'use')} first." if uses else "It is idle."
+        self._ask(Order("evict", row.lease.lease_id), f"Evict {_name(row)}? {then}", "Evict")
 
     def action_pin(self) -> None:
         if (row := self._selected()) is None:

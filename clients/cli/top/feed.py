@@ -32,6 +32,8 @@ SILENT_S = 1.5
 AGAIN_S = 10.0
 """Between two attempts to subscribe after a refusal."""
 EVENTS_KEPT = 50
+EARLIER = 20
+"""Events from before its start."""
 DATE_CHARS = len("2026-01-31 ")
 """Of an event's line: the date of a live view is no news."""
 
@@ -75,10 +77,14 @@ class Feed:
             tasks.create_task(self._poll())
 
     async def _follow(self) -> None:
+        with contextlib.suppress(VramError):  # an older arbiter, or one that is away
+            newest = (await self.client.history(limit=1)).last_seq
+            earlier = await self.client.history(after=max(0, newest - EARLIER))
+            self.events.extend(_line(event) for event in earlier.events)
         while True:
             try:
                 async for event in self.client.subscribe():
-                    self.events.append(text.event_line(event)[DATE_CHARS:])
+                    self.events.append(_line(event))
                     self._happened.set()
             except VramError as error:  # too many subscribers: the status goes on without events
                 self.events.append(f"no events: {_said(error.to_wire())}")
@@ -137,6 +143,10 @@ class Feed:
     async def _ask(self, op: str, fields: JsonMap) -> Message:
         question = partial(ask, op, fields, self.client.endpoint, role="operator")
         return await asyncio.to_thread(question)
+
+
+def _line(event: JsonMap) -> str:
+    return text.event_line(event)[DATE_CHARS:]
 
 
 def _said(error: JsonMap) -> str:

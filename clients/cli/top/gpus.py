@@ -156,7 +156,9 @@ def selected_lines(row: Row | None, width: int, most: int) -> list[str]:
         if why.eta_s is not None:
             lines[0] += f"; loaded in {duration(why.eta_s)}, as usual"
     wrapped = [part for line in lines for part in _wrapped(line, width)]
-    return wrapped if len(wrapped) <= most else [*wrapped[: most - 1], fitted("…", width)]
+    if len(wrapped) <= most:
+        return wrapped
+    return [*wrapped[: most - 1], fitted(f"{wrapped[most - 1]} {wrapped[most]}", width)]
 
 
 def _wrapped(line: str, width: int) -> list[str]:

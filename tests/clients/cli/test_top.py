@@ -142,8 +142,14 @@ async def test_80_by_24(daemon: ArbiterProcess, held_detector: Lease) -> None:
         assert shown[-1].startswith("s sort queue  / filter  e evict  p pin  d drain  ? keys  q")
         await pilot.press("j")
         await pilot.pause()
-        selected = " ".join(screen(pilot)[-6:-2])
-        assert "grab needs 6.00 GiB" in selected
+        assert " ".join(why.text.split()) in words(" ".join(screen(pilot)[-12:-2])), (
+            "the list leaves room: the reason is shown in full"
+        )
+        await until_shown(pilot, lambda: "queued" in screen(pilot)[-2])  # of before its start
+        await pilot.press("e")
+        await pilot.pause()
+        assert keys(pilot) == "grab waits: it has no bytes to evict"
+        assert len(pilot.app.screen_stack) == 1, "no dialog for what would be refused"
 
 
 @pytest.mark.e2e
@@ -324,6 +330,17 @@ def test_a_sparkline_shows_the_largest_reading_of_each_interval() -> None:
     samples.add(20 * step, 0)
     assert len(samples.points) == 1, "older readings are forgotten"
     assert Samples().sparkline(3, GIB) == "   "
+
+
+def test_a_reason_that_is_cut_says_so(told_lines: StatusReply) -> None:
+    """Regression: the second of two lines was an ellipsis alone."""
+    row, width = rows_of(told_lines)[0], 30
+    whole = gpus.selected_lines(row, width, 8)
+    assert len(whole) > 2
+    first, second = gpus.selected_lines(row, width, 2)
+    assert first == whole[0]
+    assert second.startswith(whole[1][:20])
+    assert second.endswith("…")
 
 
 def test_sizes_are_short() -> None:
