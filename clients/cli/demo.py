@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import shutil
+import sys
 import tempfile
 import time
 import uuid
@@ -257,8 +258,6 @@ async def _boot(
         f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take "
         "a while) …"
     )
-    if arbiter:
-        print(f"live in another terminal: vramctl top --endpoint ipc://{runtime}/arbiter.sock")
     without = [] if arbiter else ["--no-arbiter"]
     client = None
     if arbiter:
@@ -269,6 +268,8 @@ async def _boot(
         page = [] if http is None else ["--http", str(http)]
         await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config), *page)
         client = await stack.enter_async_context(_arbiter_client(runtime))
+        top = f"{_vramctl()} top --endpoint ipc://{runtime}/arbiter.sock"
+        print(f"live in another terminal: {top}")
         if http is not None:
             print(f"status page: http://{http}")
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
@@ -291,6 +292,15 @@ async def _boot(
                 await _until_up(programs, sidecar.ping)
         await _until_up(programs, runner.ping)
     return client
+
+
+def _vramctl() -> str:
+    """Return this program as it is typed here: a clone's environment is seldom on PATH."""
+    started = Path(sys.argv[0])
+    if started.name != "vramctl":
+        return f"{sys.executable} -m vram_arbiter.clients"
+    found = shutil.which("vramctl")
+    return "vramctl" if found is not None and started.samefile(found) else str(started)
 
 
 def _arbiter_client(runtime: Path) -> AsyncClient:

@@ -1,9 +1,17 @@
 """The main job, whole: `vramctl demo` with six real processes, with and without the arbiter."""
 
+import contextlib
 import json
 import os
+import pty
+import select
+import shlex
+import socket
 import subprocess
 import sys
+import termios
+import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +22,76 @@ pytestmark = [pytest.mark.e2e, pytest.mark.heavy, pytest.mark.timeout(720)]
 GIB = 1 << 30
 
 
-def run_demo(out: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
+def run_demo(
+    out: Path, *arguments: str, told: Callable[[str], None] = lambda line: None
+) -> tuple[int, dict[str, Any]]:
     for module in ("torch", "lerobot", "mujoco"):
         pytest.importorskip(module, reason="needs the full install")
     command = [sys.executable, "-m", "vram_arbiter.clients", "demo", "--out", str(out), *arguments]
-    ended = subprocess.run(
+    printed = []
+    with subprocess.Popen(
         command,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
-        env=os.environ | {"MUJOCO_GL": "egl"},
-        timeout=700,
-        check=False,
-    )
-    assert (out / "summary.json").exists(), ended.stdout + ended.stderr
-    return ended.returncode, json.loads((out / "summary.json").read_text())
+        env=os.environ | {"MUJOCO_GL": "egl", "PYTHONUNBUFFERED": "1"},
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            printed.append(line)
+            told(line)
+    assert (out / "summary.json").exists(), "".join(printed)
+    return process.returncode, json.loads((out / "summary.json").read_text())
+
+
+def screen_of(command: list[str], until: bytes) -> bytes:
+    """What a program draws on a terminal of 80 by 24 until a text is there; `q` ends it then."""
+    master, terminal = pty.openpty()
+    termios.tcsetwinsize(terminal, (24, 80))
+    process = subprocess.Popen(
+        command, env=os.environ | {"TERM": "xterm-256color"},
+        stdin=terminal, stdout=terminal, stderr=terminal,
+    )  # fmt: skip
+    os.close(terminal)
+    shown, asked = b"", False
+    try:
+        with contextlib.suppress(OSError):  # its end closes the terminal
+            while select.select([master], [], [], 120.0)[0]:
+                shown += os.read(master, 65_536)
+                if until in shown and not asked:
+                    asked = True
+                    os.write(master, b"q")
+        assert process.wait(60.0) == 0, shown
+    finally:
+        process.kill()
+        process.wait()
+        os.close(master)
+    return shown
+
+
+class Watched:
+    """What a person with the demo's printed lines sees meanwhile."""
+
+    def __init__(self) -> None:
+        self.page = self.screen = b""
+
+    def line(self, printed: str) -> None:
+        """Do what a line of the demo says: open the page, type the command."""
+        if printed.startswith("status page: "):
+            with urllib.request.urlopen(printed.split()[-1], timeout=60.0) as answer:
+                self.page = answer.read()
+        elif printed.startswith("live in another terminal: "):
+            self.screen = screen_of(shlex.split(printed.partition(": ")[2]), b"GPU 0")
 
 
 def test_find_navigate_grab_fits_in_eight_gib(tmp_path: Path) -> None:
-    code, summary = run_demo(tmp_path / "on", "--seed", "0")
+    """With the page and `vramctl top` over it, by the lines that the demo prints."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    watched = Watched()
+    code, summary = run_demo(tmp_path / "on", "--seed", "0", "--http", str(port), told=watched.line)
+    assert b"<title>" in watched.page
+    assert b"arbiter serving" in watched.screen
     assert summary["completed"], summary
     assert code == 0
     assert summary["oom_events"] == 0
