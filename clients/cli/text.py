@@ -202,7 +202,7 @@ def _why_details(lease: JsonMap) -> list[str]:
     lines.append(f"  next      {lease['next']}")
     lines += [f"  then      {step['text']}" for step in lease.get("plan", ())]
     eta = lease["eta_s"]
-    expected = "unknown, never seen before"
+    expected = "unknown"
     if eta is not None:
         expected = f"in {duration(eta)} ({lease['eta_source']})"
     return [*lines, f"  expected  {expected}"]

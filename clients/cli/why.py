@@ -2,8 +2,11 @@
 
 import argparse
 
-from vram_arbiter.clients.cli import arguments, text
+from vram_arbiter.clients.cli import arguments, terminal, text
 from vram_arbiter.clients.cli.replies import ENVELOPE, NO, OK, answer
+from vram_arbiter.schemas.plain import Message
+
+INDENT = len("  blocked   ")
 
 DESCRIPTIONS = {
     "why": "Explain why CONSUMER is not running: which leases block it, how many bytes, on which "
@@ -28,7 +31,12 @@ def run(args: argparse.Namespace) -> int:
         {"consumer": args.consumer},
         endpoint=args.endpoint,
         as_json=args.as_json,
-        lines=text.why_lines,
+        lines=_lines,
         hidden=ENVELOPE | {"epoch"},
     )
     return NO if code == OK and not reply["leases"] else code
+
+
+def _lines(why: Message) -> list[str]:
+    width = terminal.columns()
+    return [part for line in text.why_lines(why) for part in terminal.folded(line, INDENT, width)]

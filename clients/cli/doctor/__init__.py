@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import vram_arbiter
-from vram_arbiter.clients.cli import arguments
+from vram_arbiter.clients.cli import arguments, terminal
 from vram_arbiter.clients.cli.doctor import (
     access,
     cgroup,
@@ -82,20 +82,26 @@ def doctor(*, as_json: bool, endpoint: str | None) -> int:
     if as_json:
         print(json.dumps(to_map(report), indent=2))
     else:
-        print("\n".join(lines_of(report, color=sys.stdout.isatty())))
+        width = terminal.columns()
+        print("\n".join(lines_of(report, color=sys.stdout.isatty(), width=width)))
     if machine.arbiter.problem is not None:
         return UNREACHABLE
     return NO if any(one.severity in WRONG for one in report.findings) else OK
 
 
-def lines_of(report: Report, *, color: bool = False) -> list[str]:
-    """Return the report as lines: severity, code, what was found; below it what mends it."""
-    lines = [printable(f"examined for {report.endpoint}")]
+def lines_of(report: Report, *, color: bool = False, width: int | None = None) -> list[str]:
+    """Return the report as lines: severity, code, what was found; below it what mends it.
+
+    `width`: columns to which findings are folded; commands stay in one line.
+    """
+    lines, indent = [printable(f"examined for {report.endpoint}")], 9 + _WIDTH + 1
     for one in report.findings:
         mark = f"{one.severity.upper() if one.severity in WRONG else one.severity:<8}"
+        line = f"{mark} {one.code:<{_WIDTH}} {printable(one.found)}"
+        first, *more = terminal.folded(line, indent, width)
         if color:
-            mark = f"\x1b[{_COLORS[one.severity]}m{mark}\x1b[0m"
-        lines.append(f"{mark} {one.code:<{_WIDTH}} {printable(one.found)}")
+            first = first.replace(mark, f"\x1b[{_COLORS[one.severity]}m{mark}\x1b[0m", 1)
+        lines += [first, *more]
         if one.fix and one.severity is not Severity.OK:
             lines.append(f"{'':<{9 + _WIDTH}} → {printable(one.fix)}")
     counts = Counter(one.severity for one in report.findings)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vram_arbiter.clients.cli import arguments, history
 from vram_arbiter.clients.cli.replies import OK
+from vram_arbiter.clients.cli.text import plural
 from vram_arbiter.clients.cli.timeline import collect
 from vram_arbiter.clients.cli.timeline.collect import Range
 from vram_arbiter.clients.cli.timeline.story import Story
@@ -97,6 +98,6 @@ def write(out: Path, story: Story, title: str = "") -> None:
 def _summary(story: Story, out: Path) -> str:
     began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(story.begin_s))
     return (
-        f"{out}: {story.end_s - story.begin_s:.1f} s from {began}, {len(story.leases)} leases, "
-        f"{len(story.evictions)} evictions"
+        f"{out}: {story.end_s - story.begin_s:.1f} s from {began}, "
+        f"{plural(len(story.leases), 'lease')}, {plural(len(story.evictions), 'eviction')}"
     )

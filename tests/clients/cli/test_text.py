@@ -155,7 +155,7 @@ def test_why_somebody_waits() -> None:
     unknown = text.why_lines(
         {"consumer": "grab", "leases": [entry | {"eta_s": None, "eta_source": "none"}]}
     )
-    assert unknown[-1] == "  expected  unknown, never seen before"
+    assert unknown[-1] == "  expected  unknown"
 
 
 def test_drift_is_a_column_only_where_somebody_drifts() -> None:
