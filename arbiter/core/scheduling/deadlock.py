@@ -13,7 +13,7 @@ something (`Turn.suspects`). Ends the wait of the newest waiter in the circle, b
 revoked for it.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from math import inf
 
 from vram_arbiter.arbiter.core import eviction
@@ -22,7 +22,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 WAITS_MAX = 64
 """A process that waits for more than so many leases at a time is not looked at: each look weighs
@@ -79,6 +79,7 @@ class _Reduction:
         self.waits = {process: mine for process, mine in waits.items() if mine}
         # a request in no queue waits for others of its feature, not for bytes
         self.served: set[LeaseId] = set(core.unqueued)
+        self._movable: dict[GpuId, dict[LeaseId, int]] = {}
 
     def run(self) -> list[Lease]:
         """Waiters that are left over, by arrival."""
@@ -106,9 +107,12 @@ class _Reduction:
 
     def _serve(self, gpu: Gpu) -> None:
         """Pass once over a GPU's queue."""
+        kept = self._kept(gpu, self._blocked())
+        if not kept:  # everything leaves: no wait here depends on a use
+            self.served.update(waiter.id for waiter in gpu.queue)
+            return
         ledger = gpu.ledger
-        going = self._going(gpu, self._blocked())
-        everything = self._going(gpu, frozenset())
+        going, everything = self._going(gpu, kept), self._going(gpu)
         head: Lease | None = None
         spare = -inf
         known: dict[tuple[int, bool], bool] = {}  # crowds ask for the same, again and again
@@ -153,32 +157,40 @@ class _Reduction:
             if any(lease.gpu == gpu.info.id for lease in self.core.users[process].values())
         ]
         users.sort()
-        if admission.fits(gpu, waiter, self._going(gpu, users)):
+        if admission.fits(gpu, waiter, self._going(gpu, self._kept(gpu, users))):
             return []
         alone = [
             process
             for process in users
-            if not admission.fits(gpu, waiter, self._going(gpu, [process]))
+            if not admission.fits(gpu, waiter, self._going(gpu, self._kept(gpu, [process])))
         ]
         return alone or [process for process in users if process != waiter.process]
 
-    def _going(self, gpu: Gpu, staying: Iterable[ProcessKey]) -> dict[LeaseId, int]:
-        """Everything on a card that leaves as long as these processes do not end their uses."""
-        kept = {
+    def _kept(self, gpu: Gpu, staying: Iterable[ProcessKey]) -> set[LeaseId]:
+        """Return the leases of a GPU that these processes use."""
+        return {
             lease.id
             for process in staying
             for lease in self.core.users[process].values()
             if lease.gpu == gpu.info.id
         }
-        going: dict[LeaseId, int] = {
-            lease.id: lease.residue_bytes
-            for lease in gpu.residents.values()
-            if lease.id not in kept and lease.evictable
-        }
-        going.update(
-            (lease, 0) for lease in gpu.ledger.charges if lease not in gpu.residents
-        )  # debts
-        return going
+
+    def _going(self, gpu: Gpu, kept: Collection[LeaseId] = ()) -> Mapping[LeaseId, int]:
+        """Return what leaves a GPU some day as long as `kept` stays, with what it retains."""
+        movable = self._movable.get(gpu.info.id)
+        if movable is None:  # nothing of it changes meanwhile
+            movable = self._movable[gpu.info.id] = _movable(gpu)
+        return (
+            {one: count for one, count in movable.items() if one not in kept} if kept else movable
+        )
+
+
+def _movable(gpu: Gpu) -> dict[LeaseId, int]:
+    """Return residents of a GPU that are not pinned, with what they retain, and debts."""
+    residents = gpu.residents
+    movable = {one.id: one.residue_bytes for one in residents.values() if one.evictable}
+    movable.update((debt, 0) for debt in gpu.ledger.charges if debt not in residents)
+    return movable
 
 
 def _way_back(start: Lease, waits_for: Callable[[Lease], list[Lease]]) -> list[Lease]:
