@@ -223,12 +223,14 @@ def on_leaving(core: "Core", lease: Lease) -> None:
 
 
 def on_verdict(core: "Core", gpu: "Gpu", verification: Verification) -> None:
-    """Learn what a living process retains. Called before the charge of its lease is dropped."""
-    account = gpu.ledger.accounts[verification.process]
-    if verification.vanishes or len(account.charges) > 1:
-        return
-    if held := gpu.shown_bytes(verification.process):
+    """Learn what a living process retains, how long its bytes took to return, and from now on
+    whether it is wanted again soon. Called before the charge of its lease is dropped."""
+    consumer, process = verification.consumer, verification.process
+    alone = len(gpu.ledger.accounts[process].charges) == 1
+    if alone and not verification.vanishes and (held := gpu.shown_bytes(process)):
         core.footprints.measured(verification.model, "residue", held)
+    core.costs.learn(consumer, "verify_s", core.now - verification.confirmed_at)
+    core.costs.left(consumer, core.now)
 
 
 def _note_drift(core: "Core", lease: Lease, part: Part, measured_bytes: int) -> None:

@@ -64,7 +64,7 @@ def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
         message = unpack_map(payload, _limits(size_max))
     except VramError as error:
         raise Undecodable(error, None) from error
-    request_id, op = _id(message), message.get("op")
+    op = message.get("op")
     try:
         if not isinstance(op, str):
             raise BadRequest(
@@ -76,9 +76,9 @@ def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
         request: Request = _validate(message)
         return request
     except VramError as error:
-        raise Undecodable(error, request_id) from error
+        raise Undecodable(error, _id(message)) from error
     except ValidationError as error:
-        raise Undecodable(_bad_request(str(op), error), request_id) from error
+        raise Undecodable(_bad_request(str(op), error), _id(message)) from error
 
 
 def id_of(payload: bytes | bytearray | memoryview, size_max: int) -> int | None:

@@ -346,9 +346,10 @@ def _why(code: str, by: str = "") -> str:
 def event(note: Note) -> JsonObject:
     """Return the event of a note as history keeps it: plain values, and `reason` in words."""
     body, about = note.body, note.about
+    reason = _reason(body, about)
     plain = {**({} if about is None else to_map(about)), **to_map(body)}
-    if "reason" not in plain and (reason := _reason(body, about)):
-        plain["reason"] = reason
+    if reason:
+        plain.setdefault("reason", reason)
     return plain
 
 

@@ -294,8 +294,6 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     core.record_residue(gpu, process, retained_bytes)
     core.forget(f"lease:{lease_id}")
     # 2. its eviction, and the waiter that it was for
-    core.costs.learn(verification.consumer, "verify_s", core.now - verification.confirmed_at)
-    core.costs.left(verification.consumer, core.now)
     for eviction in gpu.evictions:
         if eviction.lease == lease_id:
             eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
