@@ -96,7 +96,7 @@ class Programs:
     def __init__(self) -> None:
         self.arbiter = ArbiterProcess(prepared=True).start()
         self.runtime = self.arbiter.runtime
-        self.running: dict[str, subprocess.Popen[bytes] | Forked] = {}
+        self.running: dict[str, Forked] = {}
         for name, manifest in MANIFESTS.items():
             (self.runtime / name).mkdir()
             (self.runtime / name / "rskill.yaml").write_text(manifest)
@@ -107,7 +107,7 @@ class Programs:
         self.sidecar("detector", DETECTOR_BYTES, "--standby", "--min-residency-s", "0")
         self.sidecar("policy", POLICY_BYTES, "--idle-release-s", "0.2", "--min-residency-s", "1")
         skills = [str(self.runtime / "policy"), str(ROOT / "configs/rskills/so101-navigate")]
-        self.start("runner", "-m", "vram_arbiter.runner", "sim", "--skills", *skills, "--seed", "1")
+        self.start("runner", "sim", "--skills", *skills, "--seed", "1")
 
     def sidecar(self, model: str, size: int, *flags: str, name: str = "") -> None:
         name, folder = name or model, self.runtime / model
@@ -129,12 +129,11 @@ class Programs:
     def start(self, name: str, *words: str, **environ: str) -> None:
         if self.runs(name):
             return
+        environ = self.arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ
         with (self.runtime / "programs.log").open("ab") as log:
-            self.running[name] = subprocess.Popen(
-                [sys.executable, *words], cwd=ROOT,
-                env=self.arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ,
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            )  # fmt: skip
+            self.running[name] = start(
+                f"vram-{name}", words, environ, log.fileno(), log.fileno(), cwd=ROOT
+            )
 
     def tell(self, flag: str, on: bool) -> None:
         path = self.runtime / "policy" / flag
@@ -462,7 +461,7 @@ async def reasoner_killed(stage: Stage) -> None:
     with server:
         stage.programs.tell("hold", True)
         stage.programs.start(
-            "reasoner", "-m", "vram_arbiter.reasoner", "--task", "hold still", "--planner",
+            "reasoner", "--task", "hold still", "--planner",
             "openai", "--detector", "none", "--scene-vlm", "none",
             VRAM_REASONER_LLM_BASE_URL=server.url, VRAM_REASONER_LLM_MODEL="m",
         )  # fmt: skip

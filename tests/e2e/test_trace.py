@@ -12,7 +12,6 @@ import json
 import re
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -27,6 +26,7 @@ pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
 
 from tests.support import promql
 from tests.support.collector import Collector, ReceivedSpan
+from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -100,15 +100,12 @@ class Programs:
     def __init__(self, arbiter: ArbiterProcess, environ: dict[str, str]) -> None:
         self.log = arbiter.runtime / "programs.log"
         self._environ = arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ
-        self._running: list[subprocess.Popen[bytes]] = []
+        self._running: list[Forked] = []
 
-    def start(self, *argv: str) -> "subprocess.Popen[bytes]":
+    def start(self, program: str, *argv: str) -> None:
         with self.log.open("ab") as log:
-            made = subprocess.Popen(
-                [sys.executable, *argv], cwd=ROOT, env=self._environ, stdout=log, stderr=log
-            )
+            made = start(program, argv, self._environ, log.fileno(), log.fileno(), cwd=ROOT)
         self._running.append(made)
-        return made
 
     def end(self) -> list[int]:
         """SIGTERM to each, the last started first; their exit codes."""
@@ -158,7 +155,6 @@ def run_programs(
 ) -> list[int]:
     """Start the programs, let the arm move, end them. Their exit codes, the last started first."""
     (folder / "rskill.yaml").write_text(DETECTOR_MANIFEST)
-    echo = str(ROOT / "tests/sidecars/echo_sidecar.py")
     device = ["--device", f"fake:{arbiter.card}", "--min-residency-s", "0"]
     detector = [
         "--name",
@@ -176,15 +172,12 @@ def run_programs(
         "--footprint",
         "4.3GB,4.3GB,450MiB",
     ]
-    programs.start(echo, str(folder), *detector, *device)
-    programs.start("-m", "vram_arbiter.sidecars", *grab, *device)
-    programs.start(
-        "-m", "vram_arbiter.runner", "sim", "--seed", "1", "--skills", str(endless(folder))
-    )
+    programs.start("echo", str(folder), *detector, *device)
+    programs.start("vram-sidecar", *grab, *device)
+    programs.start("vram-runner", "sim", "--seed", "1", "--skills", str(endless(folder)))
     asyncio.run(all_up(arbiter.runtime))
     programs.start(
-        "-m",
-        "vram_arbiter.reasoner",
+        "vram-reasoner",
         "--task",
         "grab the red cube",
         "--planner",

@@ -8,15 +8,13 @@ import asyncio
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.support.fakegpu_check import check_log
 from tests.support.paths import ROOT
-from tests.support.prepared import Forked, start
+from tests.support.prepared import Forked, run, start, warm
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 
@@ -36,10 +34,6 @@ SMALLER = {
     "--policy.device=cuda": "--policy.device=cpu",
     "--batch_size=8 --steps=50000": f"--batch_size=2 --steps=2 {TINY}",
     "--episodes 50": "--episodes 1 --max-steps 24 --no-videos --scene small.yaml",
-}
-MODULES = {
-    "vram-runner": "vram_arbiter.runner",
-    "lerobot-train": "lerobot.scripts.lerobot_train",
 }
 GB = 10**9
 WAIT_S = 300.0
@@ -74,12 +68,9 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
         "HF_HOME": str(tmp_path / "hub"),
     }
 
-    def run(command: str) -> None:
+    def typed(command: str) -> None:
         program, *arguments = smaller(command)
-        done = subprocess.run(
-            [sys.executable, "-m", MODULES[program], *arguments],
-            env=environ, capture_output=True, text=True, timeout=WAIT_S,
-        )  # fmt: skip
+        done = run(program, arguments, environ, WAIT_S)
         assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
 
     def sidecar(command: str) -> Forked:
@@ -87,8 +78,9 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
             arguments = smaller(command.removesuffix("&"))[1:]
             return start("vram-sidecar", arguments, environ, log.fileno(), log.fileno())
 
-    run(record)
-    run(train)
+    warm("dataset-writer")
+    typed(record)
+    typed(train)
     learned = json.loads(Path("train/checkpoints/last/pretrained_model/config.json").read_text())
     assert [*learned["input_features"], *learned["output_features"]] == [
         "observation.state",
@@ -106,7 +98,7 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
         serving = sidecar(serve)
         try:
             asyncio.run(until_it_serves(f"ipc://{arbiter_daemon.runtime}/grab.sock"))
-            run(measure)
+            typed(measure)
         finally:
             serving.terminate()
             serving.wait(WAIT_S)

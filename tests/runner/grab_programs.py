@@ -4,13 +4,13 @@ that is played against them.
 
 import asyncio
 import subprocess
-import sys
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +35,6 @@ class GrabPrograms:
         self.log = arbiter.runtime / "programs.log"
         environ = arbiter.environ | {"OMP_NUM_THREADS": "1"}
         sidecar = [
-            "vram_arbiter.sidecars",
             "--name",
             "grab",
             "--rskill",
@@ -45,10 +44,8 @@ class GrabPrograms:
         ]
         with self.log.open("ab") as log:
             self.sidecar, self.runner = (
-                subprocess.Popen(
-                    [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=log, stderr=log
-                )
-                for words in (sidecar, ["vram_arbiter.runner", *runner])
+                start(program, words, environ, log.fileno(), log.fileno(), cwd=ROOT)
+                for program, words in (("vram-sidecar", sidecar), ("vram-runner", runner))
             )
 
     def play(self, scenario: Coroutine[Any, Any, None]) -> None:

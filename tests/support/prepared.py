@@ -29,13 +29,14 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from tests.support import fork_server
 from tests.support.paths import ROOT
 
 MESSAGE_MAX = 1 << 17
 DESCRIPTORS_MAX = 8
+PRINTED_MAX = 1 << 27
 HELLO = b"ready"
 ABOVE = 512
 """Numbers of descriptors that none of the passed ones has."""
@@ -104,6 +105,8 @@ PROGRAMS: Mapping[str, Program] = {
             "vram_arbiter.runner.sim.env",
         ),
     ),
+    "vram-reasoner": Program("vram_arbiter.reasoner.__main__", server="vram-runner"),
+    "deploy-nod": Program("tests.runner.deploy_nod", server="vram-runner"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),
     "lerobot-train": Program("lerobot.scripts.lerobot_train", server="vram-sidecar"),
 }
@@ -124,8 +127,11 @@ def _of_interpreter(environ: Mapping[str, str]) -> dict[str, str]:
 class Forked:
     """A forked program, with the methods of `subprocess.Popen` that tests use."""
 
-    def __init__(self, pid: int, pidfd: int, status: socket.socket) -> None:
+    def __init__(
+        self, pid: int, pidfd: int, status: socket.socket, printed: Sequence[IO[bytes]]
+    ) -> None:
         self.pid = pid
+        self._printed = printed
         self.returncode: int | None = None
         self._pidfd = pidfd
         self._status = status
@@ -140,6 +146,12 @@ class Forked:
         if code is None:
             raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
         return code
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Wait for its end. Return its outputs, where `start` was given no files for them."""
+        self.wait(timeout)
+        output, errors = (os.pread(one.fileno(), PRINTED_MAX, 0).decode() for one in self._printed)
+        return output, errors
 
     def send_signal(self, number: int) -> None:
         if self.poll() is None:
@@ -168,16 +180,23 @@ def start(
     program: str,
     arguments: Sequence[str],
     environ: Mapping[str, str],
-    output: int,
-    errors: int,
+    output: int | None = None,
+    errors: int | None = None,
     *,
     cwd: Path | None = None,
     user: int | None = None,
     passed: Sequence[int] = (),
     session: bool = False,
 ) -> Forked:
-    """Start one of PROGRAMS with its outputs in two open files; as another user if one is given, in
-    a session of its own if `session`. It gets the descriptors `passed` under the same numbers."""
+    """Start one of PROGRAMS with its outputs in two open files, or for `communicate`; as another
+    user if one is given, in a session of its own if `session`. It gets the descriptors `passed`
+    under the same numbers."""
+    printed = [
+        tempfile.TemporaryFile()  # noqa: SIM115  they live as long as the program
+        for one in (output, errors)
+        if one is None
+    ]
+    files = iter(printed)
     order = {
         "program": program, "arguments": list(arguments), "environ": dict(environ),
         "cwd": str(cwd or os.getcwd()), "user": user, "session": session,
@@ -186,10 +205,11 @@ def start(
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with there, _ORDERING:
         orders = _server(PROGRAMS[program].server or program)
-        descriptors = [there.fileno(), output, errors, *passed]
+        out, err = (next(files).fileno() if one is None else one for one in (output, errors))
+        descriptors = [there.fileno(), out, err, *passed]
         socket.send_fds(orders, [json.dumps(order).encode()], descriptors)
         pid, (pidfd, *_), _, _ = socket.recv_fds(orders, 16, 1)
-    return Forked(int(pid), pidfd, here)
+    return Forked(int(pid), pidfd, here, printed)
 
 
 def run(
@@ -202,17 +222,18 @@ def run(
     user: int | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run one of PROGRAMS to its end and return what it printed."""
-    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
-        process = start(
-            program, arguments, environ, output.fileno(), errors.fileno(), cwd=cwd, user=user
-        )
-        try:
-            code = process.wait(timeout_s)
-        finally:
-            process.kill()
-        output.seek(0)
-        errors.seek(0)
-        return subprocess.CompletedProcess([*arguments], code, output.read(), errors.read())
+    process = start(program, arguments, environ, cwd=cwd, user=user)
+    try:
+        printed = process.communicate(timeout_s)
+    finally:
+        process.kill()
+    return subprocess.CompletedProcess([*arguments], process.wait(), *printed)
+
+
+def warm(program: str) -> None:
+    """Keep the server of a program that others start as long as this process runs."""
+    with _ORDERING:
+        _server(PROGRAMS[program].server or program)
 
 
 _ORDERING = threading.Lock()

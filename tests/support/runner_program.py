@@ -4,7 +4,5 @@ from tests.support.dataset_writer import FORKING
 from vram_arbiter.runner import __main__ as runner
 from vram_arbiter.runner.recording import writer_process
 
-
-def main() -> int:
-    vars(writer_process)["subprocess"] = FORKING
-    return runner.main()
+main = runner.main
+vars(writer_process)["subprocess"] = FORKING

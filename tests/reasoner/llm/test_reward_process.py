@@ -4,7 +4,6 @@ runner, and a reasoner whose model asks for progress.
 
 import asyncio
 import json
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.support.fakegpu_check import check_log
+from tests.support.prepared import Forked, start
 from tests.support.wire import WireClient
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import RewardClient
@@ -36,19 +36,14 @@ def openai(name: str, **arguments: Any) -> Any:
 
 
 @asynccontextmanager
-async def program(environ: dict[str, str], *argv: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", *argv, cwd=ROOT, env=environ, stderr=asyncio.subprocess.PIPE
-    )
-    heard = asyncio.create_task(process.stderr.read()) if process.stderr else None
+async def program(environ: dict[str, str], name: str, *argv: str) -> AsyncIterator[Forked]:
+    process = start(name, argv, environ, cwd=ROOT)
     try:
         yield process
     finally:
-        if process.returncode is None:
-            process.terminate()
-        await process.wait()
-        if heard is not None:
-            print((await heard).decode())  # shown by pytest where the test fails
+        process.terminate()
+        printed = await asyncio.to_thread(process.communicate)
+        print(*printed)  # shown by pytest where the test fails
 
 
 def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
@@ -64,7 +59,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
 
     async def story() -> None:
         serve = (
-            "vram_arbiter.sidecars",
+            "vram-sidecar",
             "--name",
             "reward",
             "--rskill",
@@ -73,7 +68,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             f"fake:{arbiter_daemon.card}",
         )
         think = (
-            "vram_arbiter.reasoner",
+            "vram-reasoner",
             "--task",
             "grab the red cube",
             "--planner",
@@ -90,7 +85,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             program(environ, *serve) as sidecar,
             program(
                 environ,
-                "vram_arbiter.runner",
+                "vram-runner",
                 "sim",
                 "--no-arbiter",
                 "--seed",
@@ -104,7 +99,9 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             picture = (await runner.frame("wrist", max_age_ms=60_000.0, encoding="png"))["data"]
             llm = {"VRAM_REASONER_LLM_BASE_URL": stand_in.url, "VRAM_REASONER_LLM_MODEL": "m"}
             async with program({**environ, **llm}, *think) as reasoner:
-                assert await reasoner.wait() == 1, "the planner said that it was no success"
+                assert await asyncio.to_thread(reasoner.wait) == 1, (
+                    "the planner said that it was no success"
+                )
 
             # resident under a lease of its own, at the inference peak of what it stands for
             identity = await reward.ping(timeout_s=60.0)

@@ -6,7 +6,6 @@ import asyncio
 import json
 import os
 import signal
-import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.prepared import Forked, start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.reasoner.server import send
 
@@ -49,31 +49,21 @@ class Programs:
         }
 
     @asynccontextmanager
-    async def run(self, *argv: str) -> AsyncIterator[asyncio.subprocess.Process]:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            *argv,
-            cwd=ROOT,
-            env=self.environ,
-            stderr=asyncio.subprocess.DEVNULL,
-        )
+    async def run(self, program: str, *argv: str) -> AsyncIterator[Forked]:
+        process = start(program, argv, self.environ, cwd=ROOT)
         try:
             yield process
         finally:
-            if process.returncode is None:
-                process.kill()
-            await process.wait()
+            process.kill()
+            await asyncio.to_thread(process.wait)
 
     def runner(self) -> Any:
         skill = str(ROOT / "configs/rskills/so101-navigate")
-        return self.run(
-            "vram_arbiter.runner", "sim", "--skills", skill, "--no-arbiter", "--seed", "1"
-        )
+        return self.run("vram-runner", "sim", "--skills", skill, "--no-arbiter", "--seed", "1")
 
     def reasoner(self, planner: str) -> Any:
         return self.run(
-            "vram_arbiter.reasoner",
+            "vram-reasoner",
             "--task",
             "turn round",
             "--planner",
@@ -129,7 +119,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
                     {"op": "say", "text": "slowly"},
                     timeout_s=60.0,
                 )
-                assert await reasoner.wait() == 0
+                assert await asyncio.to_thread(reasoner.wait) == 0
             result = programs.result()
             assert [step["status"] for step in result["steps"]] == ["succeeded"]
             assert result["reason"] == "turned"
@@ -141,7 +131,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             async with programs.reasoner("anthropic") as reasoner:
                 running = await comes_true(goal)
                 reasoner.send_signal(signal.SIGTERM)
-                assert await reasoner.wait() == 1
+                assert await asyncio.to_thread(reasoner.wait) == 1
             result = programs.result()
             assert result["reason"] == "canceled: by SIGTERM"
             assert [step["status"] for step in result["steps"]] == ["canceled"]
@@ -154,7 +144,7 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             async with programs.reasoner("anthropic") as reasoner:
                 await comes_true(lambda: len(stand_in.asked) > asked)
                 await client.estop("a hand in the way")
-                assert await reasoner.wait() == 1
+                assert await asyncio.to_thread(reasoner.wait) == 1
             assert programs.result()["reason"].startswith("stopped: emergency stop")
 
     async def bounded() -> None:

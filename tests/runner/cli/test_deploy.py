@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from tests.support import prepared
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.cli.deploy import claim
 from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
@@ -24,12 +25,11 @@ from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, Internal
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
 ROOT = Path(__file__).parents[3]
-PROGRAM = Path(__file__).parents[1] / "deploy_nod.py"
 RSKILL = "vram-arbiter/so101-navigate"
 FPS, WIDTH, HEIGHT = 30, 64, 48
 TASK = f"task: {{id: nod, instruction: nod, max_steps: 400}}\nvla: {{id: {RSKILL}}}\n"
 
-Start = Callable[..., subprocess.Popen[str]]
+Start = Callable[..., prepared.Forked]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def start(tmp_path: Path, video: Path) -> Iterator[Start]:
-    started: list[subprocess.Popen[str]] = []
+    started: list[prepared.Forked] = []
 
     def begin(
         *flags: str,
@@ -58,7 +58,7 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
         fps: int = FPS,
         steps: str = "",
         cameras: str = "front",
-    ) -> subprocess.Popen[str]:
+    ) -> prepared.Forked:
         config = tmp_path / "robot.yaml"
         config.write_text(
             "robot_id: bench\nembodiment_tags: [so101_follower, mobile_base]\nhal: {adapter:"
@@ -73,15 +73,8 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
             "NOD_CAMERAS": cameras,
         }
         skills = str(ROOT / "configs/rskills/so101-navigate")
-        argv = [sys.executable, str(PROGRAM), "deploy", "--config", str(config), "--skills", skills]
-        process = subprocess.Popen(
-            [*argv, "--no-arbiter", *flags],
-            cwd=tmp_path,
-            env=environ,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        argv = ["deploy", "--config", str(config), "--skills", skills, "--no-arbiter", *flags]
+        process = prepared.start("deploy-nod", argv, environ, cwd=tmp_path)
         started.append(process)
         return process
 

@@ -4,13 +4,12 @@ through its gate.
 
 import asyncio
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.prepared import start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import UnknownSkill
 
@@ -38,10 +37,7 @@ def test_the_arm_goes_where_the_trajectory_says(tmp_path: Path) -> None:
         "robot_id: bench\nhal: {adapter: so101_kinematic}\nsafety: {max_joint_speed_factor: 0.5}\n"
     )
     environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"}
-    command = [
-        sys.executable,
-        "-m",
-        "vram_arbiter.runner",
+    words = [
         "deploy",
         "--config",
         str(config),
@@ -50,7 +46,7 @@ def test_the_arm_goes_where_the_trajectory_says(tmp_path: Path) -> None:
         str(ROOT / "configs/rskills/so101-move"),
         str(ROOT / "configs/rskills/so101-navigate"),
     ]
-    process = subprocess.Popen(command, cwd=ROOT, env=environ, stderr=subprocess.PIPE, text=True)
+    process = start("vram-runner", words, environ, cwd=ROOT)
 
     async def story() -> None:
         async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=120.0) as client:

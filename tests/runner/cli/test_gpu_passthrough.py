@@ -4,13 +4,13 @@ lease, and the arm keeps still.
 
 import asyncio
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.runner.grab_programs import ROOT
+from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
@@ -22,12 +22,9 @@ SKILL = "vram-arbiter/gpu-passthrough"
 
 
 @pytest.fixture
-def passthrough_programs(
-    arbiter_daemon: ArbiterProcess, tmp_path: Path
-) -> Iterator[list["subprocess.Popen[bytes]"]]:
+def passthrough_programs(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> Iterator[list[Forked]]:
     environ = arbiter_daemon.environ | {"OMP_NUM_THREADS": "1"}
     sidecar = [
-        "vram_arbiter.sidecars",
         "--name",
         "passthrough",
         "--rskill",
@@ -35,14 +32,12 @@ def passthrough_programs(
         "--device",
         f"fake:{arbiter_daemon.card}",
     ]
-    runner = ["vram_arbiter.runner", "sim", "--seed", "1", "--skills", str(RSKILL)]
+    runner = ["sim", "--seed", "1", "--skills", str(RSKILL)]
     log = tmp_path / "programs.log"
     with log.open("ab") as sink:
         started = [
-            subprocess.Popen(
-                [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink
-            )
-            for words in (sidecar, runner)
+            start(program, words, environ, sink.fileno(), sink.fileno(), cwd=ROOT)
+            for program, words in (("vram-sidecar", sidecar), ("vram-runner", runner))
         ]
     yield started
     for process in reversed(started):
@@ -55,7 +50,7 @@ def passthrough_programs(
     print(log.read_text(errors="replace")[-3000:])
 
 
-async def one_goal(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -> None:
+async def one_goal(daemon: ArbiterProcess, sidecar: Forked) -> None:
     async with (
         RunnerClient(f"ipc://{daemon.runtime}/runner.sock", connect_timeout_s=120.0) as runner,
         AsyncClient("watcher", endpoint=daemon.endpoint, role="observer") as watcher,
@@ -79,6 +74,6 @@ async def one_goal(daemon: ArbiterProcess, sidecar: "subprocess.Popen[bytes]") -
 
 
 def test_frames_pass_the_card_under_a_lease_and_nothing_moves(
-    arbiter_daemon: ArbiterProcess, passthrough_programs: list["subprocess.Popen[bytes]"]
+    arbiter_daemon: ArbiterProcess, passthrough_programs: list[Forked]
 ) -> None:
     asyncio.run(asyncio.wait_for(one_goal(arbiter_daemon, passthrough_programs[0]), 280))

@@ -5,14 +5,13 @@ mistakes are said.
 import fcntl
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.prepared import Forked, start
 from vram_arbiter.clients.runner import RunnerClient, RunnerUnreachable
 from vram_arbiter.runner.__main__ import main, parse
 from vram_arbiter.runner.cli.common import sidecars_given
@@ -24,21 +23,13 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
-def start_runner(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    started: list[subprocess.Popen[bytes]] = []
+def start_runner(tmp_path: Path) -> Iterator[Callable[..., Forked]]:
+    started: list[Forked] = []
 
-    def begin(*flags: str) -> subprocess.Popen[bytes]:
+    def begin(*flags: str) -> Forked:
         environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"}
-        argv = [
-            sys.executable,
-            "-m",
-            "vram_arbiter.runner",
-            "sim",
-            "--skills",
-            str(ROOT / "configs/rskills/so101-navigate"),
-            *flags,
-        ]
-        started.append(subprocess.Popen(argv, cwd=ROOT, env=environ, stderr=subprocess.PIPE))
+        argv = ["sim", "--skills", str(ROOT / "configs/rskills/so101-navigate"), *flags]
+        started.append(start("vram-runner", argv, environ, cwd=ROOT))
         return started[-1]
 
     yield begin
@@ -52,7 +43,7 @@ def start_runner(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[byte
 @pytest.mark.e2e
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_in_order_and_the_video_is_whole(
-    start_runner: Callable[..., subprocess.Popen[bytes]],
+    start_runner: Callable[..., Forked],
     tmp_path: Path,
     run_async: Run,
     how: signal.Signals,
@@ -99,13 +90,13 @@ def run_async_long(coroutine: Callable[[], Any]) -> None:
 @pytest.mark.heavy
 @pytest.mark.e2e
 def test_without_an_arbiter_it_says_so_and_does_not_start(
-    start_runner: Callable[..., subprocess.Popen[bytes]],
+    start_runner: Callable[..., Forked],
 ) -> None:
     process = start_runner()
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert b"--no-arbiter" in errors
-    assert b"Traceback" not in errors
+    assert "--no-arbiter" in errors
+    assert "Traceback" not in errors
 
 
 def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:

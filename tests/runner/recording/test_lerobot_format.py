@@ -32,7 +32,11 @@ from vram_arbiter.runner.robots.so101 import lerobot_units_of, so101
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import JointState
 
-pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.heavy,
+    pytest.mark.timeout(600),
+    pytest.mark.usefixtures("forked_writers"),
+]
 
 ARM = so101(simulated=True)
 UNITS = lerobot_units_of(ARM)

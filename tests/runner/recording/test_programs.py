@@ -12,41 +12,44 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.prepared import Forked, start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.recording import commit
 from vram_arbiter.runner.recording.reader import read_frame
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.heavy,
+    pytest.mark.e2e,
+    pytest.mark.timeout(600),
+    pytest.mark.usefixtures("forked_writers"),
+]
 
 ROOT = Path(__file__).parents[3]
-NOD = Path(__file__).parents[1] / "deploy_nod.py"
 RSKILL = "vram-arbiter/so101-navigate"
 TRACE = "0af7651916cd43dd8448eb211c80319c"
 SPAN = "b7ad6b7169203331"
 DEAF = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"}  # spans are made; nobody takes them
 WAIT_S = 280.0
 
-Start = Callable[..., subprocess.Popen[str]]
+type Started = Forked | subprocess.Popen[bytes]
+type Start = Callable[..., Started]
 
 
 @pytest.fixture
 def start_recording(tmp_path: Path) -> Iterator[Start]:
-    started: list[subprocess.Popen[str]] = []
+    started: list[Started] = []
 
-    def begin(*argv: str, **environ: str) -> subprocess.Popen[str]:
+    def begin(program: str, *argv: str, afresh: bool = False, **environ: str) -> Started:
         given = (
             os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"} | environ
         )
         skills = ("--skills", str(ROOT / "configs/rskills/so101-navigate"), "--no-arbiter")
-        started.append(
-            subprocess.Popen(
-                [sys.executable, *argv, *skills],
-                cwd=tmp_path,
-                env=given,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-        )
+        words = [*argv, *skills]
+        if afresh:
+            command = [sys.executable, "-m", "vram_arbiter.runner", *words]
+            started.append(subprocess.Popen(command, cwd=tmp_path, env=given))
+        else:
+            started.append(start(program, words, given, cwd=tmp_path))
         return started[-1]
 
     yield begin
@@ -61,7 +64,7 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
 ) -> None:
     root = tmp_path / "set"
     process = start_recording(
-        "-m", "vram_arbiter.runner", "sim", "--record", str(root), "--rate", "0", **DEAF
+        "vram-runner", "sim", "--record", str(root), "--rate", "0", afresh=True, **DEAF
     )
 
     async def use() -> None:
@@ -116,7 +119,7 @@ def test_a_deployment_records_into_its_save_dir(start_recording: Start, tmp_path
         "task: {id: nod, instruction: nod twice, max_steps: 400}\nvla: {id: "
         f"{RSKILL}}}\nsave_dir: {root}\n"
     )
-    process = start_recording(str(NOD), "deploy", "--config", str(config), NOD_STEPS="12")
+    process = start_recording("deploy-nod", "deploy", "--config", str(config), NOD_STEPS="12")
     out, _ = process.communicate(timeout=WAIT_S)
     assert process.returncode == 0
     result = json.loads(out.splitlines()[-1])

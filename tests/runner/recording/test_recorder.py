@@ -50,6 +50,7 @@ from vram_arbiter.schemas.errors import (
 pytestmark = [
     pytest.mark.heavy,
     pytest.mark.timeout(600),
+    pytest.mark.usefixtures("forked_writers"),
 ]  # lerobot, torch: seconds to import, a minute on a busy machine
 
 WAIT_S = 280.0

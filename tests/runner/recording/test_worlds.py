@@ -14,7 +14,12 @@ from tests.support.prepared import run
 from vram_arbiter.runner import __main__ as program
 from vram_arbiter.runner.recording import commit
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.heavy,
+    pytest.mark.e2e,
+    pytest.mark.timeout(600),
+    pytest.mark.usefixtures("forked_writers"),
+]
 
 ROOT = Path(__file__).parents[3]
 HAND = "tests.runner.gym_worlds:test/Hand-v0"

@@ -1,13 +1,12 @@
 """Episodes that a policy plays are traces of their own, with their ticks."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.support.collector import Collector
+from tests.support.prepared import run
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
@@ -18,8 +17,6 @@ ROOT = Path(__file__).parents[3]
 def test_each_episode_is_a_trace_with_its_ticks(tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="needs the runner extra")
     argv = [
-        "-m",
-        "vram_arbiter.runner",
         "sim",
         "--env",
         "gym:Pendulum-v1",
@@ -36,14 +33,7 @@ def test_each_episode_is_a_trace_with_its_ticks(tmp_path: Path) -> None:
     ]
     with Collector() as collector:
         environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path)} | collector.environ()
-        done = subprocess.run(
-            [sys.executable, *argv],
-            cwd=ROOT,
-            env=environ,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
+        done = run("vram-runner", argv, environ, 120, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]
     episodes = collector.spans(telemetry.SPAN_EPISODE)
     assert len({span.trace_id for span in episodes}) == len(episodes) == 2

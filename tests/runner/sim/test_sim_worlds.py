@@ -5,13 +5,12 @@ gymnasium environments and our own scene.
 import asyncio
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.prepared import start, warm
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar import npy
@@ -203,16 +202,7 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
     closed = MANIFEST.replace("mit", "nvidia_non_commercial").replace("/point", "/closed")
     (tmp_path / "closed.yaml").write_text(closed, encoding="utf-8")
     argv = [
-        *(
-            sys.executable,
-            "-m",
-            "vram_arbiter.runner",
-            "sim",
-            "--env",
-            POINT,
-            "--env-config",
-            str(tmp_path / "world.yaml"),
-        ),
+        *("sim", "--env", POINT, "--env-config", str(tmp_path / "world.yaml")),
         *("--skills", str(tmp_path / "rskill.yaml"), str(tmp_path / "closed.yaml")),
         *("--no-arbiter", "--rate", "0"),
         *(
@@ -224,10 +214,10 @@ def test_goals_play_episodes_of_a_gymnasium_environment(tmp_path: Path) -> None:
     ]
     environ = os.environ | {
         "VRAM_ARBITER_RUNTIME": str(tmp_path),
-        "PYTHONPATH": f"{ROOT}/src:{ROOT}:{HERE}",
         "OMP_NUM_THREADS": "1",
     }
-    process = subprocess.Popen(argv, cwd=ROOT, env=environ, stdout=subprocess.PIPE)
+    warm("dataset-writer")
+    process = start("vram-runner", argv, environ, cwd=ROOT)
 
     async def scenario() -> None:
         sidecar = Sidecar()
