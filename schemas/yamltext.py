@@ -8,6 +8,8 @@ twice is an error instead of the last one winning.
 """
 
 import difflib
+import re
+import reprlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -340,9 +342,21 @@ def problems_of(
         if finding["type"] == "extra_forbidden":
             text = "unknown key" + did_you_mean(str(path[-1]), known.get(path[:-1], ()))
         else:
-            text = finding["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+            text = _said(finding)
         problems.append(Problem(source.line(path), dotted(path), text))
     return sorted(problems, key=lambda problem: problem.line)
+
+
+def _said(finding: JsonMap) -> str:
+    """Return what is wrong, with the value: `must be a valid number, not 'abc'`."""
+    if finding["type"] == "missing":
+        return "is missing"
+    text = str(finding["msg"]).removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    before, should, wanted = text.partition("Input should be ")
+    if before or not should:
+        return text
+    wanted = re.sub(r", unable to .*| or instance of \w+", "", wanted)
+    return f"must be {wanted}, not {reprlib.repr(finding['input'])}"
 
 
 def only_counts_wrong_entries(finding: JsonMap) -> bool:

@@ -249,7 +249,7 @@ def test_stopping_does_not_wait_for_the_next_try(reading: Reading) -> None:
         ({"path": "x.avi", "reconnect_tries": 3}, "not for a path: reconnect_tries"),
         ({"url": "rtsp://a/b", "fps": 30.0}, "not for a url: fps"),
         ({"url": "ftp://a/b"}, "url begins with one of rtsp://"),
-        ({"device": "0"}, "backend_params.device: Input should be a valid integer"),
+        ({"device": "0"}, "backend_params.device: must be a valid integer, not '0'"),
         ({"device": True}, "backend_params.device"),
         ({"device": 0, "width": 640}, "width and height go together"),
         ({"device": 0, "widht": 640}, "backend_params.widht: unknown key; did you mean width?"),

@@ -438,7 +438,7 @@ def test_a_network_that_is_not_there_is_said_at_the_start(
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
-        ({}, "backend_params.topic: Field required"),
+        ({}, "backend_params.topic: is missing"),
         ({"topic": "front camera"}, "expected a ROS topic"),
         ({"topic": "/a", "qos": "reliable"}, "backend_params.qos: unknown key"),
         ({"topic": "/a", "domain_id": 233}, "domain_id"),

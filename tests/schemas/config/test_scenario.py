@@ -83,7 +83,7 @@ def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> N
         ),
         ("seconds: 10", "seconds: -1", "s.yaml:2: seconds: "),
         ("about: one", "about: one\nstowaways: [{name: x, bytes: 1, card: 1}]", "x is on card 1"),
-        ("about: one\n", "", "about: Field required"),
+        ("about: one\n", "", "about: is missing"),
         ("about: one", "about: [", "not valid YAML"),
     ],
 )
