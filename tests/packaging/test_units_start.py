@@ -182,7 +182,7 @@ HOOKS = """
 hooks:
   - name: seen
     on: [granted]
-    command: [/bin/sh, -c, "cat >>$STATE_DIRECTORY/seen; vramctl drain -r no 2>>$STATE_DIRECTORY/no"]
+    command: [/bin/sh, -c, "cd $STATE_DIRECTORY; cat >>seen; vramctl drain -r no 2>>no"]
 """
 
 
