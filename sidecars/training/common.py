@@ -236,11 +236,6 @@ def batches(count: int, size: int, seed: int) -> Iterator[list[int]]:
         del queue[:size]
 
 
-def write_json(path: Path, value: JsonMap) -> None:
-    """Write stable, readable JSON with a newline at the end."""
-    path.write_text(json.dumps(value, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-
-
 def folder_bytes(folder: Path) -> int:
     """Return the size of all files under a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

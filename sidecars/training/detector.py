@@ -12,19 +12,25 @@ only touch the object are left out.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import random
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.sidecars.training import common, queries
+from vram_arbiter.sidecars.training.command import run_command
 from vram_arbiter.sidecars.training.common import Frame
+from vram_arbiter.sidecars.training.detector_model import (
+    SMOKE,
+    Recipe,
+    build_model,
+    build_processor,
+    take_over,
+)
 from vram_arbiter.sidecars.training.detector_report import (
     CARD,
     area,
@@ -35,149 +41,6 @@ from vram_arbiter.sidecars.training.detector_report import (
     rates,
     run_trials,
 )
-
-PAD, START, END = "<|pad|>", "<|startoftext|>", "<|endoftext|>"
-MAX_TOKENS: Final = 16
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Recipe:
-    """Parameters of a run beside its data."""
-
-    seed: int = 7
-    threads: int = 1
-    camera: str = "front"
-    image_px: int = 400
-    patch_px: int = 20
-    width: int = 128
-    layers: int = 4
-    heads: int = 2
-    text_width: int = 64
-    text_layers: int = 2
-    batch: int = 16
-    learning_rate: float = 1.5e-3
-    budget_s: float = 3600.0
-    max_steps: int = 3000
-    held_out: float = 0.12
-    split_seed: int = (
-        7  # not the seed of the run: a run that continues another keeps its held-out scenes
-    )
-    strange_queries: int = 10
-    word_steps: int = 250
-
-
-SMOKE: Final = Recipe(
-    image_px=128, patch_px=16, width=48, layers=2, text_width=32, text_layers=1, batch=8,
-    budget_s=8.0, max_steps=30, held_out=0.25, strange_queries=4, word_steps=40,
-)  # fmt: skip
-
-
-def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
-    """Write a CLIP-format BPE tokenizer.
-
-    Pad is id 0 (OWL masks queries that start with it), end the greatest id.
-    """
-    from transformers import CLIPTokenizer
-
-    alphabet = common.byte_alphabet()
-    tokens, merges = common.learn_merges(words, suffix="</w>")
-    vocab = [
-        PAD,
-        *alphabet,
-        *(letter + "</w>" for letter in alphabet),
-        *dict.fromkeys(tokens),
-        START,
-        END,
-    ]
-    tokenizer = CLIPTokenizer(
-        vocab={token: index for index, token in enumerate(vocab)},
-        merges=merges,
-        unk_token=END,
-        bos_token=START,
-        eos_token=END,
-        pad_token=PAD,
-        model_max_length=MAX_TOKENS,
-    )
-    tokenizer.save_pretrained(folder)
-
-
-def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
-    """Return the processor as `AutoProcessor` will read it back from `folder`."""
-    from transformers import CLIPTokenizer, OwlViTImageProcessor, OwlViTProcessor
-
-    build_tokenizer(folder, words)
-    size = {"height": image_px, "width": image_px}
-    image_processor = OwlViTImageProcessor(size=size, crop_size=size, do_center_crop=False)
-    processor = OwlViTProcessor(
-        image_processor=image_processor, tokenizer=CLIPTokenizer.from_pretrained(folder)
-    )
-    processor.save_pretrained(folder)
-    return processor
-
-
-def build_model(recipe: Recipe, tokenizer: Any) -> Any:
-    """Return a new OwlViT. Its position tables start as sines, so it need not learn adjacency."""
-    import torch
-    from transformers import OwlViTConfig, OwlViTForObjectDetection
-
-    config = OwlViTConfig(
-        text_config={
-            "vocab_size": len(tokenizer),
-            "hidden_size": recipe.text_width,
-            "intermediate_size": 2 * recipe.text_width,
-            "num_hidden_layers": recipe.text_layers,
-            "num_attention_heads": 4,
-            "max_position_embeddings": MAX_TOKENS,
-            "pad_token_id": tokenizer.pad_token_id,
-            "bos_token_id": tokenizer.bos_token_id,
-            "eos_token_id": tokenizer.eos_token_id,
-        },
-        vision_config={
-            "hidden_size": recipe.width,
-            "intermediate_size": 4 * recipe.width,
-            "num_hidden_layers": recipe.layers,
-            "num_attention_heads": recipe.heads,
-            "image_size": recipe.image_px,
-            "patch_size": recipe.patch_px,
-        },
-        projection_dim=recipe.text_width,
-    )
-    # eager attention in bfloat16 is twice as fast as fused attention on CPUs with bfloat16
-    model = OwlViTForObjectDetection._from_config(config, attn_implementation="eager")
-    vision = model.owlvit.vision_model.embeddings
-    side = recipe.image_px // recipe.patch_px
-    with torch.no_grad():
-        # transformers draws every Linear of an OwlViT with a deviation of 1, fit for a loaded
-        # checkpoint only
-        for name, module in model.named_modules():
-            if isinstance(module, torch.nn.Linear):
-                inner = name.endswith(("out_proj", "fc2"))
-                depth = (2 * recipe.layers) ** -0.5 if inner else 1.0
-                module.weight.normal_(std=depth * module.in_features**-0.5)
-        for head in (
-            model.box_head.dense2,
-            model.class_head.logit_shift,
-            model.class_head.logit_scale,
-        ):
-            head.weight.mul_(0.1)
-        vision.position_embedding.weight[1:] = 0.3 * _sine_table(side, recipe.width)
-        vision.patch_embedding.weight.normal_(std=(3 * recipe.patch_px**2) ** -0.5)
-        model.class_head.logit_shift.bias.fill_(-0.7)
-        model.class_head.logit_scale.bias.fill_(8.0)
-    return model
-
-
-def _sine_table(side: int, width: int) -> Any:
-    import torch
-
-    quarter = width // 4
-    at = torch.arange(side, dtype=torch.float32)[:, None] / side
-    angles = at * (2 * torch.pi * torch.logspace(-0.5, 0.9, quarter, 2.0 * 2.0))
-    line = torch.cat([angles.sin(), angles.cos()], dim=1)
-    grid = torch.cat(
-        [line[:, None].expand(side, side, -1), line[None].expand(side, side, -1)], dim=-1
-    )
-    return torch.nn.functional.pad(grid.reshape(side * side, -1), (0, width - 4 * quarter))
 
 
 def teach_words(
@@ -365,21 +228,6 @@ def augment(
     return common.jitter_colours(out, generator, 0.12), things
 
 
-def take_over(model: Any, start: Path) -> None:
-    """Copy the weights of an earlier checkpoint; patch filters are scaled to another patch size."""
-    import torch
-    from transformers import OwlViTForObjectDetection
-
-    weights = OwlViTForObjectDetection.from_pretrained(start, local_files_only=True).state_dict()
-    name = "owlvit.vision_model.embeddings.patch_embedding.weight"
-    old, new = weights[name], model.state_dict()[name]
-    scaled = torch.nn.functional.interpolate(
-        old, new.shape[-2:], mode="bicubic", align_corners=False
-    )
-    weights[name] = scaled * (old.shape[-1] / new.shape[-1]) ** 2
-    model.load_state_dict(weights)
-
-
 def train(
     recipe: Recipe,
     frames: Sequence[Frame],
@@ -507,39 +355,15 @@ def run(recipe: Recipe, data: Path, out: Path, start: Path | None = None) -> Jso
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; 2 for a folder that is not a data set."""
-    parser = argparse.ArgumentParser(
-        prog="python -m vram_arbiter.sidecars.training.detector", description=__doc__
-    )
-    parser.add_argument(
-        "--data", type=Path, required=True, help="folder with labels.jsonl and images"
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder for the checkpoint")
-    parser.add_argument("--start-from", type=Path, help="checkpoint of this script to continue")
-    parser.add_argument("--steps", type=int, help="steps; default: the recipe's")
-    parser.add_argument(
-        "--budget-s", type=float, help="time limit in seconds; the learning rate follows it"
-    )
-    parser.add_argument(
-        "--smoke", action="store_true", help="toy size, a few seconds: checks that all code runs"
-    )
-    parser.add_argument("--seed", type=int, default=Recipe().seed)
-    parser.add_argument("--threads", type=int, default=Recipe().threads)
-    args = parser.parse_args(argv)
-    recipe = dataclasses.replace(
-        SMOKE if args.smoke else Recipe(), seed=args.seed, threads=args.threads
-    )
-    if args.budget_s is not None:
-        recipe = dataclasses.replace(recipe, budget_s=args.budget_s)
-    if args.steps is not None:
-        recipe = dataclasses.replace(recipe, max_steps=args.steps)
-    try:
-        figures = run(recipe, args.data, args.out, args.start_from)
-    except common.BadDataset as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(json.dumps(figures, indent=2))
-    return 0
+    """Run the command line; return 2 for a folder that is not a data set."""
+    limits = {
+        "--steps": ("max_steps", "steps; default: the recipe's", int),
+        "--budget-s": (
+            "budget_s", "time limit in seconds; the learning rate follows it", float
+        ),
+    }  # fmt: skip
+    program = "python -m vram_arbiter.sidecars.training.detector"
+    return run_command(argv, program, __doc__, (Recipe(), SMOKE), limits, run)
 
 
 if __name__ == "__main__":

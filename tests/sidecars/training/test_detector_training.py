@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.sidecars.training import common, detector, queries
+from vram_arbiter.sidecars.training import common, detector, detector_model, queries
 from vram_arbiter.sidecars.training.detector_report import Trial, choose_threshold, rates
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "models" / "so101-detector"
@@ -115,7 +115,7 @@ def test_the_threshold_separates_found_from_absent() -> None:
 
 @pytest.mark.heavy
 def test_merges_make_each_word_one_token_and_the_pad_token_is_zero(tmp_path: Path) -> None:
-    processor = detector.build_processor(tmp_path, 64, ["red", "cube", "cylinder"])
+    processor = detector_model.build_processor(tmp_path, 64, ["red", "cube", "cylinder"])
     tokenizer = processor.tokenizer
     ids = tokenizer("a red cube")["input_ids"]
     assert len(ids) == 5

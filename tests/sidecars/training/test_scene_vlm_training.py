@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.sidecars.training import common, questions, scene_vlm
+from vram_arbiter.sidecars.training import common, questions, scene_vlm, scene_vlm_model
 from vram_arbiter.sidecars.training.scene_vlm_report import Asker
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "models" / "so101-scene-vlm"
@@ -87,24 +87,26 @@ def test_training_sees_the_patches_and_tokens_that_the_library_makes(tmp_path: P
     import torch
     from PIL import Image
 
-    recipe = scene_vlm.SMOKE
-    processor = scene_vlm.build_processor(tmp_path, recipe, NAMES)
+    recipe = scene_vlm_model.SMOKE
+    processor = scene_vlm_model.build_processor(tmp_path, recipe, NAMES)
     width, height = recipe.size_px
     picture = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
     prompt = "<|vision_start|><|image_pad|><|vision_end|>"
     inputs = processor(text=[prompt], images=[Image.fromarray(picture)], return_tensors="pt")
-    mine = scene_vlm.to_patches(
+    mine = scene_vlm_model.to_patches(
         torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255, recipe
     )
     assert torch.allclose(mine, inputs["pixel_values"], atol=1e-5)
 
     torch.manual_seed(0)
-    model = scene_vlm.build_model(recipe, processor).eval()
+    model = scene_vlm_model.build_model(recipe, processor).eval()
     with torch.inference_mode():
         theirs = model.model.visual(
             mine, grid_thw=inputs["image_grid_thw"], return_dict=True
         ).pooler_output
-        assert torch.allclose(scene_vlm.image_tokens(model, mine, recipe)[0], theirs, atol=1e-5)
+        assert torch.allclose(
+            scene_vlm_model.image_tokens(model, mine, recipe)[0], theirs, atol=1e-5
+        )
 
     # a 4:3 frame of any camera comes out at exactly the trained grid
     for size in ((320, 240), (480, 360), (640, 480)):
