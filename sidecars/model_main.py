@@ -29,7 +29,7 @@ from vram_arbiter.schemas.errors import ModelError, OutOfMemory, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.sidecars.adapters.base import ModelAdapter, ModelCall
-from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
+from vram_arbiter.sidecars.device.memory import REMEASURE, DeviceMemory, fill
 from vram_arbiter.sidecars.device.open import open_memory
 from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.quantization import check_precision
@@ -237,7 +237,7 @@ def _typed(error: BaseException) -> VramError:
         return error
     # torch's class; importing torch to compare it would cost seconds
     if type(error).__name__ == "OutOfMemoryError":
-        return OutOfMemory(str(error))
+        return OutOfMemory(str(error), hint=REMEASURE)
     if isinstance(error, ImportError):
         return ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'")
     logging.getLogger("sidecars").exception("the model failed", exc_info=error)

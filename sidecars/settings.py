@@ -147,7 +147,10 @@ def read_footprints(path: Path) -> dict[str, FootprintEntry]:
     """Read all entries of a footprint file. Raises ConfigError naming file, line and problem."""
     document = read_yaml(path)
     if not isinstance(document.data, Mapping):
-        raise ConfigError(f"{path}: must be a map from models to footprints")
+        raise ConfigError(
+            f"{path}: must be a map from models to footprints",
+            hint="write OWNER/NAME: {load_peak: 5.3GB, steady: 5.3GB}",
+        )
     entries = {}
     for key, value in document.data.items():
         name = str(key)
@@ -163,7 +166,8 @@ def read_footprints(path: Path) -> dict[str, FootprintEntry]:
             where = (name, *problem["loc"])
             raise ConfigError(
                 f"{path}:{document.line(where)}: {'.'.join(str(part) for part in where)}: "
-                f"{problem['msg']}"
+                f"{problem['msg']}",
+                hint="a footprint is {load_peak: 5.3GB, steady: 5.3GB, residue: 450MiB}",
             ) from None
     return entries
 

@@ -231,6 +231,7 @@ def _timeout_s(call: Call) -> float | None:
         ):
             raise BadRequest(
                 "load: data.timeout_s must be seconds, 0 or more",
+                hint="or leave it out, to wait without a limit",
                 details={"fields": ["data.timeout_s"]},
             )
         return value

@@ -74,7 +74,10 @@ def merged(text: str, name: str, key: str, entry: Entry) -> str:
     """Return the text of a footprint file with this entry. Raises ConfigError."""
     document = parse_yaml(text, name).data
     if not isinstance(document, dict):
-        raise ConfigError(f"{name}: must be a map from models to footprints")
+        raise ConfigError(
+            f"{name}: must be a map from models to footprints",
+            hint="write OWNER/NAME: {load_peak: 5.3GB, steady: 5.3GB}",
+        )
     if key not in top_keys(text):
         ended = text if not text or text.endswith("\n") else f"{text}\n"
         after = f"{ended}\n{text_of(key, entry)}" if ended else text_of(key, entry)

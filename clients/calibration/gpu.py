@@ -68,7 +68,8 @@ class FakeGpu:
                 card = settled(self._folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(
-                f"the simulated GPU in {self._folder} cannot be read: {error}"
+                f"the simulated GPU in {self._folder} cannot be read: {error}",
+                hint="stop what uses it and delete the folder; the arbiter makes it anew",
             ) from error
         if card.config.faults.hide_processes:
             return Reading(card.used_bytes, None)

@@ -113,7 +113,10 @@ def _pictures(folder: Path | None) -> Sequence[bytes]:
         found = sorted(path for path in folder.iterdir() if path.suffix.lower() in _TYPES)
         pictures = [path.read_bytes() for path in found]
     except OSError as error:
-        raise ConfigError(f"--pictures {folder} cannot be read: {error.strerror}") from error
+        raise ConfigError(
+            f"--pictures {folder} cannot be read: {error.strerror}",
+            hint="name a folder of JPEG or PNG files",
+        ) from error
     if not pictures:
         raise ConfigError(f"--pictures {folder} holds no picture", hint="expected .png or .jpg")
     return pictures

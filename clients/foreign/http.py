@@ -18,6 +18,7 @@ from vram_arbiter.schemas.errors import ActionFailed
 from vram_arbiter.schemas.runtime.printable import printable
 
 METHODS: Final = ("GET", "POST", "PUT", "PATCH", "DELETE")
+OTHER_API: Final = "is this the program's address, and a version of it that is supported?"
 ANSWER_MAX_BYTES: Final = 4 << 20
 SHOWN_MAX_CHARS: Final = 200
 """Of an answer that is quoted in an error."""
@@ -89,7 +90,9 @@ def answer(request: Request, deadline: Deadline) -> Reply:
             body += chunk
             deadline.left_s(str(request))
             if len(body) > ANSWER_MAX_BYTES:
-                raise ActionFailed(f"{request}: an answer of more than {ANSWER_MAX_BYTES} bytes")
+                raise ActionFailed(
+                    f"{request}: an answer of more than {ANSWER_MAX_BYTES} bytes", hint=OTHER_API
+                )
     except TimeoutError as error:
         raise ActionFailed(
             f"{request}: no answer within {deadline.limit_s:g} s", hint="allow more by --timeout"
@@ -111,6 +114,7 @@ def call(request: Request, deadline: Deadline) -> bytes:
         told = printable(reply.body.decode(errors="replace"))[:SHOWN_MAX_CHARS]
         raise ActionFailed(
             f"{request}: answered {reply.status}" + (f": {told}" if told else ""),
+            hint="see the program's log",
             details={"status": reply.status, "url": request.url},
         )
     return reply.body
@@ -122,7 +126,9 @@ def call_json(request: Request, deadline: Deadline) -> object:
     try:
         return json.loads(body)
     except ValueError as error:
-        raise ActionFailed(f"{request}: expected JSON, got {body[:40]!r}") from error
+        raise ActionFailed(
+            f"{request}: expected JSON, got {body[:40]!r}", hint=OTHER_API
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 from urllib.parse import quote
 
 from vram_arbiter.clients.foreign.actions import Deadline
-from vram_arbiter.clients.foreign.http import Request, answer, call, call_json
+from vram_arbiter.clients.foreign.http import OTHER_API, Request, answer, call, call_json
 from vram_arbiter.schemas.errors import ActionFailed
 
 LOOK_TIMEOUT_S: Final = 5.0
@@ -87,7 +87,9 @@ class Vllm(Server):
                 try:
                     counts.append(float(value))
                 except ValueError as error:
-                    raise ActionFailed(f"{self.url}/metrics: not a count: {line!r}") from error
+                    raise ActionFailed(
+                        f"{self.url}/metrics: not a count: {line!r}", hint=OTHER_API
+                    ) from error
         return int(sum(counts)) if counts else None
 
     def free(self, pids: Sequence[int]) -> None:
@@ -143,7 +145,9 @@ class LlamaCpp(Server):
             try:
                 slots = json.loads(reply.body)
             except ValueError as error:
-                raise ActionFailed(f"{request}: expected JSON, got {reply.body[:40]!r}") from error
+                raise ActionFailed(
+                    f"{request}: expected JSON, got {reply.body[:40]!r}", hint=OTHER_API
+                ) from error
             busy += sum(bool(slot.get("is_processing")) for slot in slots)
         return busy
 
@@ -180,7 +184,7 @@ class ComfyUi(Server):
         request = self._get("/queue")
         queue = call_json(request, deadline)
         if not isinstance(queue, dict):
-            raise ActionFailed(f"{request}: expected a map")
+            raise ActionFailed(f"{request}: expected a map", hint=OTHER_API)
         return sum(len(queue.get(name) or ()) for name in ("queue_running", "queue_pending"))
 
     def free(self, pids: Sequence[int]) -> None:
@@ -197,5 +201,5 @@ def _entries(found: object, key: str, request: Request) -> Sequence[Mapping[str,
     """Return the list of maps at `key`. Raises ActionFailed."""
     entries = found.get(key) if isinstance(found, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ActionFailed(f"{request}: expected a list of {key}")
+        raise ActionFailed(f"{request}: expected a list of {key}", hint=OTHER_API)
     return entries

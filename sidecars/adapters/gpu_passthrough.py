@@ -79,7 +79,10 @@ class GpuPassthroughAdapter:
             return {"ok": True}
         observation = (call.data or {}).get("observation")
         if not isinstance(observation, Mapping):
-            raise BadRequest("get_action needs data.observation, a map")
+            raise BadRequest(
+                "get_action needs data.observation, a map",
+                hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
+            )
         state = _state(observation)
         brightness = {
             name: self._brightness(_pixels(observation, name, *size))
@@ -109,7 +112,9 @@ def _state(observation: JsonMap) -> Any:
             f"the observation lacks {STATE_KEY}", hint=f"it has {sorted(observation)}"
         ) from None
     except (TypeError, ValueError):
-        raise BadRequest(f"{STATE_KEY} must be numbers") from None
+        raise BadRequest(
+            f"{STATE_KEY} must be numbers", hint="send the joints' positions in a row"
+        ) from None
     if state.ndim != 1 or not len(state) or not np.isfinite(state).all():
         raise BadRequest(
             f"{STATE_KEY} must be a row of finite numbers, not of shape {state.shape}",
@@ -127,5 +132,8 @@ def _pixels(observation: JsonMap, name: str, height: int, width: int) -> Any:
     if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 3:
         raise BadRequest(f"{name} must be uint8 (H, W, 3)", hint="send the camera's picture")
     if pixels.shape[2] != 3 or pixels.shape[0] < height or pixels.shape[1] < width:
-        raise BadRequest(f"{name} must be at least ({height}, {width}, 3), not {pixels.shape}")
+        raise BadRequest(
+            f"{name} must be at least ({height}, {width}, 3), not {pixels.shape}",
+            hint="send the camera's picture in its own size",
+        )
     return pixels

@@ -2,7 +2,6 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
@@ -12,6 +11,7 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
 from vram_arbiter.sidecars.adapters import lingbot
 from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, ModelCall
+from vram_arbiter.sidecars.adapters.policy_checks import need_absolute, need_trained, need_weights
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
     family_of,
@@ -155,19 +155,19 @@ class PolicyAdapter:
     def load(self, device: str) -> None:
         self._config.device = device
         self._config.pretrained_path = self._weights.source
-        _need_weights(self._weights.source)
+        need_weights(self._weights.source)
         policy = load_lerobot(
             self._policy_class, self._weights, self._config, nf4_of(self._manifest)
         )
         if device != META:
-            _need_trained(policy, self._weights.source)
+            need_trained(policy, self._weights.source)
         self._guided = False
         self._policy = policy if self._has_own_dtype else _cast(policy, torch_type(self._dtype))
         self._quantize(device)
         if self._family.replays:
             self._encoders = lingbot.load_encoders(policy)
         self._make_processors()
-        _need_absolute(self._after, self._weights.source)
+        need_absolute(self._after, self._weights.source)
         need_statistics(self._before, self._config.input_features, self._weights.source)
         need_statistics(self._after, self._config.output_features, self._weights.source)
         self._observations = Observations(
@@ -293,6 +293,7 @@ class PolicyAdapter:
         if any(len(row) != width for row in rtc.left_over):
             raise BadRequest(
                 f"rows of rtc.left_over must have {width} numbers",
+                hint="send the rows of the last answer that were not played",
                 details={"fields": ["rtc.left_over"]},
             )
         self._enable_guidance()
@@ -348,34 +349,6 @@ def _cast(policy: Any, dtype: Any) -> Any:
             if buffer.is_floating_point() and name not in module._non_persistent_buffers_set:
                 module._buffers[name] = buffer.to(dtype)
     return policy
-
-
-def _need_weights(source: str) -> None:
-    """Raise ModelError for a folder without weights: GR00T's loader takes that for another format
-    and builds a model of 3 billion random numbers."""
-    if not (Path(source) / "model.safetensors").is_file():
-        raise ModelError(
-            f"{source} has no model.safetensors", hint="check that the checkpoint is complete"
-        )
-
-
-def _need_trained(policy: Any, source: str) -> None:
-    """Raise ModelError for a VQ-BeT whose codes were never trained; lerobot only warns."""
-    vqbet = getattr(policy, "vqbet", None)
-    if vqbet is not None and not vqbet.action_head.vqvae_model.discretized.item():
-        raise ModelError(
-            f"{source}: the quantizer of its actions is not trained: `discretized` is false",
-            hint="train past n_vqvae_training_steps",
-        )
-
-
-def _need_absolute(after: Any, source: str) -> None:
-    """Raise ModelError for a GR00T whose postprocessor decodes actions relative to the state."""
-    if any(getattr(step, "use_relative_action", False) for step in after.steps):
-        raise ModelError(
-            f"{source}: its postprocessor decodes relative actions, which are not served",
-            hint="use a checkpoint with absolute actions",
-        )
 
 
 def _select(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":

@@ -1,7 +1,7 @@
 """Observations as they come over the wire, made into what lerobot's preprocessor takes."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -17,6 +17,7 @@ IMAGE_PREFIX = "observation.images."
 STATE, ACTION = "observation.state", "action"
 EMPTY_CAMERA = IMAGE_PREFIX + "empty_camera_"
 """Cameras that a checkpoint pads for itself; no robot has them."""
+_COMPARE: Final = "`vram-sidecar --check` compares the manifest with the checkpoint"
 
 
 type Batch = dict[str, "Tensor | str"]
@@ -92,7 +93,10 @@ class Observations:
             or pixels.ndim != 3
             or pixels.shape[2] != 3
         ):
-            raise BadRequest(f"{name} must be uint8 (H, W, 3) or PNG bytes, not {_shape(pixels)}")
+            raise BadRequest(
+                f"{name} must be uint8 (H, W, 3) or PNG bytes, not {_shape(pixels)}",
+                hint="send the camera's picture",
+            )
         rules = self._rules
         if rules is not None and rules.flip_180:
             pixels = pixels[::-1, ::-1]
@@ -158,11 +162,13 @@ def _vectors(name: str, value: Any, shape: tuple[int, ...]) -> list[Any]:
         numbers = np.asarray(value, dtype=np.float32)
     except (TypeError, ValueError):
         raise BadRequest(
-            f"{name} must be numbers of shape {tuple(shape)}, not {_shape(value)}"
+            f"{name} must be numbers of shape {tuple(shape)}, not {_shape(value)}", hint=_COMPARE
         ) from None
     steps = numbers if numbers.ndim == len(shape) + 1 else numbers[None]
     if steps.shape[1:] != tuple(shape) or not len(steps):
-        raise BadRequest(f"{name} must have shape {tuple(shape)}, not {numbers.shape}")
+        raise BadRequest(
+            f"{name} must have shape {tuple(shape)}, not {numbers.shape}", hint=_COMPARE
+        )
     if not np.isfinite(steps).all():
         raise BadRequest(
             f"{name} has numbers that are not finite",

@@ -9,7 +9,7 @@ from typing import Any
 from vram_arbiter.clients import cuda
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import BadState, NoGpu, OutOfMemory
-from vram_arbiter.sidecars.device.memory import Block
+from vram_arbiter.sidecars.device.memory import REMEASURE, Block
 
 _ALLOCATOR_VARIABLE = "PYTORCH_CUDA_ALLOC_CONF"
 _CHECK_VARIABLE = "PYTORCH_NVML_BASED_CUDA_CHECK"
@@ -112,6 +112,7 @@ class CudaMemory:
         free_bytes, capacity_bytes = self._torch.cuda.mem_get_info(self._index)
         return OutOfMemory(
             str(error),
+            hint=REMEASURE,
             details={
                 "requested_bytes": requested_bytes,
                 "free_bytes": int(free_bytes),

@@ -6,7 +6,10 @@ Calls block and belong to the host's worker thread. Must not know leases.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
+
+REMEASURE: Final = "measure its footprint: vramctl calibrate"
+"""What to do about a model that needs more bytes than its lease is charged."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.sidecars.__main__ import main, parser, settings_from
 from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.device.capacity import leased_gpu
 from vram_arbiter.sidecars.settings import (
     DECLARED,
     FootprintEntry,
@@ -173,9 +174,10 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     spec = found.lease_spec()
     assert (spec.consumer, spec.model_id, spec.revision) == ("detector", "test/model", "rev")
     assert (spec.priority, spec.evictable, spec.footprint.load_peak_bytes) == (70, False, 2 * 10**9)
-    assert spec.gpu == FakeProbe([tmp_path / "card"]).cards()[0].id, (
-        "the card that is charged is the card that is leased"
-    )
+    assert (found.gpu, leased_gpu(found.device)) == (
+        None,
+        FakeProbe([tmp_path / "card"]).cards()[0].id,
+    ), "the card that is charged is the card that is leased"
     alone = settings(
         "--name",
         "d",
@@ -187,9 +189,7 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
         "--device",
         "cuda:1",
     )
-    assert (alone.arbiter, alone.device, alone.gpu) == (None, "cuda:1", "1"), (
-        "not any: it loads on that one"
-    )
+    assert (alone.arbiter, alone.device) == (None, "cuda:1")
     with pytest.raises(ConfigError, match="--device gpu"):
         settings("--name", "d", "--rskill", rskill, "--footprint", "2GB", "--device", "gpu")
     with pytest.raises(ConfigError, match="any user of the machine"):
@@ -223,9 +223,15 @@ def test_what_no_sidecar_serves_is_said(text, told):
         make_adapter(parse_manifest(text), Weights("a/b"))
 
 
-def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(
-    rskill, tmp_path, capsys
-):
+def test_the_gpu_to_lease_is_the_device_that_it_loads_on(tmp_path):
+    assert leased_gpu("cuda:1", {}) == "1"
+    assert leased_gpu("cuda", {}) == leased_gpu("none", {}) == "any"
+    assert leased_gpu("cuda:1", {"CUDA_VISIBLE_DEVICES": "GPU-b"}) == "any", "CUDA counts otherwise"
+    with pytest.raises(NoGpu, match="start the arbiter with --gpu fake:8GiB"):
+        leased_gpu(f"fake:{tmp_path}", {})
+
+
+def test_what_only_a_person_can_mend_is_not_started_again(rskill, tmp_path, capsys):
     """systemd starts a sidecar again unless it ended with 2."""
     flags = ["--name", "d", "--rskill", str(rskill), "--footprint", "2GB"]
     for more in ([], ["--check"]):
@@ -236,10 +242,6 @@ def test_what_only_a_person_can_mend_is_not_started_again_and_what_may_come_is(
     assert main([*flags, "--check", "--device", "none"]) == 2
     assert "lables" in capsys.readouterr().err
     rskill.write_text(DETECTOR)
-    assert main([*flags, "--device", f"fake:{tmp_path}"]) == 1, (
-        "the arbiter makes the card when it starts"
-    )
-    assert "start the arbiter with --gpu fake:8GiB" in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
         main([*flags, "--check", "--priority", "101"])
     assert caught.value.code == 2

@@ -59,7 +59,10 @@ class FakeProbe:
             with locked(folder):
                 card = settled(folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
-            raise ProbeFailed(f"the simulated GPU in {folder} cannot be read: {error}") from error
+            raise ProbeFailed(
+                f"the simulated GPU in {folder} cannot be read: {error}",
+                hint="stop what uses it and delete the folder; the arbiter makes it anew",
+            ) from error
         processes = None
         if not card.config.faults.hide_processes:
             processes = tuple(

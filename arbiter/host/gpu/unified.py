@@ -74,7 +74,10 @@ def read_meminfo(root: Path) -> tuple[int, int]:
                 found[words[0]] = int(words[1]) * KIB
         return found["MemTotal:"], found["MemAvailable:"]
     except (OSError, ValueError, KeyError) as error:
-        raise ProbeFailed(f"{path} does not say how much memory is available: {error!r}") from error
+        raise ProbeFailed(
+            f"{path} does not say how much memory is available: {error!r}",
+            hint="MemAvailable is read there, as Linux shows it since 3.14",
+        ) from error
 
 
 def nvmap_clients(root: Path) -> tuple[ProcessUse, ...] | None:
