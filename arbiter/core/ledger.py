@@ -272,9 +272,9 @@ class GpuLedger:
                 self.stowaways[use.process] = use
             elif use.used_bytes is not None:
                 shown[account] = use.used_bytes
-        explained_bytes = sum(use.held_bytes for use in self.stowaways.values())
+        explained_bytes = sum([use.held_bytes for use in self.stowaways.values()])
         self.stowaway_bytes = explained_bytes + self.unattributed_bytes
-        complete = all(use.used_bytes is not None for use in reading.processes or ())
+        complete = None not in [use.used_bytes for use in reading.processes or ()]
         for account in self.accounts.values():
             count = shown.get(account)
             if reading.taken_at > account.changed_at and account.measured_bytes != (count or 0):

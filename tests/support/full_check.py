@@ -43,10 +43,7 @@ def check_all(core: Core) -> None:
     core.turn.touched.update((gpu.info.index, gpu) for gpu in core.gpus.values())
     invariants.check(core)
     core.turn = turn
-    queues = [gpu.queue for gpu in core.gpus.values()]
-    unqueued = {
-        lease.id for lease in core.waiting.values() if not any(lease in queue for queue in queues)
-    }
+    unqueued = core.waiting.keys() - {lease.id for gpu in core.gpus.values() for lease in gpu.queue}
     if unqueued != core.unqueued.keys():
         raise InvariantViolation(0, f"{sorted(unqueued)} wait in no queue, see {core.unqueued}")
 

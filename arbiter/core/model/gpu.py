@@ -125,9 +125,6 @@ class WaitQueue:
     def __iter__(self) -> Iterator[Lease]:
         return (self.by_arrival[arrival] for _, arrival in self._ranks)
 
-    def __contains__(self, lease: Lease) -> bool:
-        return lease.request.arrival in self.by_arrival
-
     def add(self, lease: Lease) -> None:
         insort(self._ranks, self.rank(lease))
         insort(self._needs, lease.request.load_peak_bytes)
@@ -222,8 +219,10 @@ class PendingFree:
 
     def since(self, at: float) -> int:
         """Return the most that may be pending of what was given up after `at`; forget the rest."""
+        if not self._parts:
+            return 0
         self._parts = {process: part for process, part in self._parts.items() if part[0] > at}
-        return sum(count for _, count in self._parts.values())
+        return sum([count for _, count in self._parts.values()])
 
 
 @dataclass(slots=True)

@@ -147,8 +147,8 @@ def others_since(
     # 1. leaving holders, verdicts since the baseline, and what is pending free
     leaving = {other.process for other in gpu.verifications.values()} - {process}
     accounts = gpu.ledger.accounts
-    left_bytes = sum(accounts[other].granted_bytes for other in leaving if other in accounts)
-    left_bytes += sum(left for at, left in gpu.left if at > baseline.taken_at)
+    left_bytes = sum([accounts[other].granted_bytes for other in leaving if other in accounts])
+    left_bytes += sum([left for at, left in gpu.left if at > baseline.taken_at])
     left_bytes += gpu.pending_free.since(baseline.taken_at - pending_s)
     # 2. charges of loads that began since the baseline
     loaded: Counter[ProcessKey] = Counter()

@@ -123,7 +123,7 @@ def _read_soon(core: Core, gpu: Gpu, verification: Verification) -> None:
 def _set_poll(core: Core, gpu: Gpu) -> None:
     timer = ("verify", gpu.info.id)
     if gpu.verifications:
-        core.timers.set(timer, min(v.next_poll_at for v in gpu.verifications.values()))
+        core.timers.set(timer, min([v.next_poll_at for v in gpu.verifications.values()]))
     else:
         core.timers.cancel(timer)
 
@@ -140,7 +140,7 @@ def on_poll_due(core: Core, gpu_id: str) -> None:
             if verification.last_used_bytes is None:
                 _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
         verification.next_poll_at = _next_poll_at(core, gpu, verification)
-    core.want_sample(gpu, max(verification.confirmed_at for verification in due))
+    core.want_sample(gpu, max([verification.confirmed_at for verification in due]))
     _set_poll(core, gpu)
 
 
