@@ -8,7 +8,14 @@ from collections.abc import Collection, Mapping
 from typing import Annotated, Final, Self
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
 from vram_arbiter.schemas.urls import webhook_url
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
@@ -19,6 +26,7 @@ ALIASES: Final[Mapping[str, str]] = {"revoked": "revoke_asked", "verdict": "veri
 """Names of `on` beside the history's kinds; `evicted` is another one, and no single kind."""
 NAMES: Final = (*NOTES, *DAEMON_KINDS, *ALIASES, EVICTED)
 
+EventName = Annotated[str, WithJsonSchema({"type": "string", "enum": sorted(NAMES)})]
 Seconds = Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)]
 Argument = Annotated[str, Field(max_length=4096)]
 
@@ -54,7 +62,7 @@ class Hook(BaseModel):
     queue_max: Annotated[int, Field(ge=1, le=1000)] = 100
     """Events that wait for this rule. Beyond it the oldest are dropped and counted."""
 
-    @field_validator("on", mode="before")
+    @field_validator("on", mode="before", json_schema_input_type=EventName | tuple[EventName, ...])
     @classmethod
     def _one_or_more(cls, value: object) -> object:
         return (value,) if isinstance(value, str) else value

@@ -1,15 +1,19 @@
 """Rules of hooks.yaml: what they match, what they refuse, and samples of every event."""
 
+import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
 
 from tests.support.paths import CONFIGS
 from vram_arbiter.clients.hooks.events import Delivery, environ_of, matched, sample
 from vram_arbiter.schemas.config.hooks import NAMES, Hook, HooksConfig, load_hooks
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.wire.notes import NOTES
+from vram_arbiter.schemas.yamltext import parse_yaml
 
 
 def hook(**fields: Any) -> Hook:
@@ -24,6 +28,23 @@ def test_the_shipped_example_loads_and_names_every_key() -> None:
     text = (CONFIGS / "hooks.yaml").read_text()
     assert len(load_hooks(text, "hooks.yaml").hooks) == 2
     assert [name for name in Hook.model_fields if f"{name}:" not in text] == []
+
+
+def test_an_editor_accepts_the_example_and_marks_mistakes() -> None:
+    """Regression: the schema wanted a list for `on`, and editors marked the example as wrong."""
+    text = (CONFIGS / "hooks.yaml").read_text()
+    first = re.match(r"# yaml-language-server: \$schema=(\S+)\n", text)
+    assert first
+    reader = Draft202012Validator(json.loads((CONFIGS / first[1]).read_text()))
+    read = parse_yaml(text, "hooks.yaml").data["hooks"]
+    # editors read YAML 1.2, where `on` is a name and no truth value
+    example = {
+        "hooks": [{"on" if key is True else key: rule[key] for key in rule} for rule in read]
+    }
+    assert list(reader.iter_errors(example)) == []
+    for mistake in ({"on": "evictd"}, {"on": ["evictd"]}, {"on": []}, {"timeout_s": 0}):
+        wrong = {"hooks": [example["hooks"][0] | mistake]}
+        assert list(reader.iter_errors(wrong)), mistake
 
 
 @pytest.mark.parametrize(
