@@ -27,6 +27,7 @@ ALIASES: Final[Mapping[str, str]] = {"revoked": "revoke_asked", "verdict": "veri
 NAMES: Final = (*NOTES, *DAEMON_KINDS, *ALIASES, EVICTED)
 
 EventName = Annotated[str, WithJsonSchema({"type": "string", "enum": sorted(NAMES)})]
+EventNames = Annotated[tuple[EventName, ...], Field(min_length=1, max_length=64)]
 Seconds = Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)]
 Argument = Annotated[str, Field(max_length=4096)]
 
@@ -62,7 +63,7 @@ class Hook(BaseModel):
     queue_max: Annotated[int, Field(ge=1, le=1000)] = 100
     """Events that wait for this rule. Beyond it the oldest are dropped and counted."""
 
-    @field_validator("on", mode="before", json_schema_input_type=EventName | tuple[EventName, ...])
+    @field_validator("on", mode="before", json_schema_input_type=EventName | EventNames)
     @classmethod
     def _one_or_more(cls, value: object) -> object:
         return (value,) if isinstance(value, str) else value
