@@ -14,7 +14,7 @@ import secrets
 from typing import Any, Self
 
 from vram_arbiter.runner.ros2 import messages
-from vram_arbiter.runner.ros2.dds_thread import DdsThread
+from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
     cdr_of,
     dds_problems,

@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol, Self
 
 from vram_arbiter.runner.ros2 import messages
 from vram_arbiter.runner.ros2.action_client import CANCEL, SERVICES
-from vram_arbiter.runner.ros2.dds_thread import DdsThread
+from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
     cdr_of,
     dds_problems,

@@ -9,11 +9,11 @@ from __future__ import annotations
 import functools
 import importlib.util
 import logging
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
     as_bytes,
     cdr_of,
@@ -27,8 +27,6 @@ from vram_arbiter.schemas.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
-WAIT_S = 1.0  # the longest that the thread sleeps in DDS; a message wakes it
-STOP_S = 2.0
 MESSAGES_KEPT = 64  # until the thread has come to them
 _BOOL_BYTES = 5  # four that name the encoding, and the value
 
@@ -65,15 +63,7 @@ def estop_topic(topic: str | None, stop: Callable[[str], None]) -> Iterator[None
 
 class _Listener:
     def __init__(self, topic: str, name: str, domain: int, stop: Callable[[str], None]) -> None:
-        from cyclonedds.core import (
-            DDSStatus,
-            GuardCondition,
-            InstanceState,
-            ReadCondition,
-            SampleState,
-            ViewState,
-            WaitSet,
-        )
+        from cyclonedds.core import DDSStatus
         from cyclonedds.domain import DomainParticipant
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
@@ -81,39 +71,27 @@ class _Listener:
         self._topic, self._stop = topic, stop
         with dds_problems(domain):
             participant = DomainParticipant(domain)
-            reader = DataReader(
-                participant,
-                Topic(participant, name, bool_type()),
-                # not the newest alone: a button that is let go at once has been pressed
-                qos=qos_of("reliable", writer=False, kept=MESSAGES_KEPT),
-            )
+            # not the newest alone: a button that is let go at once has been pressed
+            quality = qos_of("reliable", writer=False, kept=MESSAGES_KEPT)
+            named = Topic(participant, name, bool_type())
+            reader: Any = DataReader(participant, named, qos=quality)
             reader.set_status_mask(DDSStatus.RequestedIncompatibleQos)
-            self._guard: Any = GuardCondition(participant)
-            waitset = WaitSet(participant)
-            unread = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
-            for entity in (unread, reader, self._guard):
-                waitset.attach(entity)
-        self._thread = threading.Thread(
-            target=self._run, args=(waitset, reader), name="estop-topic", daemon=True
-        )
-        self._thread.start()
+            self._thread = DdsThread(
+                "estop-topic",
+                participant,
+                [reader],
+                [reader],
+                lambda: self._attend(reader),
+                self._broke_down,
+            )
         log.info("the robot stops when %s says true", topic)
 
     def close(self) -> None:
-        self._guard.set(True)
-        self._thread.join(STOP_S)
+        self._thread.close()
 
     # -- on its thread
-    def _run(self, waitset: Any, reader: Any) -> None:
-        from cyclonedds.util import duration
-
-        try:
-            while not self._guard.read():
-                waitset.wait(duration(seconds=WAIT_S))
-                self._attend(reader)
-        except Exception as error:
-            log.exception("the emergency stop's topic %s", self._topic)
-            self._stop(f"the listener on {self._topic} broke down: {type(error).__name__}")
+    def _broke_down(self, problem: str) -> None:
+        self._stop(f"the listener on {self._topic} broke down: {problem}")
 
     def _attend(self, reader: Any) -> None:
         from cyclonedds.core import DDSStatus

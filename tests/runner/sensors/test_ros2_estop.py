@@ -76,6 +76,21 @@ def test_true_stops_the_robot_also_when_the_button_is_let_go_at_once(
     assert stopped == [f"{topic} says stop"]
 
 
+def test_a_listener_that_breaks_down_stops_the_robot(topic: str, press: Press) -> None:
+    """The thread ends with its first error of any kind: nothing would hear the button again."""
+    stopped: list[str] = []
+
+    def stop(reason: str) -> None:
+        stopped.append(reason)
+        if len(stopped) == 1:
+            raise ZeroDivisionError("a defect")
+
+    with estop_topic(topic, stop):
+        press(True)
+        until(lambda: len(stopped) == 2)
+    assert stopped[1] == f"the listener on {topic} broke down: ZeroDivisionError: a defect"
+
+
 def test_what_cannot_be_read_stops_too() -> None:
     assert said(b"\x00\x01\x00\x00\x00") == ""
     assert said(b"\x00\x01\x00\x00\x01\x00\x00\x00") == "says stop"

@@ -17,7 +17,7 @@ STOP_S: Final = 2.0
 class DdsThread:
     """Calls `woken` on a thread of its own when a reader has data or an entity's status changed.
 
-    An error of DDS ends the thread; `failed` hears of it there.
+    An error of DDS or of `woken` ends the thread; `failed` hears of it there.
     """
 
     def __init__(
@@ -48,19 +48,26 @@ class DdsThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    async def stop(self) -> None:
-        """End the thread."""
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """End the thread. Blocks for `STOP_S` at most."""
         self._guard.set(True)
-        await asyncio.to_thread(self._thread.join, STOP_S)
+        self._thread.join(STOP_S)
+
+    async def stop(self) -> None:
+        """End the thread; the event loop goes on meanwhile."""
+        await asyncio.to_thread(self.close)
 
     def _run(self) -> None:
-        from cyclonedds.core import DDSException
         from cyclonedds.util import duration
 
         try:
             while not self._guard.read():
                 self._waitset.wait(duration(seconds=WAIT_S))
                 self._woken()
-        except DDSException as error:
-            log.error("%s: DDS failed: %s", self._thread.name, error)
-            self._failed(str(error))
+        except Exception as error:
+            log.exception("%s ends", self._thread.name)
+            self._failed(f"{type(error).__name__}: {error}")
