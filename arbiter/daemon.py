@@ -31,7 +31,7 @@ from vram_arbiter.arbiter.host.heartbeat import beat
 from vram_arbiter.arbiter.host.history import CLEAN_END, History
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.prober import Prober, within
-from vram_arbiter.arbiter.host.process import raise_limits
+from vram_arbiter.arbiter.host.process import leave_no_zombies, raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.arbiter.host.records import record_of
 from vram_arbiter.arbiter.host.systemd import Notifier
@@ -110,6 +110,7 @@ class Daemon:
             for number in (signal.SIGTERM, signal.SIGINT):
                 self._loop.add_signal_handler(number, self._stop.set)
             self._loop.add_signal_handler(signal.SIGHUP, self._reload.ask)
+            leave_no_zombies()
             gc.freeze()  # modules stay: no collection has to look at them again
             notifier.ready(self._status_text())
             for serves in (

@@ -7,9 +7,11 @@ descriptor itself waits to the microsecond. Must not know what the daemon does.
 
 import asyncio
 import ctypes
+import os
 import resource
 import select
 import selectors
+import signal
 import sys
 import time
 
@@ -59,6 +61,15 @@ def give_back_freed_memory() -> None:
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES)
+
+
+def leave_no_zombies() -> None:
+    """As the first process of a container, let the kernel reap what ends.
+
+    Orphans of other programs become children of this one, which starts no process itself.
+    """
+    if os.getpid() == 1:
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 
 
 def raise_limits() -> int:

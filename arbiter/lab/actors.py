@@ -21,7 +21,7 @@ from vram_arbiter.arbiter.core.events import (
     UseBegan,
     UseEnded,
 )
-from vram_arbiter.arbiter.lab.card import START_S, Card
+from vram_arbiter.arbiter.lab.gpu import START_S, SimulatedGpu
 from vram_arbiter.arbiter.lab.outcome import Tally
 from vram_arbiter.arbiter.lab.workload import Job, Plan
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
@@ -38,7 +38,7 @@ class Stage(Protocol):
     """Surroundings of an actor."""
 
     now: float
-    cards: dict[GpuId, Card]
+    cards: dict[GpuId, SimulatedGpu]
     holders_exit: bool
 
     def at(self, when: float, call: Callable[[], None]) -> None: ...

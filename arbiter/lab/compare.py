@@ -8,7 +8,7 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.eventlog.text import cut
-from vram_arbiter.arbiter.lab.card import START_S
+from vram_arbiter.arbiter.lab.gpu import START_S
 from vram_arbiter.arbiter.lab.outcome import SHARES, Outcome
 from vram_arbiter.arbiter.lab.simulator import simulate
 from vram_arbiter.arbiter.lab.workload import Workload

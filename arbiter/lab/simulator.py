@@ -13,7 +13,7 @@ from typing import Protocol
 from vram_arbiter.arbiter.core.effects import Effect, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import Event, MemorySampled, Tick
 from vram_arbiter.arbiter.lab.actors import Actor
-from vram_arbiter.arbiter.lab.card import START_S, Card
+from vram_arbiter.arbiter.lab.gpu import START_S, SimulatedGpu
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.workload import Workload
 from vram_arbiter.schemas.ids import ClientId, GpuId, RequestId
@@ -56,7 +56,7 @@ class _World:
         self.holders_exit = holders_exit
         self.outcome = outcome
         self.now = START_S
-        self.cards = {plan.info.id: Card(plan) for plan in workload.cards}
+        self.cards = {plan.info.id: SimulatedGpu(plan) for plan in workload.cards}
         self.actors: dict[ClientId, Actor] = {}
         self._end = START_S + workload.seconds
         self._heap: list[tuple[float, int, Callable[[], None]]] = []

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import ArbiterProcess
+from tests.support.processes import children
+from tests.support.waiting import until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -77,3 +79,22 @@ def test_a_client_that_cannot_be_seen_is_refused_and_told_why(make_arbiter: Make
         assert "pid namespace" in refused["error"]["message"]
         assert "--pid=host" in refused["error"]["hint"]
         assert client.ask("status")["error"]["code"] == "unknown_session", "and stays a stranger"
+
+
+def test_as_the_first_process_it_leaves_no_zombies(make_arbiter: Make) -> None:
+    """Regression: in a container without an init process the daemon inherits the orphans of other
+    programs, and those that had ended stayed in its process table until its own end."""
+    arbiter = make_arbiter()
+    arbiter.program = [*UNSHARE, *arbiter.program]
+    arbiter.start()
+    (daemon,) = children(arbiter.pid)
+    lasting, end = os.pipe()
+    shell = "exec 3<&0; cat <&3 &"  # cat lasts until the pipe is closed, its parent does not
+    enter = ["nsenter", "--target", str(daemon), "--pid", "--", "sh", "-c", shell]
+    try:
+        subprocess.run(enter, stdin=lasting, check=True, timeout=PATIENCE_S)
+        until(lambda: len(children(daemon)) == 1)
+    finally:
+        os.close(end)
+        os.close(lasting)
+    until(lambda: not children(daemon))

@@ -17,7 +17,7 @@ from vram_arbiter.arbiter.eventlog.logfile import (
     file_name,
     header_line,
 )
-from vram_arbiter.arbiter.lab.card import START_S as SIMULATED_START_S
+from vram_arbiter.arbiter.lab.gpu import START_S as SIMULATED_START_S
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.simulator import simulate
 from vram_arbiter.arbiter.lab.workload import Workload

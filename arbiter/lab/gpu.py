@@ -12,7 +12,7 @@ STOWAWAYS_PID = 900_000
 
 
 @dataclass(slots=True)
-class Card:
+class SimulatedGpu:
     """Bytes on one GPU.
 
     Bytes that are given up show until the lag is over; an allocation that does not fit is refused.
