@@ -7,6 +7,8 @@ import argparse
 from pathlib import Path
 from typing import Final
 
+from vram_arbiter.clients.cli.main import COMMANDS, DESCRIPTION, EPILOG, command_parser
+
 PLACES: Final = {
     "bash": Path("bash-completion/completions/vramctl"),
     "zsh": Path("zsh/site-functions/_vramctl"),
@@ -20,6 +22,9 @@ def completions() -> dict[Path, str]:
     import shtab  # only an installation needs it
 
     parser = whole_parser()
+    (commands,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
+    for name, command in COMMANDS.items():
+        commands.choices[name].description = command.summary  # a line beside each word
     return {place: shtab.complete(parser, shell=shell) for shell, place in PLACES.items()}
 
 
@@ -28,8 +33,6 @@ def whole_parser() -> argparse.ArgumentParser:
 
     A command that another program parses has no arguments here.
     """
-    from vram_arbiter.clients.cli.main import COMMANDS, DESCRIPTION, EPILOG, command_parser
-
     parser = argparse.ArgumentParser(prog="vramctl", description=DESCRIPTION, epilog=EPILOG)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():

@@ -326,3 +326,5 @@ def test_completion_is_a_script_of_its_shell(
     script = tmp_path / "script"
     script.write_text(scripts[completing.PLACES[shell]])
     subprocess.run([shell, "-n", str(script)], check=True)
+    assert COMMANDS["top"].summary in script.read_text()
+    assert "Keys: s sort" not in script.read_text(), "one line beside a word, not its whole help"
