@@ -16,6 +16,8 @@ from vram_arbiter.schemas.plain import JsonMap
 
 # two looks at one thing differ by less; the arm's gripper needs more room between two things
 SAME_M = 0.05
+# a thing is another one, which the scene VLM named, unless its score by that name is so much lower
+CLEARLY = 0.15
 UNMOVED = (0.0, 0.0, 0.0)
 # places to look from, in the frame of the search's first look: a step back widens the view, then to
 # the left and to the right of it
@@ -66,15 +68,11 @@ class Places:
 
     def add(self, data: JsonMap, others: Iterable[Place] = ()) -> bool:
         """Add `data` of a locate that found something: `point_base_m`, optionally `seen` and
-        `base_pose`. Leave out what stands where one of the `others` was seen with a better score.
+        `base_pose`. Leave out what stands where one of the `others` was seen as well.
 
         Returns: whether anything was added.
         """
-        pose = data.get("base_pose")
-        self.joined = pose is not None
-        if not self.joined:
-            self.known.clear()
-        self.base_pose = UNMOVED if pose is None else (pose[0], pose[1], pose[2])
+        self.looked_from(data.get("base_pose"))
         things = data.get("seen") or [{"point_base_m": data["point_base_m"], "score": 1.0}]
         seen = [self._place(Point(*thing["point_base_m"]), thing["score"]) for thing in things]
         if self.joined:
@@ -83,6 +81,15 @@ class Places:
         for place in seen:
             self._see(place, before)
         return bool(seen)
+
+    def looked_from(self, pose: Sequence[float] | None) -> None:
+        """Note where the base stood at the newest look. Without odometry (None) forget the looks
+        before it.
+        """
+        self.joined = pose is not None
+        if not self.joined:
+            self.known.clear()
+        self.base_pose = UNMOVED if pose is None else (pose[0], pose[1], pose[2])
 
     def _place(self, point: Point, score: float) -> Place:
         x0, y0, yaw = self.base_pose
@@ -161,7 +168,10 @@ class Search:
 
 
 def _is_other(place: Place, others: Iterable[Place]) -> bool:
-    return any(_apart_m(place, other) <= SAME_M and other.score >= place.score for other in others)
+    return any(
+        _apart_m(place, other) <= SAME_M and other.score + CLEARLY >= place.score
+        for other in others
+    )
 
 
 def _same_view(a: Pose, b: Pose) -> bool:

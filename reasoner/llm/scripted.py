@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from vram_arbiter.reasoner.palette import OPERATOR, Palette
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome, says_yes
-from vram_arbiter.reasoner.search_map import Places, Point, Pose, Search
+from vram_arbiter.reasoner.search_map import Place, Places, Point, Pose, Search
 from vram_arbiter.schemas.errors import BadRequest, UnknownSkill
 from vram_arbiter.schemas.tools import (
     EmitPrompt,
@@ -128,11 +128,13 @@ def _script(thing: str, robot: _Robot) -> Script:
     if ended is not None:
         return ended
     folded = True
+    left: list[Place] = []  # of the attempt before: other places where it may stand
     for attempt in range(1, ATTEMPTS_MAX + 1):
         if not folded:
             yield _fold(robot)
         folded = False
-        places = Places(doubted=search.doubted)
+        places = Places(left, search.doubted)
+        left = []
         lost = yield from _find(thing, robot, places, search)
         if lost:
             return Finish(False, lost)
@@ -165,6 +167,7 @@ def _script(thing: str, robot: _Robot) -> Script:
             return Finish(True, f"{seen}; the scene VLM calls it something else: {answer}")
         if robot.place is not None and attempt < ATTEMPTS_MAX:
             search.doubted.append(place)
+            left = [other for other in places.known if places.joined and other is not place]
             why = "a held thing would be looked at, and dropped before the next grasp"
             folded = (yield from _put_down(robot, answer, why, search)).status == "succeeded"
     return Finish(False, reason)
@@ -210,6 +213,8 @@ def _find(
     """
     for turn in (*TURNS_RAD, None):
         looked = yield from _locate(thing, robot, places, search)
+        if looked.status == "not_seen" and places.known:
+            return ""  # from another place
         if looked.status != "not_seen":
             return _unanswered(thing, looked)
         if unknown := looked.data.get("unknown_words"):
@@ -274,6 +279,8 @@ def _locate(
         outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
         if outcome.status == "found" and not places.add(outcome.data, search.others.values()):
             outcome = Outcome("not_seen", "what is seen was put down here", data=outcome.data)
+        if outcome.status == "not_seen" and "base_pose" in outcome.data:
+            places.looked_from(outcome.data["base_pose"])
         if outcome.status in ("found", "not_seen"):
             unknown = outcome.data.get("unknown_words")
             if unknown and robot.can_say and not search.began:
@@ -287,13 +294,14 @@ def _locate(
 def _confirm(thing: str, robot: _Robot) -> Generator[ToolCall, Outcome, tuple[bool, str]]:
     """Return whether the scene VLM confirms that the named thing is held, and its answer.
 
-    A yes that names something else, or nothing, is not enough.
+    A yes that names something else, or nothing, is not enough; nor is a no that names the thing.
     """
-    answer = yield from _ask(robot, f"Has the robot gripper grasped the {thing}?")
-    if answer is not None and says_yes(answer) and thing not in answer.lower():
-        answer = yield from _ask(robot, HOLDING)
-        return answer is not None and thing in answer.lower(), answer or NO_ANSWER
-    return answer is not None and says_yes(answer), answer or NO_ANSWER
+    answer = (yield from _ask(robot, f"Has the robot gripper grasped the {thing}?")) or ""
+    if says_yes(answer) == (thing in answer.lower()):
+        return says_yes(answer), answer or NO_ANSWER
+    answer = (yield from _ask(robot, HOLDING)) or ""
+    denied = "hold" in answer.lower() and not _HOLDS.search(answer)
+    return thing in answer.lower() and not denied, answer or NO_ANSWER
 
 
 def _ask(robot: _Robot, question: str, why: str = "") -> Generator[ToolCall, Outcome, str | None]:
