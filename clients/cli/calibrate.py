@@ -52,7 +52,7 @@ DESCRIPTIONS = {
     "calibrate": "Measure what a model needs on a GPU: vramctl calibrate MANIFEST loads it in a "
     "sidecar of its own, asks it, unloads it and ends it; vramctl calibrate -- COMMAND observes "
     "any program from its start to its end. Prints the figures and the entry for "
-    "models/footprints.yaml, with a margin of 2 %% (at most 48 MiB). Holds an exclusive lease of "
+    "models/footprints.yaml, with a margin of 2 % (at most 48 MiB). Holds an exclusive lease of "
     "the GPU meanwhile, and ends when a request of a higher priority needs it."
 }
 PRIORITY = 40

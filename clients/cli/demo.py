@@ -263,7 +263,7 @@ async def _boot(
     if arbiter:
         source = gpu if gpu == "nvml" else f"fake:{runtime}/fakegpu"
         config = runtime / "arbiter.yaml"
-        # a larger real card is budgeted like the small one
+        # a larger real GPU is budgeted like the small one
         config.write_text(f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n')
         page = [] if http is None else ["--http", str(http)]
         await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config), *page)

@@ -1,4 +1,4 @@
-"""The demo's live display: the card as a bar, the leases as a table, the last switches, and where
+"""The demo's live display: the GPU as a bar, the leases as a table, the last switches, and where
 the robot is.
 
 On a terminal it redraws in place; into a file or a CI log it prints one line per event. It sends no
@@ -114,7 +114,7 @@ class Display:
 
 def _bar(gpu: JsonMap, leases: list[JsonMap]) -> Text:
     capacity = gpu["capacity_bytes"]
-    bar = Text("card ")
+    bar = Text("GPU  ")
     cells = 0
     for lease in leases:
         if lease["charge_bytes"]:

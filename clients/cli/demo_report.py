@@ -1,4 +1,4 @@
-"""What a demo leaves behind: `summary.json` and `timeline.png`, from the card's own allocation log
+"""What a demo leaves behind: `summary.json` and `timeline.png`, from the GPU's own allocation log
 and the arbiter's history.
 
 Pure but for writing those two files. It must not know how the programs were started.
@@ -37,7 +37,7 @@ class CardStory:
 
 
 def read_log(text: str, names: Mapping[int, str]) -> CardStory:
-    """Story of a simulated card from its allocation log; `names` says which pid is which program.
+    """Story of a simulated GPU from its allocation log; `names` says which pid is which program.
     Any other process, such as a sidecar's model, has the name that it gave itself. Torn lines are
     skipped."""
     points: list[Point] = []
@@ -62,7 +62,7 @@ def read_samples(
     events: Iterable[JsonMap],
     wall_offset_s: float,
 ) -> CardStory:
-    """The same for a real card, from `status` readings of the arbiter: (monotonic seconds,
+    """The same for a real GPU, from `status` readings of the arbiter: (monotonic seconds,
     GpuView)."""
     points: list[Point] = []
     peak = 0
@@ -143,7 +143,7 @@ def draw_timeline(
         held.setdefault(point.name, []).append((at_s, point.held_bytes))
         ends.append(at_s)
     for event in events:
-        if event["kind"] != "oom":  # the card's log has them all
+        if event["kind"] != "oom":  # the GPU's log has them all
             reader.event(event)
             ends.append(event["at_wall_s"])
     for at_s in story.refused_at_s:

@@ -64,7 +64,7 @@ COMMANDS: Mapping[str, Command] = {
     "unpin": Command("operators", "undo an operator's pin"),
     "drain": Command("operators", "grant nothing new until `vramctl resume`"),
     "resume": Command("operators", "grant again after a drain"),
-    "release-dead": Command("operators", "end the lease of a holder that is not heard of"),
+    "release-dead": Command("operators", "end the lease of a silent holder"),
     "run": Command("run", "run a program under a lease: vramctl run --vram 5GiB -- COMMAND"),
     "calibrate": Command(
         "calibrate", "measure what a model or a program needs, for the footprint file", wraps=True

@@ -15,9 +15,8 @@ DESCRIPTIONS = {
     "drain": "Grant nothing new until `vramctl resume`; holders keep their leases. Outlives the "
     "daemon, not the machine. Operators only.",
     "resume": "Grant again after a drain. Operators only.",
-    "release-dead": "End the lease of a holder that is not heard of before its TTL is over; its "
-    "bytes are still measured gone. Refused for a lease in use and for a holder that is heard "
-    "of. Operators only.",
+    "release-dead": "End the lease of a silent holder before its TTL is over; its bytes are still "
+    "measured gone. Refused for a lease in use, and for a holder that was heard. Operators only.",
 }
 _WITH_TARGET = frozenset({"evict", "pin", "unpin", "release-dead"})
 _WITHOUT_REASON = frozenset({"unpin", "resume"})

@@ -15,7 +15,7 @@ import pytest
 from vram_arbiter.clients.cli.installation import completion as completing
 from vram_arbiter.clients.cli.installation import environment, install, machine
 from vram_arbiter.clients.cli.installation.site import PROGRAMS
-from vram_arbiter.clients.cli.main import COMMANDS, run_main
+from vram_arbiter.clients.cli.main import COMMANDS, command_parser, run_main
 from vram_arbiter.schemas.errors import ConfigError
 
 UNIT = "etc/systemd/system/vram-arbiter.service"
@@ -294,6 +294,12 @@ def test_the_units_run_the_version_that_installs_them(
 
 
 # -- completion
+@pytest.mark.parametrize("name", [name for name in COMMANDS if not COMMANDS[name].passes_on])
+def test_no_help_shows_an_escaped_percent_sign(name: str) -> None:
+    """argparse reads `%%` in the help of an argument, and leaves it in a description."""
+    assert "%%" not in command_parser(name).format_help()
+
+
 def test_completion_knows_every_command_and_its_options(
     scripts: dict[Path, str], tmp_path: Path
 ) -> None:
