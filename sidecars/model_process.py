@@ -1,8 +1,8 @@
 """The process of one residency, as the sidecar's host sees it.
 
 It is forked from the keeper of the weights (`weights_keeper`) and owns the device's context; its
-end returns every byte of it. The host speaks to it over a socket pair, one msgpack map each way at a
-time (`model_main`). Whatever goes wrong in it is a typed error here, never the end of the host.
+end returns every byte of it. The host speaks to it over a socket pair, one msgpack map each way at
+a time (`model_main`). Whatever goes wrong in it is a typed error here, never the end of the host.
 Must not know leases, wires or torch.
 """
 

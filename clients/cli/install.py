@@ -29,9 +29,9 @@ from vram_arbiter.schemas.runtime.version import version
 
 DESCRIPTIONS = {
     "install": "Make the arbiter a service of this machine, or of your user with --user-units: "
-    "units, users, groups, folders, links to the programs, shell completion. Shows the plan and asks "
-    "first. Repeating it, or an upgrade, changes only what differs; a file that was changed by "
-    "hand is kept, with the new text beside it as FILE.new.",
+    "units, users, groups, folders, links to the programs, shell completion. Shows the plan and "
+    "asks first. Repeating it, or an upgrade, changes only what differs; a file that was changed "
+    "by hand is kept, with the new text beside it as FILE.new.",
     "uninstall": "Remove what `vramctl install` put on this machine, after showing the plan. Files "
     "that were changed by hand stay, and so do state, settings and users, unless --purge.",
 }

@@ -50,7 +50,7 @@ class SocketFile:
         return listener
 
     def bind_again(self) -> socket.socket | None:
-        """Return a new listener where the file was deleted; None if it is there or cannot be made."""
+        """Return a new listener where the file was deleted; None if it exists or cannot be made."""
         if self._is_ours():
             return None
         if os.path.lexists(self._path):
