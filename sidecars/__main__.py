@@ -54,10 +54,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     `adapter_for` lets a program serve a model of its own.
     """
     flags = parser().parse_args(arguments)
-    service = (
-        # one service per model, so that a trace shows which one it was
-        f"vram-sidecar-{flags.name}"
-    )
+    # one service per model, so that a trace shows which one it was
+    service = f"vram-sidecar-{flags.name}"
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
     set_up_log = functools.partial(logs.set_up, service, flags.log_level, flags.log_format, human)
     set_up_log()

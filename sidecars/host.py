@@ -132,9 +132,8 @@ class SidecarHost:
 
     @staticmethod
     async def _load_at_start(residency: Residency) -> None:
-        with contextlib.suppress(
-            VramError
-        ):  # logged, kept as last_error, and retried by the next request
+        # logged, kept as last_error, and retried by the next request
+        with contextlib.suppress(VramError):
             await residency.load()
 
     # -- what the wire asks (`wires.Host`)

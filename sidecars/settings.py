@@ -82,9 +82,8 @@ class Settings:
     evictable: bool = True
     min_residency_s: float = d.MIN_RESIDENCY_S
     wait_timeout_s: float = WAIT_TIMEOUT_S
-    request_timeout_s: float = (
-        REQUEST_TIMEOUT_S  # a model that works longer is stuck, and the process ends
-    )
+    # a model that works longer is stuck, and its process is ended
+    request_timeout_s: float = REQUEST_TIMEOUT_S
     nice: int = NICE
     idle_release_s: float | None = None  # None: resident until another request needs the room
     standby: bool = False  # once evicted, it returns when there is room

@@ -196,9 +196,8 @@ def fitting(cls: Any, weights: Weights) -> Iterator[None]:
     except VramError:
         raise
     except Exception as error:
-        if (
-            type(error).__name__ == "OutOfMemoryError"
-        ):  # torch's error, which says more than that the weights are bad
+        # torch's error, which says more than that the weights are bad
+        if type(error).__name__ == "OutOfMemoryError":
             raise
         raise _unfit(cls, weights, error) from error
 

@@ -239,7 +239,6 @@ def _timeout_s(call: Call) -> float | None:
 
 
 def _field(problem: JsonMap, family: Family) -> str:
-    where = (
-        problem["loc"][1:] if family == "op" else problem["loc"]
-    )  # a union puts its tag, the op, in front
+    # a union puts its tag, the op, in front
+    where = problem["loc"][1:] if family == "op" else problem["loc"]
     return f"{'.'.join(str(part)[:64] for part in where) or 'the message'}: {problem['msg']}"

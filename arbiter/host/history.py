@@ -221,9 +221,8 @@ class _Store:
         self._db = sqlite3.connect(path, isolation_level=None, timeout=1.0, check_same_thread=False)
         try:
             path.chmod(0o600)
-            self._db.text_factory = lambda text: text.decode(
-                errors="replace"
-            )  # damage need not be UTF-8
+            # damage need not be UTF-8
+            self._db.text_factory = lambda text: text.decode(errors="replace")
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(_SCHEMA)

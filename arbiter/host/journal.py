@@ -265,9 +265,8 @@ class Journal:
         except OSError as error:
             self._failed(error)
         else:
-            if (
-                self._connection.total_changes > written
-            ):  # else nothing was written, which a full disk allows
+            # a full disk lets an empty commit through
+            if self._connection.total_changes > written:
                 self.problem = ""
 
     def _failed(self, error: Exception) -> None:

@@ -52,9 +52,8 @@ class Found:
     records: dict[str, JsonObject] = field(default_factory=dict)
     digests: dict[str, int] = field(default_factory=dict)
     total: int = 0  # of the rows as they are, damaged ones too
-    damaged: dict[bytes, str] = field(
-        default_factory=dict
-    )  # key of a row that cannot be used → why
+    # key of a row that cannot be used → why
+    damaged: dict[bytes, str] = field(default_factory=dict)
     seal: Sealed | None = None
     seal_problem: str = ""
     last: LastStart | None = None

@@ -54,9 +54,8 @@ class Lineages:
         found: dict[ProcessKey, Lineage] = {}
         for use in processes:
             process, lineage = use.process, self._ancestors(use.process)
-            if (
-                lineage is None and use.process.pid in before
-            ):  # it is gone; so may be its start time
+            # a process that is gone is found by its pid alone
+            if lineage is None and use.process.pid in before:
                 process, lineage = before[use.process.pid]
                 if use.process.start_ticks not in (0, process.start_ticks):
                     lineage = None

@@ -72,9 +72,8 @@ class Actor:
         self._lease = LeaseId("")
         self._token = Token(0, 0)
         self._gpu = GpuId("")
-        self._job = (
-            plan.jobs[0] if plan.jobs else None
-        )  # the plan with the model, times and bytes of the present lease
+        # the plan with the model, times and bytes of the present lease
+        self._job = plan.jobs[0] if plan.jobs else None
         self._held_at = 0.0
         self._revoked = False
         self._pending: deque[_Work] = deque()

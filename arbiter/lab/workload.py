@@ -69,6 +69,5 @@ class Workload:
     cards: list[CardPlan]
     plans: list[Plan]
     seconds: float
-    approximations: list[str] = field(
-        default_factory=list
-    )  # parts of a log that could not be taken over, in words
+    # parts of a log that could not be taken over, in words
+    approximations: list[str] = field(default_factory=list)

@@ -59,9 +59,8 @@ class DetectorAdapter(OneNetwork):
         _name_backbones_offline()
         self._processor = from_pretrained(AutoProcessor, self._weights)
         config = from_pretrained(AutoConfig, self._weights)
-        MODEL_FOR_ZERO_SHOT_OBJECT_DETECTION_MAPPING.get(
-            type(config), None
-        )  # imports the model's code, which saves seconds under the lease
+        # imports the model's code, which saves seconds under the lease
+        MODEL_FOR_ZERO_SHOT_OBJECT_DETECTION_MAPPING.get(type(config), None)
 
     def load(self, device: str) -> None:
         from transformers import AutoModelForZeroShotObjectDetection

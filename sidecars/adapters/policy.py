@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-_OWN_POLICIES = (
-    "vram_arbiter.sidecars.models.compact_act",
-)  # own policy types, by lerobot's naming convention
+# own policy types, by lerobot's naming convention
+_OWN_POLICIES = ("vram_arbiter.sidecars.models.compact_act",)
 _OURS: Final = {
     "pretrained_backbone_weights": None,  # the checkpoint holds these weights, as `load` sees
     "load_vlm_weights": False,
@@ -263,9 +262,8 @@ class PolicyAdapter:
         ):
             inputs = [_inputs(self._before(step), dtype, casts) for step in steps]
             chunk = self._predict(inputs, guidance)
-            rows = [
-                self._after(chunk[:, step].to(torch.float32)) for step in range(chunk.shape[1])
-            ]  # postprocessors take (B, D), as lerobot's own server does
+            # postprocessors take (B, D), as lerobot's own server does
+            rows = [self._after(chunk[:, step].to(torch.float32)) for step in range(chunk.shape[1])]
         actions = torch.stack([row[0] for row in rows]).to(torch.float32).cpu()
         if not bool(torch.isfinite(actions).all()):
             raise ModelError(

@@ -18,9 +18,8 @@ from vram_arbiter.sidecars.images import decode_all, of_one_size
 from vram_arbiter.sidecars.quantization import check_weights, nf4_of, quantize_linear
 from vram_arbiter.sidecars.weights import Weights, read_config
 
-_OWN_MODELS = (
-    "vram_arbiter.sidecars.models.compact_progress",
-)  # own reward types, by lerobot's naming convention
+# own reward types, by lerobot's naming convention
+_OWN_MODELS = ("vram_arbiter.sidecars.models.compact_progress",)
 BYTES_A_PIXEL = 3
 
 

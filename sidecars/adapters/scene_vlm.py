@@ -50,9 +50,8 @@ class SceneVlmAdapter(OneNetwork):
 
         self._processor = from_pretrained(AutoProcessor, self._weights)
         config = from_pretrained(AutoConfig, self._weights)
-        MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING.get(
-            type(config), None
-        )  # imports the model's code, which saves seconds under the lease
+        # imports the model's code, which saves seconds under the lease
+        MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING.get(type(config), None)
         try:
             self._prompt([{"type": "text", "text": "?"}])
         except Exception as error:

@@ -26,9 +26,8 @@ class CudaMemory:
     def __init__(self, index: int | None = None, context_bytes: int = RESIDUE_BYTES) -> None:
         # segments that grow and shrink: otherwise a fragmented cache keeps far more than is in use
         os.environ.setdefault(_ALLOCATOR_VARIABLE, "expandable_segments:True")
-        os.environ.setdefault(
-            _CHECK_VARIABLE, "1"
-        )  # with it is_available() asks NVML and does not initialize CUDA
+        # with it is_available() asks NVML and does not initialize CUDA
+        os.environ.setdefault(_CHECK_VARIABLE, "1")
         if cuda.VISIBLE not in os.environ:
             os.environ.setdefault(cuda.ORDER, cuda.PCI)  # GPU N of CUDA is the arbiter's GPU N
         import torch

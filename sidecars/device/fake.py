@@ -31,9 +31,8 @@ class FakeMemory:
         self._name = name
         self._context_bytes = context_bytes
         self._key = ProcessKey(os.getpid(), procfs.start_ticks(os.getpid()) or 0)
-        self._thread_lock = (
-            threading.Lock()
-        )  # flock guards against other processes, not against threads of this one
+        # flock guards against other processes, not against threads of this one
+        self._thread_lock = threading.Lock()
         self._number = 0
         if not (folder / fakegpu.CARD_FILE).exists():
             raise NoGpu(

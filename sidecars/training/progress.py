@@ -216,9 +216,8 @@ def train(
                 json.dumps(line | {key: round(value, 4) for key, value in running.items()}),
                 flush=True,
             )
-    best = (
-        averaged.module if done >= 500 else model
-    )  # a short run's average still contains the untrained weights
+    # a short run's average still contains the untrained weights
+    best = averaged.module if done >= 500 else model
     best.eval()
     best.save_pretrained(out)
     return running | {"steps": float(done), "seconds": time.monotonic() - began}

@@ -37,10 +37,8 @@ class VlmRecipe:
     seed: int = 7
     threads: int = 1
     cameras: tuple[str, ...] = ("wrist",)
-    grid: tuple[int, int] = (
-        14,
-        10,
-    )  # patches across and down; even, as 2 x 2 of them make one token
+    # patches across and down; even, as 2 x 2 of them make one token
+    grid: tuple[int, int] = (14, 10)
     patch_px: int = 16
     vision_width: int = 128
     vision_layers: int = 3

@@ -343,9 +343,8 @@ class LeaseTelemetry:
     def _verifying(self, leaving: _Leaving, about: About, at_ns: int) -> trace.Span:
         if leaving.verify is None:
             parent, links = Context(), links_to(context_of(about.traceparent))
-            if (
-                leaving.evict is not None
-            ):  # else it left by itself: not part of its acquirer's trace
+            # a lease that left by itself is not part of its acquirer's trace
+            if leaving.evict is not None:
                 parent, links = trace.set_span_in_context(leaving.evict, parent), ()
             leaving.verify = self._tracer.start_span(
                 names.SPAN_VERIFY,

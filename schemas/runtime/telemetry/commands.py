@@ -53,9 +53,8 @@ def command(
         return
     from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
-    in_main = (
-        threading.current_thread() is threading.main_thread()
-    )  # only the main thread may set handlers
+    # only the main thread may set handlers
+    in_main = threading.current_thread() is threading.main_thread()
     if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
     span = tracing.begin(
