@@ -29,6 +29,7 @@ import yaml
 from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 from tests.packaging.machine import TOOLS, obstacle
 from tests.support.waiting import until
+from vram_arbiter.clients.cli.doctor.cgroup import UNIT_SCORE
 from vram_arbiter.schemas.runtime.trust import SERVICE_USERS
 
 FOLDER = TREE / "configs" / "containers"
@@ -125,6 +126,7 @@ def test_the_arbiter_sees_every_process_and_a_sidecar_does_not_end_with_it() -> 
     assert services["arbiter"]["network_mode"] == "none"
     assert "state:/var/lib/vram-arbiter" in services["arbiter"]["volumes"]
     assert "depends_on" not in services["reward"]
+    assert services["arbiter"]["oom_score_adj"] == UNIT_SCORE, "doctor warned in every container"
 
 
 def test_the_users_have_the_same_ids_and_names_in_both_images() -> None:
