@@ -24,6 +24,8 @@ UNMOVED = (0.0, 0.0, 0.0)
 VIEWPOINTS_M = ((-0.35, 0.0), (-0.35, 0.45), (-0.35, -0.45), (-0.2, 0.9), (-0.2, -0.9))
 SAME_VIEW_M, SAME_VIEW_RAD = 0.2, 0.2
 
+_POINT = "point_base_m"
+
 type Pose = tuple[float, float, float]
 """x, y in meters and yaw in radians, in the odometry's frame."""
 
@@ -61,35 +63,35 @@ class Places:
 
     known: list[Place] = field(default_factory=list)
     doubted: Sequence[Place] = ()
-    """Places whose thing was in the hand and was called something else: they come last."""
+    """Places whose thing was in the hand, and the scene VLM called it something else."""
     base_pose: Pose = UNMOVED
     joined: bool = False
     """Whether odometry joins the newest look to the ones before."""
 
     def add(self, data: JsonMap, others: Iterable[Place] = ()) -> bool:
-        """Add `data` of a locate that found something: `point_base_m`, optionally `seen` and
-        `base_pose`. Leave out what stands where one of the `others` was seen as well.
+        """Add `data` of a look: `point_base_m` or `seen` if it found something, and `base_pose`.
 
+        What stands where one of the `others` was seen as well is left out, and forgotten.
         Returns: whether anything was added.
         """
-        self.looked_from(data.get("base_pose"))
-        things = data.get("seen") or [{"point_base_m": data["point_base_m"], "score": 1.0}]
-        seen = [self._place(Point(*thing["point_base_m"]), thing["score"]) for thing in things]
-        if self.joined:
-            seen = [place for place in seen if not _is_other(place, others)]
-        before = list(self.known)
-        for place in seen:
-            self._see(place, before)
-        return bool(seen)
-
-    def looked_from(self, pose: Sequence[float] | None) -> None:
-        """Note where the base stood at the newest look. Without odometry (None) forget the looks
-        before it.
-        """
+        pose = data.get("base_pose")
         self.joined = pose is not None
         if not self.joined:
             self.known.clear()
         self.base_pose = UNMOVED if pose is None else (pose[0], pose[1], pose[2])
+        point = [{"point_base_m": data["point_base_m"], "score": 1.0}] if _POINT in data else []
+        things = data.get("seen") or point
+        seen = [self._place(Point(*thing["point_base_m"]), thing["score"]) for thing in things]
+        if self.joined:
+            others = list(others)
+            seen = [place for place in seen if not _is_other(place, others)]
+            self.known = [
+                place for place in self.known if _near(place, seen) or not _near(place, others)
+            ]
+        before = list(self.known)
+        for place in seen:
+            self._see(place, before)
+        return bool(seen)
 
     def _place(self, point: Point, score: float) -> Place:
         x0, y0, yaw = self.base_pose
@@ -109,14 +111,12 @@ class Places:
             same.x, same.y, same.z, same.seen_from_m = seen.x, seen.y, seen.z, seen.seen_from_m
 
     def best(self) -> Place | None:
-        """Return the likeliest place, doubted ones last; None before anything was seen."""
-        return max(
-            self.known, key=lambda place: (not self.doubts(place), place.score), default=None
-        )
+        """Return the likeliest place; None before anything was seen."""
+        return max(self.known, key=lambda place: place.score, default=None)
 
     def doubts(self, place: Place) -> bool:
         """Return whether a place is a doubted one. Without odometry none can be told."""
-        return self.joined and any(_apart_m(place, other) <= SAME_M for other in self.doubted)
+        return self.joined and _near(place, self.doubted)
 
     def from_base(self, place: Place) -> Point:
         """Return its position relative to the base at the newest look."""
@@ -165,6 +165,10 @@ class Search:
             if not any(_same_view(pose, view) for view in self._views):
                 return pose
         return None
+
+
+def _near(place: Place, others: Iterable[Place]) -> bool:
+    return any(_apart_m(place, other) <= SAME_M for other in others)
 
 
 def _is_other(place: Place, others: Iterable[Place]) -> bool:

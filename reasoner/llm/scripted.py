@@ -128,13 +128,13 @@ def _script(thing: str, robot: _Robot) -> Script:
     if ended is not None:
         return ended
     folded = True
-    left: list[Place] = []  # of the attempt before: other places where it may stand
+    known: list[Place] = []  # of the attempt before, if it grasped what was called something else
     for attempt in range(1, ATTEMPTS_MAX + 1):
         if not folded:
             yield _fold(robot)
         folded = False
-        places = Places(left, search.doubted)
-        left = []
+        places = Places(known, search.doubted)
+        known = []
         lost = yield from _find(thing, robot, places, search)
         if lost:
             return Finish(False, lost)
@@ -167,7 +167,7 @@ def _script(thing: str, robot: _Robot) -> Script:
             return Finish(True, f"{seen}; the scene VLM calls it something else: {answer}")
         if robot.place is not None and attempt < ATTEMPTS_MAX:
             search.doubted.append(place)
-            left = [other for other in places.known if places.joined and other is not place]
+            known = places.known if places.joined else []
             why = "a held thing would be looked at, and dropped before the next grasp"
             folded = (yield from _put_down(robot, answer, why, search)).status == "succeeded"
     return Finish(False, reason)
@@ -277,10 +277,10 @@ def _locate(
     outcome = Outcome("error", "never looked")
     for _ in range(LOOKS_MAX):
         outcome = yield LocateInView(query=thing, rationale=f"where is the {thing}?")
-        if outcome.status == "found" and not places.add(outcome.data, search.others.values()):
+        looked = outcome.status == "found" or "base_pose" in outcome.data
+        added = looked and places.add(outcome.data, search.others.values())
+        if outcome.status == "found" and not added:
             outcome = Outcome("not_seen", "what is seen was put down here", data=outcome.data)
-        if outcome.status == "not_seen" and "base_pose" in outcome.data:
-            places.looked_from(outcome.data["base_pose"])
         if outcome.status in ("found", "not_seen"):
             unknown = outcome.data.get("unknown_words")
             if unknown and robot.can_say and not search.began:
