@@ -4,27 +4,20 @@ ended."""
 import json
 import os
 import select
-import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
-from threading import Event
 from time import monotonic
 
 import pytest
 
-from tests.support.paths import SUPPORT
 from tests.support.processes import children, server_of_imports
 from tests.support.waiting import until
-from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 
 GB = 10**9
 MB = 10**6
 PATIENCE_S = 60.0
-ATTACKER = str(SUPPORT / "attacker.py")
 
 
 def leases(arbiter):
@@ -66,8 +59,8 @@ def test_unload_leaves_nothing_on_the_gpu_and_the_next_request_loads_again(box, 
     sidecar.detect()
     assert sidecar.ask("unload")["ok"]
     assert sidecar.state() == "unloaded"
-    from_outside(lambda: leases(arbiter) == {})
-    from_outside(lambda: box.used() == 0)
+    until(lambda: leases(arbiter) == {})
+    until(lambda: box.used() == 0)
     assert sidecar.ask("unload")["ok"], "twice is once"
     assert sidecar.detect()["ok"]
 
@@ -104,7 +97,7 @@ def test_ping_is_answered_and_a_revoke_acknowledged_while_an_op_runs_which_is_no
     grab = box.start("grab", footprint="5GB,5GB,100MB")
     running = detector.hold()
     waiting = grab.send_detect()
-    from_outside(lambda: leases(arbiter)["detector"]["state"] == "revoking")
+    until(lambda: leases(arbiter)["detector"]["state"] == "revoking")
     assert detector.state() == "resident"
     assert grab.state() == "waiting"
     detector.let_go()
@@ -120,7 +113,7 @@ def test_a_callers_use_on_the_lease_keeps_the_model_until_it_ends(box, arbiter):
     goal = {"lease_id": held["lease_id"], "token": held["token"], "use_id": "goal-1"}
     assert arbiter.ask("use_begin", **goal)["ok"]
     waiting = other.send_detect()
-    from_outside(lambda: leases(arbiter)["policy"]["state"] == "revoking")
+    until(lambda: leases(arbiter)["policy"]["state"] == "revoking")
     for _ in range(3):
         assert policy.detect("step", token=held["token"])["ok"], (
             "the goal goes on while its holder is asked to leave"
@@ -150,7 +143,7 @@ def test_a_failed_start_takes_everything_back_and_can_be_tried_again(box, arbite
         "model_error",
         f"ModelError: RuntimeError: {step} fails as told",
     )
-    from_outside(lambda: leases(arbiter) == {})
+    until(lambda: leases(arbiter) == {})
     assert "fails as told" in sidecar.ask("ping")["last_error"]
     switch.unlink()
     assert sidecar.detect()["ok"]
@@ -166,7 +159,7 @@ def test_a_load_that_can_not_even_be_taken_back_keeps_no_lease(box, arbiter):
         switch.touch()
     sidecar = box.start("detector")
     assert sidecar.detect()["code"] == "model_error"
-    from_outside(lambda: leases(arbiter) == {})
+    until(lambda: leases(arbiter) == {})
     for switch in switches:
         switch.unlink()
     assert sidecar.detect()["ok"]
@@ -177,7 +170,7 @@ def test_an_out_of_memory_while_loading_rolls_back_and_is_reported(box, arbiter)
     (box.runtime / "detector-model" / "slow_load").touch()
     sidecar = box.start("detector", footprint="4GB,4GB,100MB")
     request = sidecar.send_detect()
-    from_outside(lambda: box.used() == 100 * MB)  # granted, and its context is there
+    until(lambda: box.used() == 100 * MB)  # granted, and its context is there
     stowaway = {"pid": os.getpid(), "name": "browser", "allocated_bytes": 6 * GB}
     replace(box.card / "browser.json", json.dumps(stowaway))
     (box.runtime / "detector-model" / "slow_load").unlink()
@@ -197,14 +190,14 @@ def test_the_end_of_the_process_waits_for_the_op_and_gives_everything_back(box, 
     sidecar = box.start("detector")
     running = sidecar.hold()
     sidecar.process.terminate()
-    from_outside(lambda: sidecar.state() == "unloading")
+    until(lambda: sidecar.state() == "unloading")
     refused = sidecar.detect()
     assert refused["code"] == "sidecar_unavailable", "nothing is loaded by a process that ends"
     sidecar.let_go()
     assert sidecar.client.reply(running, PATIENCE_S)["ok"]
     assert sidecar.process.wait(PATIENCE_S) == 0
-    from_outside(lambda: leases(arbiter) == {})
-    from_outside(lambda: box.used() == 0)
+    until(lambda: leases(arbiter) == {})
+    until(lambda: box.used() == 0)
 
 
 def test_the_end_does_not_wait_for_imports(box):
@@ -212,7 +205,7 @@ def test_the_end_does_not_wait_for_imports(box):
     (box.runtime / "detector-model" / "slow_prepare").touch()
     sidecar = box.start("detector")
     sidecar.send_detect()
-    from_outside(lambda: sidecar.state() == "waiting")
+    until(lambda: sidecar.state() == "waiting")
     assert sidecar.terminate() == 0
 
 
@@ -226,8 +219,8 @@ def test_shutdown_on_the_wire(box):
 def test_an_idle_model_lets_go_by_itself(box, arbiter):
     sidecar = box.start("detector", "--idle-release-s", "0.3")
     sidecar.detect()
-    from_outside(lambda: sidecar.state() == "unloaded")
-    from_outside(lambda: leases(arbiter) == {})
+    until(lambda: sidecar.state() == "unloaded")
+    until(lambda: leases(arbiter) == {})
 
 
 def test_a_wait_for_the_lease_is_bounded(box):
@@ -250,7 +243,7 @@ def test_imports_are_no_wait_for_the_lease(box, arbiter):
     sidecar = box.start("detector", footprint="5GB,5GB,100MB")
     asked = monotonic()
     waiting = sidecar.client.send("load", timeout_s=0.2)
-    from_outside(lambda: sidecar.state() == "waiting" and monotonic() > asked + 0.2)
+    until(lambda: sidecar.state() == "waiting" and monotonic() > asked + 0.2)
     switch.unlink()
     denied = sidecar.client.reply(waiting, PATIENCE_S)
     assert (denied["ok"], denied["code"]) == (False, "wait_timeout")
@@ -277,93 +270,11 @@ def test_the_arbiter_may_be_killed_between_two_requests(box, arbiter_daemon, arb
     assert sidecar.ask("ping")["token"] == token
 
 
-def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):
-    detector = lone_box.start("detector", "--no-arbiter", footprint="5GB,5GB,100MB")
-    from_outside(lambda: detector.state() == "resident")
-    grab = lone_box.start("grab", "--no-arbiter", footprint="4GB,4GB,100MB")
-    failed = grab.detect()
-    assert failed["code"] == "oom"
-    assert grab.ask("ping")["last_error"].startswith("oom: CUDA out of memory (simulated)")
-    assert detector.ask("load") == {
-        "ok": True,
-        "lease_id": None,
-        "token": None,
-        "loaded": False,
-        "re": detector.client._id,
-    }
-    assert detector.terminate() == 0
-    from_outside(lambda: lone_box.used() <= 100 * MB)
-    assert grab.detect()["ok"]
-
-
-def test_a_process_without_a_device_needs_no_card(lone_box):
-    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
-    assert sidecar.detect()["ok"]
-
-
-@pytest.mark.parametrize("mode", ["empties", "maps", "more", "connects"])
-def test_an_attacked_sidecar_serves_others_and_lives(lone_box, mode):
-    """Regression: bare connects, an odd identity or frames without end aborted the process, or took
-    its memory."""
-    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
-    assert sidecar.detect()["ok"]
-    path = sidecar.endpoint.removeprefix("ipc://")
-    with subprocess.Popen(
-        [sys.executable, ATTACKER, mode, path], stdout=subprocess.PIPE
-    ) as attacker:
-        try:
-            assert attacker.stdout.readline() == b"under way\n"
-            for _ in range(20):
-                assert sidecar.detect()["ok"]
-            with WireClient(sidecar.endpoint) as another:
-                assert another.ask("ping")["state"] == "resident"
-            assert attacker.poll() is None
-        finally:
-            attacker.kill()
-    assert sidecar.terminate() == 0
-
-
-def test_two_sidecars_cannot_serve_one_socket(lone_box):
-    lone_box.start("detector", "--no-arbiter", device="none")
-    second = lone_box.spawn("detector", "--no-arbiter", device="none")
-    assert second.process.wait(PATIENCE_S) == 1
-    assert "already uses" in second.log
-
-
-def test_without_the_arbiter_that_it_needs_it_says_so_and_ends(lone_box):
-    sidecar = lone_box.spawn("detector")
-    assert sidecar.process.wait(PATIENCE_S) == 1
-    assert "no arbiter at" in sidecar.log
-    assert "start `vram-arbiter`" in sidecar.log
-
-
-def test_on_a_simulated_gpu_it_waits_for_the_arbiter_that_makes_the_gpu(box, arbiter_daemon):
-    """Regression: the GPU's folder was read before the arbiter was asked for, so a sidecar started
-    before its arbiter ended at once."""
-    arbiter_daemon.stop()
-    shutil.rmtree(box.card)
-    sidecar = box.spawn("detector")
-    until(lambda: f"waiting for the arbiter at {arbiter_daemon.endpoint}" in sidecar.log)
-    arbiter_daemon.start()
-    assert sidecar.detect()["ok"]
-    with WireClient(arbiter_daemon.endpoint) as client:
-        (lease,) = client.hello("looker", role="observer").ask("status")["leases"]
-    uuid = json.loads((box.card / "gpu.json").read_text())["uuid"]
-    assert lease["gpu"] == uuid, "the lease is of the GPU that holds the bytes"
-
-
 def replace(path, text):
     """In one step: others read the card meanwhile."""
     fresh = path.with_name(".new")
     fresh.write_text(text)
     fresh.rename(path)
-
-
-def from_outside(condition):
-    deadline = monotonic() + PATIENCE_S
-    while not condition():
-        assert monotonic() < deadline, "it did not happen in time"
-        Event().wait(0.01)
 
 
 def test_a_request_that_waits_behind_another_does_not_keep_the_lease_in_use(box, arbiter):
@@ -372,10 +283,10 @@ def test_a_request_that_waits_behind_another_does_not_keep_the_lease_in_use(box,
     sidecar.detect()
     held = sidecar.hold()
     assert sidecar.detect()["code"] == "wait_timeout"
-    from_outside(lambda: leases(arbiter)["detector"]["uses"] == 1)  # the one that runs
+    until(lambda: leases(arbiter)["detector"]["uses"] == 1)  # the one that runs
     sidecar.let_go()
     assert sidecar.client.reply(held, PATIENCE_S)["ok"]
-    from_outside(lambda: leases(arbiter)["detector"]["uses"] == 0)
+    until(lambda: leases(arbiter)["detector"]["uses"] == 0)
     assert sidecar.detect()["ok"]
 
 
@@ -388,7 +299,7 @@ def test_a_stuck_model_is_said_and_its_process_ended(box, arbiter):
     answer = sidecar.client.reply(hanging, PATIENCE_S)
     assert (answer["code"], answer["ok"]) == ("model_error", False)
     assert "has not answered within" in answer["error"]
-    from_outside(lambda: leases(arbiter) == {})
+    until(lambda: leases(arbiter) == {})
     grab = box.start("grab", footprint="5GB,5GB,100MB")
     assert grab.detect()["ok"], "the room is there for others"
     grab.ask("unload")
@@ -410,7 +321,7 @@ def test_a_model_that_dies_while_it_works_is_an_error_and_its_lease_ends(box, ar
     answer = sidecar.client.reply(running, PATIENCE_S)
     assert (answer["code"], answer["ok"]) == ("model_error", False)
     assert "process ended by SIGKILL" in answer["error"]
-    from_outside(lambda: leases(arbiter) == {})
+    until(lambda: leases(arbiter) == {})
     identity = sidecar.ask("ping")
     assert (identity["state"], identity["token"]) == ("unloaded", None)
     assert "model_error" in identity["last_error"]
@@ -424,11 +335,11 @@ def test_a_model_that_dies_while_it_loads_is_an_error(box, arbiter):
     switch.touch()
     sidecar = box.start("detector")
     waiting = sidecar.send_detect()
-    from_outside(lambda: box.used() > 0)
+    until(lambda: box.used() > 0)
     os.kill(sidecar.model_pid(), signal.SIGKILL)
     answer = sidecar.client.reply(waiting, PATIENCE_S)
     assert (answer["code"], answer["ok"]) == ("model_error", False)
-    from_outside(lambda: leases(arbiter) == {})
+    until(lambda: leases(arbiter) == {})
     switch.unlink()
     assert sidecar.detect()["ok"]
 
@@ -441,7 +352,7 @@ def test_a_model_dies_with_its_host(box):
     sidecar.process.kill()
     assert select.select([model], [], [], PATIENCE_S)[0], "also in the middle of its work"
     os.close(model)
-    from_outside(lambda: box.used() == 0)
+    until(lambda: box.used() == 0)
 
 
 def test_torch_is_not_imported_where_no_tensor_is(box):

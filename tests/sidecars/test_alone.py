@@ -1,0 +1,93 @@
+"""A sidecar without its arbiter: told to do without, started before it, or attacked."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from tests.support.paths import SUPPORT
+from tests.support.waiting import until
+from tests.support.wire import WireClient
+
+pytestmark = pytest.mark.e2e
+
+MB = 10**6
+PATIENCE_S = 60.0
+ATTACKER = str(SUPPORT / "attacker.py")
+
+
+def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):
+    detector = lone_box.start("detector", "--no-arbiter", footprint="5GB,5GB,100MB")
+    until(lambda: detector.state() == "resident")
+    grab = lone_box.start("grab", "--no-arbiter", footprint="4GB,4GB,100MB")
+    failed = grab.detect()
+    assert failed["code"] == "oom"
+    assert grab.ask("ping")["last_error"].startswith("oom: CUDA out of memory (simulated)")
+    assert detector.ask("load") == {
+        "ok": True,
+        "lease_id": None,
+        "token": None,
+        "loaded": False,
+        "re": detector.client._id,
+    }
+    assert detector.terminate() == 0
+    until(lambda: lone_box.used() <= 100 * MB)
+    assert grab.detect()["ok"]
+
+
+def test_a_process_without_a_device_needs_no_card(lone_box):
+    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
+    assert sidecar.detect()["ok"]
+
+
+@pytest.mark.parametrize("mode", ["empties", "maps", "more", "connects"])
+def test_an_attacked_sidecar_serves_others_and_lives(lone_box, mode):
+    """Regression: bare connects, an odd identity or frames without end aborted the process, or took
+    its memory."""
+    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
+    assert sidecar.detect()["ok"]
+    path = sidecar.endpoint.removeprefix("ipc://")
+    with subprocess.Popen(
+        [sys.executable, ATTACKER, mode, path], stdout=subprocess.PIPE
+    ) as attacker:
+        try:
+            assert attacker.stdout.readline() == b"under way\n"
+            for _ in range(20):
+                assert sidecar.detect()["ok"]
+            with WireClient(sidecar.endpoint) as another:
+                assert another.ask("ping")["state"] == "resident"
+            assert attacker.poll() is None
+        finally:
+            attacker.kill()
+    assert sidecar.terminate() == 0
+
+
+def test_two_sidecars_cannot_serve_one_socket(lone_box):
+    lone_box.start("detector", "--no-arbiter", device="none")
+    second = lone_box.spawn("detector", "--no-arbiter", device="none")
+    assert second.process.wait(PATIENCE_S) == 1
+    assert "already uses" in second.log
+
+
+def test_without_the_arbiter_that_it_needs_it_says_so_and_ends(lone_box):
+    sidecar = lone_box.spawn("detector")
+    assert sidecar.process.wait(PATIENCE_S) == 1
+    assert "no arbiter at" in sidecar.log
+    assert "start `vram-arbiter`" in sidecar.log
+
+
+def test_on_a_simulated_gpu_it_waits_for_the_arbiter_that_makes_the_gpu(box, arbiter_daemon):
+    """Regression: the GPU's folder was read before the arbiter was asked for, so a sidecar started
+    before its arbiter ended at once."""
+    arbiter_daemon.stop()
+    shutil.rmtree(box.card)
+    sidecar = box.spawn("detector")
+    until(lambda: f"waiting for the arbiter at {arbiter_daemon.endpoint}" in sidecar.log)
+    arbiter_daemon.start()
+    assert sidecar.detect()["ok"]
+    with WireClient(arbiter_daemon.endpoint) as client:
+        (lease,) = client.hello("looker", role="observer").ask("status")["leases"]
+    uuid = json.loads((box.card / "gpu.json").read_text())["uuid"]
+    assert lease["gpu"] == uuid, "the lease is of the GPU that holds the bytes"
