@@ -241,6 +241,7 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"gpu", "consumers"}): lambda text: load_scenario(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
     frozenset({"http"}): lambda text: load_config(text, "page"),
+    frozenset({"telemetry"}): lambda text: load_config(text, "page"),
     frozenset({"services"}): yaml.safe_load,  # compose
     frozenset({"scrape_configs"}): yaml.safe_load,  # Prometheus
 }
