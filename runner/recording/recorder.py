@@ -24,7 +24,7 @@ from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded
 from vram_arbiter.runner.recording import commit, wire
 from vram_arbiter.runner.recording.counts import Counts
 from vram_arbiter.runner.recording.queue import TickQueue
-from vram_arbiter.runner.recording.rows import LEROBOT, ROBOT, Incomplete, row_of
+from vram_arbiter.runner.recording.rows import LEROBOT, ROBOT, Incomplete, row_of, whole_rate
 from vram_arbiter.runner.recording.writer_process import Opening, WriterProcess
 from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.schemas.errors import BadState, ConfigError, InternalError, VramError, from_wire
@@ -70,19 +70,6 @@ class _Gone:
 
     writer: WriterProcess
     code: int
-
-
-def whole_rate(rate_hz: float) -> int:
-    """Return the dataset's frames per second.
-
-    Raises ConfigError for a rate that is not a whole number.
-    """
-    if rate_hz < 1 or rate_hz != round(rate_hz):
-        raise ConfigError(
-            f"a recording needs a whole number of ticks a second, not {rate_hz:g}",
-            hint="change the rate",
-        )
-    return round(rate_hz)
 
 
 class DatasetRecorder:

@@ -13,6 +13,7 @@ from typing import TypedDict
 
 from vram_arbiter.runner.protocols import GoalTick, Transition
 from vram_arbiter.runner.robots.units import LerobotUnits
+from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
@@ -72,6 +73,19 @@ class Row(TypedDict):
 
 class Incomplete(Exception):
     """This tick cannot become a row of the dataset; the message names what it lacks."""
+
+
+def whole_rate(rate_hz: float) -> int:
+    """Return the dataset's frames per second.
+
+    Raises ConfigError for a rate that is not a whole number.
+    """
+    if rate_hz < 1 or rate_hz != round(rate_hz):
+        raise ConfigError(
+            f"a recording needs a whole number of ticks a second, not {rate_hz:g}",
+            hint="change the rate",
+        )
+    return round(rate_hz)
 
 
 def row_of(

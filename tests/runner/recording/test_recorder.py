@@ -35,8 +35,8 @@ from vram_arbiter.runner.recording.columns import features_of, frame_of
 from vram_arbiter.runner.recording.lerobot_files import LerobotFiles
 from vram_arbiter.runner.recording.queue import QUEUE_TICKS
 from vram_arbiter.runner.recording.reader import read_frame
-from vram_arbiter.runner.recording.recorder import DatasetRecorder, whole_rate
-from vram_arbiter.runner.recording.rows import row_of
+from vram_arbiter.runner.recording.recorder import DatasetRecorder
+from vram_arbiter.runner.recording.rows import row_of, whole_rate
 from vram_arbiter.runner.recording.writer import EpisodeWriter
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,
