@@ -170,13 +170,12 @@ class Feed:
 class SlotReader(ABC):
     """A `SensorReader` whose thread, bus or listener fills a slot; subclasses provide it.
 
-    `decodes_on_gpu`: its pictures come from a decoder of an NVIDIA GPU.
-
     They override `_run_begins` and `_run_ends`. `start` and `stop` may be repeated. After `stop`
     every read raises FrameStale; `start` begins anew.
     """
 
     decodes_on_gpu = False
+    """Whether its pictures come from a decoder that takes memory of an NVIDIA GPU."""
 
     def __init__(
         self, sensor_id: str, max_age_ms: float, clock: Clock, tee: FrameTee | None = None

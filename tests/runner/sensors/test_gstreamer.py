@@ -265,6 +265,22 @@ def test_a_file_is_scaled(reader: Callable[..., SlotReader], h264_file: Path) ->
     assert (frame.width, frame.height, len(frame.data or b"")) == (31, 21, 31 * 21 * 3)
 
 
+@pytest.mark.parametrize(
+    ("platform", "on_gpu"),
+    # a Jetson's decoder is no CUDA context: its memory is the board's own
+    [(Platform.NVIDIA_DESKTOP, True), (Platform.CPU_ONLY, False), (Platform.TEGRA, False)],
+)
+def test_a_decoder_of_an_nvidia_gpu_asks_for_a_lease(platform: Platform, on_gpu: bool) -> None:
+    """`deploy` takes its lease for as many cameras as say so."""
+    for codec in ("h264", "h265"):
+        params = GStreamerParams(source="rtsp", url="rtsp://10.0.0.7/main", codec=codec)
+        text = build(params, platform)
+        assert GStreamerReader("hall", 100, params, text, CLOCK).decodes_on_gpu is on_gpu
+    raw = GStreamerParams(source="v4l2", device="/dev/video0")
+    text = build(raw, platform)
+    assert not GStreamerReader("wrist", 100, raw, text, CLOCK).decodes_on_gpu
+
+
 def test_a_file_that_is_no_video(reader: Callable[..., SlotReader], tmp_path: Path) -> None:
     path = tmp_path / "notes.mp4"
     path.write_text("not a film" * 1000, encoding="utf-8")
