@@ -58,6 +58,11 @@ class GpuCopy:
         assert state in TRANSITIONS[self.state], f"{self.state} → {state}"
         self.state = state
 
+    def not_loaded(self) -> None:
+        """Leave the states before `resident`; an unload in progress leaves them itself."""
+        if self.state in ("waiting", "loading"):
+            self.to("unloaded")
+
     # -- loading
     async def load(self, lease: AsyncLease | None, given_up: Callable[[], bool]) -> None:
         """Load the model; `given_up` says whether it is not wanted any more.

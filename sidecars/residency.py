@@ -195,8 +195,11 @@ class Residency:
             self._prepared.cancel()
             await asyncio.wait({self._prepared})
         await self._host.stop()
-        await self._gpu.unload()
-        await self._models.end()
+        self._unloads += 1  # a load in progress is not wanted anymore
+        try:
+            await self._gpu.unload()
+        finally:
+            await self._models.end()
         if lease is not None:
             await lease.release(exiting=True)
 
@@ -246,8 +249,7 @@ class Residency:
                 raise unwanted(self._settings.name)
             await self._load(lease)
         except BaseException as error:
-            if self.state != "unloaded":
-                self._gpu.to("unloaded")
+            self._gpu.not_loaded()
             if not isinstance(error, WaitTimeout):  # asked again, it need not read them again
                 self._host.drop()
             if (
@@ -278,8 +280,7 @@ class Residency:
         try:
             await self._load(lease)
         except BaseException as error:
-            if self.state != "unloaded":
-                self._gpu.to("unloaded")
+            self._gpu.not_loaded()
             if not isinstance(error, VramError):
                 raise
             self.last_error = error

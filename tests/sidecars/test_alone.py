@@ -91,3 +91,16 @@ def test_on_a_simulated_gpu_it_waits_for_the_arbiter_that_makes_the_gpu(box, arb
         (lease,) = client.hello("looker", role="observer").ask("status")["leases"]
     uuid = json.loads((box.card / "gpu.json").read_text())["uuid"]
     assert lease["gpu"] == uuid, "the lease is of the GPU that holds the bytes"
+
+
+def test_its_end_in_the_middle_of_a_load_is_in_order(lone_box):
+    """Regression: the load that was undone and the unload both left the state `unloading`, and the
+    program hung behind the assertion until it was killed."""
+    (lone_box.runtime / "detector-model").mkdir()
+    (lone_box.runtime / "detector-model" / "slow_load").touch()
+    sidecar = lone_box.start("detector", "--no-arbiter")
+    until(lambda: sidecar.state() == "loading" and lone_box.used() > 0)
+    assert sidecar.terminate() == 0
+    until(lambda: lone_box.used() == 0)
+    assert "the load was undone" in sidecar.log
+    assert "Traceback" not in sidecar.log
