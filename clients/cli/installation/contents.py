@@ -3,6 +3,7 @@ links to the programs, and shell completions. It reads shipped files and compare
 """
 
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ def wanted(site: Site, prefix: Path, group: str) -> Contents:
     files = {path: _adapted(text, prefix, group) for path, text in files.items()}
     settings, shared = site.layout.settings, site.layout.shared
     for name in ("arbiter.yaml", "hooks.yaml"):
-        files[settings / f"{name}.example"] = _read(name)
+        files[settings / f"{name}.example"] = _example(name, prefix)
     for place, text in completions().items():
         files[shared / place] = text
     links = {}
@@ -73,6 +74,14 @@ def tegra_drop_in(text: str, devices: list[str]) -> str:
     """Return the shipped drop-in with the device nodes of this machine that it does not name."""
     lines = [f"DeviceAllow={device} rw" for device in devices]
     return text + "".join(f"{line}\n" for line in lines if line not in text.splitlines())
+
+
+def _example(name: str, prefix: Path) -> str:
+    """Return a commented example that names the schema of the environment `prefix` for editors."""
+    package, here = SHIPPED.parent, Path(sys.prefix)
+    if package.is_relative_to(here):
+        package = prefix / package.relative_to(here)
+    return _read(name).replace("$schema=../", f"$schema={package}/", 1)
 
 
 def _read(name: str) -> str:

@@ -3,7 +3,9 @@
 On a machine with a real systemd they run in tests/packaging/test_units_start.py.
 """
 
+import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -81,6 +83,16 @@ def test_a_plan_is_shown_then_performed_once(
     assert "nothing to change" in said
     assert " new " not in said
     assert (tree(root), os.stat(root / UNIT).st_ino) == (files, written)
+
+
+@pytest.mark.parametrize("name", ["arbiter", "hooks"])
+def test_an_installed_example_names_a_schema_that_is_there(root: Path, name: str) -> None:
+    """Regression: it named the clone's by a relative path, and editors found none."""
+    assert vramctl(root, "install", "--prefix", "/opt/other", "--yes") == 0
+    text = (root / f"etc/vram-arbiter/{name}.yaml.example").read_text()
+    first = re.match(r"# yaml-language-server: \$schema=(/\S+)\n", text)
+    assert first
+    assert json.loads(Path(first[1]).read_text())["$schema"].startswith("https://json-schema.org/")
 
 
 def test_the_plan_needs_a_yes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
