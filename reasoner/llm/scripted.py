@@ -166,8 +166,9 @@ def _script(thing: str, robot: _Robot) -> Script:
             seen = f"the detector sees the {thing} there, before the first grasp and after it"
             return Finish(True, f"{seen}; the scene VLM calls it something else: {answer}")
         if robot.place is not None and attempt < ATTEMPTS_MAX:
-            search.doubted.append(place)
-            known = places.known if places.joined else []
+            if _NAMED.search(answer):
+                search.doubted.append(place)
+                known = places.known if places.joined else []
             why = "a held thing would be looked at, and dropped before the next grasp"
             folded = (yield from _put_down(robot, answer, why, search)).status == "succeeded"
     return Finish(False, reason)

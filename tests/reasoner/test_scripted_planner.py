@@ -515,6 +515,18 @@ def test_a_doubted_thing_that_is_not_held_the_next_time_is_no_success() -> None:
     assert run_script(table, WITH_PLACE)[0]["status"] == "failure"
 
 
+def test_a_thing_without_a_name_is_not_doubted() -> None:
+    """There is no second opinion then: nothing says that it is the wanted thing."""
+
+    def world(call: ToolCall, _: int) -> Outcome:
+        if isinstance(call, QueryScene):
+            return Outcome("answered", "Yes, the gripper is holding something.")
+        return sees([0.0, 0.0, 0.0], (0.33, 0.1, 0.7)) if isinstance(call, LocateInView) else DONE
+
+    result, _ = run_script(world, WITH_PLACE)
+    assert (result["status"], result["attempts"]) == ("failure", 3)
+
+
 def test_a_name_that_the_detector_confirms_rules_the_place_out() -> None:
     """What the scene VLM calls a ball, and the detector too, is no cube, whatever the detector
     gives it as one: the next place is the better one.
