@@ -22,7 +22,7 @@ def lease_something(arbiter: ArbiterProcess) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def recorded(arbiter: ArbiterProcess, event: str) -> bool:
+def on_disk(arbiter: ArbiterProcess, event: str) -> bool:
     """Whether the log on the disk holds an event of this kind."""
     files = (arbiter.state / FOLDER).glob("*")
     return any(f'"event":"{event}"' in file.read_text() for file in files)
@@ -32,7 +32,7 @@ def test_a_daemon_replays_identically_also_after_kill_9_and_a_restart(make_arbit
     """The log goes to the disk in batches: a kill before the first of them leaves no file."""
     arbiter = make_arbiter().start()
     lease_something(arbiter)
-    until(lambda: recorded(arbiter, "AcquireRequested"))
+    until(lambda: on_disk(arbiter, "AcquireRequested"))
     arbiter.kill()
     arbiter.start()
     lease_something(arbiter)

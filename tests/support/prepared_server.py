@@ -1,4 +1,4 @@
-"""Server that imports a program and forks it for each order of `prepared`; started by that alone."""
+"""Server that imports a program, and forks it for each order of `prepared`; started by that."""
 
 import contextlib
 import fcntl

@@ -1,4 +1,4 @@
-"""Forked programs: one server for the processes of a run, outputs, exit codes, and waiting threads."""
+"""Forked programs: one server for the processes of a run, outputs, exit codes, waiting threads."""
 
 import os
 import subprocess
