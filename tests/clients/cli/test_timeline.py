@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.waiting import until
 from vram_arbiter.clients.cli.timeline import collect
 from vram_arbiter.clients.cli.timeline.collect import BadEventLog, EmptyTimeline, Range
 from vram_arbiter.clients.cli.timeline.command import write
@@ -59,6 +60,7 @@ def switched() -> Iterator[ArbiterProcess]:
                 asked = {"spec": as_plain(spec("grab", 6)), "nonce": "grab"}
                 grab.ask("acquire", asked)
             until_gone(detector)
+            until(lambda: "loading" in logged_states(daemon).get("grab", []))
             yield daemon
     finally:
         daemon.close()
@@ -83,6 +85,14 @@ def printed(switched: ArbiterProcess) -> Story:
 
 def lease_states(story: Story) -> dict[str, list[str]]:
     return {one.consumer: [span.name for span in one.states] for one in story.leases}
+
+
+def logged_states(daemon: ArbiterProcess) -> dict[str, list[str]]:
+    """The states by the event log, which reaches the disk in batches: at first there is none."""
+    try:
+        return lease_states(collect.story_of(collect.read_log(daemon.state), Range()))
+    except (BadEventLog, EmptyTimeline):
+        return {}
 
 
 # -- the story
