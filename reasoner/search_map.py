@@ -111,8 +111,10 @@ class Places:
             same.x, same.y, same.z, same.seen_from_m = seen.x, seen.y, seen.z, seen.seen_from_m
 
     def best(self) -> Place | None:
-        """Return the likeliest place; None before anything was seen."""
-        return max(self.known, key=lambda place: place.score, default=None)
+        """Return the likeliest place, doubted ones last; None before anything was seen."""
+        return max(
+            self.known, key=lambda place: (not self.doubts(place), place.score), default=None
+        )
 
     def doubts(self, place: Place) -> bool:
         """Return whether a place is a doubted one. Without odometry none can be told."""

@@ -616,16 +616,20 @@ def test_a_no_that_names_the_target_is_asked_after() -> None:
         assert run_script(world(other))[0]["status"] == "failure"
 
 
-def test_a_doubted_place_is_tried_again_before_less_likely_ones() -> None:
-    """Every grasp of another thing is a chance for the scene VLM to call that one the target."""
+def test_a_doubted_place_comes_after_the_others() -> None:
+    """The detector may be wrong as well: in the demo's seed 57 it preferred an orange ball to the
+    orange cube, by either name, and the ball that was grasped again counted as the cube."""
     scores = {
-        "red cube": [(0.33, 0.1, 0.7), (0.33, -0.1, 0.5)],
-        "red ball": [(0.33, -0.1, 0.8)],
+        "red cube": [(0.33, 0.1, 0.64), (0.33, -0.1, 0.42)],
+        "red ball": [(0.33, 0.1, 0.45)],
     }
-    table = Table(scores, {0.1: "red cylinder", -0.1: "red cube"})
-    result, calls = run_script(table, WITH_PLACE)
-    assert grasped_at(calls) == [0.1, 0.1]
-    assert (result["status"], result["attempts"]) == ("success", 2)
+    for other, places, attempts in (
+        ("red cube", [0.1, -0.1], 2),
+        ("red cone", [0.1, -0.1, 0.1], 3),
+    ):
+        result, calls = run_script(Table(scores, {0.1: "red ball", -0.1: other}), WITH_PLACE)
+        assert grasped_at(calls) == places
+        assert (result["status"], result["attempts"]) == ("success", attempts)
 
 
 def test_the_arm_is_folded_before_it_looks_at_what_it_put_down() -> None:
