@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tests.support.prepared import Forked, as_here, run, start
+from tests.support.waiting import until
 
 START_S = 60.0
 STOP_S = 60.0
@@ -188,7 +189,12 @@ class ArbiterProcess:
             self.process.kill()
             self.process.wait(STOP_S)
         self._notify.close()
+        until(self._removed)
+
+    def _removed(self) -> bool:
+        """Remove the folder; False where a program that is ending wrote its last bytes meanwhile."""
         shutil.rmtree(self.runtime, ignore_errors=True)
+        return not self.runtime.exists()
 
 
 type Finished = subprocess.CompletedProcess[str]
