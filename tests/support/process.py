@@ -192,7 +192,7 @@ class ArbiterProcess:
         until(self._removed)
 
     def _removed(self) -> bool:
-        """Remove the folder; False where a program that is ending wrote its last bytes meanwhile."""
+        """Remove the folder; False where a program that is ending wrote to it meanwhile."""
         shutil.rmtree(self.runtime, ignore_errors=True)
         return not self.runtime.exists()
 

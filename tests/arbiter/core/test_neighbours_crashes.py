@@ -43,7 +43,7 @@ def test_17_a_crash_loop_does_not_take_the_card_for_every_try() -> None:
     assert "policy failed 3 times in a row to load policy-model" in error.message
     assert "died" in error.details["cause"]
     assert 0 < error.details["retry_in_s"] <= 2.0
-    assert driver.state(working) == "held", "and nobody was revoked for it"
+    assert driver.state(working) == "held", "and it was not revoked"
     driver.advance(2.0)
     waiter = again.acquire(5 * GIB)
     driver.until(lambda: driver.state(working) == "revoking")

@@ -87,4 +87,4 @@ def test_15_and_a_job_that_does_not_is_told_instead_of_hanging() -> None:
     assert refused.code == "would_deadlock"
     assert refused.details["cycle"][0]["consumer"] == "comfy"
     assert "yield" in refused.hint
-    assert driver.state(job) == "held", "and nobody was revoked for it"
+    assert driver.state(job) == "held", "and it was not revoked"

@@ -252,7 +252,7 @@ def test_the_estimate_behind_others_counts_their_loads() -> None:
     assert driver.state(lease) == "revoking"
     assert eta(driver, "head") == pytest.approx(2.0 + 3.0)
     assert eta(driver, "second") == pytest.approx(2.0 + 3.0 + 3.0), "one loads at a time"
-    assert eta(driver, "third") is None, "head and second have to leave for it; nobody knows when"
+    assert eta(driver, "third") is None, "head and second have to leave for it; it is unknown when"
 
 
 def test_the_estimate_behind_a_load_counts_what_is_left_of_it() -> None:

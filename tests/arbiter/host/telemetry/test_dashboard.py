@@ -42,7 +42,7 @@ class NeverCalled:
 
 class Scene:
     """An engine whose words reach the real metrics, as the executor hands them on, and a Prometheus
-    endpoint's page of them. Only metrics are on: there is no tracer."""
+    endpoint's page of them. Only metrics are on: spans have no tracer."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -265,7 +265,7 @@ def test_a_holder_that_dies_while_it_loads_fails_its_spans(
     assert str(failed(acquire)).startswith("lost: ")
     verify = heard.span("lease.verify")
     assert parent_of(verify) is None
-    assert heard.numbers("vram_arbiter.lease.evictions") == {}, "nobody asked it to leave"
+    assert heard.numbers("vram_arbiter.lease.evictions") == {}, "it was not revoked"
 
 
 def test_a_victim_that_is_lost_fails_its_eviction(driver: CoreDriver, heard: Listener) -> None:
