@@ -34,7 +34,6 @@ from vram_arbiter.arbiter.host.prober import Prober, within
 from vram_arbiter.arbiter.host.process import leave_no_zombies, raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.arbiter.host.records import record_of
-from vram_arbiter.arbiter.host.systemd import Notifier
 from vram_arbiter.arbiter.inbox import NO_READER, Inbox, SuspendWatch
 from vram_arbiter.arbiter.places import Places, find_places, take_folders
 from vram_arbiter.arbiter.recovery import recover, report, try_records
@@ -50,6 +49,7 @@ from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.folders import LockFile
 from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
 from vram_arbiter.schemas.runtime.router import Router
+from vram_arbiter.schemas.runtime.systemd import Notifier
 from vram_arbiter.schemas.runtime.telemetry import setup as otel
 from vram_arbiter.schemas.runtime.telemetry.commands import TRACEPARENT_VARIABLE
 from vram_arbiter.schemas.units import format_bytes

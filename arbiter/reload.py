@@ -18,12 +18,12 @@ from typing import Any
 from vram_arbiter.arbiter.core.events import SettingsChanged
 from vram_arbiter.arbiter.host.history import History
 from vram_arbiter.arbiter.host.prober import within
-from vram_arbiter.arbiter.host.systemd import Notifier
 from vram_arbiter.arbiter.inbox import Inbox
 from vram_arbiter.arbiter.settings import core_changes
 from vram_arbiter.schemas.config.arbiter import LIVE_KEYS, ArbiterConfig
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.systemd import Notifier
 
 READ_S = 10.0
 """Time limit of reading the file, which may be on a disk that hangs."""

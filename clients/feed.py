@@ -75,9 +75,9 @@ class Source(Protocol):
 
 
 async def follow(source: Source, cursor: Cursor) -> AsyncGenerator[Sequence[JsonMap]]:
-    """Yield new events in batches, until closed; none where only the cursor moved.
+    """Yield what each reading of the history found, until closed: new events, or none.
 
-    Raises what ends the subscription.
+    Events that happen after the first batch are never missed. Raises what ends the subscription.
     """
     happened = asyncio.Event()
 
@@ -102,11 +102,8 @@ async def follow(source: Source, cursor: Cursor) -> AsyncGenerator[Sequence[Json
                 silent = problem
                 if problem:
                     log.warning("the history cannot be read: %s", problem)
-            if events is None:
-                yield ()
-            elif events:
-                yield events
-            else:
+            yield events or ()
+            if events is not None and not events:
                 waiting = asyncio.create_task(happened.wait())
                 try:
                     await asyncio.wait(

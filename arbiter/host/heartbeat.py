@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable, Iterable
 
-from vram_arbiter.arbiter.host.systemd import Notifier
+from vram_arbiter.schemas.runtime.systemd import Notifier
 
 STATUS_EVERY_S = 5.0
 

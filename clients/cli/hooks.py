@@ -28,6 +28,7 @@ from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.runtime.systemd import Notifier
 from vram_arbiter.schemas.yamltext import read_text
 
 log = logging.getLogger(__name__)
@@ -225,7 +226,11 @@ async def serve(config: HooksConfig, endpoint: str, state: StateFile) -> int:
 
 
 async def _read(endpoint: str, cursor: Cursor, runner: Runner) -> None:
-    """Queue new events. Waits for an arbiter that is not there."""
+    """Queue new events. Waits for an arbiter that is not there.
+
+    Tells systemd that the unit has started once no later event can be missed, or while it waits.
+    """
+    manager = Notifier(os.environ)
     client = AsyncClient(
         "vramctl hooks", endpoint=endpoint, role="observer", connect_timeout_s=RETRY_S
     )
@@ -237,12 +242,17 @@ async def _read(endpoint: str, cursor: Cursor, runner: Runner) -> None:
         except ArbiterUnreachable as error:
             if not said:
                 log.warning("waiting for an arbiter: %s", error)
+                manager.ready("waiting for an arbiter")
             said = True
             await asyncio.sleep(RETRY_S)
+    said = False
     try:
-        log.info("delivers events of the arbiter at %s", client.endpoint)
         async with aclosing(follow(client, cursor)) as batches:
             async for events in batches:
                 runner.put(events, cursor.numbering)
+                if not said and cursor.numbering:
+                    said = True
+                    log.info("delivers events of the arbiter at %s", client.endpoint)
+                    manager.ready(f"delivers events of {client.endpoint}")
     finally:
         await client.__aexit__(None, None, None)

@@ -144,13 +144,15 @@ class Runner:
 
     async def keep(self, save: Callable[[Saved], None], read: Callable[[], Saved]) -> None:
         """Save what changed, at most every `SAVE_EVERY_S`, until canceled."""
-        failing = ""
+        failing, saved = "", None
         while True:
             await self._changed.wait()
             self._changed.clear()
+            now = read()
             try:
-                save(read())
-                failing = ""
+                if now != saved:
+                    save(now)
+                failing, saved = "", now
             except OSError as error:
                 if str(error) != failing:
                     failing = str(error)

@@ -131,10 +131,13 @@ def held_inside(
     lease = answer_of(
         lambda: (leases_inside(machine) or {}).get(name), lambda: machine.log(ARBITER)
     )
-    yield lease
-    assert process.poll() is None, "the holder ended with the arbiter"
-    machine.run("kill", str(lease["pid"]))
-    assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
+    try:
+        yield lease
+        assert process.poll() is None, "the holder ended with the arbiter"
+    finally:
+        if process.poll() is None:
+            machine.run("kill", str(lease["pid"]))
+            assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
 
 
 def hit(machine: Machine, name: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vram_arbiter.arbiter.host.systemd import Notifier
+from vram_arbiter.schemas.runtime.systemd import Notifier
 
 
 @pytest.fixture

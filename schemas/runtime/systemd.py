@@ -1,7 +1,7 @@
 """sd_notify in thirty lines: tells the service manager READY, RELOADING, STATUS, WATCHDOG and
 STOPPING over its datagram socket.
 
-No socket (not started by systemd): every call does nothing. Must not know what the daemon does.
+No socket (not started by systemd): every call does nothing. Must not know what the program does.
 """
 
 import os
@@ -26,7 +26,7 @@ class Notifier:
         self.watchdog_s: float | None = (
             int(usec) / 1e6 if usec.isdecimal() and int(usec) and mine else None
         )
-        """The manager kills the daemon if it hears nothing for so long; None: no watchdog."""
+        """The manager kills the program if it hears nothing for so long; None: no watchdog."""
 
     def ready(self, status: str) -> None:
         self._send(f"READY=1\nSTATUS={status}\nMAINPID={os.getpid()}", READY_S)
@@ -53,5 +53,5 @@ class Notifier:
                 out.settimeout(timeout_s)
                 out.sendto(message.encode(), self._address)
         except OSError:
-            return False  # a manager that does not listen must not stop the daemon
+            return False  # a manager that does not listen must not stop the program
         return True
