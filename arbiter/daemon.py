@@ -327,8 +327,8 @@ class Daemon:
         opening = partial(open_probe, self._config.gpu, places.runtime)
         probe, source = await within(PROBE_START_S, opening, "the GPU driver")
         try:
-            cards = await within(PROBE_START_S, probe.cards, "the GPU driver")
-            return probe, budget(cards, self._config, source)
+            gpus = await within(PROBE_START_S, probe.gpus, "the GPU driver")
+            return probe, budget(gpus, self._config, source)
         except BaseException:
             probe.close()
             raise

@@ -6,7 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
-from vram_arbiter.arbiter.host.gpu.probe import Card
+from vram_arbiter.arbiter.host.gpu.probe import GpuDevice
 from vram_arbiter.arbiter.host.gpu.unified import read_meminfo
 from vram_arbiter.arbiter.host.journal import Opened
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
@@ -22,35 +22,37 @@ PARK_SHARE = 2
 """Of the host RAM that is available at start, one part in so many may keep parked weights."""
 
 
-def budget(cards: Sequence[Card], config: ArbiterConfig, source: str = "") -> tuple[GpuInfo, ...]:
+def budget(
+    gpus: Sequence[GpuDevice], config: ArbiterConfig, source: str = ""
+) -> tuple[GpuInfo, ...]:
     """What of each GPU is leased out. Raises ConfigError for a cap on a GPU that is not there, or
     a reserve larger than a GPU."""
     caps = dict(config.gpu.capacity_bytes)
     found = []
-    for card in cards:
-        by_id, by_index = caps.pop(card.id, None), caps.pop(str(card.index), None)
-        capacity = min(size for size in (card.total_bytes, by_id, by_index) if size is not None)
-        reserve = max(config.gpu.reserve_bytes, card.margin_bytes)
+    for gpu in gpus:
+        by_id, by_index = caps.pop(gpu.id, None), caps.pop(str(gpu.index), None)
+        capacity = min(size for size in (gpu.total_bytes, by_id, by_index) if size is not None)
+        reserve = max(config.gpu.reserve_bytes, gpu.margin_bytes)
         if capacity <= reserve:
             raise ConfigError(
-                f"gpu.reserve_bytes ({format_bytes(reserve)}) leaves nothing of {card.name} "
+                f"gpu.reserve_bytes ({format_bytes(reserve)}) leaves nothing of {gpu.name} "
                 f"({format_bytes(capacity)})",
                 hint="lower the reserve or raise the cap",
             )
         found.append(
             GpuInfo(
-                id=card.id,
-                index=card.index,
-                name=card.name,
+                id=gpu.id,
+                index=gpu.index,
+                name=gpu.name,
                 capacity_bytes=capacity,
                 reserve_bytes=reserve,
                 source=source,
-                noise_bytes=card.noise_bytes,
-                total_bytes=card.total_bytes,
+                noise_bytes=gpu.noise_bytes,
+                total_bytes=gpu.total_bytes,
             )
         )
     if caps:
-        known = ", ".join(f"{card.index} ({card.id})" for card in cards)
+        known = ", ".join(f"{gpu.index} ({gpu.id})" for gpu in gpus)
         raise ConfigError(
             f"gpu.capacity_bytes names no GPU of this machine: {', '.join(caps)}",
             hint=f"GPUs: {known}",

@@ -31,7 +31,7 @@ VERIFY_POLL_S = (0.005, 0.020, 0.050)  # pauses between readings after a release
 # how long each pause but the last is kept; drivers take 0.5-1.5 s, and this is what is waited for
 VERIFY_POLL_UNTIL_S = (2.0, 5.0)
 VERIFY_CONFIRM_S = 0.002  # after a reading that is on target: the second one, which has to agree
-VERIFY_READING_SHARE = 0.5  # a slow card is not read more than this share of the time
+VERIFY_READING_SHARE = 0.5  # a slow GPU is not read more than this share of the time
 VERIFY_SLOW_POLL_S = 0.5  # after a verdict that does not allow a grant
 VERIFY_TOLERANCE_BYTES = 64 * MIB  # allocator granularity and driver bookkeeping
 PROBE_DEADLINE_S = 2.0

@@ -1,22 +1,22 @@
-"""The simulated card: the format of its folder and every change that can happen to it, as pure
+"""The simulated GPU: the format of its folder and every change that can happen to it, as pure
 functions. No I/O, no clock.
 
-One folder per card:
-    gpu.json          what the card is, how it lags, which faults are on (`CardConfig`); people may
-    edit it while it is in use
-    PID-START.json    one file per process with bytes on the card (`ProcessFile`); any `*.json`
-    beside gpu.json counts, so a
-                      stowaway is a file with the pid of some living process
+One folder per GPU:
+    gpu.json          what the GPU is, how it lags, which faults are on (`FakeGpuConfig`); may be
+                      edited while it is in use
+    PID-START.json    one file per process with bytes on the GPU (`ProcessFile`); any `*.json`
+                      beside gpu.json counts, so a stowaway is a file with the pid of some living
+                      process
     log.jsonl         append-only, one line per change (`LogLine`), for timelines and for the
-    independent checker
+                      independent checker
     lock              flock'ed exclusively around every reading and every change
 
-Reader and writer do the I/O: take the lock, hand all texts to `read_card`, call transitions,
+Reader and writer do the I/O: take the lock, hand all texts to `read_gpu`, call transitions,
 perform their `Edit`s in order. A step first replaces one process file (temporary file + rename),
-then appends that file's `last` to the log. So a kill at any instant leaves a readable card, and at
-most one line unwritten, which `read_card` orders the next process to append.
+then appends that file's `last` to the log. So a kill at any instant leaves a readable GPU, and at
+most one line unwritten, which `read_gpu` orders the next process to append.
 
-It behaves as a card under a caching framework does: a context on first touch stays until the
+It behaves as a GPU under a caching framework does: a context on first touch stays until the
 process ends; a freed block goes to the process's cache and only `empty_cache` gives it back; memory
 comes back `release_lag_s` late, also that of a dead process; what does not fit raises
 `SimulatedOutOfMemory` in the process that asked.
@@ -35,7 +35,7 @@ from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.units import ByteSize, format_bytes
 
-CARD_FILE = "gpu.json"
+GPU_FILE = "gpu.json"
 LOG_FILE = "log.jsonl"
 LOCK_FILE = "lock"
 FOLDER_VARIABLE = "VRAM_FAKE_GPU"
@@ -47,7 +47,7 @@ Alive = Callable[[ProcessKey], bool]
 
 
 class SimulatedOutOfMemory(OutOfMemory):
-    """The simulated card is full; stands for `torch.OutOfMemoryError`. details: requested_bytes,
+    """The simulated GPU is full; stands for `torch.OutOfMemoryError`. details: requested_bytes,
     free_bytes, capacity_bytes."""
 
 
@@ -64,8 +64,8 @@ class Faults(_Frozen):
     hide_processes: bool = False  # the probe cannot list processes, as inside some containers
 
 
-class CardConfig(_Frozen):
-    """`gpu.json`. `throttle_bytes_per_s` is how fast a simulated load fills the card (None: at
+class FakeGpuConfig(_Frozen):
+    """`gpu.json`. `throttle_bytes_per_s` is how fast a simulated load fills the GPU (None: at
     once)."""
 
     uuid: Annotated[str, Field(min_length=1, max_length=64)]
@@ -86,11 +86,11 @@ class Returning(_Frozen):
 
 
 class LogLine(TypedDict):
-    """One line of the log. `delta` is what it changed on the card; the sum of all deltas is
+    """One line of the log. `delta` is what it changed on the GPU; the sum of all deltas is
     `used_after`.
 
     ops: context, alloc, cache (freed into the process's cache), free (let go of: still on the
-    card), leak, returned (free again), oom (refused: delta 0), died (noticed: delta 0), edited (pid
+    GPU), leak, returned (free again), oom (refused: delta 0), died (noticed: delta 0), edited (pid
     0: process files were written or removed by hand).
     """
 
@@ -103,7 +103,7 @@ class LogLine(TypedDict):
     label: str
     bytes: int
     delta: int
-    process_bytes: int  # this process's bytes on the card afterwards
+    process_bytes: int  # this process's bytes on the GPU afterwards
     used_after: int
     capacity: int
 
@@ -132,7 +132,7 @@ class ProcessFile(_Frozen):
         return self.context_bytes + self.allocated_bytes + self.cached_bytes + self.leaked_bytes
 
     @property
-    def on_card_bytes(self) -> int:
+    def on_gpu_bytes(self) -> int:
         """What the device total counts for it: also what is on its way back."""
         return self.own_bytes + sum(part.bytes for part in self.returning)
 
@@ -148,10 +148,10 @@ class Edit:
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
-    """A card as of one reading. Transitions return the next one."""
+class GpuState:
+    """A GPU as of one reading. Transitions return the next one."""
 
-    config: CardConfig
+    config: FakeGpuConfig
     processes: Mapping[str, ProcessFile]
     seq: int = 0
     logged_bytes: int = (
@@ -160,7 +160,7 @@ class Card:
 
     @property
     def used_bytes(self) -> int:
-        return sum(process.on_card_bytes for process in self.processes.values())
+        return sum(process.on_gpu_bytes for process in self.processes.values())
 
     @property
     def free_bytes(self) -> int:
@@ -172,18 +172,18 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a transition did: the next card, the steps that make it so on disk, and the refusal, if
+    """What a transition did: the next GPU, the steps that make it so on disk, and the refusal, if
     it was one."""
 
-    card: Card
+    gpu: GpuState
     steps: tuple[Edit, ...] = ()
     error: SimulatedOutOfMemory | None = None
 
-    def then(self, transition: Callable[[Card], "Change"]) -> "Change":
+    def then(self, transition: Callable[[GpuState], "Change"]) -> "Change":
         """Chain another transition, unless this one was refused."""
         if self.error is not None:
             return self
-        after = transition(self.card)
+        after = transition(self.gpu)
         return replace(after, steps=self.steps + after.steps)
 
 
@@ -194,34 +194,34 @@ def file_name(key: ProcessKey) -> str:
 
 def is_process_file(name: str) -> bool:
     """Whether a file of the folder is a process's account (temporary files are not)."""
-    return name.endswith(".json") and name != CARD_FILE
+    return name.endswith(".json") and name != GPU_FILE
 
 
 # -- texts
-def parse_config(text: str | bytes) -> CardConfig:
+def parse_config(text: str | bytes) -> FakeGpuConfig:
     """Read `gpu.json`. Raises ConfigError."""
     try:
-        return CardConfig.model_validate_json(text)
+        return FakeGpuConfig.model_validate_json(text)
     except ValidationError as error:
         raise ConfigError(
-            f"{CARD_FILE} of a simulated card is wrong: {_first(error)}", hint="correct it"
+            f"{GPU_FILE} of a simulated GPU is wrong: {_first(error)}", hint="correct it"
         ) from None
 
 
-def dump_config(config: CardConfig) -> str:
+def dump_config(config: FakeGpuConfig) -> str:
     """Text of `gpu.json`, made to be edited."""
     return config.model_dump_json(indent=2) + "\n"
 
 
-def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
-    """A card from the texts of its files and the end of its log. The steps mend what a killed
+def read_gpu(texts: Mapping[str, str], log_tail: str) -> Change:
+    """A GPU from the texts of its files and the end of its log. The steps mend what a killed
     process left unfinished.
 
     Raises ConfigError for a file that is not what it should be.
     """
-    if CARD_FILE not in texts:
+    if GPU_FILE not in texts:
         raise ConfigError(
-            f"the folder of a simulated card has no {CARD_FILE}",
+            f"the folder of a simulated GPU has no {GPU_FILE}",
             hint="start the arbiter with --gpu fake:8GiB",
         )
     processes = {}
@@ -232,7 +232,7 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
             except ValidationError as error:
                 hint = "remove it if no process owns it"
                 raise ConfigError(
-                    f"{name} of a simulated card is wrong: {_first(error)}", hint=hint
+                    f"{name} of a simulated GPU is wrong: {_first(error)}", hint=hint
                 ) from None
     newest = _last_line(log_tail)
     logged = int(newest.get("seq", 0))
@@ -248,13 +248,13 @@ def read_card(texts: Mapping[str, str], log_tail: str) -> Change:
         lines = "".join(_dump(line) for line in missing)
         steps = (Edit("", None, ("\n" if torn else "") + lines),)
     newest = missing[-1] if missing else newest
-    card = Card(
-        parse_config(texts[CARD_FILE]),
+    gpu = GpuState(
+        parse_config(texts[GPU_FILE]),
         processes,
         int(newest.get("seq", 0)),
         int(newest.get("used_after", 0)),
     )
-    return Change(card, steps)
+    return Change(gpu, steps)
 
 
 def _last_line(log_tail: str) -> JsonMap:
@@ -278,16 +278,16 @@ def _first(error: ValidationError) -> str:
 
 
 # -- transitions
-def settle(card: Card, now: float, alive: Alive) -> Change:
+def settle(gpu: GpuState, now: float, alive: Alive) -> Change:
     """Let time pass: notice edits by hand and deaths, and let what is due come back. Comes before
     every other transition."""
-    change = _notice_edits(card, now)
-    for name, process in card.processes.items():
+    change = _notice_edits(gpu, now)
+    for name, process in gpu.processes.items():
         if process.died_at_s is None and not alive(process.key):
             process = process.model_copy(update={"died_at_s": now})
-            change = change.then(_step(name, process, now, "died", process.on_card_bytes, 0))
-        if process.died_at_s is not None and now >= process.died_at_s + card.config.release_lag_s:
-            change = change.then(_return(name, process, now, process.on_card_bytes, {
+            change = change.then(_step(name, process, now, "died", process.on_gpu_bytes, 0))
+        if process.died_at_s is not None and now >= process.died_at_s + gpu.config.release_lag_s:
+            change = change.then(_return(name, process, now, process.on_gpu_bytes, {
                 "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0,
                 "returning": (),
             })).then(_remove(name))  # fmt: skip
@@ -299,33 +299,35 @@ def settle(card: Card, now: float, alive: Alive) -> Change:
     return change
 
 
-def _notice_edits(card: Card, now: float) -> Change:
-    delta = card.used_bytes - card.logged_bytes
+def _notice_edits(gpu: GpuState, now: float) -> Change:
+    delta = gpu.used_bytes - gpu.logged_bytes
     if not delta:
-        return Change(card)
+        return Change(gpu)
     line: LogLine = {
-        "seq": card.seq + 1, "t": now, "pid": 0, "start": 0, "name": "edited by hand",
+        "seq": gpu.seq + 1, "t": now, "pid": 0, "start": 0, "name": "edited by hand",
         "op": "edited", "label": "",
-        "bytes": abs(delta), "delta": delta, "process_bytes": 0, "used_after": card.used_bytes,
-        "capacity": card.config.capacity_bytes,
+        "bytes": abs(delta), "delta": delta, "process_bytes": 0, "used_after": gpu.used_bytes,
+        "capacity": gpu.config.capacity_bytes,
     }  # fmt: skip
-    after = replace(card, seq=card.seq + 1, logged_bytes=card.used_bytes)
+    after = replace(gpu, seq=gpu.seq + 1, logged_bytes=gpu.used_bytes)
     return Change(after, (Edit("", None, _dump(line)),))
 
 
-def touch(card: Card, key: ProcessKey, name: str, context_bytes: int, now: float) -> Change:
-    """The first use of the card by a process puts its context there; later ones change nothing."""
-    process = card.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
+def touch(gpu: GpuState, key: ProcessKey, name: str, context_bytes: int, now: float) -> Change:
+    """The first use of the GPU by a process puts its context there; later ones change nothing."""
+    process = gpu.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
     if process.context_bytes or not context_bytes:
-        return Change(card)
+        return Change(gpu)
     grown = process.model_copy(update={"context_bytes": context_bytes})
-    return _grow(card, process, grown, now, "context", "context", context_bytes, context_bytes)
+    return _grow(gpu, process, grown, now, "context", "context", context_bytes, context_bytes)
 
 
-def allocate(card: Card, key: ProcessKey, name: str, label: str, size: int, now: float) -> Change:
-    """Put `size` bytes on the card for a process, from its own cache first. Refused with `error` if
+def allocate(
+    gpu: GpuState, key: ProcessKey, name: str, label: str, size: int, now: float
+) -> Change:
+    """Put `size` bytes on the GPU for a process, from its own cache first. Refused with `error` if
     they do not fit."""
-    process = card.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
+    process = gpu.process(key) or ProcessFile(pid=key.pid, start_ticks=key.start_ticks, name=name)
     cached = min(process.cached_bytes, size)
     grown = process.model_copy(
         update={
@@ -333,13 +335,13 @@ def allocate(card: Card, key: ProcessKey, name: str, label: str, size: int, now:
             "cached_bytes": process.cached_bytes - cached,
         }
     )
-    return _grow(card, process, grown, now, "alloc", label, size, size - cached)
+    return _grow(gpu, process, grown, now, "alloc", label, size, size - cached)
 
 
-def free(card: Card, key: ProcessKey, label: str, size: int, now: float) -> Change:
+def free(gpu: GpuState, key: ProcessKey, label: str, size: int, now: float) -> Change:
     """A block goes back to its process's cache; no other process gets it. Raises ValueError for
     more than is allocated."""
-    process = card.process(key)
+    process = gpu.process(key)
     if process is None or process.allocated_bytes < size:
         raise ValueError(f"process {key} frees {size} bytes that it has not")
     after = process.model_copy(
@@ -348,50 +350,50 @@ def free(card: Card, key: ProcessKey, label: str, size: int, now: float) -> Chan
             "cached_bytes": process.cached_bytes + size,
         }
     )
-    return _step(file_name(key), after, now, "cache", size, 0, label)(card)
+    return _step(file_name(key), after, now, "cache", size, 0, label)(gpu)
 
 
-def empty_cache(card: Card, key: ProcessKey, now: float) -> Change:
-    """A process gives its cache back to the card, where it is free `release_lag_s` later, less what
+def empty_cache(gpu: GpuState, key: ProcessKey, now: float) -> Change:
+    """A process gives its cache back to the GPU, where it is free `release_lag_s` later, less what
     leaks."""
-    process = card.process(key)
+    process = gpu.process(key)
     if process is None or not process.cached_bytes:
-        return Change(card)
-    leak = min(process.cached_bytes, max(0, card.config.faults.leak_bytes - process.leaked_bytes))
+        return Change(gpu)
+    leak = min(process.cached_bytes, max(0, gpu.config.faults.leak_bytes - process.leaked_bytes))
     freed = process.cached_bytes - leak
-    change, name = Change(card), file_name(key)
+    change, name = Change(gpu), file_name(key)
     process = process.model_copy(
         update={"cached_bytes": freed, "leaked_bytes": process.leaked_bytes + leak}
     )
     if leak:
         change = change.then(_step(name, process, now, "leak", leak, 0))
     process = process.model_copy(
-        update={"cached_bytes": 0, "returning": _later(process, freed, card, now)}
+        update={"cached_bytes": 0, "returning": _later(process, freed, gpu, now)}
     )
     return change.then(_step(name, process, now, "free", freed, 0))
 
 
-def leave(card: Card, key: ProcessKey, now: float) -> Change:
+def leave(gpu: GpuState, key: ProcessKey, now: float) -> Change:
     """A process destroys its context and everything with it, as at an orderly exit."""
-    process = card.process(key)
+    process = gpu.process(key)
     if process is None or not process.own_bytes:
-        return Change(card)
+        return Change(gpu)
     freed = process.own_bytes
     after = process.model_copy(update={
         "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0,
-        "returning": _later(process, freed, card, now),
+        "returning": _later(process, freed, gpu, now),
     })  # fmt: skip
-    return _step(file_name(key), after, now, "free", freed, 0)(card)
+    return _step(file_name(key), after, now, "free", freed, 0)(gpu)
 
 
-def _later(process: ProcessFile, size: int, card: Card, now: float) -> tuple[Returning, ...]:
+def _later(process: ProcessFile, size: int, gpu: GpuState, now: float) -> tuple[Returning, ...]:
     if not size:
         return process.returning
-    return (*process.returning, Returning(bytes=size, due_s=now + card.config.release_lag_s))
+    return (*process.returning, Returning(bytes=size, due_s=now + gpu.config.release_lag_s))
 
 
 def _grow(
-    card: Card,
+    gpu: GpuState,
     before: ProcessFile,
     after: ProcessFile,
     now: float,
@@ -401,28 +403,27 @@ def _grow(
     delta: int,
 ) -> Change:
     name = file_name(before.key)
-    if delta <= card.config.capacity_bytes - card.used_bytes:
-        return _step(name, after, now, op, size, delta, label)(card)
-    refused = _step(name, before, now, "oom", size, 0, label)(card)
-    return replace(refused, error=_out_of_memory(card, before, size))
+    if delta <= gpu.config.capacity_bytes - gpu.used_bytes:
+        return _step(name, after, now, op, size, delta, label)(gpu)
+    refused = _step(name, before, now, "oom", size, 0, label)(gpu)
+    return replace(refused, error=_out_of_memory(gpu, before, size))
 
 
-def _out_of_memory(card: Card, process: ProcessFile, size: int) -> SimulatedOutOfMemory:
+def _out_of_memory(gpu: GpuState, process: ProcessFile, size: int) -> SimulatedOutOfMemory:
     others = "".join(
-        f" Process {other.pid} ({other.name or '?'}) has {format_bytes(other.on_card_bytes)} in "
-        "use."
-        for other in card.processes.values()
-        if other.key != process.key and other.on_card_bytes
+        f" Process {other.pid} ({other.name or '?'}) has {format_bytes(other.on_gpu_bytes)} in use."
+        for other in gpu.processes.values()
+        if other.key != process.key and other.on_gpu_bytes
     )
-    config = card.config
+    config = gpu.config
     return SimulatedOutOfMemory(
         f"CUDA out of memory (simulated). Tried to allocate {format_bytes(size)}. GPU "
         f"{config.index} has a total capacity of "
-        f"{format_bytes(config.capacity_bytes)} of which {format_bytes(card.free_bytes)} is free. "
+        f"{format_bytes(config.capacity_bytes)} of which {format_bytes(gpu.free_bytes)} is free. "
         f"This process has {format_bytes(process.own_bytes)} in use.{others}",
         details={
             "requested_bytes": size,
-            "free_bytes": card.free_bytes,
+            "free_bytes": gpu.free_bytes,
             "capacity_bytes": config.capacity_bytes,
             "allocated_bytes": process.own_bytes,
         },
@@ -431,17 +432,17 @@ def _out_of_memory(card: Card, process: ProcessFile, size: int) -> SimulatedOutO
 
 def _step(
     name: str, process: ProcessFile, now: float, op: str, size: int, delta: int, label: str = ""
-) -> Callable[[Card], Change]:
-    def transition(card: Card) -> Change:
+) -> Callable[[GpuState], Change]:
+    def transition(gpu: GpuState) -> Change:
         line: LogLine = {
-            "seq": card.seq + 1, "t": now, "pid": process.pid, "start": process.start_ticks,
+            "seq": gpu.seq + 1, "t": now, "pid": process.pid, "start": process.start_ticks,
             "name": process.name, "op": op,
-            "label": label, "bytes": size, "delta": delta, "process_bytes": process.on_card_bytes,
-            "used_after": card.logged_bytes + delta, "capacity": card.config.capacity_bytes,
+            "label": label, "bytes": size, "delta": delta, "process_bytes": process.on_gpu_bytes,
+            "used_after": gpu.logged_bytes + delta, "capacity": gpu.config.capacity_bytes,
         }  # fmt: skip
         written = process.model_copy(update={"last": dict(line)})
-        after = Card(
-            card.config, {**card.processes, name: written}, card.seq + 1, card.logged_bytes + delta
+        after = GpuState(
+            gpu.config, {**gpu.processes, name: written}, gpu.seq + 1, gpu.logged_bytes + delta
         )
         return Change(
             after, (Edit(name, written.model_dump_json(exclude_defaults=True), _dump(line)),)
@@ -452,14 +453,14 @@ def _step(
 
 def _return(
     name: str, process: ProcessFile, now: float, size: int, update: Mapping[str, object]
-) -> Callable[[Card], Change]:
+) -> Callable[[GpuState], Change]:
     return _step(name, process.model_copy(update=update), now, "returned", size, -size)
 
 
-def _remove(name: str) -> Callable[[Card], Change]:
-    def transition(card: Card) -> Change:
-        processes = {other: process for other, process in card.processes.items() if other != name}
-        return Change(replace(card, processes=processes), (Edit(name, None),))
+def _remove(name: str) -> Callable[[GpuState], Change]:
+    def transition(gpu: GpuState) -> Change:
+        processes = {other: process for other, process in gpu.processes.items() if other != name}
+        return Change(replace(gpu, processes=processes), (Edit(name, None),))
 
     return transition
 
@@ -467,7 +468,7 @@ def _remove(name: str) -> Callable[[Card], Change]:
 # -- making one
 @dataclass(frozen=True, slots=True)
 class FolderPlan:
-    """How to bring a folder to hold a card: files to write (by name), process files to remove,
+    """How to bring a folder to hold a GPU: files to write (by name), process files to remove,
     whether the log starts anew."""
 
     write: Mapping[str, str] = field(default_factory=dict)
@@ -476,21 +477,21 @@ class FolderPlan:
 
 
 def plan_folder(
-    wanted: CardConfig, existing: str | None, process_files: Iterable[str]
+    wanted: FakeGpuConfig, existing: str | None, process_files: Iterable[str]
 ) -> FolderPlan:
-    """Make a card, or keep the one that is there: a restarted daemon must find what living
+    """Make a GPU, or keep the one that is there: a restarted daemon must find what living
     processes still hold.
 
-    Process files of an earlier boot are void. Raises ConfigError if the card is in use with another
+    Process files of an earlier boot are void. Raises ConfigError if the GPU is in use with another
     capacity.
     """
     processes = tuple(process_files)
     if existing is None:
-        return FolderPlan({CARD_FILE: dump_config(wanted)}, processes, fresh_log=True)
+        return FolderPlan({GPU_FILE: dump_config(wanted)}, processes, fresh_log=True)
     current = parse_config(existing)
     if current.boot_id != wanted.boot_id:
         return FolderPlan(
-            {CARD_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))},
+            {GPU_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))},
             processes,
             fresh_log=True,
         )
@@ -498,11 +499,11 @@ def plan_folder(
         return FolderPlan()
     if processes:
         raise ConfigError(
-            f"a simulated card of {format_bytes(current.capacity_bytes)} is in use here, not one "
+            f"a simulated GPU of {format_bytes(current.capacity_bytes)} is in use here, not one "
             "of "
             f"{format_bytes(wanted.capacity_bytes)}",
             hint="stop the processes that use it, or choose another runtime folder",
         )
     return FolderPlan(
-        {CARD_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))}, fresh_log=True
+        {GPU_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))}, fresh_log=True
     )

@@ -10,7 +10,7 @@ LeaseId = NewType("LeaseId", str)
 """Names one lease for ever, e.g. `L3-17` (epoch 3, serial 17)."""
 
 GpuId = NewType("GpuId", str)
-"""UUID of a card as its driver reports it, e.g. `GPU-5b6c…`."""
+"""UUID of a GPU as its driver reports it, e.g. `GPU-5b6c…`."""
 
 ClientId = NewType("ClientId", str)
 """Names one connection to the arbiter (the hex of its ZeroMQ routing id)."""

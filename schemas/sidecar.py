@@ -11,7 +11,7 @@ Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "g
                                      without "id": `get_action` → [the result, {}], an error →
                                      {"error": "Type: message"}, as the field's clients expect
 
-`detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the card, a
+`detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the GPU, a
 load, another request) are not looked at. Every request may carry "id" (echoed as "re": a DEALER may
 have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
 unless it is the sidecar's current one) and "traceparent". Images are PNG or JPEG bytes of RGB,

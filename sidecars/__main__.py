@@ -28,7 +28,7 @@ from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
 from vram_arbiter.sidecars.adapters.choose import make_adapter
-from vram_arbiter.sidecars.adapters.gpu_passthrough import need_card
+from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.settings import (
@@ -107,7 +107,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
     wanted = wanted_from(flags, make_adapter)
     manifest, weights = read_model(wanted.rskill, wanted.configs)
     entry, device, endpoint = wanted.footprint(manifest), wanted.device, _endpoint(flags)
-    need_card(manifest, device)
+    need_gpu(manifest, device)
     return Settings(
         name=flags.name,
         manifest=manifest,

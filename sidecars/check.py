@@ -20,7 +20,7 @@ from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.sidecars.adapters import policy_families
 from vram_arbiter.sidecars.adapters.base import ModelAdapter
-from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_card
+from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_gpu
 from vram_arbiter.sidecars.device.capacity import capacities
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.quantization import check_precision
@@ -233,7 +233,7 @@ def _bytes(manifest: RSkillManifest, wanted: Wanted) -> list[Finding]:
         findings.append(_bad("footprint", error))
     if wanted.device == "none":
         try:
-            need_card(manifest, wanted.device)
+            need_gpu(manifest, wanted.device)
         except NoGpu as error:
             return [*findings, _bad("gpu", error)]
         return [*findings, Finding("gpu", None, "not checked: --device none")]

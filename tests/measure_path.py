@@ -41,7 +41,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
 from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
-from vram_arbiter.arbiter.host.gpu.fake import make_card
+from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 
 GIB = 1 << 30
 PATIENCE_S = 60.0
@@ -184,7 +184,7 @@ def _spec(consumer: str) -> Any:
 def record(folder: Path, *, cold: bool = False) -> dict[str, list[Step]]:
     """Play the scene twice, or once with `cold`. Returns the steps of each side in the last one."""
     arbiter = ArbiterProcess()
-    make_card(arbiter.card, 8 * GIB, release_lag_s=0.0)
+    make_gpu(arbiter.card, 8 * GIB, release_lag_s=0.0)
     out = {side: folder / f"{side}.json" for side in ("daemon", "holder", "waiter")}
     arbiter.program = [sys.executable, str(Path(__file__)), "daemon", str(out["daemon"])]
     programs: dict[str, subprocess.Popen[str]] = {}

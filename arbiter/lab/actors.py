@@ -38,7 +38,7 @@ class Stage(Protocol):
     """Surroundings of an actor."""
 
     now: float
-    cards: dict[GpuId, SimulatedGpu]
+    gpus: dict[GpuId, SimulatedGpu]
     holders_exit: bool
 
     def at(self, when: float, call: Callable[[], None]) -> None: ...
@@ -88,8 +88,8 @@ class Actor:
     # -- work
     def begin(self) -> None:
         stage, plan = self._stage, self._plan
-        for card in stage.cards.values():
-            card.names[self._process] = plan.consumer
+        for gpu in stage.gpus.values():
+            gpu.names[self._process] = plan.consumer
         stage.post(ClientConnected(self.client, self._process, 1000, plan.consumer, self.client))
         if plan.resident and plan.jobs:
             self._acquire(plan.jobs[0])
@@ -194,8 +194,8 @@ class Actor:
         if self._idle() and self._state in ("none", "held"):
             self._state = "gone"
             self._round += 1
-            for card in self._stage.cards.values():
-                card.set(self._process, 0, self._stage.now)
+            for gpu in self._stage.gpus.values():
+                gpu.set(self._process, 0, self._stage.now)
             self._stage.post(ProcessDied(self._process))
 
     # -- the lease
@@ -259,7 +259,7 @@ class Actor:
         self._gpu = GpuId(lease.gpu)
         self._round += 1
         turn = self._round
-        if not self._stage.cards[self._gpu].set(
+        if not self._stage.gpus[self._gpu].set(
             self._process, self._job.spec.footprint.load_peak_bytes, self._stage.now
         ):
             self._tally.ooms += 1
@@ -287,7 +287,7 @@ class Actor:
         count = (
             job.spec.footprint.steady_bytes if job.measured_bytes is None else job.measured_bytes
         )
-        self._stage.cards[self._gpu].set(self._process, count, self._stage.now)
+        self._stage.gpus[self._gpu].set(self._process, count, self._stage.now)
         self._state, self._held_at = "held", self._stage.now
         self._say(ReadyReported, job.measured_bytes)
         if self._revoked:
@@ -322,7 +322,7 @@ class Actor:
         if turn != self._round or self._job is None:
             return
         kept = 0 if self._stage.holders_exit else self._job.spec.footprint.residue_bytes
-        self._stage.cards[self._gpu].set(self._process, kept, self._stage.now)
+        self._stage.gpus[self._gpu].set(self._process, kept, self._stage.now)
         self._release()
         self._state = "none"
         self._go()

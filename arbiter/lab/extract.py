@@ -24,7 +24,7 @@ from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.eventlog.logfile import Entry, LogFile
 from vram_arbiter.arbiter.eventlog.replay import Replayed, replay
 from vram_arbiter.arbiter.lab.outcome import Outcome
-from vram_arbiter.arbiter.lab.workload import CardPlan, Job, Plan, Workload
+from vram_arbiter.arbiter.lab.workload import GpuPlan, Job, Plan, Workload
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire import notes
 from vram_arbiter.schemas.wire.replies import AcquireReply
@@ -251,8 +251,8 @@ class _Reader:
         lanes = self._lanes(until)
         plans = [self._plan(lane, began, until) for lane in lanes]
         lag_s = max(0.0, median(self._verified_s) - POLLING_S) if self._verified_s else 0.0
-        cards = [
-            CardPlan(
+        gpus = [
+            GpuPlan(
                 info,
                 self._totals.get(info.id, info.capacity_bytes),
                 self._overhead(info.id),
@@ -268,7 +268,7 @@ class _Reader:
         notes = [f"{what} ({count})" for what, count in sorted(self._odd.items())]
         if found.gaps:
             notes.append("the recording was interrupted; what was resident then is taken as loaded")
-        workload = Workload(cards, plans, until - began, notes)
+        workload = Workload(gpus, plans, until - began, notes)
         return Extract(workload, self.outcome, self._settings, found)
 
     def _overhead(self, gpu: GpuId) -> int:

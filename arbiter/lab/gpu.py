@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.arbiter.lab.workload import CardPlan
+from vram_arbiter.arbiter.lab.workload import GpuPlan
 from vram_arbiter.schemas.ids import ProcessKey
 
 START_S = 1000.0
@@ -18,7 +18,7 @@ class SimulatedGpu:
     Bytes that are given up show until the lag is over; an allocation that does not fit is refused.
     """
 
-    plan: CardPlan
+    plan: GpuPlan
     held: dict[ProcessKey, int] = field(default_factory=dict)
     names: dict[ProcessKey, str] = field(default_factory=dict)
     peak_bytes: int = 0

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from random import Random
 
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
-from vram_arbiter.arbiter.lab.workload import CardPlan, Follower, Job, Plan, Workload
+from vram_arbiter.arbiter.lab.workload import Follower, GpuPlan, Job, Plan, Workload
 from vram_arbiter.schemas.config.scenario import JOBS_MAX, Scenario, ScenarioConsumer
 from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
@@ -15,20 +15,20 @@ from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 def settings_of(scenario: Scenario) -> Settings:
     """Settings of the engine with its default constants."""
-    return Settings(epoch=1, gpus=tuple(card.info for card in workload_of(scenario).cards))
+    return Settings(epoch=1, gpus=tuple(gpu.info for gpu in workload_of(scenario).gpus))
 
 
 def workload_of(scenario: Scenario) -> Workload:
     """Return the workload of a scenario; the same scenario always gives the same one."""
-    cards = [
-        CardPlan(
-            GpuInfo(GpuId(f"GPU-{index}"), index, f"card {index}", card.capacity, card.reserve),
-            card.capacity,
-            card.overhead,
-            card.release_lag_s,
+    gpus = [
+        GpuPlan(
+            GpuInfo(GpuId(f"GPU-{index}"), index, f"GPU {index}", gpu.capacity, gpu.reserve),
+            gpu.capacity,
+            gpu.overhead,
+            gpu.release_lag_s,
             tuple(_others(scenario, index)),
         )
-        for index, card in enumerate(scenario.cards)
+        for index, gpu in enumerate(scenario.cards)
     ]
     plans: dict[str, Plan] = {}
     later: dict[str, list[Job]] = {}
@@ -48,7 +48,7 @@ def workload_of(scenario: Scenario) -> Workload:
     for name, jobs in later.items():
         after = scenario.consumers[name].arrivals.after
         plans[str(after)].followers.append(Follower(plans[name], jobs))
-    return Workload(cards, list(plans.values()), scenario.seconds)
+    return Workload(gpus, list(plans.values()), scenario.seconds)
 
 
 def _most(scenario: Scenario) -> int:

@@ -56,7 +56,7 @@ class _World:
         self.holders_exit = holders_exit
         self.outcome = outcome
         self.now = START_S
-        self.cards = {plan.info.id: SimulatedGpu(plan) for plan in workload.cards}
+        self.gpus = {plan.info.id: SimulatedGpu(plan) for plan in workload.gpus}
         self.actors: dict[ClientId, Actor] = {}
         self._end = START_S + workload.seconds
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
@@ -100,7 +100,7 @@ class _World:
         self.now = self._end
         for actor in self.actors.values():
             actor.finish()
-        self.outcome.peak_bytes = max(card.peak_bytes for card in self.cards.values())
+        self.outcome.peak_bytes = max(gpu.peak_bytes for gpu in self.gpus.values())
 
     # -- the scheduler
     def post(self, event: Event) -> None:
@@ -126,7 +126,7 @@ class _World:
                 self.actors[client].told(body)
             case Sample(gpu) if gpu not in self._reading:
                 self._reading.add(gpu)
-                sample = self.cards[gpu].read(self.now)
+                sample = self.gpus[gpu].read(self.now)
                 self.at(self.now + READING_S, lambda: self._read(sample))
             case _:
                 pass

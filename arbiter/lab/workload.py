@@ -50,7 +50,7 @@ class Follower:
 
 
 @dataclass(frozen=True, slots=True)
-class CardPlan:
+class GpuPlan:
     """One GPU and its behavior."""
 
     info: GpuInfo
@@ -66,7 +66,7 @@ class CardPlan:
 class Workload:
     """A whole workload."""
 
-    cards: list[CardPlan]
+    gpus: list[GpuPlan]
     plans: list[Plan]
     seconds: float
     # parts of a log that could not be taken over, in words

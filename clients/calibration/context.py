@@ -33,8 +33,8 @@ def make_fake_context(folder: Path) -> None:
     """Create a context of the usual size on a simulated GPU. Raises SimulatedOutOfMemory."""
     key = ProcessKey(os.getpid(), procfs.start_ticks(os.getpid()) or 0)
 
-    def touch(card: fakegpu.Card) -> fakegpu.Change:
-        return fakegpu.touch(card, key, "context", RESIDUE_BYTES, time.monotonic())
+    def touch(gpu: fakegpu.GpuState) -> fakegpu.Change:
+        return fakegpu.touch(gpu, key, "context", RESIDUE_BYTES, time.monotonic())
 
     with fakegpu_folder.locked(folder):
         fakegpu_folder.change(folder, touch)

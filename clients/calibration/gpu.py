@@ -51,7 +51,7 @@ class FakeGpu:
 
     def __init__(self, folder: Path) -> None:
         try:
-            config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+            config = fakegpu.parse_config((folder / fakegpu.GPU_FILE).read_text())
         except (OSError, UnicodeDecodeError) as error:
             raise NoGpu(
                 f"no simulated GPU in {folder}: {error}",
@@ -65,16 +65,16 @@ class FakeGpu:
     def read(self) -> Reading:
         try:
             with locked(self._folder):
-                card = settled(self._folder)
+                gpu = settled(self._folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(
                 f"the simulated GPU in {self._folder} cannot be read: {error}",
                 hint="stop what uses it and delete the folder; the arbiter makes it anew",
             ) from error
-        if card.config.faults.hide_processes:
-            return Reading(card.used_bytes, None)
-        living = [one for one in card.processes.values() if one.died_at_s is None]
-        return Reading(card.used_bytes, {one.pid: one.on_card_bytes for one in living})
+        if gpu.config.faults.hide_processes:
+            return Reading(gpu.used_bytes, None)
+        living = [one for one in gpu.processes.values() if one.died_at_s is None]
+        return Reading(gpu.used_bytes, {one.pid: one.on_gpu_bytes for one in living})
 
 
 class NvmlGpu:

@@ -24,7 +24,7 @@ from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.demo_display import Display
 from vram_arbiter.clients.cli.demo_programs import Program, Programs
 from vram_arbiter.clients.cli.demo_report import (
-    CardStory,
+    MemoryStory,
     draw_timeline,
     read_log,
     read_samples,
@@ -231,13 +231,13 @@ def _make_card(folder: Path, capacity_bytes: int) -> None:
     """Make the simulated GPU before a program needs it: there may be no arbiter that makes one."""
     boot_id = procfs.boot_id()
     folder.mkdir()
-    config = fakegpu.CardConfig(
+    config = fakegpu.FakeGpuConfig(
         uuid=f"GPU-fake-{uuid.uuid4()}",
         capacity_bytes=capacity_bytes,
         boot_id=boot_id,
         throttle_bytes_per_s=COPY_BYTES_PER_S,
     )
-    (folder / fakegpu.CARD_FILE).write_text(fakegpu.dump_config(config))
+    (folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(config))
 
 
 async def _boot(
@@ -367,7 +367,7 @@ def _last_line(program: Program) -> str:
     return lines[-1].partition("reasoner.loop ")[2] if lines else ""
 
 
-def _story(card: Path, gpu: str, names: Mapping[int, str], watch: Watch) -> CardStory:
+def _story(folder: Path, gpu: str, names: Mapping[int, str], watch: Watch) -> MemoryStory:
     if gpu == "nvml":
         return read_samples(watch.samples, names, watch.events, watch.wall_offset_s)
-    return read_log((card / fakegpu.LOG_FILE).read_text(), names)
+    return read_log((folder / fakegpu.LOG_FILE).read_text(), names)

@@ -27,7 +27,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class CardStory:
+class MemoryStory:
     """What happened on the GPU: every change of every program, the peak, and how often an
     allocation was refused."""
 
@@ -36,7 +36,7 @@ class CardStory:
     refused_at_s: tuple[float, ...]  # each an out-of-memory in the process that asked
 
 
-def read_log(text: str, names: Mapping[int, str]) -> CardStory:
+def read_log(text: str, names: Mapping[int, str]) -> MemoryStory:
     """Story of a simulated GPU from its allocation log; `names` says which pid is which program.
     Any other process, such as a sidecar's model, has the name that it gave itself. Torn lines are
     skipped."""
@@ -53,7 +53,7 @@ def read_log(text: str, names: Mapping[int, str]) -> CardStory:
         peak = max(peak, entry["used_after"])
         if entry["op"] == "oom":
             refused.append(entry["t"])
-    return CardStory(tuple(points), peak, tuple(refused))
+    return MemoryStory(tuple(points), peak, tuple(refused))
 
 
 def read_samples(
@@ -61,7 +61,7 @@ def read_samples(
     names: Mapping[int, str],
     events: Iterable[JsonMap],
     wall_offset_s: float,
-) -> CardStory:
+) -> MemoryStory:
     """The same for a real GPU, from `status` readings of the arbiter: (monotonic seconds,
     GpuView)."""
     points: list[Point] = []
@@ -77,11 +77,11 @@ def read_samples(
     refused = tuple(
         event["at_wall_s"] - wall_offset_s for event in events if event["kind"] == "oom"
     )
-    return CardStory(tuple(points), peak, refused)
+    return MemoryStory(tuple(points), peak, refused)
 
 
 def summarise(
-    *, seed: int, arbiter: bool, task: str, story: CardStory, capacity_bytes: int,
+    *, seed: int, arbiter: bool, task: str, story: MemoryStory, capacity_bytes: int,
     events: Sequence[JsonMap],
     reasoner: JsonMap, truth: JsonMap, target: str, seconds: float,
 ) -> JsonObject:  # fmt: skip
@@ -123,7 +123,7 @@ def summarise(
 
 def draw_timeline(
     path: Path,
-    story: CardStory,
+    story: MemoryStory,
     capacity_bytes: int,
     events: Sequence[JsonMap],
     *,

@@ -15,7 +15,7 @@ TEGRA_RELEASE = "etc/nv_tegra_release"
 # NUL-separated texts, such as nvidia,p3737-0000 and nvidia,tegra234
 BOARD = "proc/device-tree/compatible"
 DRIVER = "proc/driver/nvidia/version"
-CARDS = "dev/nvidia[0-9]*"
+GPU_NODES = "dev/nvidia[0-9]*"
 
 
 class Platform(StrEnum):
@@ -48,12 +48,12 @@ def probe_platform(root: Path = Path("/")) -> PlatformReport:
         (text for text in _texts(root / BOARD) if text.startswith("nvidia,tegra")), None
     ):
         return PlatformReport(Platform.TEGRA, f"the board is {board}")
-    cards = sorted(path.name for path in root.glob(CARDS))
-    if cards:
-        return PlatformReport(Platform.NVIDIA_DESKTOP, f"/dev/{cards[0]} exists")
+    nodes = sorted(path.name for path in root.glob(GPU_NODES))
+    if nodes:
+        return PlatformReport(Platform.NVIDIA_DESKTOP, f"/dev/{nodes[0]} exists")
     if (root / DRIVER).exists():
         return PlatformReport(
-            Platform.CPU_ONLY, "the NVIDIA driver is loaded, but no card is visible to this process"
+            Platform.CPU_ONLY, "the NVIDIA driver is loaded, but no GPU is visible to this process"
         )
     return PlatformReport(Platform.CPU_ONLY, "no NVIDIA device")
 

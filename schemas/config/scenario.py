@@ -1,4 +1,4 @@
-"""Scenarios for `vramctl simulate`: cards, consumers with their footprints, arrivals and times. One
+"""Scenarios for `vramctl simulate`: GPUs, consumers with their footprints, arrivals and times. One
 model, one YAML file each.
 
 Pure: `load_scenario(text, name)` takes the text of a file. configs/scenarios holds examples with
@@ -34,8 +34,8 @@ Span = Annotated[tuple[Seconds, Seconds], BeforeValidator(_span)]
 """A number of seconds, or `[least, most]` of which a number is drawn."""
 
 
-class ScenarioCard(_Part):
-    """One card."""
+class ScenarioGpu(_Part):
+    """One GPU."""
 
     capacity: ByteSize
     """All its bytes."""
@@ -106,11 +106,11 @@ class ScenarioConsumer(_Part):
     evictable: bool = True
     """False: pinned once it is loaded."""
     exclusive: bool = False
-    """No other model on its card."""
+    """No other model on its GPU."""
     min_residency_s: Seconds = d.MIN_RESIDENCY_S
     """It may stay at least so long once it is ready."""
     gpu: Name = "any"
-    """Index of the card, or any."""
+    """Index of the GPU, or any."""
     wait_timeout_s: Positive | None = None
     """It gives up waiting after so long. Null: never."""
     idle_release_s: Seconds | None = None
@@ -130,7 +130,7 @@ class Stowaway(_Part):
     to_s: Seconds | None = None
     """Until when. Null: the end."""
     card: Annotated[int, Field(ge=0)] = 0
-    """Index of the card."""
+    """Index of the GPU."""
 
 
 class Scenario(_Part):
@@ -142,7 +142,7 @@ class Scenario(_Part):
     """How long."""
     seed: int = 0
     """Of everything that is drawn."""
-    cards: Annotated[tuple[ScenarioCard, ...], Field(min_length=1, max_length=16)]
+    cards: Annotated[tuple[ScenarioGpu, ...], Field(min_length=1, max_length=16)]
     consumers: Annotated[dict[Name, ScenarioConsumer], Field(min_length=1, max_length=256)]
     stowaways: tuple[Stowaway, ...] = ()
 
@@ -156,7 +156,7 @@ class Scenario(_Part):
                 consumer.gpu.isdecimal() and int(consumer.gpu) < len(self.cards)
             ):
                 raise ValueError(
-                    f"consumers.{name}.gpu: {consumer.gpu!r} is no card; write 0 to "
+                    f"consumers.{name}.gpu: {consumer.gpu!r} is not a GPU; write 0 to "
                     f"{len(self.cards) - 1} or any"
                 )
             if (consumer.steady or 0) > consumer.load_peak:
@@ -164,7 +164,7 @@ class Scenario(_Part):
         for stowaway in self.stowaways:
             if stowaway.card >= len(self.cards):
                 raise ValueError(
-                    f"stowaways: {stowaway.name} is on card {stowaway.card}, which is not there"
+                    f"stowaways: {stowaway.name} is on GPU {stowaway.card}, which is not there"
                 )
         return self
 
@@ -178,7 +178,7 @@ class _Keys(Mapping[Path, Collection[str]]):
             for name in consumers:
                 self._found["consumers", name] = list(ScenarioConsumer.model_fields)
                 self._found["consumers", name, "arrivals"] = list(Arrivals.model_fields)
-        for key, part in (("cards", ScenarioCard), ("stowaways", Stowaway)):
+        for key, part in (("cards", ScenarioGpu), ("stowaways", Stowaway)):
             items = data.get(key) if isinstance(data, dict) else None
             for index in range(len(items) if isinstance(items, list) else 0):
                 self._found[key, index] = list(part.model_fields)

@@ -27,7 +27,7 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(lock)
 
 
-def settled(folder: Path) -> fakegpu.Card:
+def settled(folder: Path) -> fakegpu.GpuState:
     """Return the GPU as it is now. The caller holds the lock.
 
     Deaths and due returns since the last reading are written down first.
@@ -35,7 +35,9 @@ def settled(folder: Path) -> fakegpu.Card:
     return change(folder, fakegpu.Change)
 
 
-def change(folder: Path, transition: Callable[[fakegpu.Card], fakegpu.Change]) -> fakegpu.Card:
+def change(
+    folder: Path, transition: Callable[[fakegpu.GpuState], fakegpu.Change]
+) -> fakegpu.GpuState:
     """Let time pass, apply `transition`, and write what changed. The caller holds the lock.
 
     Raises the error of a transition that was refused, after it is written to the log.
@@ -43,20 +45,20 @@ def change(folder: Path, transition: Callable[[fakegpu.Card], fakegpu.Change]) -
     names = [
         name
         for name in os.listdir(folder)
-        if name == fakegpu.CARD_FILE or fakegpu.is_process_file(name)
+        if name == fakegpu.GPU_FILE or fakegpu.is_process_file(name)
     ]
     texts = {name: (folder / name).read_text() for name in names}
     now = time.monotonic()
     found = (
-        fakegpu.read_card(texts, _tail(folder / fakegpu.LOG_FILE))
-        .then(lambda card: fakegpu.settle(card, now, alive))
+        fakegpu.read_gpu(texts, _tail(folder / fakegpu.LOG_FILE))
+        .then(lambda gpu: fakegpu.settle(gpu, now, alive))
         .then(transition)
     )
     for step in found.steps:
         _perform(folder, step)
     if found.error is not None:
         raise found.error
-    return found.card
+    return found.gpu
 
 
 def replace(path: Path, text: str) -> None:

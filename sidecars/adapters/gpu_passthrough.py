@@ -25,7 +25,7 @@ def is_passthrough(manifest: RSkillManifest) -> bool:
     return manifest.policy_extras.get("adapter") == ADAPTER
 
 
-def need_card(manifest: RSkillManifest, device: str) -> None:
+def need_gpu(manifest: RSkillManifest, device: str) -> None:
     """Raise NoGpu for `--device none`. A missing CUDA GPU is refused where the device is opened."""
     if is_passthrough(manifest) and device == "none":
         raise NoGpu(

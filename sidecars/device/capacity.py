@@ -7,14 +7,14 @@ from typing import Any
 
 from vram_arbiter.clients import cuda
 from vram_arbiter.schemas.errors import NoGpu
-from vram_arbiter.schemas.fakegpu import CARD_FILE, CardConfig, parse_config
+from vram_arbiter.schemas.fakegpu import GPU_FILE, FakeGpuConfig, parse_config
 
 FAKE = "fake:"
 
 
-def simulated(device: str) -> CardConfig:
+def simulated(device: str) -> FakeGpuConfig:
     """Return the configuration of `fake:FOLDER`. Raises NoGpu, ConfigError for a wrong file."""
-    path = Path(device.removeprefix(FAKE)) / CARD_FILE
+    path = Path(device.removeprefix(FAKE)) / GPU_FILE
     try:
         return parse_config(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -44,8 +44,8 @@ def capacities(
     brings its own. Raises NoGpu.
     """
     if device.startswith(FAKE):
-        card = simulated(device)
-        return {card.uuid: card.capacity_bytes}
+        gpu = simulated(device)
+        return {gpu.uuid: gpu.capacity_bytes}
     if nvml is None:
         import pynvml
 

@@ -34,7 +34,7 @@ class FakeMemory:
         # flock guards against other processes, not against threads of this one
         self._thread_lock = threading.Lock()
         self._number = 0
-        if not (folder / fakegpu.CARD_FILE).exists():
+        if not (folder / fakegpu.GPU_FILE).exists():
             raise NoGpu(
                 f"no simulated GPU in {folder}", hint="start the arbiter with --gpu fake:8GiB"
             )
@@ -45,14 +45,14 @@ class FakeMemory:
     def touch(self) -> None:
         """Create the context. Raises SimulatedOutOfMemory if it does not fit."""
         self._do(
-            lambda card, now: fakegpu.touch(card, self._key, self._name, self._context_bytes, now)
+            lambda gpu, now: fakegpu.touch(gpu, self._key, self._name, self._context_bytes, now)
         )
 
     def allocate(self, label: str, size_bytes: int) -> Block:
         """Allocate bytes. Raises SimulatedOutOfMemory."""
 
-        def change(card: fakegpu.Card, now: float) -> fakegpu.Change:
-            touched = fakegpu.touch(card, self._key, self._name, self._context_bytes, now)
+        def change(gpu: fakegpu.GpuState, now: float) -> fakegpu.Change:
+            touched = fakegpu.touch(gpu, self._key, self._name, self._context_bytes, now)
             return touched.then(
                 lambda c: fakegpu.allocate(c, self._key, self._name, label, size_bytes, now)
             )
@@ -62,30 +62,30 @@ class FakeMemory:
         return Block(label, size_bytes, self._number)
 
     def free(self, block: Block) -> None:
-        self._do(
-            lambda card, now: fakegpu.free(card, self._key, block.label, block.size_bytes, now)
-        )
+        self._do(lambda gpu, now: fakegpu.free(gpu, self._key, block.label, block.size_bytes, now))
 
     def empty_cache(self) -> None:
-        self._do(lambda card, now: fakegpu.empty_cache(card, self._key, now))
+        self._do(lambda gpu, now: fakegpu.empty_cache(gpu, self._key, now))
 
     def used_bytes(self) -> int | None:
-        process = self._do(lambda card, now: fakegpu.Change(card)).process(self._key)
+        process = self._do(lambda gpu, now: fakegpu.Change(gpu)).process(self._key)
         return process.own_bytes if process else 0
 
     def throttle_bytes_per_s(self) -> int | None:
         return fakegpu.parse_config(
-            (self._folder / fakegpu.CARD_FILE).read_text()
+            (self._folder / fakegpu.GPU_FILE).read_text()
         ).throttle_bytes_per_s
 
     def close(self) -> None:
         """Destroy the context and all allocations, as an orderly exit does."""
-        if (self._folder / fakegpu.CARD_FILE).exists():
-            self._do(lambda card, now: fakegpu.leave(card, self._key, now))
+        if (self._folder / fakegpu.GPU_FILE).exists():
+            self._do(lambda gpu, now: fakegpu.leave(gpu, self._key, now))
 
-    def _do(self, transition: Callable[[fakegpu.Card, float], fakegpu.Change]) -> fakegpu.Card:
+    def _do(
+        self, transition: Callable[[fakegpu.GpuState, float], fakegpu.Change]
+    ) -> fakegpu.GpuState:
         """Apply one change under the lock. A refusal is written down and raised."""
         with self._thread_lock, fakegpu_folder.locked(self._folder):
             return fakegpu_folder.change(
-                self._folder, lambda card: transition(card, time.monotonic())
+                self._folder, lambda gpu: transition(gpu, time.monotonic())
             )

@@ -282,7 +282,7 @@ def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
 
 
 def change_card(arbiter: ArbiterProcess, change: Callable[[dict[str, Any]], None]) -> None:
-    path = arbiter.card / fakegpu.CARD_FILE
+    path = arbiter.card / fakegpu.GPU_FILE
     config = json.loads(path.read_text())
     change(config)
     temporary = path.with_name(".new")
@@ -360,7 +360,7 @@ def test_status_of_a_gpu_that_does_not_answer_is_answered_with_the_age_of_its_re
     with contextlib.closing(WireClient(arbiter.endpoint)) as client:
         client.hello()
         assert client.ask("status")["ok"]
-        path = arbiter.card / fakegpu.CARD_FILE
+        path = arbiter.card / fakegpu.GPU_FILE
         hanging = fakegpu.parse_config(path.read_text()).model_copy(
             update={"faults": fakegpu.Faults(probe="hang")}
         )

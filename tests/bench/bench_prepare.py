@@ -129,8 +129,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/bench/prepare.json"))
     options = parser.parse_args()
     with arbiter(SHIPPED + NO_HOLD + HOST_RAM) as daemon:
-        path = daemon.card / fakegpu.CARD_FILE
-        card = fakegpu.CardConfig.model_validate_json(path.read_text(encoding="utf-8"))
+        path = daemon.card / fakegpu.GPU_FILE
+        card = fakegpu.FakeGpuConfig.model_validate_json(path.read_text(encoding="utf-8"))
         slow = card.model_copy(update={"throttle_bytes_per_s": COPY_BYTES_PER_S})
         path.write_text(fakegpu.dump_config(slow), encoding="utf-8")
         rows = asyncio.run(_measure(daemon, options.rounds))

@@ -47,7 +47,7 @@ from vram_arbiter.arbiter.lab import compare
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
 from vram_arbiter.arbiter.lab.simulator import simulate
-from vram_arbiter.arbiter.lab.workload import CardPlan, Workload
+from vram_arbiter.arbiter.lab.workload import GpuPlan, Workload
 from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
 from vram_arbiter.schemas.errors import CallerError
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, Token
@@ -87,7 +87,7 @@ class _Model:
 class Rules(ABC):
     """Bookkeeping that the ports share; `_serve` decides."""
 
-    def __init__(self, cards: Sequence[CardPlan]) -> None:
+    def __init__(self, cards: Sequence[GpuPlan]) -> None:
         if len(cards) != 1:
             raise OneCardOnly(
                 "the ports of other programs' rules know one GPU", hint="compare on one GPU"
@@ -241,7 +241,7 @@ class Unmanaged(Rules):
 class OllamaRules(Rules):
     """ollama: one pending request at a time."""
 
-    def __init__(self, cards: Sequence[CardPlan]) -> None:
+    def __init__(self, cards: Sequence[GpuPlan]) -> None:
         super().__init__(cards)
         self._leaving: _Model | None = None
         self._released_at: float | None = None  # it has gone; its memory is awaited
@@ -307,7 +307,7 @@ class LlamaSwapRules(Rules):
             self._ask(present, self._queue[0])
 
 
-RULES: Mapping[str, Callable[[Sequence[CardPlan]], Rules]] = {
+RULES: Mapping[str, Callable[[Sequence[GpuPlan]], Rules]] = {
     "unmanaged": Unmanaged,
     "ollama_rules": OllamaRules,
     "llama_swap_rules": LlamaSwapRules,
@@ -316,7 +316,7 @@ RULES: Mapping[str, Callable[[Sequence[CardPlan]], Rules]] = {
 
 def under(workload: Workload, name: str) -> Outcome:
     """Simulate a workload under another program's rules: its models are processes that end."""
-    return simulate(workload, RULES[name](workload.cards), name, holders_exit=True)
+    return simulate(workload, RULES[name](workload.gpus), name, holders_exit=True)
 
 
 def outcomes_of(scenario: Scenario) -> list[Outcome]:

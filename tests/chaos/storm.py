@@ -434,7 +434,7 @@ class Storm:
     def _set_card(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
         """Not on the loop: whoever holds the card's lock may have been stopped, and the loop lets
         it go on."""
-        path = self._arbiter.card / fakegpu.CARD_FILE
+        path = self._arbiter.card / fakegpu.GPU_FILE
         with locked(self._arbiter.card):
             config = fakegpu.parse_config(path.read_text())
             changed = config.model_copy(

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from tests.support.fakegpu_check import check_log
-from vram_arbiter.arbiter.host.gpu.fake import make_card
+from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable
@@ -70,7 +70,7 @@ class Box:
         self.card = runtime / "card"
         self.runtime = runtime
         self.children: list[Child] = []
-        make_card(self.card, CAPACITY, release_lag_s=LAG_S)
+        make_gpu(self.card, CAPACITY, release_lag_s=LAG_S)
 
     async def _start(self, *arguments: str, pause: str = "") -> Child:
         environ = os.environ | {RUNTIME_VARIABLE: str(self.runtime), "VRAM_TEST_PAUSE": pause}

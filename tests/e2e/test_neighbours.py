@@ -51,7 +51,7 @@ class Stage:
         self.watcher: WireClient | None = None
 
     def configure(self, **changes: Any) -> None:
-        path = self.arbiter.card / fakegpu.CARD_FILE
+        path = self.arbiter.card / fakegpu.GPU_FILE
         config = fakegpu.parse_config(path.read_text()).model_copy(update=changes)
         temporary = path.with_name(".new")
         temporary.write_text(fakegpu.dump_config(config))

@@ -106,7 +106,7 @@ def stage() -> Iterator[Stage]:
 
 
 def set_lag(card: Path) -> None:
-    path = card / fakegpu.CARD_FILE
+    path = card / fakegpu.GPU_FILE
     config = fakegpu.parse_config(path.read_text()).model_copy(update={"release_lag_s": LAG_S})
     temporary = path.with_name(".new")
     temporary.write_text(fakegpu.dump_config(config))

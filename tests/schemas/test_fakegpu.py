@@ -1,4 +1,4 @@
-"""The simulated card as pure transitions: never over capacity, nothing lost, and a kill at any
+"""The simulated GPU as pure transitions: never over capacity, nothing lost, and a kill at any
 instant leaves it readable."""
 
 import json
@@ -14,17 +14,17 @@ from vram_arbiter.schemas.errors import CODES, ConfigError, OutOfMemory
 from vram_arbiter.schemas.ids import ProcessKey
 
 GB = 10**9
-CONFIG = fakegpu.CardConfig(
+CONFIG = fakegpu.FakeGpuConfig(
     uuid="GPU-fake-1", capacity_bytes=8 * GB, release_lag_s=0.5, boot_id="boot"
 )
 A, B = ProcessKey(100, 1), ProcessKey(200, 2)
 
 
 class Folder:
-    """A card's folder in memory; can be killed in the middle of a step."""
+    """A GPU's folder in memory; can be killed in the middle of a step."""
 
-    def __init__(self, config: fakegpu.CardConfig = CONFIG) -> None:
-        self.texts = {fakegpu.CARD_FILE: fakegpu.dump_config(config)}
+    def __init__(self, config: fakegpu.FakeGpuConfig = CONFIG) -> None:
+        self.texts = {fakegpu.GPU_FILE: fakegpu.dump_config(config)}
         self.log = ""
         self.now = 0.0
         self.dead: set[ProcessKey] = set()
@@ -33,9 +33,9 @@ class Folder:
         """Apply a transition as reader and writer do. `kill_at` n: only the first n pieces of I/O
         happen, the last log line torn."""
         change = (
-            fakegpu.read_card(self.texts, self.log[-fakegpu.LOG_TAIL_BYTES :])
-            .then(lambda card: fakegpu.settle(card, self.now, lambda key: key not in self.dead))
-            .then(lambda card: transition(card, *args, self.now))
+            fakegpu.read_gpu(self.texts, self.log[-fakegpu.LOG_TAIL_BYTES :])
+            .then(lambda gpu: fakegpu.settle(gpu, self.now, lambda key: key not in self.dead))
+            .then(lambda gpu: transition(gpu, *args, self.now))
         )
         pieces = 0
         for step in change.steps:
@@ -54,8 +54,8 @@ class Folder:
         return change
 
     @property
-    def card(self) -> fakegpu.Card:
-        return self.do(lambda card, now: fakegpu.Change(card)).card
+    def gpu(self) -> fakegpu.GpuState:
+        return self.do(lambda gpu, now: fakegpu.Change(gpu)).gpu
 
 
 def allocate(folder: Folder, key: ProcessKey, size: int):
@@ -75,7 +75,7 @@ def test_what_fits_is_allocated_and_what_does_not_is_refused_with_the_numbers():
         "CUDA out of memory (simulated). Tried to allocate 3.73 GiB. GPU 0 has a total capacity"
     )
     assert "Process 100 (p) has 4.66 GiB in use" in error.message
-    assert folder.card.used_bytes == 5 * GB
+    assert folder.gpu.used_bytes == 5 * GB
     assert CODES["oom"] is OutOfMemory, "the wire code names the public type"
 
 
@@ -83,12 +83,12 @@ def test_the_context_is_charged_once_and_stays():
     folder = Folder()
     for _ in range(2):
         folder.do(fakegpu.touch, A, "p", GB)
-    assert folder.card.used_bytes == GB
+    assert folder.gpu.used_bytes == GB
     allocate(folder, A, GB)
     folder.do(fakegpu.free, A, "weights", GB)
     folder.do(fakegpu.empty_cache, A)
     folder.now = 10
-    assert folder.card.used_bytes == GB
+    assert folder.gpu.used_bytes == GB
 
 
 def test_a_freed_block_stays_in_the_cache_until_it_is_emptied_and_then_comes_back_late():
@@ -98,15 +98,15 @@ def test_a_freed_block_stays_in_the_cache_until_it_is_emptied_and_then_comes_bac
     assert allocate(folder, B, 4 * GB).error is not None, (
         "the cache belongs to the process that freed"
     )
-    assert allocate(folder, A, 6 * GB).error is None, "which gets it without asking the card again"
+    assert allocate(folder, A, 6 * GB).error is None, "which gets it without asking the GPU again"
     folder.do(fakegpu.free, A, "weights", 6 * GB)
     folder.do(fakegpu.empty_cache, A)
     folder.now = 0.4
     assert allocate(folder, B, 4 * GB).error is not None
-    process = folder.card.process(A)
+    process = folder.gpu.process(A)
     assert process is not None
-    assert (process.own_bytes, process.on_card_bytes) == (0, 6 * GB), (
-        "gone from the process, not from the card"
+    assert (process.own_bytes, process.on_gpu_bytes) == (0, 6 * GB), (
+        "gone from the process, not from the GPU"
     )
     folder.now = 0.5
     assert allocate(folder, B, 4 * GB).error is None
@@ -118,12 +118,12 @@ def test_memory_of_a_dead_process_comes_back_after_the_lag_counted_from_the_firs
     allocate(folder, A, 5 * GB)
     folder.dead.add(A)
     folder.now = 100.0
-    assert folder.card.used_bytes == 6 * GB
+    assert folder.gpu.used_bytes == 6 * GB
     folder.now = 100.4
-    assert folder.card.used_bytes == 6 * GB
+    assert folder.gpu.used_bytes == 6 * GB
     folder.now = 100.5
-    assert folder.card.used_bytes == 0
-    assert folder.card.processes == {}
+    assert folder.gpu.used_bytes == 0
+    assert folder.gpu.processes == {}
     assert [json.loads(line)["op"] for line in folder.log.splitlines()][-2:] == ["died", "returned"]
 
 
@@ -134,11 +134,11 @@ def test_a_leak_keeps_bytes_until_the_process_exits():
         folder.do(fakegpu.free, A, "weights", 3 * GB)
         folder.do(fakegpu.empty_cache, A)
         folder.now += 1
-        assert folder.card.used_bytes == GB, "it leaks once, not at every unload"
+        assert folder.gpu.used_bytes == GB, "it leaks once, not at every unload"
     folder.dead.add(A)
-    assert folder.card.used_bytes == GB
+    assert folder.gpu.used_bytes == GB
     folder.now += 1
-    assert folder.card.used_bytes == 0
+    assert folder.gpu.used_bytes == 0
 
 
 def test_leaving_gives_everything_back():
@@ -147,7 +147,7 @@ def test_leaving_gives_everything_back():
     allocate(folder, A, GB)
     folder.do(fakegpu.leave, A)
     folder.now = 1
-    assert folder.card.used_bytes == 0
+    assert folder.gpu.used_bytes == 0
 
 
 def test_freeing_what_was_never_allocated_is_a_mistake_of_the_program():
@@ -167,29 +167,29 @@ def test_a_file_that_is_wrong_is_named(name, text, told):
     folder = Folder()
     folder.texts[name] = text
     with pytest.raises(ConfigError, match=told):
-        folder.card  # noqa: B018
+        folder.gpu  # noqa: B018
 
 
 def test_a_stowaway_is_a_file_that_anybody_may_write():
     folder = Folder()
     folder.texts["browser.json"] = '{"pid": 1, "name": "browser", "allocated_bytes": "2GB"}'
-    assert folder.card.used_bytes == 2 * GB
+    assert folder.gpu.used_bytes == 2 * GB
     allocate(folder, A, GB)
     assert check_log(folder.log).problems == []
     assert check_log(folder.log).peak_bytes == 3 * GB
     folder.dead.add(ProcessKey(1, 0))
     folder.now = 1
-    folder.card  # noqa: B018  its death is noticed
+    folder.gpu  # noqa: B018  its death is noticed
     folder.now = 2
-    assert "browser.json" not in folder.card.processes
+    assert "browser.json" not in folder.gpu.processes
     folder.texts["browser.json"] = '{"pid": 1, "name": "browser", "allocated_bytes": "2GB"}'
     del folder.texts["100-1.json"]
     folder.dead.clear()
-    assert folder.card.used_bytes == 2 * GB
+    assert folder.gpu.used_bytes == 2 * GB
     assert check_log(folder.log).problems == [], "files that come and go by hand are on the record"
 
 
-def test_a_card_survives_the_daemon_but_not_the_boot():
+def test_a_gpu_survives_the_daemon_but_not_the_boot():
     existing = fakegpu.dump_config(CONFIG)
     same = CONFIG.model_copy(update={"uuid": "other"})
     assert fakegpu.plan_folder(same, existing, ["100-1.json"]) == fakegpu.FolderPlan()
@@ -199,7 +199,7 @@ def test_a_card_survives_the_daemon_but_not_the_boot():
     assert rebooted.remove == ("100-1.json",)
     assert rebooted.fresh_log
     assert fakegpu.parse_config(rebooted.write["gpu.json"]).uuid == CONFIG.uuid, (
-        "a card keeps its name"
+        "a GPU keeps its name"
     )
     larger = CONFIG.model_copy(update={"capacity_bytes": 16 * GB})
     with pytest.raises(ConfigError, match="is in use here"):
@@ -213,13 +213,13 @@ def test_a_card_survives_the_daemon_but_not_the_boot():
 
 
 @pytest.mark.parametrize("kill_at", range(8))
-def test_a_kill_at_any_instant_leaves_a_card_whose_log_still_adds_up(kill_at):
+def test_a_kill_at_any_instant_leaves_a_gpu_whose_log_still_adds_up(kill_at):
     folder = Folder()
     allocate(folder, A, 2 * GB)
     folder.now = 1.0
 
-    def two_steps(card, now):
-        return fakegpu.touch(card, B, "p", GB, now).then(
+    def two_steps(gpu, now):
+        return fakegpu.touch(gpu, B, "p", GB, now).then(
             lambda after: fakegpu.allocate(after, B, "p", "weights", 3 * GB, now)
         )
 
@@ -229,7 +229,7 @@ def test_a_kill_at_any_instant_leaves_a_card_whose_log_still_adds_up(kill_at):
         allocate(folder, A, GB)
     report = check_log(folder.log)
     assert report.problems == []
-    assert folder.card.used_bytes == 5 * GB
+    assert folder.gpu.used_bytes == 5 * GB
 
 
 def test_the_checker_finds_what_is_wrong():
@@ -254,7 +254,7 @@ def test_the_checker_finds_what_is_wrong():
     assert check_log("{torn\n[]\n").torn_lines == 2
 
 
-class CardMachine(RuleBasedStateMachine):
+class GpuMachine(RuleBasedStateMachine):
     """Any order of changes by three processes, kills in the middle of a write included."""
 
     keys = st.sampled_from([ProcessKey(n, n) for n in (1, 2, 3)])
@@ -273,15 +273,15 @@ class CardMachine(RuleBasedStateMachine):
 
     @rule(key=keys, size=st.integers(1, 900), kill_at=kills)
     def allocate(self, key, size, kill_at):
-        def change(card, now):
-            touched = fakegpu.touch(card, key, "p", 50, now)
+        def change(gpu, now):
+            touched = fakegpu.touch(gpu, key, "p", 50, now)
             return touched.then(lambda after: fakegpu.allocate(after, key, "p", "w", size, now))
 
         self._do(key, kill_at, change)
 
     @rule(key=keys, share=st.floats(0, 1), kill_at=kills)
     def free(self, key, share, kill_at):
-        process = self.folder.card.process(key)
+        process = self.folder.gpu.process(key)
         if process is not None:
             self._do(key, kill_at, fakegpu.free, key, "w", int(process.allocated_bytes * share))
 
@@ -303,17 +303,17 @@ class CardMachine(RuleBasedStateMachine):
 
     @invariant()
     def never_over_capacity(self):
-        card = self.folder.card
-        assert 0 <= card.used_bytes <= card.config.capacity_bytes
+        gpu = self.folder.gpu
+        assert 0 <= gpu.used_bytes <= gpu.config.capacity_bytes
 
     def teardown(self):
         self.folder.dead.update(ProcessKey(n, n) for n in (1, 2, 3))
         for _ in range(2):
-            self.folder.card  # noqa: B018  deaths are noticed, then everything is due
+            self.folder.gpu  # noqa: B018  deaths are noticed, then everything is due
             self.folder.now += 10
-        assert self.folder.card.used_bytes == 0
+        assert self.folder.gpu.used_bytes == 0
         assert check_log(self.folder.log).problems == []
 
 
-TestCardMachine = CardMachine.TestCase
-TestCardMachine.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestGpuMachine = GpuMachine.TestCase
+TestGpuMachine.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)

@@ -12,7 +12,7 @@ from tests.support.prepared import start
 from tests.support.processes import children, server_of_imports
 from tests.support.waiting import until
 from tests.support.wire import WireClient
-from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 
 PNG = b"\x89PNG\r\n\x1a\n"  # the echo does not look at it
 PATIENCE_S = 60.0
@@ -107,7 +107,7 @@ class Box:
 
     def used(self):
         probe = FakeProbe([self.card])
-        return probe.sample(probe.cards()[0].id).used_bytes
+        return probe.sample(probe.gpus()[0].id).used_bytes
 
     def close(self):
         for sidecar in self.sidecars:
@@ -142,7 +142,7 @@ def arbiter(arbiter_daemon):
 def lone_box():
     """Sidecars without an arbiter."""
     runtime = Path(tempfile.mkdtemp(prefix="vs"))
-    make_card(runtime / "fakegpu", 8 * 2**30, release_lag_s=0.1)
+    make_gpu(runtime / "fakegpu", 8 * 2**30, release_lag_s=0.1)
     root = str(Path(__file__).parents[2])
     box = Box(
         runtime,

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.arbiter.host.gpu.fake import make_card
+from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.schemas.errors import ModelError, NoGpu, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import Kind, load_manifest
 from vram_arbiter.sidecars.__main__ import main
@@ -239,7 +239,7 @@ def test_all_is_well_and_nothing_was_downloaded(check: Check, tmp_path: Path) ->
 
 
 def test_every_finding_is_collected(check: Check, tmp_path: Path) -> None:
-    make_card(tmp_path / "card", 2 * GIB)
+    make_gpu(tmp_path / "card", 2 * GIB)
     gpu = f"fake:{tmp_path / 'card'}"
     closed = DETECTOR.replace("mit", "proprietary")
     code, findings, _ = check(closed, "--device", gpu, "--footprint", "2GiB", adapter=make_adapter)

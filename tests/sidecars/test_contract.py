@@ -156,7 +156,7 @@ class Host:
 
     def used(self) -> int:
         probe = FakeProbe([self.arbiter.card])
-        return probe.sample(probe.cards()[0].id).used_bytes
+        return probe.sample(probe.gpus()[0].id).used_bytes
 
     @contextmanager
     def evicted(self) -> Iterator[None]:

@@ -16,7 +16,7 @@ from tests.sidecars.conftest import PNG
 from tests.sidecars.echo_sidecar import echo_for
 from tests.support.matrix_model import matrix_for
 from tests.support.waiting import until
-from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.errors import BadRequest, ModelError, OutOfMemory, WaitTimeout
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.schemas.wire.requests import Footprint
@@ -52,7 +52,7 @@ class Place:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.card = folder / "fakegpu"
-        make_card(self.card, 8 * 2**30, release_lag_s=0.01)
+        make_gpu(self.card, 8 * 2**30, release_lag_s=0.01)
         self.made: list[ModelProcesses] = []
 
     def processes(self, steady: int = GB, adapter: AdapterFor | None = None) -> ModelProcesses:
@@ -71,7 +71,7 @@ class Place:
 
     def used(self) -> int:
         probe = FakeProbe([self.card])
-        return probe.sample(probe.cards()[0].id).used_bytes
+        return probe.sample(probe.gpus()[0].id).used_bytes
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.errors import ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.sidecars.__main__ import main, parser, settings_from
@@ -151,7 +151,7 @@ def test_without_an_entry_the_manifest_counts_and_without_both_nobody_guesses():
 
 
 def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
-    make_card(tmp_path / "card", 8 * 2**30)
+    make_gpu(tmp_path / "card", 8 * 2**30)
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "/run/x")
     monkeypatch.setenv("VRAM_FAKE_GPU", str(tmp_path / "card"))
     found = settings(
@@ -176,7 +176,7 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     assert (spec.priority, spec.evictable, spec.footprint.load_peak_bytes) == (70, False, 2 * 10**9)
     assert (found.gpu, leased_gpu(found.device)) == (
         None,
-        FakeProbe([tmp_path / "card"]).cards()[0].id,
+        FakeProbe([tmp_path / "card"]).gpus()[0].id,
     ), "the card that is charged is the card that is leased"
     alone = settings(
         "--name",

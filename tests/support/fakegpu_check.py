@@ -1,4 +1,4 @@
-"""Independent checker of a simulated card's allocation log: proves afterwards that no instant
+"""Independent checker of a simulated GPU's allocation log: proves afterwards that no instant
 exceeded the capacity.
 
 It reads the JSON lines by itself and shares no code with `schemas.fakegpu`, whose mistakes it is
@@ -16,7 +16,7 @@ _OPS = {"context", "alloc", "cache", "free", "leak", "returned", "oom", "died", 
 
 @dataclass(slots=True)
 class Report:
-    """What a log shows. `problems` empty: the card was never over capacity and every byte is
+    """What a log shows. `problems` empty: the GPU was never over capacity and every byte is
     accounted for."""
 
     lines: int = 0
@@ -34,7 +34,7 @@ def check_log(text: str) -> Report:
     Rules: numbers rise by one, time never runs back; the sum of all deltas is what each line says
     is used; it stays within the capacity; no process goes below zero, grows after its death, or is
     refused what would have fitted. What somebody wrote into the folder by hand (`edited`: a test's
-    stowaway) counts for the card, and cannot be told apart from a process's own bytes.
+    stowaway) counts for the GPU, and cannot be told apart from a process's own bytes.
     """
     report = Report()
     held: dict[tuple[int, int], int] = {}
@@ -66,7 +66,7 @@ def check_log(text: str) -> Report:
         if op not in _OPS:
             bad(f"unknown op {op}")
         if used > line["capacity"]:
-            bad(f"{used} bytes on a card of {line['capacity']}")
+            bad(f"{used} bytes on a GPU of {line['capacity']}")
         if used != line["used_after"]:
             bad(f"the deltas sum up to {used}, not to {line['used_after']}")
         by_hand += abs(delta) if op == "edited" else 0
@@ -79,7 +79,7 @@ def check_log(text: str) -> Report:
         if (delta > 0 and op not in ("context", "alloc", "edited")) or (
             delta < 0 and op not in ("returned", "edited")
         ):
-            bad(f"{op} must not change the card by {delta}")
+            bad(f"{op} must not change the GPU by {delta}")
         if op == "died":
             dead.add(key)
         if op == "oom":

@@ -14,7 +14,7 @@ class NvmlStub:
 
     library: Path
     control: Path
-    cards: list[str] = field(default_factory=lambda: [f"card GPU-stub-0 {8 * GIB} {256 * MIB} 0"])
+    gpus: list[str] = field(default_factory=lambda: [f"gpu GPU-stub-0 {8 * GIB} {256 * MIB} 0"])
 
     @property
     def environ(self) -> dict[str, str]:
@@ -23,11 +23,11 @@ class NvmlStub:
         return {"LD_LIBRARY_PATH": folders, "NVML_STUB": str(self.control)}
 
     def write(self, *lines: str) -> None:
-        """The cards, and what is said of them now."""
+        """The GPUs, and what is said of them now."""
         fresh = self.control.with_suffix(".new")
-        fresh.write_text("\n".join([*self.cards, *lines]) + "\n")
+        fresh.write_text("\n".join([*self.gpus, *lines]) + "\n")
         fresh.rename(self.control)
 
-    def card(self, used: int, *, more: str = "") -> None:
-        """One card of 8 GiB, of which the driver keeps 256 MiB."""
-        self.cards = [f"card GPU-stub-0 {8 * GIB} {256 * MIB} {used} {more}".rstrip()]
+    def gpu(self, used: int, *, more: str = "") -> None:
+        """One GPU of 8 GiB, of which the driver keeps 256 MiB."""
+        self.gpus = [f"gpu GPU-stub-0 {8 * GIB} {256 * MIB} {used} {more}".rstrip()]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vram_arbiter.arbiter.core.events import ProcessUse
-from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
+from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, Reading
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
@@ -31,7 +31,7 @@ class FakeProbe:
         self._closed = threading.Event()
         for folder in folders:
             try:
-                config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+                config = fakegpu.parse_config((folder / fakegpu.GPU_FILE).read_text())
             except FileNotFoundError:
                 raise NoGpu(
                     f"no simulated GPU in {folder}", hint="start with --gpu fake:8GiB to make one"
@@ -40,15 +40,15 @@ class FakeProbe:
                 raise _unreadable(folder, error) from error
             self._folders[GpuId(config.uuid)] = folder
 
-    def cards(self) -> tuple[Card, ...]:
+    def gpus(self) -> tuple[GpuDevice, ...]:
         found = []
         for gpu, folder in self._folders.items():
             try:
-                config = fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text())
+                config = fakegpu.parse_config((folder / fakegpu.GPU_FILE).read_text())
             except (OSError, UnicodeDecodeError) as error:
                 raise _unreadable(folder, error) from error
-            found.append(Card(gpu, config.index, config.name, config.capacity_bytes))
-        return tuple(sorted(found, key=lambda card: card.index))
+            found.append(GpuDevice(gpu, config.index, config.name, config.capacity_bytes))
+        return tuple(sorted(found, key=lambda device: device.index))
 
     def sample(self, gpu: GpuId) -> Reading:
         if gpu not in self._folders:
@@ -57,20 +57,20 @@ class FakeProbe:
         try:
             self._suffer(folder)
             with locked(folder):
-                card = settled(folder)
+                state = settled(folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(
                 f"the simulated GPU in {folder} cannot be read: {error}",
                 hint="stop what uses it and delete the folder; the arbiter makes it anew",
             ) from error
         processes = None
-        if not card.config.faults.hide_processes:
+        if not state.config.faults.hide_processes:
             processes = tuple(
                 ProcessUse(process.key, process.name, process.own_bytes)
-                for process in card.processes.values()
+                for process in state.processes.values()
                 if process.own_bytes and process.died_at_s is None
             )
-        return Reading(card.used_bytes, card.config.capacity_bytes, processes)
+        return Reading(state.used_bytes, state.config.capacity_bytes, processes)
 
     def close(self) -> None:
         self._closed.set()
@@ -78,7 +78,7 @@ class FakeProbe:
     def _suffer(self, folder: Path) -> None:
         """Fail or hang as the GPU's faults say; a hang ends with the fault or with `close`."""
         while (
-            fault := fakegpu.parse_config((folder / fakegpu.CARD_FILE).read_text()).faults.probe
+            fault := fakegpu.parse_config((folder / fakegpu.GPU_FILE).read_text()).faults.probe
         ) != "ok":
             if fault == "fail":
                 raise ProbeFailed(
@@ -95,7 +95,7 @@ def _unreadable(folder: Path, error: OSError | UnicodeDecodeError) -> ConfigErro
     )
 
 
-def open_cards(text: str, runtime: Path) -> FakeProbe:
+def open_gpus(text: str, runtime: Path) -> FakeProbe:
     """Probe for what stands behind `fake:` in `--gpu`: a size (makes or keeps the GPU in
     RUNTIME/fakegpu) or a folder.
 
@@ -108,20 +108,20 @@ def open_cards(text: str, runtime: Path) -> FakeProbe:
         sizes = [parse_bytes(part) for part in text.split(",")]
     except ValueError as error:
         raise ConfigError(
-            f"--gpu fake:{text}: {error}", hint="write fake:8GiB or fake:/path/to/card"
+            f"--gpu fake:{text}: {error}", hint="write fake:8GiB or fake:/path/to/folder"
         ) from None
     folders = []
     for index, size in enumerate(sizes):
         folder = runtime / ("fakegpu" if index == 0 else f"fakegpu-{index}")
         try:
-            make_card(folder, size, index=index)
+            make_gpu(folder, size, index=index)
         except (OSError, UnicodeDecodeError) as error:
             raise _unreadable(folder, error) from error
         folders.append(folder)
     return FakeProbe(folders)
 
 
-def make_card(
+def make_gpu(
     folder: Path,
     capacity_bytes: int,
     *,
@@ -131,7 +131,7 @@ def make_card(
     """Make a GPU in `folder`, or keep the one there. Raises ConfigError if that one is in use with
     another capacity."""
     boot_id = procfs.boot_id()
-    wanted = fakegpu.CardConfig(
+    wanted = fakegpu.FakeGpuConfig(
         uuid=f"GPU-fake-{uuid.uuid4()}",
         name="Simulated GPU",
         index=index,
@@ -141,7 +141,7 @@ def make_card(
     )
     folder.mkdir(mode=0o750, parents=True, exist_ok=True)
     with locked(folder):
-        path = folder / fakegpu.CARD_FILE
+        path = folder / fakegpu.GPU_FILE
         existing = path.read_text() if path.exists() else None
         if existing is not None and fakegpu.parse_config(existing).boot_id == boot_id:
             settled(folder)  # so that processes which died since do not count as using it

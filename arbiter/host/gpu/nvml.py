@@ -10,7 +10,7 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
-from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
+from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, Reading
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 
@@ -89,14 +89,14 @@ class NvmlProbe:
             self._handles = found
             self._failing.clear()
 
-    def cards(self) -> tuple[Card, ...]:
+    def gpus(self) -> tuple[GpuDevice, ...]:
         found = []
         for gpu, handle in self._handles.items():
             index = int(self._ask(gpu, self._nvml.nvmlDeviceGetIndex))
             name = _text(self._ask(gpu, self._nvml.nvmlDeviceGetName))
             _, total, reserved = self._memory(gpu, handle)
-            found.append(Card(gpu, index, name, total, reserved))
-        return tuple(sorted(found, key=lambda card: card.index))
+            found.append(GpuDevice(gpu, index, name, total, reserved))
+        return tuple(sorted(found, key=lambda device: device.index))
 
     def sample(self, gpu: GpuId) -> Reading:
         if gpu not in self._handles:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from vram_arbiter.arbiter.host.gpu.fake import open_cards
+from vram_arbiter.arbiter.host.gpu.fake import open_gpus
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
 from vram_arbiter.arbiter.host.gpu.probe import GpuProbe
 from vram_arbiter.arbiter.host.gpu.unified import choose
@@ -16,7 +16,7 @@ def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
     """
     kind, _, what = config.source.partition(":")
     if kind == "fake":
-        return open_cards(what, runtime), "fake"
+        return open_gpus(what, runtime), "fake"
     host_proc = None if config.host_proc is None else Path(config.host_proc)
     pids = PidMap(config.pids, host_proc)
     return choose("nvml" if kind == "nvml" else "unified" if kind == "unified" else "auto", pids)

@@ -28,7 +28,7 @@ from vram_arbiter.schemas.ids import GpuId
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class GpuDevice:
     """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself.
 
     A GPU that shares the machine's memory needs more: `margin_bytes` is its least reserve,
@@ -59,12 +59,12 @@ class Reading:
 class GpuProbe(Protocol):
     """A backend. Every method blocks.
 
-    `cards` raises NoGpu where there is none. `sample` raises ProbeFailed when the reading fails
-    (unknown, never free) and UnknownGpu for a GPU that `cards` does not list. `close` may be called
+    `gpus` raises NoGpu where there is none. `sample` raises ProbeFailed when the reading fails
+    (unknown, never free) and UnknownGpu for a GPU that `gpus` does not list. `close` may be called
     from another thread and ends a hanging `sample` where the backend can.
     """
 
-    def cards(self) -> tuple[Card, ...]: ...
+    def gpus(self) -> tuple[GpuDevice, ...]: ...
 
     def sample(self, gpu: GpuId) -> Reading: ...
 

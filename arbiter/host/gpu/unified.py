@@ -16,7 +16,7 @@ from typing import Any, Literal
 from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
 from vram_arbiter.arbiter.host.gpu.pids import PidMap, process_key, process_name
-from vram_arbiter.arbiter.host.gpu.probe import Card, GpuProbe, Reading
+from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, GpuProbe, Reading
 from vram_arbiter.schemas.defaults import GIB, KIB, MIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
@@ -46,11 +46,13 @@ class UnifiedProbe:
         self._root = root
         self._evidence = evidence
 
-    def cards(self) -> tuple[Card, ...]:
+    def gpus(self) -> tuple[GpuDevice, ...]:
         total, _ = read_meminfo(self._root)
         margin = max(MARGIN_MIN_BYTES, int(total * MARGIN_SHARE))
         return (
-            Card(self._gpu, 0, self._name, total, margin_bytes=margin, noise_bytes=NOISE_BYTES),
+            GpuDevice(
+                self._gpu, 0, self._name, total, margin_bytes=margin, noise_bytes=NOISE_BYTES
+            ),
         )
 
     def sample(self, gpu: GpuId) -> Reading:

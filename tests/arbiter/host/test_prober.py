@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Set
 import pytest
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.host.gpu.probe import Card, Reading
+from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, Reading
 from vram_arbiter.arbiter.host.prober import Prober, within
 from vram_arbiter.arbiter.host.process_tree import read_kin
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
@@ -30,8 +30,8 @@ class ScriptedProbe:
         self.calls = 0
         self.closed = threading.Event()
 
-    def cards(self) -> tuple[Card, ...]:
-        return (Card(GPU, 0, "scripted", 100),)
+    def gpus(self) -> tuple[GpuDevice, ...]:
+        return (GpuDevice(GPU, 0, "scripted", 100),)
 
     def sample(self, gpu: GpuId) -> Reading:
         assert gpu == GPU
@@ -174,7 +174,7 @@ def test_a_hanging_reading_is_unknown_until_a_fresh_one_answers() -> None:
 
 def test_bytes_of_a_child_are_booked_on_who_holds_the_lease_when_the_reading_is_handed_on() -> None:
     """This very process is the child, the test's parent holds the lease, and was granted it while
-    the card was being read."""
+    the GPU was being read."""
     me, parent = read_kin(os.getpid()), read_kin(os.getppid())
     assert me is not None
     assert parent is not None

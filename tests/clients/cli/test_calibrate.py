@@ -18,7 +18,7 @@ import pytest
 from tests.sidecars import echo_sidecar
 from tests.support.paths import CONFIGS
 from tests.support.process import ArbiterProcess
-from vram_arbiter.arbiter.host.gpu.fake import make_card
+from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration import entry as entries
 from vram_arbiter.clients.calibration.basis import Basis, Pace
 from vram_arbiter.clients.calibration.gpu import FakeGpu, NvmlGpu, Reading, open_gpu
@@ -379,7 +379,7 @@ class Watched(FakeGpu):
 
 @pytest.fixture
 def card(tmp_path: Path) -> Path:
-    make_card(tmp_path / "gpu", 8 * GIB, release_lag_s=0.0)
+    make_gpu(tmp_path / "gpu", 8 * GIB, release_lag_s=0.0)
     return tmp_path / "gpu"
 
 
@@ -394,9 +394,9 @@ def command(gpu: Watched, program: str = PROGRAM) -> list[str]:
 
 
 def hide(card: Path) -> None:
-    config = fakegpu.parse_config((card / fakegpu.CARD_FILE).read_text())
+    config = fakegpu.parse_config((card / fakegpu.GPU_FILE).read_text())
     hidden = config.model_copy(update={"faults": fakegpu.Faults(hide_processes=True)})
-    (card / fakegpu.CARD_FILE).write_text(fakegpu.dump_config(hidden))
+    (card / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(hidden))
 
 
 @pytest.mark.e2e
@@ -471,9 +471,9 @@ detector: {labels: [cube]}
 @pytest.mark.anyio
 async def test_a_model_in_a_sidecar_of_its_own(gpu: Watched) -> None:
     """Its load peak is seen although it is freed at once: memory comes back later."""
-    config = fakegpu.parse_config((gpu.folder / fakegpu.CARD_FILE).read_text())
+    config = fakegpu.parse_config((gpu.folder / fakegpu.GPU_FILE).read_text())
     slow = config.model_copy(update={"release_lag_s": 0.3})
-    (gpu.folder / fakegpu.CARD_FILE).write_text(fakegpu.dump_config(slow))
+    (gpu.folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
     (gpu.seen / "rskill.yaml").write_text(MANIFEST)
     measured = await measure_model(
         gpu,

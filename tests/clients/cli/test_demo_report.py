@@ -1,4 +1,4 @@
-"""The demo's judgement and its reading of the card's log."""
+"""The demo's judgement and its reading of the GPU's log."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from vram_arbiter.clients.cli.demo_display import describe
 from vram_arbiter.clients.cli.demo_report import (
-    CardStory,
+    MemoryStory,
     Point,
     draw_timeline,
     read_log,
@@ -38,7 +38,7 @@ def line(pid: int, t: float, op: str, process: int, used: int) -> str:
 
 
 def demo_summary(**changes: Any) -> dict[str, Any]:
-    story = CardStory((), 5 * GIB, ())
+    story = MemoryStory((), 5 * GIB, ())
     given: dict[str, Any] = {
         "seed": 3, "arbiter": True, "task": "grab the red cube", "story": story,
         "capacity_bytes": 8 * GIB, "events": [LOAD, SWITCH],
@@ -55,7 +55,7 @@ def test_the_log_gives_bytes_by_program_peak_and_refusals() -> None:
         + '{"torn'
     )
     story = read_log(text, {7: "detector"})
-    assert story == CardStory(
+    assert story == MemoryStory(
         (Point(1.0, "detector", 5), Point(2.0, "pid 8", 0), Point(3.0, "pid 8", 4)), 9, (2.0,)
     )
 
@@ -67,7 +67,7 @@ def test_a_models_process_has_the_name_that_it_gave_itself() -> None:
     assert story.points == (Point(1.0, "detector", 5),)
 
 
-def test_samples_of_a_real_card_give_the_same_story() -> None:
+def test_samples_of_a_real_gpu_give_the_same_story() -> None:
     gpu = {
         "measured_used_bytes": 6,
         "processes": [{"pid": 7, "used_bytes": 5}, {"pid": 9, "used_bytes": None}],
@@ -75,7 +75,7 @@ def test_samples_of_a_real_card_give_the_same_story() -> None:
     story = read_samples(
         [(1.0, gpu)], {7: "grab"}, [{"kind": "oom", "at_wall_s": 12.0}], wall_offset_s=10.0
     )
-    assert story == CardStory((Point(1.0, "grab", 5), Point(1.0, "pid 9", 0)), 6, (2.0,))
+    assert story == MemoryStory((Point(1.0, "grab", 5), Point(1.0, "pid 9", 0)), 6, (2.0,))
 
 
 def test_completed_needs_all_three_witnesses() -> None:
@@ -109,13 +109,13 @@ def test_events_read_as_sentences() -> None:
 @pytest.mark.heavy
 def test_a_timeline_is_drawn_even_of_nothing(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the runner extra")
-    story = CardStory(
+    story = MemoryStory(
         (Point(1.0, "detector", GIB), Point(2.0, "detector", 0), Point(2.5, "grab", 2 * GIB)),
         2 * GIB,
         (2.2,),
     )
     events = [{"kind": "revoke_asked", "at_wall_s": 101.9, "consumer": "detector"}]
-    for number, told in enumerate((story, CardStory((), 0, ()))):
+    for number, told in enumerate((story, MemoryStory((), 0, ()))):
         path = tmp_path / f"{number}.png"
         draw_timeline(path, told, 8 * GIB, events, start_s=0.5, wall_offset_s=100.0, title="t")
         assert path.read_bytes().startswith(b"\x89PNG")

@@ -11,7 +11,7 @@ from vram_arbiter.runner.sensors.platform import Platform, probe_platform
     ("files", "platform", "evidence"),
     [
         ({}, Platform.CPU_ONLY, "no NVIDIA device"),
-        ({"proc/driver/nvidia/version": b"NVRM"}, Platform.CPU_ONLY, "no card is visible"),
+        ({"proc/driver/nvidia/version": b"NVRM"}, Platform.CPU_ONLY, "no GPU is visible"),
         ({"dev/nvidiactl": b""}, Platform.CPU_ONLY, "no NVIDIA device"),
         (
             {"dev/nvidia0": b"", "dev/nvidiactl": b""},

@@ -8,8 +8,8 @@ from tests.support.paths import ROOT
 from vram_arbiter.schemas.config.scenario import (
     Arrivals,
     Scenario,
-    ScenarioCard,
     ScenarioConsumer,
+    ScenarioGpu,
     Stowaway,
     load_scenario,
 )
@@ -48,7 +48,7 @@ def test_the_defaults_of_a_small_one() -> None:
     assert scenario.cards[0].release_lag_s == 0.5
 
 
-@pytest.mark.parametrize("model", [Scenario, ScenarioCard, ScenarioConsumer, Arrivals, Stowaway])
+@pytest.mark.parametrize("model", [Scenario, ScenarioGpu, ScenarioConsumer, Arrivals, Stowaway])
 def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> None:
     silent = {name for name, field in model.model_fields.items() if not field.description}
     assert silent <= {"cards", "consumers", "stowaways", "name"}
@@ -75,14 +75,14 @@ def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> N
             "give exactly one of at_s, every_s, per_minute and after",
         ),
         ("every_s: 5", "after: b", "consumers.a.arrivals.after: there is no consumer 'b'"),
-        ("use_s: 1", "use_s: 1\n    gpu: '3'", "consumers.a.gpu: '3' is no card"),
+        ("use_s: 1", "use_s: 1\n    gpu: '3'", "consumers.a.gpu: '3' is not a GPU"),
         (
             "use_s: 1",
             "use_s: 1\n    steady: 3GiB",
             "consumers.a.steady is larger than its load_peak",
         ),
         ("seconds: 10", "seconds: -1", "s.yaml:2: seconds: "),
-        ("about: one", "about: one\nstowaways: [{name: x, bytes: 1, card: 1}]", "x is on card 1"),
+        ("about: one", "about: one\nstowaways: [{name: x, bytes: 1, card: 1}]", "x is on GPU 1"),
         ("about: one\n", "", "about: is missing"),
         ("about: one", "about: [", "not valid YAML"),
     ],

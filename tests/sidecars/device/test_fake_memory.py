@@ -11,7 +11,7 @@ import time
 import pytest
 
 from tests.support.fakegpu_check import check_log
-from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_card
+from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.errors import NoGpu, OutOfMemory
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.sidecars.device.fake import FakeMemory
@@ -55,7 +55,7 @@ sys.stdin.read()
 
 @pytest.fixture
 def card_folder(tmp_path):
-    make_card(tmp_path, 8 * GIB, release_lag_s=0.2)
+    make_gpu(tmp_path, 8 * GIB, release_lag_s=0.2)
     return tmp_path
 
 
@@ -77,7 +77,7 @@ def start_child(card_folder):
 
 def used(card_folder):
     probe = FakeProbe([card_folder])
-    return probe.sample(probe.cards()[0].id).used_bytes
+    return probe.sample(probe.gpus()[0].id).used_bytes
 
 
 def seconds_until(condition, deadline_s=60.0):
@@ -90,7 +90,7 @@ def seconds_until(condition, deadline_s=60.0):
 
 
 def test_racing_processes_never_exceed_the_capacity(tmp_path, start_child, card_folder):
-    make_card(card_folder, 1 * GIB, release_lag_s=0.01)
+    make_gpu(card_folder, 1 * GIB, release_lag_s=0.01)
     children = [start_child(CONTENDER, str(seed)) for seed in range(4)]
     refused = [int(child.communicate(timeout=60)[0]) for child in children]
     assert sum(refused) > 0, "the race was not tight enough to show anything"

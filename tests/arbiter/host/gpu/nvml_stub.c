@@ -1,8 +1,8 @@
 /* A libnvidia-ml.so.1 for tests: what pynvml calls, answered from the control file $NVML_STUB, read again at every call.
  *
- *   card UUID TOTAL RESERVED USED [mig]                        one line a card, in the driver's order
- *   late CARD BYTES UNTIL                                      BYTES more are used until UNTIL (CLOCK_MONOTONIC, seconds)
- *   process CARD compute|graphics PID BYTES|na [UNTIL]         listed until then
+ *   gpu UUID TOTAL RESERVED USED [mig]                         one line a GPU, in the driver's order
+ *   late GPU BYTES UNTIL                                       BYTES more are used until UNTIL (CLOCK_MONOTONIC, seconds)
+ *   process GPU compute|graphics PID BYTES|na [UNTIL]          listed until then
  *   error CALL CODE                                            CALL: init count memory memory_v2 compute graphics mig
  *   hang CALL                                                  does not return before the line is gone
  */
@@ -12,15 +12,15 @@
 #include <time.h>
 #include <unistd.h>
 
-#define CARDS 8
+#define GPUS 8
 #define PROCESSES 64
 #define NA 0xFFFFFFFFFFFFFFFFull
 enum { SUCCESS = 0, NOT_SUPPORTED = 3, INSUFFICIENT_SIZE = 7, NOT_FOUND = 6, VERSION_MISMATCH = 25, UNKNOWN = 999 };
 
 typedef unsigned long long u64;
-typedef struct { char uuid[96]; u64 total, reserved, used; int mig; } Card;
-typedef struct { int card, graphics; unsigned pid; u64 used; } Process;
-typedef struct { Card cards[CARDS]; int n_cards; Process processes[PROCESSES]; int n_processes; int error, hangs; } World;
+typedef struct { char uuid[96]; u64 total, reserved, used; int mig; } Gpu;
+typedef struct { int gpu, graphics; unsigned pid; u64 used; } Process;
+typedef struct { Gpu gpus[GPUS]; int n_gpus; Process processes[PROCESSES]; int n_processes; int error, hangs; } World;
 
 typedef struct { u64 total, free, used; } Memory;
 typedef struct { unsigned version; u64 total, reserved, free, used; } MemoryV2;
@@ -39,17 +39,17 @@ static void look(const char *call, World *world) {
     if (!file) { world->error = UNKNOWN; return; }
     char line[512], word[96], bytes[32];
     while (fgets(line, sizeof line, file)) {
-        Card card = {0};
+        Gpu gpu = {0};
         Process process = {0};
         u64 count;
         int index, code;
         double until = 1e18;
-        if (sscanf(line, "card %95s %llu %llu %llu", card.uuid, &card.total, &card.reserved, &card.used) == 4) {
-            card.mig = strstr(line, " mig") != NULL;
-            if (world->n_cards < CARDS) world->cards[world->n_cards++] = card;
+        if (sscanf(line, "gpu %95s %llu %llu %llu", gpu.uuid, &gpu.total, &gpu.reserved, &gpu.used) == 4) {
+            gpu.mig = strstr(line, " mig") != NULL;
+            if (world->n_gpus < GPUS) world->gpus[world->n_gpus++] = gpu;
         } else if (sscanf(line, "late %d %llu %lf", &index, &count, &until) == 3) {
-            if (until > now()) world->cards[index].used += count;
-        } else if (sscanf(line, "process %d %95s %u %31s %lf", &process.card, word, &process.pid, bytes, &until) >= 4) {
+            if (until > now()) world->gpus[index].used += count;
+        } else if (sscanf(line, "process %d %95s %u %31s %lf", &process.gpu, word, &process.pid, bytes, &until) >= 4) {
             process.graphics = strcmp(word, "graphics") == 0;
             process.used = strcmp(bytes, "na") == 0 ? NA : strtoull(bytes, NULL, 10);
             if (until > now() && world->n_processes < PROCESSES) world->processes[world->n_processes++] = process;
@@ -88,7 +88,7 @@ int nvmlSystemGetDriverVersion(char *text, unsigned size) { snprintf(text, size,
 int nvmlDeviceGetCount_v2(unsigned *count) {
     World w;
     int error = begin("count", &w);
-    *count = w.n_cards;
+    *count = w.n_gpus;
     return error;
 }
 
@@ -97,7 +97,7 @@ int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **handle) { *handle = (vo
 int nvmlDeviceGetUUID(void *handle, char *text, unsigned size) {
     World w;
     int error = begin("uuid", &w);
-    snprintf(text, size, "%s", w.cards[index_of(handle)].uuid);
+    snprintf(text, size, "%s", w.gpus[index_of(handle)].uuid);
     return error;
 }
 
@@ -107,15 +107,15 @@ int nvmlDeviceGetIndex(void *handle, unsigned *index) { *index = index_of(handle
 int nvmlDeviceGetMigMode(void *handle, unsigned *current, unsigned *pending) {
     World w;
     int error = begin("mig", &w);
-    *current = *pending = w.cards[index_of(handle)].mig;
+    *current = *pending = w.gpus[index_of(handle)].mig;
     return error;
 }
 
 int nvmlDeviceGetMemoryInfo(void *handle, Memory *memory) {
     World w;
     int error = begin("memory", &w);
-    Card *card = &w.cards[index_of(handle)];
-    *memory = (Memory){card->total, card->total - card->used - card->reserved, card->used + card->reserved};
+    Gpu *gpu = &w.gpus[index_of(handle)];
+    *memory = (Memory){gpu->total, gpu->total - gpu->used - gpu->reserved, gpu->used + gpu->reserved};
     return error;
 }
 
@@ -125,11 +125,11 @@ int nvmlDeviceGetMemoryInfo_v2(void *handle, MemoryV2 *memory) {
     if (error) return error;
     if ((error = begin("memory", &w))) return error;
     if (memory->version != (sizeof(MemoryV2) | 2u << 24)) return VERSION_MISMATCH;
-    Card *card = &w.cards[index_of(handle)];
-    memory->total = card->total;
-    memory->reserved = card->reserved;
-    memory->used = card->used;
-    memory->free = card->total - card->reserved - card->used;
+    Gpu *gpu = &w.gpus[index_of(handle)];
+    memory->total = gpu->total;
+    memory->reserved = gpu->reserved;
+    memory->used = gpu->used;
+    memory->free = gpu->total - gpu->reserved - gpu->used;
     return SUCCESS;
 }
 
@@ -140,7 +140,7 @@ static int list(void *handle, const char *call, int graphics, unsigned *count, P
     unsigned room = infos ? *count : 0, found = 0;
     for (int i = 0; i < w.n_processes; i++) {
         Process *p = &w.processes[i];
-        if (p->card != index_of(handle) || p->graphics != graphics) continue;
+        if (p->gpu != index_of(handle) || p->graphics != graphics) continue;
         if (found < room) infos[found] = (ProcessInfo){p->pid, p->used, 0xFFFFFFFFu, 0xFFFFFFFFu};
         found++;
     }

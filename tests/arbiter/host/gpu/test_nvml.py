@@ -27,15 +27,15 @@ class FunctionNotFound(NVMLError):
 
 
 class Driver:
-    """Answers as `pynvml` does, for cards given as dictionaries."""
+    """Answers as `pynvml` does, for GPUs given as dictionaries."""
 
     NVMLError = NVMLError
     NVMLError_NotSupported = NotSupported
     NVMLError_FunctionNotFound = FunctionNotFound
     nvmlMemory_v2 = 2
 
-    def __init__(self, *cards, init_error=None):
-        self.cards = cards
+    def __init__(self, *gpus, init_error=None):
+        self.gpus = gpus
         self.init_error = init_error
         self.shutdowns = 0
 
@@ -49,10 +49,10 @@ class Driver:
             raise NVMLError("Uninitialized")
 
     def nvmlDeviceGetCount(self):
-        return len(self.cards)
+        return len(self.gpus)
 
     def nvmlDeviceGetHandleByIndex(self, index):
-        return self.cards[index]
+        return self.gpus[index]
 
     def nvmlDeviceGetIndex(self, handle):
         return handle["index"]
@@ -61,7 +61,7 @@ class Driver:
         return handle["uuid"]
 
     def nvmlDeviceGetName(self, handle):
-        return handle.get("name", "NVIDIA Card")
+        return handle.get("name", "NVIDIA GPU")
 
     def nvmlDeviceGetMigMode(self, handle):
         if "mig" not in handle:
@@ -91,7 +91,7 @@ class Driver:
         return [SimpleNamespace(pid=pid, usedGpuMemory=size) for pid, size in listed]
 
 
-def card(**changes):
+def gpu(**changes):
     return {
         "uuid": "GPU-1",
         "index": 0,
@@ -102,29 +102,29 @@ def card(**changes):
 
 
 def test_the_drivers_reserve_is_neither_used_nor_there():
-    probe = NvmlProbe(Driver(card(uuid=b"GPU-1", name=b"NVIDIA Card")))
-    (found,) = probe.cards()
-    assert (found.id, found.name) == ("GPU-1", "NVIDIA Card")
+    probe = NvmlProbe(Driver(gpu(uuid=b"GPU-1", name=b"NVIDIA GPU")))
+    (found,) = probe.gpus()
+    assert (found.id, found.name) == ("GPU-1", "NVIDIA GPU")
     assert (found.total_bytes, found.reserved_bytes) == (8 * GIB - GIB // 4, GIB // 4)
     reading = probe.sample(found.id)
     assert (reading.used_bytes, reading.total_bytes) == (GIB, 8 * GIB - GIB // 4)
 
 
 def test_an_old_driver_counts_its_reserve_as_used():
-    probe = NvmlProbe(Driver(card(old=True)))
+    probe = NvmlProbe(Driver(gpu(old=True)))
     reading = probe.sample(GpuId("GPU-1"))
     assert (reading.used_bytes, reading.total_bytes) == (GIB + GIB // 4, 8 * GIB)
 
 
-def test_cards_come_in_the_drivers_order_under_their_uuids():
-    probe = NvmlProbe(Driver(card(uuid="GPU-b", index=1), card(uuid="GPU-a", index=0)))
-    assert [found.id for found in probe.cards()] == ["GPU-a", "GPU-b"]
+def test_gpus_come_in_the_drivers_order_under_their_uuids():
+    probe = NvmlProbe(Driver(gpu(uuid="GPU-b", index=1), gpu(uuid="GPU-a", index=0)))
+    assert [found.id for found in probe.gpus()] == ["GPU-a", "GPU-b"]
 
 
 def test_a_process_with_compute_and_graphics_counts_once_and_unknown_stays_unknown():
     me = os.getpid()
     probe = NvmlProbe(
-        Driver(card(compute=[(me, 300), (2**22 + 1, None)], graphics=[(me, 300), (2**22 + 2, 5)]))
+        Driver(gpu(compute=[(me, 300), (2**22 + 1, None)], graphics=[(me, 300), (2**22 + 2, 5)]))
     )
     processes = probe.sample(GpuId("GPU-1")).processes
     assert processes is not None
@@ -141,20 +141,20 @@ def test_a_process_with_compute_and_graphics_counts_once_and_unknown_stays_unkno
 
 
 def test_where_processes_cannot_be_listed_the_total_still_counts():
-    probe = NvmlProbe(Driver(card(graphics=NotSupported("Not Supported"))))
+    probe = NvmlProbe(Driver(gpu(graphics=NotSupported("Not Supported"))))
     reading = probe.sample(GpuId("GPU-1"))
     assert (reading.used_bytes, reading.processes) == (GIB, None)
 
 
-def test_a_card_that_fell_off_the_bus_is_a_failed_reading():
-    handle = card()
+def test_a_gpu_that_fell_off_the_bus_is_a_failed_reading():
+    handle = gpu()
     probe = NvmlProbe(Driver(handle))
     handle["memory_error"] = NVMLError("GPU is lost")
     with pytest.raises(ProbeFailed, match="GPU is lost"):
         probe.sample(GpuId("GPU-1"))
 
 
-def test_no_driver_no_card_unknown_card():
+def test_no_driver_no_gpu_unknown_gpu():
     with pytest.raises(NoGpu, match="--gpu fake:8GiB"):
         NvmlProbe(Driver(init_error=NVMLError("Driver Not Loaded")))
     empty = Driver()
@@ -162,11 +162,11 @@ def test_no_driver_no_card_unknown_card():
         NvmlProbe(empty)
     assert empty.shutdowns == 1
     with pytest.raises(UnknownGpu):
-        NvmlProbe(Driver(card())).sample(GpuId("GPU-2"))
+        NvmlProbe(Driver(gpu())).sample(GpuId("GPU-2"))
 
 
-def test_one_card_that_fails_does_not_disturb_the_other():
-    lost, fine = card(), card(uuid="GPU-2", index=1, used=5)
+def test_one_gpu_that_fails_does_not_disturb_the_other():
+    lost, fine = gpu(), gpu(uuid="GPU-2", index=1, used=5)
     driver = Driver(lost, fine)
     probe = NvmlProbe(driver)
     lost["memory_error"] = NVMLError("GPU is lost")
@@ -182,12 +182,12 @@ def test_one_card_that_fails_does_not_disturb_the_other():
 def test_a_list_whose_pids_mean_nothing_here_is_no_evidence(tmp_path):
     (tmp_path / "self" / "ns").mkdir(parents=True)
     os.symlink("pid:[4026532999]", tmp_path / "self" / "ns" / "pid")
-    probe = NvmlProbe(Driver(card(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
+    probe = NvmlProbe(Driver(gpu(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
     assert probe.sample(GpuId("GPU-1")).processes is None
 
 
 def test_closing_twice_is_harmless():
-    driver = Driver(card())
+    driver = Driver(gpu())
     probe = NvmlProbe(driver)
     probe.close()
     probe.close()

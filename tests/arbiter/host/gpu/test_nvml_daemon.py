@@ -44,7 +44,7 @@ def granted(client: WireClient, name: str, size: int, **spec: Any) -> dict[str, 
 def held_here(client: WireClient, nvml: NvmlStub, size: int) -> dict[str, Any]:
     """This very process holds a lease and its bytes."""
     on = granted(client, "holder", size)
-    nvml.card(size)
+    nvml.gpu(size)
     nvml.write(f"process 0 compute {ME} {size}")
     assert client.ask("ready", **on, measured_bytes=size)["ok"]
     until_read(client, size)
@@ -55,14 +55,14 @@ def until_read(client: WireClient, used: int) -> None:
     """Until the daemon has read so much: what a release is compared with."""
     deadline = time.monotonic() + PATIENCE_S
     while client.ask("status")["gpus"][0]["measured_used_bytes"] != used:
-        assert time.monotonic() < deadline, "the card is not read"
+        assert time.monotonic() < deadline, "the GPU is not read"
 
 
 def let_go(client: WireClient, nvml: NvmlStub, on: dict[str, Any], left: int, *lines: str) -> None:
     """As holders do: say so first, so that no reading of what is half gone is taken for the state
     before; give back; release."""
     assert client.ask("unloading", **on)["ok"]
-    nvml.card(left)
+    nvml.gpu(left)
     nvml.write(*lines)
     assert client.ask("release", **on)["ok"]
 
@@ -84,9 +84,9 @@ def event(
 def test_a_cycle_with_release_lag(
     client: WireClient, daemon: ArbiterProcess, nvml: NvmlStub
 ) -> None:
-    (card,) = client.ask("status")["gpus"]
-    assert (card["gpu"], card["name"]) == ("GPU-stub-0", "NVIDIA Stub")
-    assert card["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
+    (gpu,) = client.ask("status")["gpus"]
+    assert (gpu["gpu"], gpu["name"]) == ("GPU-stub-0", "NVIDIA Stub")
+    assert gpu["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
     assert client.ask("subscribe")["ok"]
     on = held_here(client, nvml, 5 * GIB)
     let_go(
@@ -97,9 +97,9 @@ def test_a_cycle_with_release_lag(
     event(client, "queued", lambda told: told["lease_id"] == waiter["lease"]["lease_id"])
     before = client.ask("status")
     assert [lease["state"] for lease in before["leases"]] == ["verifying", "queued"], (
-        "not before the card shows it"
+        "not before the GPU shows it"
     )
-    nvml.card(0)
+    nvml.gpu(0)
     nvml.write()
     assert client.push("granted")["lease"]["lease_id"] == waiter["lease"]["lease_id"]
     verdict = event(client, "verified")
@@ -118,9 +118,9 @@ def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
     assert event(client, "verified")["verdict"] == "stale"
     waiter = client.acquire("next", GIB, nonce="next")
     assert waiter["state"] == "queued"
-    (card,) = client.ask("status")["gpus"]
-    assert card["measured_used_bytes"] is None
-    assert "cannot be read" in card["blocked"]["text"]
+    (gpu,) = client.ask("status")["gpus"]
+    assert gpu["measured_used_bytes"] is None
+    assert "cannot be read" in gpu["blocked"]["text"]
     assert client.ask("ping")["ok"], "the daemon itself hangs on nothing"
     nvml.write()
     event(client, "probe_ok")
@@ -161,7 +161,7 @@ def test_where_bytes_per_process_are_na_the_total_decides(
     go, as nobody else can be named."""
     assert client.ask("subscribe")["ok"]
     on = granted(client, "holder", 5 * GIB)
-    nvml.card(5 * GIB)
+    nvml.gpu(5 * GIB)
     nvml.write(f"process 0 compute {ME} na")
     assert client.ask("ready", **on)["ok"]
     until_read(client, 5 * GIB)
@@ -174,7 +174,7 @@ def test_where_bytes_per_process_are_na_the_total_decides(
 def test_a_stowaway_is_named_and_charged_as_reserve(client: WireClient, nvml: NvmlStub) -> None:
     assert client.ask("subscribe")["ok"]
     parent = os.getppid()
-    nvml.card(3 * GIB)
+    nvml.gpu(3 * GIB)
     nvml.write(f"process 0 graphics {parent} {3 * GIB}")
     found = event(client, "stowaway")
     assert (found["pid"], found["used_bytes"]) == (parent, 3 * GIB)
@@ -183,7 +183,7 @@ def test_a_stowaway_is_named_and_charged_as_reserve(client: WireClient, nvml: Nv
 
 
 def test_mig_mode_is_an_error_of_the_configuration(make_arbiter: Make, nvml: NvmlStub) -> None:
-    nvml.card(0, more="mig")
+    nvml.gpu(0, more="mig")
     nvml.write()
     arbiter = make_arbiter(gpu="nvml")
     assert arbiter.spawn(nvml.environ).wait(60) == 2
@@ -193,7 +193,7 @@ def test_mig_mode_is_an_error_of_the_configuration(make_arbiter: Make, nvml: Nvm
 
 
 def test_the_daemon_makes_no_cuda_context(daemon: ArbiterProcess) -> None:
-    """llama.cpp#20582: a manager that asks CUDA for free memory eats 120-550 MB of every card
+    """llama.cpp#20582: a manager that asks CUDA for free memory eats 120-550 MB of every GPU
     itself."""
     mapped = {
         Path(line.split()[-1]).name

@@ -16,10 +16,10 @@ pytest.importorskip("pynvml")
 READ = """
     from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
     probe = NvmlProbe()
-    cards = probe.cards()
-    reading = probe.sample(cards[0].id)
+    gpus = probe.gpus()
+    reading = probe.sample(gpus[0].id)
     print(json.dumps({
-        "cards": [[c.id, c.index, c.name, c.total_bytes, c.reserved_bytes] for c in cards],
+        "gpus": [[c.id, c.index, c.name, c.total_bytes, c.reserved_bytes] for c in gpus],
         "used": reading.used_bytes,
         "total": reading.total_bytes,
         "processes": reading.processes and [
@@ -49,7 +49,7 @@ REFUSED = """
     from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
     from vram_arbiter.schemas.errors import VramError
     try:
-        NvmlProbe().cards()
+        NvmlProbe().gpus()
     except VramError as error:
         print(json.dumps([type(error).__name__, error.message, error.hint]))
 """
@@ -57,7 +57,7 @@ LOST = """
     from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
     from vram_arbiter.schemas.errors import ProbeFailed
     probe = NvmlProbe()
-    gpu = probe.cards()[0].id
+    gpu = probe.gpus()[0].id
     said = []
     for line in sys.stdin:
         with open(os.environ["NVML_STUB"], "w") as control:
@@ -86,13 +86,13 @@ def answer_of_child(stub: NvmlStub, code: str, text: str = "") -> Any:
 
 
 def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
-    nvml.cards = [
-        f"card GPU-stub-b {8 * GIB} {256 * MIB} {GIB}",
-        f"card GPU-stub-a {24 * GIB} {512 * MIB} 0",
+    nvml.gpus = [
+        f"gpu GPU-stub-b {8 * GIB} {256 * MIB} {GIB}",
+        f"gpu GPU-stub-a {24 * GIB} {512 * MIB} 0",
     ]
     nvml.write()
     said = answer_of_child(nvml, READ)
-    assert said["cards"] == [
+    assert said["gpus"] == [
         ["GPU-stub-b", 0, "NVIDIA Stub", 8 * GIB - 256 * MIB, 256 * MIB],
         ["GPU-stub-a", 1, "NVIDIA Stub", 24 * GIB - 512 * MIB, 512 * MIB],
     ]
@@ -101,7 +101,7 @@ def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
 
 @pytest.mark.parametrize("code", [13, 3], ids=["FUNCTION_NOT_FOUND", "NOT_SUPPORTED"])
 def test_a_driver_without_memory_v2_counts_its_reserve_as_used(nvml: NvmlStub, code: int) -> None:
-    nvml.card(GIB)
+    nvml.gpu(GIB)
     nvml.write(f"error memory_v2 {code}")
     said = answer_of_child(nvml, READ)
     assert (said["used"], said["total"]) == (GIB + 256 * MIB, 8 * GIB)
@@ -109,7 +109,7 @@ def test_a_driver_without_memory_v2_counts_its_reserve_as_used(nvml: NvmlStub, c
 
 def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml: NvmlStub) -> None:
     me = os.getpid()
-    nvml.card(3 * GIB)
+    nvml.gpu(3 * GIB)
     nvml.write(
         f"process 0 compute {me} {2 * GIB}",
         f"process 0 graphics {me} {2 * GIB}",
@@ -124,7 +124,7 @@ def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml:
 
 
 def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> None:
-    nvml.card(GIB)
+    nvml.gpu(GIB)
     nvml.write("error compute 3")
     said = answer_of_child(nvml, READ)
     assert (said["used"], said["processes"]) == (GIB, None)
@@ -143,28 +143,28 @@ def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> Non
 def test_what_cannot_be_served_is_a_typed_error(
     nvml: NvmlStub, more: str, lines: list[str], error: str, words: str
 ) -> None:
-    nvml.card(0, more=more)
+    nvml.gpu(0, more=more)
     nvml.write(*lines)
     name, message, hint = answer_of_child(nvml, REFUSED)
     assert (name, words in message) == (error, True), message
     assert hint
 
 
-def test_no_card_at_all(nvml: NvmlStub) -> None:
-    nvml.cards = []
+def test_no_gpu_at_all(nvml: NvmlStub) -> None:
+    nvml.gpus = []
     nvml.write()
     assert answer_of_child(nvml, REFUSED)[0] == "NoGpu"
 
 
-def test_a_card_that_was_lost_is_read_again_after_the_driver_came_back(nvml: NvmlStub) -> None:
-    """Every card failed, so everything is opened anew; a driver that is away meanwhile is one more
+def test_a_gpu_that_was_lost_is_read_again_after_the_driver_came_back(nvml: NvmlStub) -> None:
+    """Every GPU failed, so everything is opened anew; a driver that is away meanwhile is one more
     failed reading."""
-    card = f"card GPU-stub-0 {8 * GIB} 0"
+    gpu = f"gpu GPU-stub-0 {8 * GIB} 0"
     said = answer_of_child(
         nvml,
         LOST,
-        f"{card} 1\n{card} 2;error memory 15\n{card} 3;error init 9\ncard GPU-other {GIB} 0 "
-        f"4\n{card} 5\n{card} 6\n",
+        f"{gpu} 1\n{gpu} 2;error memory 15\n{gpu} 3;error init 9\ngpu GPU-other {GIB} 0 "
+        f"4\n{gpu} 5\n{gpu} 6\n",
     )
     assert said[0] == 1
     assert "GPU is lost" in said[1]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
-from vram_arbiter.arbiter.host.gpu.probe import Card
+from vram_arbiter.arbiter.host.gpu.probe import GpuDevice
 from vram_arbiter.arbiter.host.gpu.unified import (
     NOISE_BYTES,
     choose,
@@ -42,7 +42,7 @@ class NotSupported(NVMLError):
 
 
 class Nvml:
-    """`pynvml` with one card whose memory may be NOT_SUPPORTED."""
+    """`pynvml` with one GPU whose memory may be NOT_SUPPORTED."""
 
     NVMLError, NVMLError_NotSupported, NVMLError_FunctionNotFound = (
         NVMLError,
@@ -132,12 +132,12 @@ def gb10(tmp_path: Path) -> Path:
 def test_an_orin_is_read_by_what_is_available(orin: Path) -> None:
     probe, source = choose("auto", PIDS, orin, NO_DRIVER)
     assert source == "unified"
-    (card,) = probe.cards()
-    assert (card.id, card.name) == (
+    (gpu,) = probe.gpus()
+    assert (gpu.id, gpu.name) == (
         "UNIFIED-1423223012345",
         "NVIDIA Jetson Orin Nano Developer Kit",
     )
-    reading = probe.sample(card.id)
+    reading = probe.sample(gpu.id)
     assert (reading.total_bytes, reading.used_bytes) == (
         7802124 * KIB,
         (7802124 - 4688128) * KIB,
@@ -149,7 +149,7 @@ def test_an_orin_is_read_by_what_is_available(orin: Path) -> None:
 
 def test_nvmaps_clients_are_evidence(orin: Path) -> None:
     probe, _ = choose("unified", PIDS, orin, NO_DRIVER)
-    processes = probe.sample(probe.cards()[0].id).processes
+    processes = probe.sample(probe.gpus()[0].id).processes
     assert processes is not None
     assert [(use.process.pid, use.used_bytes) for use in processes] == [
         (1203, 12288 * KIB),
@@ -161,7 +161,7 @@ def test_nvmaps_clients_are_evidence(orin: Path) -> None:
 def test_without_root_nobody_says_who_holds_what(orin: Path) -> None:
     shutil.rmtree(orin / "sys")
     probe, _ = choose("auto", PIDS, orin, NO_DRIVER)
-    assert probe.sample(probe.cards()[0].id).processes is None
+    assert probe.sample(probe.gpus()[0].id).processes is None
 
 
 def test_on_a_thor_nvmap_shows_nothing_and_nvml_lists_processes(orin: Path) -> None:
@@ -170,7 +170,7 @@ def test_on_a_thor_nvmap_shows_nothing_and_nvml_lists_processes(orin: Path) -> N
     assert nvmap_clients(orin) is None
     probe, source = choose("auto", PIDS, orin, UMA)
     assert source == "unified"
-    processes = probe.sample(probe.cards()[0].id).processes
+    processes = probe.sample(probe.gpus()[0].id).processes
     assert processes is not None
     assert [(use.process.pid, use.used_bytes) for use in processes] == [(os.getpid(), 7 * GIB)]
 
@@ -192,9 +192,9 @@ def test_on_a_tegra_nvml_is_an_error_of_the_configuration(orin: Path) -> None:
 def test_a_gb10_has_nvmls_name_and_list_and_the_machines_memory(gb10: Path) -> None:
     probe, source = choose("auto", PIDS, gb10, UMA)
     assert source == "unified"
-    (card,) = probe.cards()
-    assert (card.id, card.name, card.total_bytes) == ("GPU-gb10", "NVIDIA GB10", 127600748 * KIB)
-    reading = probe.sample(card.id)
+    (gpu,) = probe.gpus()
+    assert (gpu.id, gpu.name, gpu.total_bytes) == ("GPU-gb10", "NVIDIA GB10", 127600748 * KIB)
+    reading = probe.sample(gpu.id)
     assert reading.used_bytes == (127600748 - 118566368) * KIB
     assert reading.processes is not None
     assert [use.used_bytes for use in reading.processes] == [7 * GIB]
@@ -202,8 +202,8 @@ def test_a_gb10_has_nvmls_name_and_list_and_the_machines_memory(gb10: Path) -> N
 
 def test_a_gb10_without_nvml_is_known_by_its_name(gb10: Path) -> None:
     probe, source = choose("unified", PIDS, gb10, NO_DRIVER)
-    assert (source, probe.cards()[0].name) == ("unified", "NVIDIA_DGX_Spark")
-    assert probe.sample(probe.cards()[0].id).processes is None
+    assert (source, probe.gpus()[0].name) == ("unified", "NVIDIA_DGX_Spark")
+    assert probe.sample(probe.gpus()[0].id).processes is None
     with pytest.raises(NoGpu):
         choose("nvml", PIDS, gb10, NO_DRIVER)
 
@@ -215,25 +215,25 @@ def test_on_a_gb10_nvml_alone_is_an_error_of_the_configuration(gb10: Path) -> No
 
 # -- other machines
 @pytest.mark.parametrize("source", ["auto", "nvml"])
-def test_a_card_with_memory_of_its_own_is_read_by_nvml(tmp_path: Path, source: Any) -> None:
+def test_a_gpu_with_memory_of_its_own_is_read_by_nvml(tmp_path: Path, source: Any) -> None:
     probe, chosen = choose(source, PIDS, tmp_path, DISCRETE)
-    assert (chosen, probe.cards()[0].total_bytes) == ("nvml", 8 * GIB)
+    assert (chosen, probe.gpus()[0].total_bytes) == ("nvml", 8 * GIB)
 
 
-def test_main_memory_never_stands_for_a_card_that_has_its_own(tmp_path: Path) -> None:
+def test_main_memory_never_stands_for_a_gpu_that_has_its_own(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="memory of its own"):
         choose("unified", PIDS, tmp_path, DISCRETE)
 
 
-def test_a_lost_card_is_no_reason_to_read_main_memory(tmp_path: Path) -> None:
+def test_a_lost_gpu_is_no_reason_to_read_main_memory(tmp_path: Path) -> None:
     probe, chosen = choose("auto", PIDS, tmp_path, Nvml(memory=NVMLError("GPU is lost")))
     assert chosen == "nvml"
     with pytest.raises(ProbeFailed, match="GPU is lost"):
-        probe.cards()
+        probe.gpus()
 
 
 @pytest.mark.parametrize("source", ["auto", "nvml", "unified"])
-def test_a_machine_without_any_card_has_no_card(tmp_path: Path, source: Any) -> None:
+def test_a_machine_without_any_gpu_has_no_gpu(tmp_path: Path, source: Any) -> None:
     with pytest.raises(NoGpu):
         choose(source, PIDS, tmp_path, NO_DRIVER)
 
@@ -258,19 +258,19 @@ def test_a_meminfo_that_does_not_say_is_a_failed_reading(tmp_path: Path, text: s
 
 
 def test_the_machine_keeps_a_larger_margin_and_tolerance(orin: Path) -> None:
-    (card,) = choose("auto", PIDS, orin, NO_DRIVER)[0].cards()
+    (device,) = choose("auto", PIDS, orin, NO_DRIVER)[0].gpus()
     config = load_config("", "x")
-    (gpu,) = budget([card], config, "unified")
-    assert gpu.reserve_bytes == max(GIB, int(card.total_bytes * 0.15))
+    (gpu,) = budget([device], config, "unified")
+    assert gpu.reserve_bytes == max(GIB, int(gpu.total_bytes * 0.15))
     assert gpu.source == "unified"
     assert core_settings(config, (gpu,), Opened(1, {})).verify_tolerance_bytes == NOISE_BYTES
     assert (
-        budget([card], load_config("gpu: {reserve_bytes: 3GiB}", "x"))[0].reserve_bytes == 3 * GIB
+        budget([device], load_config("gpu: {reserve_bytes: 3GiB}", "x"))[0].reserve_bytes == 3 * GIB
     )
-    (plain,) = budget([Card(GpuId("GPU-1"), 0, "card", 8 * GIB)], config, "nvml")
+    (plain,) = budget([GpuDevice(GpuId("GPU-1"), 0, "gpu", 8 * GIB)], config, "nvml")
     assert (
         core_settings(config, (plain,), Opened(1, {})).verify_tolerance_bytes
         == config.verify.tolerance_bytes
     )
     with pytest.raises(ConfigError, match="leaves nothing"):
-        budget([card], load_config("gpu: {capacity_bytes: {'0': 1GiB}}", "x"))
+        budget([device], load_config("gpu: {capacity_bytes: {'0': 1GiB}}", "x"))
