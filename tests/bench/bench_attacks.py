@@ -3,8 +3,7 @@ the most. Limits as shipped."""
 
 import time
 
-from harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, helper, pause
-
+from tests.bench.harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, helper, pause
 from tests.support.attacks import ATTACKS
 from tests.support.costly import COSTLY
 from vram_arbiter.arbiter.rpc import codec

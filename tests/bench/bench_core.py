@@ -6,8 +6,7 @@ import random
 import time
 from typing import Any
 
-from harness import SLIVER, Suite, p50
-
+from tests.bench.harness import SLIVER, Suite, p50
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Push, Reply, Sample

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from harness import (
+from tests.bench.harness import (
     ANSWER_TIMEOUT_S,
     SHIPPED,
     Peer,

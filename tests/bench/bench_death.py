@@ -8,7 +8,7 @@ import os
 import signal
 import time
 
-from harness import Peer, Suite, arbiter, end, spawn
+from tests.bench.harness import Peer, Suite, arbiter, end, spawn
 
 
 def run(suite: Suite) -> None:

@@ -11,8 +11,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from harness import GIB, WIDE, Peer, Suite, arbiter
-
+from tests.bench.harness import GIB, WIDE, Peer, Suite, arbiter
 from tests.support.process import ArbiterProcess
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.ids import ProcessKey

@@ -7,8 +7,8 @@ next grant. `bench_throughput` has what that costs when there is no pause.
 
 from contextlib import ExitStack
 
-import redis_locks
-from harness import FLOOR, Peer, Suite, arbiter, elapsed_us, floor, in_turns, p99
+from tests.bench import redis_locks
+from tests.bench.harness import FLOOR, Peer, Suite, arbiter, elapsed_us, floor, in_turns, p99
 
 
 def run(suite: Suite) -> None:

@@ -9,8 +9,8 @@ from collections import deque
 from contextlib import ExitStack
 from typing import Any
 
-import redis_locks
-from harness import Peer, Suite, arbiter, elapsed_us, in_turns
+from tests.bench import redis_locks
+from tests.bench.harness import Peer, Suite, arbiter, elapsed_us, in_turns
 
 CONNECTIONS_MAX = 64
 

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from bench_crowd import rss_bytes
-from bench_rest import QUIET_AFTER_S, busy_percent
-from harness import SHIPPED, WIDE, Peer, Suite, arbiter, elapsed_us, in_turns, pause
+from tests.bench.bench_crowd import rss_bytes
+from tests.bench.bench_rest import QUIET_AFTER_S, busy_percent
+from tests.bench.harness import SHIPPED, WIDE, Peer, Suite, arbiter, elapsed_us, in_turns, pause
 
 PAGE = "http:\n  listen: 127.0.0.1:0\n"
 LEASES = 1000

@@ -21,7 +21,7 @@ import time
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-from bench_runner import (
+from tests.bench.bench_runner import (
     BOOT_S,
     GRAB,
     NAVIGATE,
@@ -31,8 +31,7 @@ from bench_runner import (
     _program,
     _until_up,
 )
-from harness import SHIPPED, arbiter
-
+from tests.bench.harness import SHIPPED, arbiter
 from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient

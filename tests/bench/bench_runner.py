@@ -27,8 +27,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from harness import SHIPPED, arbiter, p50, p99
-
+from tests.bench.harness import SHIPPED, arbiter, p50, p99
 from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.runner import RunnerClient

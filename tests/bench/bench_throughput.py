@@ -4,8 +4,8 @@ same load on a Redis lock."""
 import json
 from contextlib import ExitStack
 
-import redis_locks
-from harness import Suite, arbiter, end, pause, spawn
+from tests.bench import redis_locks
+from tests.bench.harness import Suite, arbiter, end, pause, spawn
 
 PROCESSES = 4
 REFERENCE = "Redis: cycles a second, 16 clients on one lock"

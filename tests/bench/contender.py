@@ -12,9 +12,10 @@ import sys
 from typing import Any
 
 import msgpack
-import redis_locks
 import zmq
-from harness import Peer
+
+from tests.bench import redis_locks
+from tests.bench.harness import Peer
 
 LOCK = b"contended"
 

@@ -4,7 +4,8 @@ then sits until it is killed."""
 import sys
 
 import zmq
-from harness import Peer
+
+from tests.bench.harness import Peer
 
 STEP = 100
 

@@ -6,7 +6,8 @@ import threading
 
 import msgpack
 import zmq
-from harness import Peer
+
+from tests.bench.harness import Peer
 
 BURST = 100
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from harness import Peer
+from tests.bench.harness import Peer
 
 if __name__ == "__main__":
     Peer(sys.argv[1], "victim").hello().acquire()

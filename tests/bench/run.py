@@ -13,18 +13,20 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import bench_attacks
-import bench_core
-import bench_crowd
-import bench_death
-import bench_eviction
-import bench_grants
-import bench_handover
-import bench_page
-import bench_rest
-import bench_runner
-import bench_throughput
-from harness import Row, Suite
+from tests.bench import (
+    bench_attacks,
+    bench_core,
+    bench_crowd,
+    bench_death,
+    bench_eviction,
+    bench_grants,
+    bench_handover,
+    bench_page,
+    bench_rest,
+    bench_runner,
+    bench_throughput,
+)
+from tests.bench.harness import Row, Suite
 
 SUBJECTS = {
     "grants": bench_grants.run,

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench.bench_attacks import cost_us
+from tests.bench.bench_core import Bench
+from tests.bench.bench_runner import Measured, Tick
 from tests.support.costly import COSTLY
 
 HERE = Path(__file__).parent
@@ -105,16 +108,10 @@ def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> 
 @pytest.mark.parametrize("kind", COSTLY)
 def test_a_costly_message_is_decoded_or_refused(kind: str) -> None:
     """The row called a function that had changed, and no test ran it."""
-    sys.path.insert(0, str(HERE))
-    from bench_attacks import cost_us
-
     assert cost_us(COSTLY[kind]) > 0
 
 
 def test_decisions_of_the_engine_alone_are_timed() -> None:
-    sys.path.insert(0, str(HERE))
-    from bench_core import Bench
-
     bench = Bench(leases=4, waiters=8)
     bench.mix(3)
     assert {kind: len(took) for kind, took in bench.samples.items()}["Renewed"] == 3
@@ -122,8 +119,6 @@ def test_decisions_of_the_engine_alone_are_timed() -> None:
 
 def test_a_loop_that_stood_still_is_in_the_figures_however_long() -> None:
     """Regression: gaps of a second counted as pauses between stretches and were left out."""
-    sys.path.insert(0, str(HERE))
-    from bench_runner import Measured, Tick
 
     def tick(started_s: float) -> Tick:
         return {"started_s": started_s, "late_ms": 0.0, "tick_ms": 1.0, "hal_ms": 0.5}
