@@ -28,7 +28,7 @@ from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients.handlers import Handlers
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
 from vram_arbiter.clients.net.answer import Answer
-from vram_arbiter.clients.net.dealer import Dealer
+from vram_arbiter.clients.net.dealer import Dealer, Transport
 from vram_arbiter.clients.net.diagnose import START, obstacle
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
@@ -99,7 +99,7 @@ class Session:
         self._tasks: TaskGroup | None = None
         self._spawned: dict[int, anyio.CancelScope] = {}  # in the order of their beginning
         self._serial = 0
-        self._dealer: Dealer | None = None
+        self._dealer: Transport | None = None
         self._contact_lost = anyio.Event()
         self._greeted: Answer[None] = Answer()
         self._alarm_at = float("inf")
@@ -326,7 +326,7 @@ class Session:
                 tasks.cancel_scope.cancel()
             await anyio.sleep(REOPEN_S)
 
-    def _new_dealer(self) -> Dealer:
+    def _new_dealer(self) -> Transport:
         return Dealer(
             self.endpoint, self._received, self._hung_up, self._refused, program="arbiter"
         )

@@ -15,7 +15,6 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
 from vram_arbiter.schemas.errors import LimitExceeded, NotPermitted
 from vram_arbiter.schemas.ids import ClientId, ProcessKey
-from vram_arbiter.schemas.runtime.connection import Connection
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
@@ -48,6 +47,22 @@ class Decisions(Protocol):
     ) -> StatusReply: ...
 
     def why(self, consumer: str) -> WhyReply: ...
+
+
+class Connection(Protocol):
+    """One peer's connection (`schemas.runtime.connection.Connection`), as sessions need it."""
+
+    @property
+    def serial(self) -> int: ...
+
+    @property
+    def peer(self) -> Peer: ...
+
+    def admit(self) -> None: ...
+
+    def send(self, payload: bytes) -> bool: ...
+
+    def close(self, reason: str) -> None: ...
 
 
 class Watch(Protocol):

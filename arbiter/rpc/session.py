@@ -14,6 +14,7 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.log import RefusalLog
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.arbiter.rpc.registry import (
+    Connection,
     Decisions,
     Registry,
     Session,
@@ -34,7 +35,6 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.connection import Connection
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView

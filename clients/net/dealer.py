@@ -8,7 +8,7 @@ where heartbeats would take seconds. The module must not know what messages mean
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import anyio
 import anyio.lowlevel
@@ -28,6 +28,14 @@ RETRY_S: Final = 0.02  # the first pause before another connection is tried …
 RETRY_MAX_S: Final = 0.5  # … and the longest
 UNSENT_MAX: Final = 1000  # messages kept until there is a connection
 ANSWER_VALUES_MAX: Final = 65_536  # keys, list items and what they hold, of one answer
+
+
+class Transport(Protocol):
+    """One connection to a server (`Dealer`), as a client's session needs it."""
+
+    def send(self, message: Message) -> bool: ...
+
+    async def run(self) -> None: ...
 
 
 class Dealer:
