@@ -117,7 +117,8 @@ def daemon(tracer: Tracer, arguments: list[str]) -> None:
 async def holder(tracer: Tracer) -> None:
     """Hold the GPU with an idle lease; free it when the arbiter asks: `hold`, `trace`, `write`."""
     from vram_arbiter.clients.client import AsyncClient
-    from vram_arbiter.sidecars.device.fake import Block, FakeMemory
+    from vram_arbiter.sidecars.device.fake import FakeMemory
+    from vram_arbiter.sidecars.device.memory import Block
 
     memory = FakeMemory(Path(os.environ["VRAM_ARBITER_RUNTIME"]) / "fakegpu", "holder")
     blocks: list[Block] = []

@@ -34,7 +34,7 @@ class Contender:
     def go_on(self) -> None:
         """What has come: a grant is given back at once, a release that is confirmed is followed by
         the next acquire."""
-        while self.peer.socket.getsockopt(zmq.EVENTS) & zmq.POLLIN:
+        while int(self.peer.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             message: dict[str, Any] = msgpack.unpackb(self.peer.socket.recv())
             if message.get("push") == "granted" or message.get("state") == "loading":
                 self.peer.letting_go(message["lease"])

@@ -15,7 +15,12 @@ BURST = 100
 def main(endpoint: str) -> None:
     peer = Peer(endpoint, "flooder").hello()
     ended = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
+
+    def wait_for_end() -> None:
+        sys.stdin.read()
+        ended.set()
+
+    threading.Thread(target=wait_for_end, daemon=True).start()
     print("up", flush=True)
     payload = msgpack.packb({"op": "ping", "id": 9})
     while not ended.is_set():

@@ -89,6 +89,10 @@ class RedisLocks:
         if self.answer() != b"1":
             raise RuntimeError("the lock was not ours")
 
+    def cycle(self, lock: bytes) -> None:
+        self.take(lock)
+        self.give_back(lock)
+
     def close(self) -> None:
         self._file.close()
         self.socket.close()

@@ -37,6 +37,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked
 
 STEPS = {
@@ -103,8 +104,8 @@ class Storm:
         self._user: Child | None = None
         self._strangers: list[Child] = []
         self._children: list[Child] = []
-        self._events: dict[tuple[int, float], dict[str, Any]] = {}
-        self._steps: dict[str, list[asyncio.Future[dict[str, Any]]]] = defaultdict(list)
+        self._events: dict[tuple[int, float], JsonMap] = {}
+        self._steps: dict[str, list[asyncio.Future[JsonMap]]] = defaultdict(list)
         self._queued: dict[str, str] = {}  # lease → consumer
         self._tasks: set[asyncio.Task[None]] = set()
         self._hindrances: list[Hindrance] = []
@@ -220,7 +221,7 @@ class Storm:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def _heard(self, event: dict[str, Any]) -> None:
+    def _heard(self, event: JsonMap) -> None:
         self._events[event["seq"], event["at_wall_s"]] = event
         kind, lease = event["kind"], event.get("lease_id")
         if kind == "queued":
@@ -233,9 +234,9 @@ class Storm:
                 if not future.done():
                     future.set_result(event)
 
-    async def _next(self, step: str) -> dict[str, Any] | None:
+    async def _next(self, step: str) -> JsonMap | None:
         """The next event that begins a step; None if none comes soon."""
-        future: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        future: asyncio.Future[JsonMap] = asyncio.get_running_loop().create_future()
         self._steps[step].append(future)
         try:
             return await asyncio.wait_for(future, STEP_WAIT_S)
@@ -269,7 +270,7 @@ class Storm:
         grants = sum(event["kind"] == "granted" for event in self._events.values())
         return sum(self._tally.by_kind.values()) >= self._faults and 2 * grants >= self._faults
 
-    async def _strike_process(self, step: str, role: str, how: str, event: dict[str, Any]) -> None:
+    async def _strike_process(self, step: str, role: str, how: str, event: JsonMap) -> None:
         if role == "daemon":
             await self._strike_daemon(step, how)
             return
@@ -284,10 +285,10 @@ class Storm:
         target.kill()
         self._replace(target)
 
-    def _target(self, role: str, event: dict[str, Any]) -> Child | None:
+    def _target(self, role: str, event: JsonMap) -> Child | None:
         if role == "user":
             return self._user
-        holder = event.get("consumer")
+        holder: str = event.get("consumer", "")
         if role == "holder":
             names = {holder}
         elif role == "waiter":
@@ -393,14 +394,14 @@ class Storm:
                 )
             case _:
                 self._tally.count(fault)
-                faulty: dict[str, Any] = {
+                settings: dict[str, dict[str, Any]] = {
                     "probe fails": {"faults": {"probe": "fail"}},
                     "probe hangs": {"faults": {"probe": "hang"}},
                     "leak": {"faults": {"leak_bytes": 600 * MIB}},
                     "hidden processes": {"faults": {"hide_processes": True}},
                     "lag": {"release_lag_s": 0.7},
-                }[fault]
-                await asyncio.to_thread(self._set_card, **faulty)
+                }
+                await asyncio.to_thread(self._set_card, **settings[fault])
                 self._later(pause_s, self._mend_card)
 
     async def _strike_disk(self, fault: str, pause_s: float) -> None:
@@ -560,7 +561,7 @@ class Storm:
             "after": usage,
         }
 
-    def _whole_history(self) -> list[dict[str, Any]]:
+    def _whole_history(self) -> list[JsonMap]:
         """What the subscriber heard and what the disk kept: each may miss what the other has."""
         found = dict(self._events)
         with contextlib.closing(

@@ -3,7 +3,7 @@
 import asyncio
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -19,7 +19,7 @@ class Arbiter:
         self.pid = 2**22  # nobody has it
         self.starts = 0
         self.succeeds_at = 1
-        self.emptied_meanwhile = lambda: None
+        self.emptied_meanwhile: Callable[[], None] = lambda: None
 
     def start(self) -> None:
         self.starts += 1

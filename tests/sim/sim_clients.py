@@ -20,7 +20,7 @@ from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._session import Session
 from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.clients.net.dealer import Dealer
+from vram_arbiter.clients.net.dealer import Transport
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.ids import GpuId
@@ -56,7 +56,7 @@ class SimSession(Session):
             super().pump()
             self._world.touch()
 
-    def _new_dealer(self) -> Dealer:
+    def _new_dealer(self) -> Transport:
         return self._world.open_link(self._process, self._received, self._hung_up)
 
     def _killed(self) -> None:

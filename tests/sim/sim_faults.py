@@ -3,6 +3,7 @@ faults as rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from tests.sim.sim_clients import Cast, Program
 from tests.support.simulation.card import ProbeFaults, SimOutOfMemory
@@ -237,9 +238,7 @@ class Nemesis:
         self.world.reboot()
         self.clock.after(2.0, self._restart)
         for index in range(len(self.slots)):
-            self.clock.after(
-                self.random.uniform(2.0, 5.0), lambda index=index: self._respawn(index, None)
-            )
+            self.clock.after(self.random.uniform(2.0, 5.0), partial(self._respawn, index, None))
 
     # -- cards and probes
     def _spoil(self, spoil: Callable[[ProbeFaults], None]) -> None:

@@ -19,6 +19,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 from tests.sim.sim_clients import Cast, Character, Consumer, Observer, Operator, Runner
@@ -125,10 +126,10 @@ def _play(world: World, cast: Cast) -> None:
             leaks=0.2 if rogue and n == 2 else 0.0,
             leases=random.choice((1, 1, 2)),
         )
-        slots.append(Slot(lambda pid, n=n, c=character: Consumer(cast, f"consumer{n}", c, pid)))
-    slots += [Slot(lambda pid, n=n: Runner(cast, f"runner{n}", pid)) for n in range(2)]
-    slots.append(Slot(lambda pid: Observer(cast, "observer", pid)))
-    slots.append(Slot(lambda pid: Operator(cast, "operator", pid)))
+        slots.append(Slot(partial(Consumer, cast, f"consumer{n}", character)))
+    slots += [Slot(partial(Runner, cast, f"runner{n}")) for n in range(2)]
+    slots.append(Slot(partial(Observer, cast, "observer")))
+    slots.append(Slot(partial(Operator, cast, "operator")))
     nemesis = Nemesis(world, cast, slots)
     world.run(TROUBLE_S)
     nemesis.calm()

@@ -10,7 +10,7 @@ import pytest
 from tests.sim.sim_clients import SimClient
 from tests.sim.sim_run import run_seed, summary
 from tests.support.simulation.card import Device, SimOutOfMemory
-from tests.support.simulation.clock import Clock, ProcessLoop
+from tests.support.simulation.clock import Clock, new_loop
 from tests.support.simulation.daemon import Happening
 from tests.support.simulation.world import Entitlement, SimFailure, World
 from vram_arbiter.clients.lease import AsyncLease
@@ -103,7 +103,8 @@ def test_a_token_that_does_not_grow_is_a_breach(tmp_path: Path) -> None:
 # -- the parts
 def test_a_frozen_process_catches_up_and_a_dead_one_never_does() -> None:
     clock = Clock(1)
-    loop, dead, happened = ProcessLoop(clock, "frozen"), ProcessLoop(clock, "dead"), []
+    loop, dead = new_loop(clock, "frozen"), new_loop(clock, "dead")
+    happened: list[str] = []
     loop.freeze()
     loop.call_later(1.0, happened.append, "late")
     dead.call_later(1.0, happened.append, "never")

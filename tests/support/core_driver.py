@@ -73,6 +73,7 @@ from vram_arbiter.schemas.ids import (
     UseId,
 )
 from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
 READING_S = 0.001
@@ -450,12 +451,13 @@ class Consumer:
         effects = self.try_acquire(
             load_peak_bytes, steady_bytes, wait_timeout_s=wait_timeout_s, nonce=nonce, **spec
         )
-        reply = next((e for e in effects if isinstance(e, Reply)), None)
+        bodies = (e.body for e in effects if isinstance(e, Reply))
+        reply = next((body for body in bodies if isinstance(body, AcquireReply)), None)
         if reply is None:
             raise AssertionError(
                 f"{self.name} was refused: {[e for e in effects if isinstance(e, Refuse)]}"
             )
-        lease = LeaseId(reply.body.lease.lease_id)
+        lease = LeaseId(reply.lease.lease_id)
         self.specs[lease] = self.spec(load_peak_bytes, steady_bytes, **spec)
         return lease
 

@@ -28,7 +28,7 @@ def _popen(
     start_new_session: bool,
     **_: Any,
 ) -> Forked:
-    *_, module, descriptor = command
+    module, descriptor = command[-2:]
     assert module == "vram_arbiter.runner.recording.writer"
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:

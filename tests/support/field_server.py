@@ -54,8 +54,7 @@ class FieldServer:
         self._socket = self._context.socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVTIMEO, 20)
-        self._socket.bind(endpoint)
-        self.endpoint = self._socket.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0").decode()
+        self.endpoint = self._socket.bind(endpoint).addr
         self._ending = False
         self._thread = threading.Thread(target=self._serve)
 

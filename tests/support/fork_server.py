@@ -39,18 +39,18 @@ def lend() -> None:
         orders.close()
         _run_server(ordered)
     ordered.close()
-    start = util.spawnv_passfds  # type: ignore[attr-defined]
+    start = util.spawnv_passfds
 
     def spawn(path: bytes, arguments: Sequence[str], passed: Sequence[int]) -> int:
         if not arguments[-1].startswith("from multiprocessing.forkserver import main"):
-            return int(start(path, arguments, passed))
-        util.spawnv_passfds = start  # type: ignore[attr-defined]
+            return start(path, arguments, passed)
+        util.spawnv_passfds = start
         order = {"code": arguments[-1], "passed": passed, "environ": dict(os.environ)}
         with orders:
             socket.send_fds(orders, [json.dumps(order).encode()], passed)
         return pid
 
-    util.spawnv_passfds = spawn  # type: ignore[attr-defined]
+    util.spawnv_passfds = spawn  # type: ignore[assignment]  # the stub takes numbers as arguments
 
 
 def _run_server(ordered: socket.socket) -> NoReturn:

@@ -166,6 +166,8 @@ def _value(node: Any, before: Scrape, after: Scrape) -> Any:
             if operator == "or":
                 return right | left
             assert operator == "unless", f"{operator} is not evaluated"
+            assert node.modifier is not None
+            assert node.modifier.matching is not None
             on = set(node.modifier.matching.labels)
             gone = {_only(on, key) for key in right}
             return {key: value for key, value in left.items() if _only(on, key) not in gone}

@@ -62,6 +62,8 @@ class EventStream:
 
     def __init__(self, port: int, **headers: str) -> None:
         self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=REPLY_S)
+        self._connection.connect()
+        self._socket = self._connection.sock
         self._connection.request("GET", "/events", headers=headers)
         self.reply = self._connection.getresponse()
         self.status = self.reply.status
@@ -82,8 +84,7 @@ class EventStream:
 
     def reset(self) -> None:
         """End the connection as a host does that crashed and came back."""
-        end = self.reply.fp.raw._sock
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.close()
 
     def close(self) -> None:

@@ -17,7 +17,8 @@ def batch(name: str) -> bytes:
 
     request = ExportTraceServiceRequest()
     request.resource_spans.add().scope_spans.add().spans.add().name = name
-    return request.SerializeToString()
+    body: bytes = request.SerializeToString()
+    return body
 
 
 def connected(collector: Collector) -> socket.socket:

@@ -18,7 +18,7 @@ STEPS_MAX = 2_000_000
 """More than any sane run needs: beyond it, something is busy without end."""
 TRACE_LINES = 400
 
-Callback = Callable[[], None]
+Callback = Callable[[], object]
 
 
 class Trace:
@@ -188,14 +188,15 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     def create_future(self) -> asyncio.Future[Any]:
         return asyncio.Future(loop=self)
 
-    def create_task(
+    def create_task[T](
         self,
-        coro: Coroutine[Any, Any, Any] | Generator[Any, Any, Any],
+        coro: Coroutine[Any, Any, T] | Generator[Any, Any, T],
         *,
         name: str | None = None,
         context: contextvars.Context | None = None,
-    ) -> asyncio.Task[Any]:
-        task: asyncio.Task[Any] = asyncio.Task(coro, loop=self, name=name, context=context)
+    ) -> asyncio.Task[T]:
+        assert isinstance(coro, Coroutine)
+        task = asyncio.Task(coro, loop=self, name=name, context=context)
         self._tasks.append(task)
         return task
 
@@ -206,3 +207,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         error = context.get("exception")
         if not self.dead and error is not None and self.on_failure is not None:
             self.on_failure(error)
+
+
+def new_loop(clock: Clock, name: str) -> ProcessLoop:
+    """Return the loop of a new process."""
+    return ProcessLoop(clock, name)  # type: ignore[abstract]  # only the stub's methods are abstract

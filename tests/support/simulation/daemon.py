@@ -15,7 +15,7 @@ import msgpack
 
 from tests.support.full_check import check_arbiter
 from tests.support.simulation.card import Device, ProbeFaults, SimProber
-from tests.support.simulation.clock import Clock, ProcessLoop
+from tests.support.simulation.clock import Clock, new_loop
 from tests.support.simulation.wire import Line, SimWire
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
@@ -82,7 +82,7 @@ class SimDaemon:
     def __init__(self, machine: Machine, failed: Callable[[BaseException], None]) -> None:
         self.machine = machine
         self.clock = machine.clock
-        self.loop = ProcessLoop(machine.clock, "daemon")
+        self.loop = new_loop(machine.clock, "daemon")
         self.loop.on_failure = self._loop_failed
         self.journal_full = False
         self.on_crash: Callable[[], None] | None = None

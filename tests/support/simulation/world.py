@@ -22,7 +22,7 @@ from typing import Any
 
 from tests.support.engine_state import state_of
 from tests.support.simulation.card import Device, ProbeFaults
-from tests.support.simulation.clock import TRACE_LINES, Clock, ProcessLoop
+from tests.support.simulation.clock import TRACE_LINES, Clock, ProcessLoop, new_loop
 from tests.support.simulation.daemon import Happening, Machine, SimDaemon
 from tests.support.simulation.wire import Link, SimWire
 from vram_arbiter.arbiter.core.scheduling import admission
@@ -150,7 +150,7 @@ class World:
             self._pids += 1
             pid = self._pids
         key = ProcessKey(pid, int(self.clock.now * 100))
-        loop = ProcessLoop(self.clock, f"{name}:{pid}")
+        loop = new_loop(self.clock, f"{name}:{pid}")
         process = SimProcess(key, name, loop, Peer(key, uid, uid, -1))
         loop.on_failure = lambda error: self.fail(
             f"{name} ({key}): {type(error).__name__}: {error}"
