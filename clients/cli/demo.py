@@ -249,8 +249,8 @@ async def _boot(
     seed: int,
     arbiter: bool,
     gpu: str,
-    http: HttpAddress | None,
     out: Path,
+    http: HttpAddress | None = None,
 ) -> AsyncClient | None:
     """Start everything and wait until each answers. The arbiter's client, if there is an
     arbiter."""
