@@ -175,11 +175,11 @@ async def _episode(
 ) -> JsonObject:
     card = runtime / "fakegpu"
     if gpu.startswith("fake:"):
-        _make_card(card, parse_bytes(gpu.removeprefix("fake:")))
+        make_gpu(card, parse_bytes(gpu.removeprefix("fake:")))
     watch = Watch(time.monotonic(), time.time() - time.monotonic())
     async with contextlib.AsyncExitStack() as stack:
         runner = await stack.enter_async_context(RunnerClient(f"ipc://{runtime}/runner.sock"))
-        client = await _boot(
+        client = await boot(
             programs,
             runtime,
             runner,
@@ -227,7 +227,7 @@ async def _episode(
     return summary
 
 
-def _make_card(folder: Path, capacity_bytes: int) -> None:
+def make_gpu(folder: Path, capacity_bytes: int) -> None:
     """Make the simulated GPU before a program needs it: there may be no arbiter that makes one."""
     boot_id = procfs.boot_id()
     folder.mkdir()
@@ -240,7 +240,7 @@ def _make_card(folder: Path, capacity_bytes: int) -> None:
     (folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(config))
 
 
-async def _boot(
+async def boot(
     programs: Programs,
     runtime: Path,
     runner: RunnerClient,

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from tests.support.paths import ROOT
-from vram_arbiter.clients.cli.demo import BUDGET, LOOP_S, _boot, _make_card
+from vram_arbiter.clients.cli.demo import BUDGET, LOOP_S, boot, make_gpu
 from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
@@ -50,13 +50,13 @@ async def play_world(seed: int, out: Path) -> list[Task]:
         environ = {RUNTIME_VARIABLE: name, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
         programs = Programs(out / "logs", environ)
         try:
-            _make_card(runtime / "fakegpu", parse_bytes(BUDGET))
+            make_gpu(runtime / "fakegpu", parse_bytes(BUDGET))
             async with contextlib.AsyncExitStack() as stack:
                 runner = await stack.enter_async_context(
                     RunnerClient(f"ipc://{runtime}/runner.sock")
                 )
                 gpu = f"fake:{BUDGET}"
-                await _boot(
+                await boot(
                     programs, runtime, runner, stack, seed=seed, arbiter=True, gpu=gpu, out=out
                 )
                 truth = await runner.ground_truth()
