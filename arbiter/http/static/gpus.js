@@ -2,11 +2,11 @@
 import { Chart } from "/chart.js";
 import { $, bytes, chip, el, partClass, partName, setText } from "/format.js";
 
-const cards = new Map();
+const panels = new Map();
 let minutes = 3;
 
-function cardOf(gpu) {
-  if (cards.has(gpu.index)) return cards.get(gpu.index);
+function panelOf(gpu) {
+  if (panels.has(gpu.index)) return panels.get(gpu.index);
   const title = el("h3"),
     figures = el("p.figures"),
     block = el("p.block"),
@@ -17,14 +17,14 @@ function cardOf(gpu) {
   bar.setAttribute("role", "img");
   output.setAttribute("aria-live", "polite");
   const root = el(
-    "div.card",
+    "div.panel",
     el("div.title", title, figures, block),
     bar,
     legend,
     el("div.chart", canvas, output),
   );
-  $("cards").append(root);
-  const card = {
+  $("panels").append(root);
+  const panel = {
     root,
     title,
     figures,
@@ -33,8 +33,8 @@ function cardOf(gpu) {
     legend,
     chart: new Chart(canvas, output, `Memory of GPU ${gpu.index}`),
   };
-  cards.set(gpu.index, card);
-  return card;
+  panels.set(gpu.index, panel);
+  return panel;
 }
 
 // The parts of a GPU's bytes now: from its leases, so that a change shows at once.
@@ -64,16 +64,16 @@ function partsOf(feed, gpu) {
 
 export function renderGpus(feed) {
   const known = new Set(feed.status.gpus.map((gpu) => gpu.index));
-  for (const [index, card] of cards)
+  for (const [index, panel] of panels)
     if (!known.has(index)) {
-      card.root.remove();
-      cards.delete(index);
+      panel.root.remove();
+      panels.delete(index);
     }
   for (const gpu of feed.status.gpus) {
-    const card = cardOf(gpu),
+    const panel = panelOf(gpu),
       parts = partsOf(feed, gpu);
-    setText(card.title, `GPU ${gpu.index} · ${gpu.name}`);
-    card.figures.replaceChildren(
+    setText(panel.title, `GPU ${gpu.index} · ${gpu.name}`);
+    panel.figures.replaceChildren(
       el("b", bytes(gpu.charged_bytes)),
       " charged · ",
       el("b", bytes(gpu.measured_used_bytes)),
@@ -81,15 +81,15 @@ export function renderGpus(feed) {
       el("b", bytes(gpu.capacity_bytes)),
       " capacity",
     );
-    setText(card.block, gpu.blocked ? `Nothing is granted: ${gpu.blocked.text}` : "");
-    card.block.hidden = !gpu.blocked;
-    card.block.classList.toggle(
+    setText(panel.block, gpu.blocked ? `Nothing is granted: ${gpu.blocked.text}` : "");
+    panel.block.hidden = !gpu.blocked;
+    panel.block.classList.toggle(
       "hard",
       Boolean(gpu.blocked) && ["unreadable", "pressure"].includes(gpu.blocked.code),
     );
     const used = parts.reduce((sum, [, count]) => sum + count, 0);
     const free = Math.max(0, gpu.capacity_bytes - gpu.reserve_bytes - used);
-    card.legend.replaceChildren(
+    panel.legend.replaceChildren(
       ...parts.map(([part, count]) =>
         el("li", chip(part), `${partName(part)} `, el("b", bytes(count))),
       ),
@@ -103,13 +103,13 @@ export function renderGpus(feed) {
       made.style.flexBasis = `${(100 * count) / scale}%`;
       return made;
     };
-    card.bar.replaceChildren(
+    panel.bar.replaceChildren(
       ...parts.map(([part, count]) => segment(partClass(part), count)),
       el("i.gap"),
       segment("reserve", gpu.reserve_bytes),
     );
     const told = parts.map(([part, count]) => `${partName(part)} ${bytes(count)}`).join(", ");
-    card.bar.setAttribute(
+    panel.bar.setAttribute(
       "aria-label",
       `${told || "nothing charged"}; free ${bytes(free)}, reserve ${bytes(gpu.reserve_bytes)}`,
     );
@@ -120,7 +120,7 @@ export function renderGpus(feed) {
 export function drawCharts(feed) {
   for (const gpu of feed.status.gpus) {
     const samples = feed.samples.get(gpu.index) ?? [];
-    cards.get(gpu.index)?.chart.update(gpu, samples, feed.uptime, minutes * 60);
+    panels.get(gpu.index)?.chart.update(gpu, samples, feed.uptime, minutes * 60);
   }
 }
 
