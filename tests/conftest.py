@@ -91,7 +91,7 @@ def make_arbiter() -> Iterator[Callable[..., ArbiterProcess]]:
 
 @pytest.fixture
 def arbiter_daemon(make_arbiter: Callable[..., ArbiterProcess]) -> ArbiterProcess:
-    """A running daemon with one simulated card of 8 GiB."""
+    """A running daemon with one simulated GPU of 8 GiB."""
     return make_arbiter().start()
 
 

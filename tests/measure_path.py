@@ -185,7 +185,7 @@ def _spec(consumer: str) -> Any:
 def record(folder: Path, *, cold: bool = False) -> dict[str, list[Step]]:
     """Play the scene twice, or once with `cold`. Returns the steps of each side in the last one."""
     arbiter = ArbiterProcess()
-    make_gpu(arbiter.card, 8 * GIB, release_lag_s=0.0)
+    make_gpu(arbiter.gpu_folder, 8 * GIB, release_lag_s=0.0)
     out = {side: folder / f"{side}.json" for side in ("daemon", "holder", "waiter")}
     arbiter.program = [sys.executable, str(Path(__file__)), "daemon", str(out["daemon"])]
     programs: dict[str, subprocess.Popen[str]] = {}

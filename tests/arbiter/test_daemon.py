@@ -90,7 +90,7 @@ def test_wrong_flags_end_with_2_and_say_what_to_do(
     assert "Traceback" not in done.stderr
 
 
-def test_a_cap_on_a_card_that_is_not_there(make_arbiter: Make) -> None:
+def test_a_cap_on_a_gpu_that_is_not_there(make_arbiter: Make) -> None:
     arbiter = make_arbiter(config="gpu:\n  capacity_bytes: {'7': 4GiB}\n")
     done = run_daemon(arbiter, *arbiter.arguments, "--gpu", "fake:8GiB")
     assert done.returncode == 2
@@ -104,7 +104,7 @@ def test_without_a_driver_nothing_is_simulated_unasked(make_arbiter: Make) -> No
     assert done.returncode == 4
     assert "--gpu fake:8GiB" in done.stderr
     assert "Traceback" not in done.stderr
-    assert not arbiter.card.exists()
+    assert not arbiter.gpu_folder.exists()
     assert not (arbiter.runtime / "arbiter.sock").exists()
 
 

@@ -60,7 +60,7 @@ def holder_in_use(arbiter: ArbiterProcess) -> Iterator[subprocess.Popen[str]]:
     """A process by the product's own client: an exclusive lease, bytes on the GPU, a use
     under way."""
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(arbiter.card)],
+        [sys.executable, "-c", HOLDER, str(arbiter.gpu_folder)],
         env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

@@ -136,7 +136,7 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
         answer = client.acquire("refused", GIB)
         refused = (
             answer if not answer["ok"] else client.push("denied")
-        )  # it waited for a reading of the card
+        )  # it waited for a reading of the GPU
         assert refused["error"]["code"] == "journal_unavailable"
         assert any(
             "journal cannot be written" in problem for problem in client.ask("status")["problems"]

@@ -124,7 +124,7 @@ def in_order(spans: dict[str, ReceivedSpan]) -> None:
     assert spans["lease.evict"].end_ns <= load.start_ns
 
 
-def test_prometheus_reads_the_cards_on_loopback(make_arbiter: Make) -> None:
+def test_prometheus_reads_the_gpus_on_loopback(make_arbiter: Make) -> None:
     pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
     arbiter = make_arbiter(config="telemetry:\n  prometheus_port: 0\n").start()
     hand_over(arbiter)
@@ -153,7 +153,7 @@ def test_prometheus_reads_the_cards_on_loopback(make_arbiter: Make) -> None:
 
 def scraped(port: int, wanted: str) -> None:
     """Until it is there: an event is answered before it is counted, and a loop that was held up
-    shows no picture of the cards."""
+    shows no picture of the GPUs."""
     deadline = time.monotonic() + 60.0
     while not re.search(wanted, text := scrape(port), re.MULTILINE):
         assert time.monotonic() < deadline, f"no {wanted} in {text}"

@@ -30,14 +30,14 @@ Make = Callable[..., ArbiterProcess]
 
 
 def occupy(arbiter: ArbiterProcess, size: int) -> None:
-    """Put bytes of this very process on the simulated card."""
+    """Put bytes of this very process on the simulated GPU."""
     ticks = start_ticks(os.getpid())
     assert ticks is not None
     key = ProcessKey(os.getpid(), ticks)
     process = fakegpu.ProcessFile(
         pid=key.pid, start_ticks=key.start_ticks, name="test", allocated_bytes=size
     )
-    path = arbiter.card / fakegpu.file_name(key)
+    path = arbiter.gpu_folder / fakegpu.file_name(key)
     temporary = path.with_name(".new")
     temporary.write_text(process.model_dump_json())
     temporary.rename(path)
@@ -186,7 +186,7 @@ def test_leases_survive_an_orderly_restart_and_go_with_their_dead_holder(
         [(key, {**record, "start_ticks": 1}) for key, record in journal.opened.records.items()]
     )
     journal.close()
-    for file in arbiter.card.glob(f"{os.getpid()}-*.json"):
+    for file in arbiter.gpu_folder.glob(f"{os.getpid()}-*.json"):
         file.unlink()
     arbiter.start()
     with WireClient(arbiter.endpoint) as client:
@@ -241,7 +241,7 @@ def test_a_grant_that_cannot_be_written_is_refused_and_not_charged(make_arbiter:
         answer = client.acquire("first", 5 * GIB)
         refused = (
             answer if not answer["ok"] else client.push("denied")
-        )  # it waited for a reading of the card
+        )  # it waited for a reading of the GPU
         assert refused["error"]["code"] == "journal_unavailable"
         blocker.execute("ROLLBACK")
         blocker.close()
@@ -278,11 +278,11 @@ def test_a_measured_footprint_is_charged_after_a_restart_and_a_reboot(make_arbit
 
 
 def set_fault(arbiter: ArbiterProcess, probe: str) -> None:
-    change_card(arbiter, lambda config: config["faults"].update(probe=probe))
+    change_gpu(arbiter, lambda config: config["faults"].update(probe=probe))
 
 
-def change_card(arbiter: ArbiterProcess, change: Callable[[dict[str, Any]], None]) -> None:
-    path = arbiter.card / fakegpu.GPU_FILE
+def change_gpu(arbiter: ArbiterProcess, change: Callable[[dict[str, Any]], None]) -> None:
+    path = arbiter.gpu_folder / fakegpu.GPU_FILE
     config = json.loads(path.read_text())
     change(config)
     temporary = path.with_name(".new")
@@ -291,7 +291,7 @@ def change_card(arbiter: ArbiterProcess, change: Callable[[dict[str, Any]], None
 
 
 @pytest.mark.parametrize("fault", ["fail", "hang"])
-def test_a_card_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fault: str) -> None:
+def test_a_gpu_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fault: str) -> None:
     arbiter = make_arbiter(config="probe: {deadline_s: 0.5, period_s: 0.1}\n").start()
     with WireClient(arbiter.endpoint) as watcher, WireClient(arbiter.endpoint) as client:
         watcher.hello("watcher").ask("subscribe")
@@ -306,16 +306,16 @@ def test_a_card_that_cannot_be_read_blocks_and_comes_back(make_arbiter: Make, fa
 
 
 @pytest.mark.parametrize("capacity_bytes", [4 * GIB, 16 * GIB, 1 << 50])
-def test_a_card_whose_capacity_changes_is_unknown_until_it_is_as_it_was(
+def test_a_gpu_whose_capacity_changes_is_unknown_until_it_is_as_it_was(
     make_arbiter: Make, capacity_bytes: int
 ) -> None:
-    """The larger card was believed: what was granted on it did not exist."""
+    """The larger GPU was believed: what was granted on it did not exist."""
     arbiter = make_arbiter(config="probe: {period_s: 0.1}\n").start()
     with WireClient(arbiter.endpoint) as watcher, WireClient(arbiter.endpoint) as client:
         watcher.hello("watcher").ask("subscribe")
         client.hello()
         before = client.ask("status")["gpus"][0]["capacity_bytes"]
-        change_card(arbiter, lambda config: config.update(capacity_bytes=capacity_bytes))
+        change_gpu(arbiter, lambda config: config.update(capacity_bytes=capacity_bytes))
         told = watcher.push("event", where=lambda push: push["event"]["kind"] == "probe_failed")
         assert f"{capacity_bytes} bytes of memory, {before} at the start" in told["event"]["reason"]
         assert client.acquire("waiter", GIB)["state"] == "queued"
@@ -324,7 +324,7 @@ def test_a_card_whose_capacity_changes_is_unknown_until_it_is_as_it_was(
             None,
             True,
         )
-        change_card(arbiter, lambda config: config.update(capacity_bytes=before))
+        change_gpu(arbiter, lambda config: config.update(capacity_bytes=before))
         assert client.push("granted")["lease"]["consumer"] == "waiter"
 
 
@@ -360,7 +360,7 @@ def test_status_of_a_gpu_that_does_not_answer_is_answered_with_the_age_of_its_re
     with contextlib.closing(WireClient(arbiter.endpoint)) as client:
         client.hello()
         assert client.ask("status")["ok"]
-        path = arbiter.card / fakegpu.GPU_FILE
+        path = arbiter.gpu_folder / fakegpu.GPU_FILE
         hanging = fakegpu.parse_config(path.read_text()).model_copy(
             update={"faults": fakegpu.Faults(probe="hang")}
         )

@@ -1,5 +1,5 @@
 """A lease owns a process tree: a real daemon, the real `vramctl run`, and a child that puts its
-bytes on the simulated card."""
+bytes on the simulated GPU."""
 
 import contextlib
 import signal
@@ -33,7 +33,7 @@ sys.stdin.readline()
 def quick_reader(
     make_arbiter: Callable[..., ArbiterProcess], request: pytest.FixtureRequest
 ) -> ArbiterProcess:
-    """Reads its card ten times a second, and waits for bytes for a minute, or as long as `indirect`
+    """Reads its GPU ten times a second, and waits for bytes for a minute, or as long as `indirect`
     parametrization says."""
     timeout_s = getattr(request, "param", 60)
     return make_arbiter(
@@ -43,7 +43,7 @@ def quick_reader(
 
 @pytest.fixture
 def observer(quick_reader: ArbiterProcess) -> Iterator[WireClient]:
-    """A connected client: the card is read in the background while there is one."""
+    """A connected client: the GPU is read in the background while there is one."""
     with WireClient(quick_reader.endpoint) as client:
         yield client.hello("watcher", role="observer")
 
@@ -57,7 +57,7 @@ def job(
     process = subprocess.Popen(
         [sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "5GiB", "--name", "job",
         "--",
-         *extra, sys.executable, "-c", CHILD, str(quick_reader.card), str(size)],
+         *extra, sys.executable, "-c", CHILD, str(quick_reader.gpu_folder), str(size)],
         env=quick_reader.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdin is not None
@@ -71,7 +71,7 @@ def job(
 
 
 def seen(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """The card's view as soon as it is like that. Every answer of the daemon paces the questions;
+    """The GPU's view as soon as it is like that. Every answer of the daemon paces the questions;
     raises TimeoutError."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
@@ -79,7 +79,7 @@ def seen(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[s
         if when(gpu):
             return gpu
         observer.receive(0.05)
-    raise TimeoutError(f"the card stays {gpu}")
+    raise TimeoutError(f"the GPU stays {gpu}")
 
 
 def told(observer: WireClient, *kinds: str) -> list[dict[str, Any]]:
@@ -153,7 +153,7 @@ def test_what_the_child_of_an_observer_holds_is_not_hidden(
 ) -> None:
     """This very process is connected and the child's parent."""
     with subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(quick_reader.card), str(GIB)],
+        [sys.executable, "-c", CHILD, str(quick_reader.gpu_folder), str(GIB)],
         env=quick_reader.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     ) as child:  # fmt: skip
         assert child.stdout is not None

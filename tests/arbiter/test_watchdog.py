@@ -22,7 +22,7 @@ PATIENCE_S = 60
 WATCHDOG_S = 0.6
 GIB = 1 << 30
 SMALL = 200 << 20
-"""No bytes are on the card here: a larger lease would be void at the restart, because the card is
+"""No bytes are on the GPU here: a larger lease would be void at the restart, because the GPU is
 read as empty."""
 
 Make = Callable[..., ArbiterProcess]

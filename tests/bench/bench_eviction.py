@@ -48,14 +48,14 @@ def evict(daemon: ArbiterProcess, peers: list[Peer], lag_s: float) -> tuple[floa
     peers change places."""
     holder, waiter = peers
     held = holder.acquire(5 * GIB)
-    put(daemon.card, 5 * GIB)
+    put(daemon.gpu_folder, 5 * GIB)
     holder.ready(held)
     start = time.perf_counter()
     request = waiter.want(5 * GIB)
     holder.push("revoke")
     asked = time.perf_counter()
     holder.ask("unloading", lease_id=held["lease_id"], token=held["token"])
-    back_at = give_back(daemon.card, lag_s)
+    back_at = give_back(daemon.gpu_folder, lag_s)
     released = time.perf_counter()
     goodbye = holder.letting_go(held)
     lease = waiter.push("granted")["lease"]

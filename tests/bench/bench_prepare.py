@@ -60,7 +60,7 @@ def _words(daemon: ArbiterProcess, name: str) -> list[str]:
     manifest = ROOT / "configs" / "rskills" / SKILLS[name] / "rskill.yaml"
     return [
         "vram_arbiter.sidecars", "--name", name, "--rskill", str(manifest),
-        "--device", f"fake:{daemon.card}", "--min-residency-s", "0",
+        "--device", f"fake:{daemon.gpu_folder}", "--min-residency-s", "0",
     ]  # fmt: skip
 
 
@@ -128,7 +128,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/bench/prepare.json"))
     options = parser.parse_args()
     with arbiter(SHIPPED + NO_HOLD + HOST_RAM) as daemon:
-        path = daemon.card / fakegpu.GPU_FILE
+        path = daemon.gpu_folder / fakegpu.GPU_FILE
         card = fakegpu.FakeGpuConfig.model_validate_json(path.read_text(encoding="utf-8"))
         slow = card.model_copy(update={"throttle_bytes_per_s": COPY_BYTES_PER_S})
         path.write_text(fakegpu.dump_config(slow), encoding="utf-8")

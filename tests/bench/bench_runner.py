@@ -428,7 +428,7 @@ def _sidecar(
         "--rskill",
         str(manifest),
         "--device",
-        f"fake:{daemon.card}",
+        f"fake:{daemon.gpu_folder}",
     ]
     with _program(
         daemon, name, [*words, "--min-residency-s", "0", "--footprint", FOOTPRINT]

@@ -123,7 +123,7 @@ class Host:
         self._command = [
             sys.executable, "-m", "vram_arbiter.sidecars", "--name", family.name,
             "--rskill", str(folder / "rskill.yaml"), "--configs", str(folder),
-            "--footprint", f"{count},{count},0", "--device", f"fake:{arbiter.card}",
+            "--footprint", f"{count},{count},0", "--device", f"fake:{arbiter.gpu_folder}",
             "--min-residency-s", "0", "--nice", "0", "--log-level", "warning",
         ]  # fmt: skip
         self._endpoint = f"ipc://{arbiter.runtime}/{family.name}.sock"

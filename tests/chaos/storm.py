@@ -1,5 +1,5 @@
 """Fault injection on real processes: a daemon, consumers, a user of other processes' leases,
-stowaways and attackers of the daemon's socket on one simulated card, hit at every named step of a
+stowaways and attackers of the daemon's socket on one simulated GPU, hit at every named step of a
 switch, for as long as is asked. An independent checker judges afterwards.
 
 `make chaos SECONDS=300 SEED=0`, or `python tests/chaos/storm.py --seconds 300 --seed 0 --out
@@ -51,7 +51,7 @@ STEPS = {
 }
 """Event that begins a step → the step's name."""
 ROLES = ("holder", "waiter", "bystander", "user", "daemon")
-CARD_FAULTS = ("probe fails", "probe hangs", "leak", "lag", "hidden processes", "stowaway")
+GPU_FAULTS = ("probe fails", "probe hangs", "leak", "lag", "hidden processes", "stowaway")
 DISK_FAULTS = ("disk full", "file limit", "daemon restart")
 ATTACK_FAULTS = tuple(f"attack: {attack}" for attack in ATTACKS)
 CONSUMERS = 6
@@ -126,7 +126,7 @@ class Storm:
         usage: dict[str, Any] = {}
         try:
             await asyncio.to_thread(self._arbiter.start)
-            self._set_card()
+            self._set_gpu()
             watcher = asyncio.get_running_loop().create_task(self._watch())
             for slot in range(CONSUMERS):
                 self._spawn_consumer(slot)
@@ -157,7 +157,7 @@ class Storm:
         self._arbiter.close()
 
     def _keep_evidence(self) -> None:
-        """What a finding is looked into with: the last run's log, card log, traces and the workers'
+        """What a finding is looked into with: the last run's log, GPU log, traces and the workers'
         errors."""
         kept = self._out / "evidence"
         shutil.rmtree(kept, ignore_errors=True)
@@ -165,8 +165,8 @@ class Storm:
         for path in (self._arbiter.runtime / "arbiter.log", self._arbiter.runtime / "errors.log"):
             if path.exists():
                 shutil.copy(path, kept)
-        if (log := self._arbiter.card / fakegpu.LOG_FILE).exists():
-            shutil.copy(log, kept / "card.jsonl")
+        if (log := self._arbiter.gpu_folder / fakegpu.LOG_FILE).exists():
+            shutil.copy(log, kept / "gpu.jsonl")
         with (kept / "history.jsonl").open("w") as file:
             file.writelines(json.dumps(event) + "\n" for event in self._whole_history())
         lines = read_lines(path.read_text() for path in self._traces.iterdir())
@@ -182,7 +182,7 @@ class Storm:
     # -- processes
     def _spawn(self, kind: str, name: str, what: str) -> Child:
         child = self._forks.spawn(
-            kind, name, what, str(self._arbiter.card), str(self._traces), name=name
+            kind, name, what, str(self._arbiter.gpu_folder), str(self._traces), name=name
         )
         self._children.append(child)
         return child
@@ -245,7 +245,7 @@ class Storm:
 
     # -- striking
     async def _strike_until(self, end: float) -> None:
-        """Every cell of step × role × signal in a shuffled order, again and again; faults of card
+        """Every cell of step × role × signal in a shuffled order, again and again; faults of GPU
         and disk in between."""
         while time.monotonic() < end or not self._enough():
             if not self._plan:
@@ -254,7 +254,7 @@ class Storm:
                 ]
                 self._plan += [
                     ("any time", "machine", fault)
-                    for fault in (*CARD_FAULTS, *DISK_FAULTS, *ATTACK_FAULTS) * 2
+                    for fault in (*GPU_FAULTS, *DISK_FAULTS, *ATTACK_FAULTS) * 2
                 ]
                 self._random.shuffle(self._plan)
             step, role, how = self._plan.pop()
@@ -401,8 +401,8 @@ class Storm:
                     "hidden processes": {"faults": {"hide_processes": True}},
                     "lag": {"release_lag_s": 0.7},
                 }
-                await asyncio.to_thread(self._set_card, **settings[fault])
-                self._later(pause_s, self._mend_card)
+                await asyncio.to_thread(self._set_gpu, **settings[fault])
+                self._later(pause_s, self._mend_gpu)
 
     async def _strike_disk(self, fault: str, pause_s: float) -> None:
         if self._disk_is_full or self._daemon_busy.locked():
@@ -429,14 +429,14 @@ class Storm:
             _, hard = resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE)
             resource.prlimit(self._arbiter.pid, resource.RLIMIT_FSIZE, (hard, hard))
 
-    def _mend_card(self) -> None:
-        self._start(asyncio.to_thread(self._set_card))
+    def _mend_gpu(self) -> None:
+        self._start(asyncio.to_thread(self._set_gpu))
 
-    def _set_card(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
-        """Not on the loop: whoever holds the card's lock may have been stopped, and the loop lets
+    def _set_gpu(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
+        """Not on the loop: whoever holds the GPU's lock may have been stopped, and the loop lets
         it go on."""
-        path = self._arbiter.card / fakegpu.GPU_FILE
-        with locked(self._arbiter.card):
+        path = self._arbiter.gpu_folder / fakegpu.GPU_FILE
+        with locked(self._arbiter.gpu_folder):
             config = fakegpu.parse_config(path.read_text())
             changed = config.model_copy(
                 update={"release_lag_s": release_lag_s, "faults": fakegpu.Faults(**(faults or {}))}
@@ -473,7 +473,7 @@ class Storm:
             go_on()
         self._empty_disk()
         await asyncio.gather(*self._tasks)
-        await asyncio.to_thread(self._set_card)
+        await asyncio.to_thread(self._set_gpu)
         for stranger in self._strangers:
             stranger.hang_up()
         everybody = [*self._slots.values(), *self._strangers, *([self._user] if self._user else [])]
@@ -520,9 +520,9 @@ class Storm:
         return {"daemon_fds": fds, "daemon_rss_kib": int(rss), "clients": status.get("clients")}
 
     def _report(self, seconds: float, usage: dict[str, Any]) -> dict[str, Any]:
-        log = (self._arbiter.card / fakegpu.LOG_FILE).read_text()
+        log = (self._arbiter.gpu_folder / fakegpu.LOG_FILE).read_text()
         traces = read_lines(path.read_text() for path in self._traces.iterdir())
-        card = check_log(log)
+        gpu = check_log(log)
         story = check_leases(
             log,
             self._whole_history(),
@@ -533,7 +533,7 @@ class Storm:
         )
         found = [
             *self._findings,
-            *(Finding("card", 0.0, problem) for problem in card.problems),
+            *(Finding("gpu", 0.0, problem) for problem in gpu.problems),
             *story.findings,
         ]
         return {
@@ -550,13 +550,13 @@ class Storm:
             },
             "disk": "tmpfs and file limit" if self._mounted else "file limit only",
             **_figures(story),
-            "card": {
-                "changes": card.lines,
-                "processes": card.processes,
-                "peak_bytes": card.peak_bytes,
-                "capacity_bytes": card.capacity_bytes,
-                "refused": card.oom_events,
-                "torn_lines": card.torn_lines,
+            "gpu": {
+                "changes": gpu.lines,
+                "processes": gpu.processes,
+                "peak_bytes": gpu.peak_bytes,
+                "capacity_bytes": gpu.capacity_bytes,
+                "refused": gpu.oom_events,
+                "torn_lines": gpu.torn_lines,
             },
             "after": usage,
         }

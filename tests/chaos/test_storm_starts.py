@@ -14,7 +14,7 @@ class Arbiter:
     """Starts from the n-th try on, and may see the disk emptied while it fails."""
 
     def __init__(self, runtime: Path) -> None:
-        self.runtime, self.state, self.card = runtime, runtime / "state", runtime / "card"
+        self.runtime, self.state, self.gpu_folder = runtime, runtime / "state", runtime / "gpu"
         self.environ: dict[str, str] = {}
         self.pid = 2**22  # nobody has it
         self.starts = 0

@@ -58,12 +58,12 @@ class Trace:
 class Consumer:
     """One process with one lease at a time."""
 
-    def __init__(self, name: str, seed: str, card: Path, trace: Trace) -> None:
+    def __init__(self, name: str, seed: str, gpu_folder: Path, trace: Trace) -> None:
         self._name = name
         self._random = random.Random(f"{name} {seed}")
         self._trace = trace
         self._residue = self._random.choice([128, 256, 450]) * MIB
-        self._memory = FakeMemory(card, name, self._residue)
+        self._memory = FakeMemory(gpu_folder, name, self._residue)
         self._stopping = asyncio.Event()
 
     async def run(self) -> None:
@@ -164,7 +164,7 @@ class Consumer:
         self._trace.say("ready", lease_id=lease.lease_id)
 
     async def _allocate(self, lease: AsyncLease, size: int) -> Block:
-        """Off the loop, as real loaders do: the card's lock may be held by a process that was
+        """Off the loop, as real loaders do: the GPU's lock may be held by a process that was
         stopped."""
         return await asyncio.to_thread(self._memory.allocate, lease.lease_id, size)
 
@@ -203,10 +203,10 @@ class Consumer:
         await asyncio.sleep(self._random.uniform(longest_s / 3, longest_s))
 
 
-async def take_bytes(card: Path, trace: Trace, size: int) -> None:
+async def take_bytes(gpu_folder: Path, trace: Trace, size: int) -> None:
     """A stowaway: allocates without a lease, and exits when it is told to or its standard input
     ends."""
-    memory = FakeMemory(card, "stowaway", 64 * MIB)
+    memory = FakeMemory(gpu_folder, "stowaway", 64 * MIB)
     try:
         memory.allocate("stowaway", size)
         trace.say("took", bytes=size)
@@ -244,17 +244,17 @@ async def lines() -> asyncio.StreamReader:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`consumer NAME SEED CARD TRACES`, `stowaway NAME BYTES CARD TRACES`, `user NAME - CARD
-    TRACES` or `attacker NAME ATTACK:SECONDS CARD TRACES`."""
-    kind, name, what, card, traces = arguments
+    """`consumer NAME SEED GPU_FOLDER TRACES`, `stowaway NAME BYTES GPU_FOLDER TRACES`,
+    `user NAME - GPU_FOLDER TRACES` or `attacker NAME ATTACK:SECONDS GPU_FOLDER TRACES`."""
+    kind, name, what, gpu_folder, traces = arguments
     trace = Trace(Path(traces) / f"{name}.jsonl", name)
     trace.say("born", kind=kind)
     try:
         match kind:
             case "consumer":
-                asyncio.run(Consumer(name, what, Path(card), trace).run())
+                asyncio.run(Consumer(name, what, Path(gpu_folder), trace).run())
             case "stowaway":
-                asyncio.run(take_bytes(Path(card), trace, int(what)))
+                asyncio.run(take_bytes(Path(gpu_folder), trace, int(what)))
             case "attacker":
                 attack, seconds = what.split(":")
                 endpoint = arbiter_endpoint(os.environ, os.getuid())

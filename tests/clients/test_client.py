@@ -454,7 +454,7 @@ async def test_subscribers_see_events_in_order(
             await following
         kinds = [
             kind for kind in kinds if kind != "queued"
-        ]  # where the first reading of the card is still under way
+        ]  # where the first reading of the GPU is still under way
         assert kinds == ["granted", "ready", "switch", "released"]
         assert [event["kind"] for event in (await client.history(kinds=["granted"])).events] == [
             "granted"
@@ -573,7 +573,7 @@ async def test_leases_and_uses_survive_a_kill_of_the_daemon(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
 ) -> None:
     arbiter = make_arbiter().start()
-    memory = FakeMemory(arbiter.card, "a", 0)
+    memory = FakeMemory(arbiter.gpu_folder, "a", 0)
     unloaded = anyio.Event()
 
     async def unload() -> None:

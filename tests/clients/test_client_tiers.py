@@ -144,7 +144,7 @@ async def test_a_standby_lease_survives_the_daemon(
     model = Model()
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
-        memory = FakeMemory(arbiter_daemon.card, "t", 0)
+        memory = FakeMemory(arbiter_daemon.gpu_folder, "t", 0)
         policy = await client.acquire(spec("policy", 4), WAIT_S)
         block = memory.allocate("policy", 4 * GIB)
         await policy.ready()
@@ -274,7 +274,7 @@ def five_gib() -> Footprint:
     return Footprint(load_peak_bytes=5 * GIB, steady_bytes=5 * GIB, residue_bytes=0)
 
 
-async def test_a_resize_ends_with_the_stay_on_the_card(
+async def test_a_resize_ends_with_the_stay_on_the_gpu(
     arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
 ) -> None:
     """Regression: what a lease that was revoked had waited for was dropped, and its `resize`
@@ -299,7 +299,7 @@ async def test_a_resize_that_waits_outlives_the_daemon(
 ) -> None:
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         cache = await client.acquire(spec("cache", 2))
-        memory = FakeMemory(arbiter_daemon.card, "t", 0)
+        memory = FakeMemory(arbiter_daemon.gpu_folder, "t", 0)
         memory.allocate("cache", 2 * GIB)
         await cache.ready()
         busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)

@@ -1,7 +1,7 @@
-"""A real consumer for the kill tests: one process, one lease, bytes on the simulated card. Not a
+"""A real consumer for the kill tests: one process, one lease, bytes on the simulated GPU. Not a
 test module.
 
-Usage: consumer.py NAME BYTES CARD_FOLDER RESIDUE_BYTES. Prints one JSON line per thing that
+Usage: consumer.py NAME BYTES GPU_FOLDER RESIDUE_BYTES. Prints one JSON line per thing that
 happens; commands come on stdin: `use`, `end`. Steps at which it stops and waits to be killed are
 given by VRAM_TEST_PAUSE (comma-separated: `loading`, `unloading`).
 """
@@ -39,8 +39,8 @@ async def commands() -> asyncio.StreamReader:
     return reader
 
 
-async def main(name: str, size: int, card: Path, residue: int) -> None:
-    memory = FakeMemory(card, name, residue)
+async def main(name: str, size: int, gpu_folder: Path, residue: int) -> None:
+    memory = FakeMemory(gpu_folder, name, residue)
     blocks: list[Block] = []
 
     async def unload() -> None:

@@ -1,4 +1,4 @@
-"""A sidecar process for the episodes: a real host, lease and simulated card around a model that
+"""A sidecar process for the episodes: a real host, lease and simulated GPU around a model that
 looks at nothing and holds the arm still.
 
 `python episode_sidecar.py FOLDER [flags of vram-sidecar]`. While a file `hold` is in FOLDER, a call

@@ -1,7 +1,7 @@
 """A consumer with the habits that users of the neighbours complain about. Not a test module; run by
 `tests.support.forkserver`.
 
-Arguments: NAME BYTES CARD_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`,
+Arguments: NAME BYTES GPU_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`,
 `gone`. Habits: `slow` loads when it is told `go`, `stuck` never ends its unloading, `deaf` ignores
 SIGTERM, `again` asks for its lease again in the very moment it has lost it, `spec` goes into its
 lease.
@@ -25,12 +25,12 @@ RESIDUE = 256 << 20
 TTL_S = 120.0  # one that is stopped for a while, on a busy machine, has its lease still
 
 
-async def live(name: str, size: int, card: Path, habits: dict[str, Any]) -> None:
+async def live(name: str, size: int, gpu_folder: Path, habits: dict[str, Any]) -> None:
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(
         lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
     )
-    memory = FakeMemory(card, name, RESIDUE)
+    memory = FakeMemory(gpu_folder, name, RESIDUE)
     blocks: list[Block] = []
 
     async def unload() -> None:
@@ -66,8 +66,8 @@ async def live(name: str, size: int, card: Path, habits: dict[str, Any]) -> None
 
 
 def main(arguments: Sequence[str]) -> None:
-    name, size, card, habits = arguments
+    name, size, gpu_folder, habits = arguments
     wanted = json.loads(habits)
     if wanted.get("deaf"):
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    asyncio.run(live(name, int(size), Path(card), wanted))
+    asyncio.run(live(name, int(size), Path(gpu_folder), wanted))

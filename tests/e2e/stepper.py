@@ -1,7 +1,7 @@
 """A consumer that stops at every step of its life and goes on when it is told `go`. Not a test
 module; run by `tests.support.forkserver`.
 
-Arguments: NAME BYTES CARD_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`,
+Arguments: NAME BYTES GPU_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`,
 `unloading`, `released`; it waits for `go` after `loading`, `in_use` and `unloading`. `use` begins a
 use, which the next `go` ends.
 """
@@ -21,7 +21,7 @@ from vram_arbiter.sidecars.device.fake import FakeMemory
 TTL_S = 120.0
 
 
-async def live(name: str, size: int, card: Path, residue: int) -> None:
+async def live(name: str, size: int, gpu_folder: Path, residue: int) -> None:
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(
         lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
@@ -37,7 +37,7 @@ async def live(name: str, size: int, card: Path, residue: int) -> None:
             pass
 
     listening = asyncio.ensure_future(listen())
-    memory = FakeMemory(card, name, residue)
+    memory = FakeMemory(gpu_folder, name, residue)
     block = None
 
     async def unload() -> None:
@@ -77,5 +77,5 @@ async def live(name: str, size: int, card: Path, residue: int) -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    name, size, card, residue = arguments
-    asyncio.run(live(name, int(size), Path(card), int(residue)))
+    name, size, gpu_folder, residue = arguments
+    asyncio.run(live(name, int(size), Path(gpu_folder), int(residue)))

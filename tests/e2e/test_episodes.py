@@ -1,9 +1,9 @@
-"""Episodes: after every goal's end, however it came, the detector is back on the card by itself,
+"""Episodes: after every goal's end, however it came, the detector is back on the GPU by itself,
 and never before.
 
 Real processes: arbiter, detector on standby, policy that lets go when idle, runner with the
 simulator, reasoner. Nobody sequences anything: each is a plain client. The witnesses are the
-arbiter's history and the card's own log, which an independent checker reads.
+arbiter's history and the GPU's own log, which an independent checker reads.
 """
 
 import asyncio
@@ -114,7 +114,7 @@ class Programs:
         if not self.runs(name):
             arguments = [
                 str(folder), "--name", name, "--rskill", f"{folder}/rskill.yaml",
-                "--device", f"fake:{self.arbiter.card}",
+                "--device", f"fake:{self.arbiter.gpu_folder}",
                 "--footprint", f"{size},{size},{CONTEXT_BYTES}", *flags,
             ]  # fmt: skip
             environ = self.arbiter.environ | {"OMP_NUM_THREADS": "1"}
@@ -162,7 +162,7 @@ class Programs:
         return self.wrong_on_the_gpu()
 
     def wrong_on_the_gpu(self) -> list[str]:
-        return check_log((self.arbiter.card / "log.jsonl").read_text()).problems
+        return check_log((self.arbiter.gpu_folder / "log.jsonl").read_text()).problems
 
     def close(self) -> None:
         for process in reversed(self.running.values()):
@@ -181,7 +181,7 @@ class Programs:
 
 class Stage:
     """One test's clients, and the history from its beginning on. It opens with the detector on the
-    card and nobody else."""
+    GPU and nobody else."""
 
     def __init__(self, episode_programs: Programs) -> None:
         self.programs = episode_programs
@@ -375,7 +375,7 @@ async def rejected(stage: Stage) -> None:
 
 
 async def past_its_deadline(stage: Stage) -> None:
-    """The result is out, but a call of the model still runs: its bytes are on the card, so the
+    """The result is out, but a call of the model still runs: its bytes are on the GPU, so the
     detector stays away until they are measured gone."""
     async with PolicyClient(
         f"ipc://{stage.programs.runtime}/policy.sock", connect_timeout_s=BOOT_S
@@ -390,8 +390,8 @@ async def past_its_deadline(stage: Stage) -> None:
     assert (stage.programs.runtime / "policy/holding").exists()
     assert (await stage.leases())["detector"] == "standby"
     assert stage.detector_was_away()
-    (card,) = (await stage.arbiter.status()).gpus
-    assert card.charged_bytes >= POLICY_BYTES
+    (gpu,) = (await stage.arbiter.status()).gpus
+    assert gpu.charged_bytes >= POLICY_BYTES
     stage.programs.tell("hold", False)
     await stage.detector_is_back()
 
@@ -418,12 +418,12 @@ async def load_failed(stage: Stage) -> None:
 
 
 async def out_of_memory(stage: Stage) -> None:
-    """Somebody without a lease fills the card while the policy loads: the goal hears of it by type,
+    """Somebody without a lease fills the GPU while the policy loads: the goal hears of it by type,
     and the detector waits for the room."""
     stage.programs.tell("slow_load", True)
     goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
     await stage.until("granted", "policy")
-    stowaway = stage.programs.arbiter.card / "browser.json"
+    stowaway = stage.programs.arbiter.gpu_folder / "browser.json"
     fresh = stowaway.with_name(".new")
     fresh.write_text(json.dumps({"pid": os.getpid(), "name": "browser", "allocated_bytes": 6 * GB}))
     fresh.rename(stowaway)
@@ -533,7 +533,7 @@ async def called_back(stage: Stage) -> None:
 def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
     episode_programs: Programs,
 ) -> None:
-    """Regression: the detector left the card for a goal that had been canceled, and stayed away."""
+    """Regression: the detector left the GPU for a goal that had been canceled, and stayed away."""
     try:
         assert episode_programs.play(called_back) == []
     finally:

@@ -1,8 +1,8 @@
 """`kill -9` of a waiter, of the daemon and of both sides in the middle of a switch: real processes,
 sockets and files. `test_steps` kills each side at each step.
 
-Every test ends with the independent checker over the card's own allocation log: no instant with
-more bytes than the card has.
+Every test ends with the independent checker over the GPU's own allocation log: no instant with
+more bytes than the GPU has.
 """
 
 import asyncio
@@ -64,13 +64,13 @@ class Child:
 
 
 class Box:
-    """One runtime folder with a card, an arbiter and any number of consumers."""
+    """One runtime folder with a GPU, an arbiter and any number of consumers."""
 
     def __init__(self, runtime: Path) -> None:
-        self.card = runtime / "card"
+        self.gpu_folder = runtime / "gpu"
         self.runtime = runtime
         self.children: list[Child] = []
-        make_gpu(self.card, CAPACITY, release_lag_s=LAG_S)
+        make_gpu(self.gpu_folder, CAPACITY, release_lag_s=LAG_S)
 
     async def _start(self, *arguments: str, pause: str = "") -> Child:
         environ = os.environ | {RUNTIME_VARIABLE: str(self.runtime), "VRAM_TEST_PAUSE": pause}
@@ -93,14 +93,19 @@ class Box:
             "-m",
             "vram_arbiter.arbiter",
             "--gpu",
-            f"fake:{self.card}",
+            f"fake:{self.gpu_folder}",
             "--state-dir",
             str(self.runtime / "state"),
         )
 
     async def consumer(self, name: str, gib: float, pause: str = "") -> Child:
         return await self._start(
-            str(CONSUMER), name, str(int(gib * GIB)), str(self.card), str(RESIDUE), pause=pause
+            str(CONSUMER),
+            name,
+            str(int(gib * GIB)),
+            str(self.gpu_folder),
+            str(RESIDUE),
+            pause=pause,
         )
 
     @contextlib.asynccontextmanager
@@ -128,7 +133,7 @@ class Box:
             return [dict(event) for event in (await client.history()).events]
 
     def log(self) -> str:
-        return (self.card / "log.jsonl").read_text()
+        return (self.gpu_folder / "log.jsonl").read_text()
 
     def check(self) -> None:
         report = check_log(self.log())
@@ -166,7 +171,7 @@ def consumers(status: dict[str, Any]) -> dict[str, str]:
 
 
 def bytes_of(log: str, name: str, before_first_alloc_of: str) -> int:
-    """Bytes that `name` had on the card when the other one put its first bytes there."""
+    """Bytes that `name` had on the GPU when the other one put its first bytes there."""
     held = 0
     for line in map(json.loads, log.splitlines()):
         if line["name"] == before_first_alloc_of and line["op"] == "alloc":

@@ -1,5 +1,5 @@
-"""What users of the neighbours complain about, where the complaint is about processes, cards and
-what an operator is shown: a real daemon, real programs, a simulated card. Numbers are those of the
+"""What users of the neighbours complain about, where the complaint is about processes, GPUs and
+what an operator is shown: a real daemon, real programs, a simulated GPU. Numbers are those of the
 list of complaints; docs/explanation/neighbours.md is the table.
 """
 
@@ -40,7 +40,7 @@ sys.stdin.readline()
 
 
 class Stage:
-    """One daemon, one card and one fork server for all tests of this file."""
+    """One daemon, one GPU and one fork server for all tests of this file."""
 
     def __init__(self) -> None:
         self.arbiter = ArbiterProcess(config=CONFIG, prepared=True).start()
@@ -51,7 +51,7 @@ class Stage:
         self.watcher: WireClient | None = None
 
     def configure(self, **changes: Any) -> None:
-        path = self.arbiter.card / fakegpu.GPU_FILE
+        path = self.arbiter.gpu_folder / fakegpu.GPU_FILE
         config = fakegpu.parse_config(path.read_text()).model_copy(update=changes)
         temporary = path.with_name(".new")
         temporary.write_text(fakegpu.dump_config(config))
@@ -76,7 +76,7 @@ class Stage:
 
     def spawn(self, name: str, gib: float, **habits: Any) -> Child:
         child = self.forks.spawn(
-            name, str(int(gib * GIB)), str(self.arbiter.card), json.dumps(habits), name=name
+            name, str(int(gib * GIB)), str(self.arbiter.gpu_folder), json.dumps(habits), name=name
         )
         self.children.append(child)
         return child
@@ -95,15 +95,15 @@ class Stage:
         return done.stdout + done.stderr
 
     def used_when(self, name: str) -> int:
-        """Bytes on the card, of everybody, in the moment before `name` touched it first."""
+        """Bytes on the GPU, of everybody, in the moment before `name` touched it first."""
         used = 0
         for line in map(
-            json.loads, (self.arbiter.card / fakegpu.LOG_FILE).read_text().splitlines()
+            json.loads, (self.arbiter.gpu_folder / fakegpu.LOG_FILE).read_text().splitlines()
         ):
             if line["name"] == name:
                 return used
             used = line["used_after"]
-        raise AssertionError(f"{name} never touched the card")
+        raise AssertionError(f"{name} never touched the GPU")
 
     def end_case(self) -> None:
         """Everybody dies; nothing of them stays with the daemon."""
@@ -113,7 +113,7 @@ class Stage:
         self.configure(faults=fakegpu.Faults())
         watcher = self.watch()
         while not self._clean(watcher.ask("status")):
-            watcher.receive(0.02)  # the next event; the card is being read meanwhile
+            watcher.receive(0.02)  # the next event; the GPU is being read meanwhile
 
     @staticmethod
     def _clean(status: dict[str, Any]) -> bool:
@@ -126,7 +126,7 @@ class Stage:
         if self.watcher is not None:
             self.watcher.close()
         self.forks.close()
-        log = (self.arbiter.card / fakegpu.LOG_FILE).read_text()
+        log = (self.arbiter.gpu_folder / fakegpu.LOG_FILE).read_text()
         self.arbiter.close()
         return log
 
@@ -172,7 +172,7 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
     stage.configure(release_lag_s=0.15)
 
 
-def test_1_while_the_card_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
+def test_1_while_the_gpu_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
     """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print
     nothing."""
     asked_until(lambda: stage.vramctl("status"), "free 7.71 GiB")
@@ -247,7 +247,7 @@ def test_11_a_game_that_starts_is_seen_named_and_makes_idle_models_leave(stage: 
     idle = stage.spawn("idle-11", 5)
     idle.until("ready")
     with subprocess.Popen(
-        [sys.executable, "-c", GAME, str(stage.arbiter.card), str(int(2.9 * GIB))],
+        [sys.executable, "-c", GAME, str(stage.arbiter.gpu_folder), str(int(2.9 * GIB))],
         env=stage.arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     ) as game:  # fmt: skip
         seen = stage.event("stowaway", pid=game.pid)
@@ -262,8 +262,8 @@ def test_11_a_game_that_starts_is_seen_named_and_makes_idle_models_leave(stage: 
     waiter.until("ready")
 
 
-def test_12_the_running_manager_has_no_bytes_on_the_card_and_no_cuda_in_it(stage: Stage) -> None:
-    """llama.cpp#20582, #21692: 120-550 MB of every card, for a router that only asked how much is
+def test_12_the_running_manager_has_no_bytes_on_the_gpu_and_no_cuda_in_it(stage: Stage) -> None:
+    """llama.cpp#20582, #21692: 120-550 MB of every GPU, for a router that only asked how much is
     free."""
     stage.spawn("user-12", 1).until("ready")
     maps = Path(f"/proc/{stage.arbiter.pid}/maps").read_text()
@@ -273,21 +273,23 @@ def test_12_the_running_manager_has_no_bytes_on_the_card_and_no_cuda_in_it(stage
     assert stage.arbiter.pid not in [process["pid"] for process in processes]
 
 
-def test_13_a_second_authority_on_the_same_card_does_not_give_away_what_the_first_one_gave(
+def test_13_a_second_authority_on_the_same_gpu_does_not_give_away_what_the_first_one_gave(
     stage: Stage,
 ) -> None:
     """taOS#859: two VRAM authorities. Each arbiter sees the other's holders: bytes without a lease
     of its own."""
     holder = stage.spawn("holder-13", 5)
     holder.until("ready")
-    other = ArbiterProcess(gpu=f"fake:{stage.arbiter.card}", config=CONFIG, prepared=True).start()
+    other = ArbiterProcess(
+        gpu=f"fake:{stage.arbiter.gpu_folder}", config=CONFIG, prepared=True
+    ).start()
     try:
         with WireClient(other.endpoint) as client:
             assert client.hello("elsewhere").acquire("elsewhere", 5 * GIB)["state"] == "queued"
             while not (seen := client.ask("status"))["gpus"][0]["stowaway_bytes"]:
                 client.receive(
                     0.02
-                )  # it has just started: its first reading of the card may be under way
+                )  # it has just started: its first reading of the GPU may be under way
             assert seen["gpus"][0]["stowaway_bytes"] == 5 * GIB
             assert [lease["state"] for lease in seen["leases"]] == ["queued"]
     finally:
@@ -316,7 +318,7 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     waiter.until("ready")
 
 
-def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_card_for_each_start(
+def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_gpu_for_each_start(
     stage: Stage,
 ) -> None:
     """A supervisor starts it again at once, every time. The model that works stays, and the program

@@ -51,7 +51,7 @@ class Service(ArbiterProcess):
         return f"ipc://{self.runtime}/run/arbiter.sock"
 
     @property
-    def card(self) -> Path:
+    def gpu_folder(self) -> Path:
         return self.runtime / "run" / "fakegpu"
 
     @property
@@ -112,11 +112,11 @@ def test_a_mistake_in_the_configuration_folder_ends_it_for_good(service: Service
 
 # -- a manager stops, restarts and kills it
 class Holder:
-    """A real consumer process with a lease and bytes on the card."""
+    """A real consumer process with a lease and bytes on the GPU."""
 
     def __init__(self, service: Service) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), str(service.card),
+            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), str(service.gpu_folder),
             str(GIB // 2)],
             env=service.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
         )  # fmt: skip

@@ -59,7 +59,9 @@ class Stage:
         return event
 
     def spawn(self, name: str) -> Child:
-        child = self.forks.spawn(name, str(SIZE), str(self.arbiter.card), str(RESIDUE), name=name)
+        child = self.forks.spawn(
+            name, str(SIZE), str(self.arbiter.gpu_folder), str(RESIDUE), name=name
+        )
         self.children.append(child)
         return child
 
@@ -69,7 +71,7 @@ class Stage:
         self.watch()
 
     def log(self) -> str:
-        return (self.arbiter.card / fakegpu.LOG_FILE).read_text()
+        return (self.arbiter.gpu_folder / fakegpu.LOG_FILE).read_text()
 
     def end_case(self) -> None:
         """Everybody dies; nothing of them stays with the daemon."""
@@ -78,7 +80,7 @@ class Stage:
         self.children.clear()
         watcher = self.watch()
         while not self._clean(watcher.ask("status")):
-            watcher.receive(0.02)  # the next event; the card is being read meanwhile
+            watcher.receive(0.02)  # the next event; the GPU is being read meanwhile
 
     @staticmethod
     def _clean(status: dict[str, Any]) -> bool:
@@ -89,7 +91,7 @@ class Stage:
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
     arbiter = ArbiterProcess(config="lease: {fence_grace_s: 1.0}\n", prepared=True).start()
-    set_lag(arbiter.card)
+    set_lag(arbiter.gpu_folder)
     forks = ForkServer(
         Path(__file__).with_name("stepper.py"), arbiter.environ, arbiter.runtime / "errors.log"
     )
@@ -105,8 +107,8 @@ def stage() -> Iterator[Stage]:
     assert report.peak_bytes <= 8 * GIB
 
 
-def set_lag(card: Path) -> None:
-    path = card / fakegpu.GPU_FILE
+def set_lag(gpu_folder: Path) -> None:
+    path = gpu_folder / fakegpu.GPU_FILE
     config = fakegpu.parse_config(path.read_text()).model_copy(update={"release_lag_s": LAG_S})
     temporary = path.with_name(".new")
     temporary.write_text(fakegpu.dump_config(config))
@@ -156,7 +158,7 @@ def strike(stage: Stage, target: Child | None, how: str) -> Callable[[], None]:
 
 
 def bytes_beside(log: str, holder: str, newcomer: str) -> int:
-    """Bytes of the holder when the newcomer put its first ones on the card."""
+    """Bytes of the holder when the newcomer put its first ones on the GPU."""
     held = 0
     for line in map(json.loads, log.splitlines()):
         if line["name"] == newcomer and line["op"] in ("context", "alloc"):

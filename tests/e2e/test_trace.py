@@ -3,7 +3,7 @@ the robot.
 
 Real programs (arbiter, two sidecars, the simulator's runner, reasoner) export by OTLP to a
 collector in the test. The language model decides twice: look for the cube, so that the detector has
-the card; then grab, so that it has to leave. Once the arm has moved, everything is ended by
+the GPU; then grab, so that it has to leave. Once the arm has moved, everything is ended by
 SIGTERM, which has to lose nothing.
 """
 
@@ -155,7 +155,7 @@ def run_programs(
 ) -> list[int]:
     """Start the programs, let the arm move, end them. Their exit codes, the last started first."""
     (folder / "rskill.yaml").write_text(DETECTOR_MANIFEST)
-    device = ["--device", f"fake:{arbiter.card}", "--min-residency-s", "0"]
+    device = ["--device", f"fake:{arbiter.gpu_folder}", "--min-residency-s", "0"]
     detector = [
         "--name",
         "detector",

@@ -62,7 +62,7 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
     Path("act-grab").mkdir()
     Path("act-grab/rskill.yaml").write_text(manifest)
     environ = arbiter_daemon.environ | {
-        "VRAM_FAKE_GPU": str(arbiter_daemon.card),
+        "VRAM_FAKE_GPU": str(arbiter_daemon.gpu_folder),
         "OMP_NUM_THREADS": "1",
         "HF_HUB_OFFLINE": "1",
         "HF_HOME": str(tmp_path / "hub"),
@@ -112,7 +112,7 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
     assert cell["mean_steps"] > 0
     history = vramctl("history", "-c", "grab", environ=environ).stdout
     assert "use_began" in history, history
-    used = check_log((arbiter_daemon.card / "log.jsonl").read_text())
+    used = check_log((arbiter_daemon.gpu_folder / "log.jsonl").read_text())
     assert (used.problems, used.peak_bytes >= 0.6 * GB) == ([], True)
 
 

@@ -191,7 +191,7 @@ def kind(request: pytest.FixtureRequest) -> str:
 def machine(kind: str, make_arbiter: Callable[..., ArbiterProcess]) -> Iterator[Machine]:
     if kind == "fake":
         arbiter = make_arbiter().start()
-        made = Machine(kind, arbiter, FakeGpu(arbiter.card), 32 * MIB)
+        made = Machine(kind, arbiter, FakeGpu(arbiter.gpu_folder), 32 * MIB)
     else:
         made = Machine(kind, make_arbiter(gpu="nvml").start(), NvmlGpu(0), 512 * MIB)
     yield made

@@ -194,7 +194,7 @@ def test_the_watchdog_is_on_and_the_daemon_speaks_for_itself() -> None:
         )
 
 
-def test_other_processes_stay_visible_and_the_cards_reachable() -> None:
+def test_other_processes_stay_visible_and_the_gpus_reachable() -> None:
     found = unit("vram-arbiter.service")
     assert found["Service", "ProtectProc"] == ["default"]
     assert found["Service", "ProcSubset"] == ["all"]

@@ -1,6 +1,6 @@
-"""No answer of a language model makes a holder in use leave, or fills the card past its capacity.
+"""No answer of a language model makes a holder in use leave, or fills the GPU past its capacity.
 
-Real: decoding, nudges, palette, loop, tools, and the arbiter's core on a simulated card of 8 GiB
+Real: decoding, nudges, palette, loop, tools, and the arbiter's core on a simulated GPU of 8 GiB
 whose memory comes back late. Hypothesis plays the model, and other people who use the same robot
 beside it. The processes between (runner, sidecars) are played as the client library behaves: they
 load when granted, leave when asked and idle, and never in the middle of a use.
@@ -49,7 +49,7 @@ class World:
 
     def __init__(self) -> None:
         self.driver = CoreDriver(CAPACITY)
-        self.driver.card.lag_s = 0.6
+        self.driver.device.lag_s = 0.6
         self.sidecars = {name: self.driver.consumer(name) for name in SIZES}
         self.runner = self.driver.consumer("runner")
         self.leases: dict[str, LeaseId] = {}
@@ -61,7 +61,7 @@ class World:
 
     def _judge(self) -> None:
         """After every event, and independent of the core's own invariants."""
-        shown = sum(self.driver.card.shown(self.driver.now).values())
+        shown = sum(self.driver.device.shown(self.driver.now).values())
         assert shown <= CAPACITY, f"out of memory: {shown} of {CAPACITY} bytes"
         for lease in self.uses:
             state = self.driver.state(lease)
@@ -163,7 +163,7 @@ class Goal:
 
 class Runner:
     """Executes the policy as uses of its lease; whatever else it is told moves nothing on the
-    card.
+    GPU.
     """
 
     def __init__(self, world: World) -> None:
@@ -377,7 +377,7 @@ BESIDE = st.sampled_from(["", "", "", "goal", "long goal", "look", "wait"])
 
 @settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.lists(st.tuples(st.one_of(GOOD, GOOD, GOOD, ANSWERS), BESIDE), min_size=1, max_size=14))
-def test_no_answer_evicts_a_holder_in_use_or_fills_the_card(
+def test_no_answer_evicts_a_holder_in_use_or_fills_the_gpu(
     answers: list[tuple[Answer, str]],
 ) -> None:
     world, results, runner = _play(list(answers))

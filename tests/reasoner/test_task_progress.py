@@ -166,7 +166,7 @@ def test_an_opinion_is_said_with_what_it_is_worth(a_runner: Any, a_sidecar: Any)
     assert 1 <= len(asked[0]["images"]) <= SHOWN_MAX
 
 
-def test_pictures_that_waited_for_the_card_are_taken_anew(a_runner: Any, a_sidecar: Any) -> None:
+def test_pictures_that_waited_for_the_gpu_are_taken_anew(a_runner: Any, a_sidecar: Any) -> None:
     def late(runner: Any, sidecar: Any) -> None:
         sidecar.late = 1
         sidecar.judgement |= {"progress": [0.5], "success": []}

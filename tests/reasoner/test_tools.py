@@ -134,7 +134,7 @@ def test_a_goal_whose_acceptance_was_not_heard_is_cancelled_by_its_name(a_runner
     assert play(story)
 
 
-def test_patience_counts_motion_and_not_the_wait_for_the_card(a_runner: Any) -> None:
+def test_patience_counts_motion_and_not_the_wait_for_the_gpu(a_runner: Any) -> None:
     async def story(patient: ExecuteRskill, feed: Callable[[Any], Any]) -> Any:
         async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
             doing = asyncio.create_task(Tools(client, None, None)(patient))
@@ -352,7 +352,7 @@ def test_a_place_that_is_always_of_long_ago_is_none(
 
 @pytest.mark.parametrize("call", [LOOK, ASK])
 @pytest.mark.parametrize("late", [0, LOOKS_MAX - 1, LOOKS_MAX])
-def test_a_picture_that_waited_for_the_card_is_not_looked_at_and_a_new_one_is(
+def test_a_picture_that_waited_for_the_gpu_is_not_looked_at_and_a_new_one_is(
     a_runner: Any, a_sidecar: Any, call: Any, late: int
 ) -> None:
     """Regression: only the detector's was looked at again, by the time that the answer took."""
@@ -378,7 +378,7 @@ def test_a_picture_that_waited_for_the_card_is_not_looked_at_and_a_new_one_is(
 def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Regression: a detector that waited two minutes for the card told where the thing had stood
+    """Regression: a detector that waited two minutes for the GPU told where the thing had stood
     when it was asked.
     """
     now = [100.0]
@@ -621,7 +621,7 @@ def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(
 def test_a_model_whose_licence_is_barred_is_not_loaded_either(
     a_runner: Any, a_sidecar: Any
 ) -> None:
-    """Regression: it was not asked, but `lifecycle_transition` put it on the card."""
+    """Regression: it was not asked, but `lifecycle_transition` put it on the GPU."""
 
     async def story() -> tuple[str, str, list[str]]:
         async with (

@@ -40,7 +40,7 @@ class GrabPrograms:
             "--rskill",
             str(SKILL),
             "--device",
-            f"fake:{arbiter.card}",
+            f"fake:{arbiter.gpu_folder}",
         ]
         with self.log.open("ab") as log:
             self.sidecar, self.runner = (

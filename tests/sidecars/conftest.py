@@ -78,11 +78,11 @@ class Sidecar:
 
 
 class Box:
-    """A runtime folder with a card; `start` starts sidecars in it."""
+    """A runtime folder with a GPU; `start` starts sidecars in it."""
 
-    def __init__(self, runtime, card, environ):
+    def __init__(self, runtime, gpu_folder, environ):
         self.runtime = runtime
-        self.card = card
+        self.gpu_folder = gpu_folder
         self.environ = environ
         self.sidecars = []
 
@@ -92,7 +92,7 @@ class Box:
         (folder / "rskill.yaml").write_text(MANIFEST.format(name=name))
         arguments = [
             str(folder), "--name", name, "--rskill", str(folder / "rskill.yaml"),
-            "--device", device or f"fake:{self.card}", "--footprint", footprint, *flags,
+            "--device", device or f"fake:{self.gpu_folder}", "--footprint", footprint, *flags,
         ]  # fmt: skip
         with (folder / "log").open("ab") as log:
             process = start("echo", arguments, self.environ, log.fileno(), log.fileno())
@@ -106,7 +106,7 @@ class Box:
         return sidecar
 
     def used(self):
-        probe = FakeProbe([self.card])
+        probe = FakeProbe([self.gpu_folder])
         return probe.sample(probe.gpus()[0].id).used_bytes
 
     def close(self):
@@ -116,8 +116,8 @@ class Box:
                 sidecar.process.kill()
                 sidecar.process.wait(PATIENCE_S)
         report = (
-            check_log((self.card / "log.jsonl").read_text())
-            if (self.card / "log.jsonl").exists()
+            check_log((self.gpu_folder / "log.jsonl").read_text())
+            if (self.gpu_folder / "log.jsonl").exists()
             else None
         )
         assert report is None or report.problems == [], report
@@ -126,7 +126,7 @@ class Box:
 @pytest.fixture
 def box(arbiter_daemon):
     """Sidecars beside a real daemon."""
-    box = Box(arbiter_daemon.runtime, arbiter_daemon.card, arbiter_daemon.environ)
+    box = Box(arbiter_daemon.runtime, arbiter_daemon.gpu_folder, arbiter_daemon.environ)
     yield box
     box.close()
 

@@ -37,7 +37,7 @@ def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):
     assert grab.detect()["ok"]
 
 
-def test_a_process_without_a_device_needs_no_card(lone_box):
+def test_a_process_without_a_device_needs_no_gpu(lone_box):
     sidecar = lone_box.start("detector", "--no-arbiter", device="none")
     assert sidecar.detect()["ok"]
 
@@ -82,14 +82,14 @@ def test_on_a_simulated_gpu_it_waits_for_the_arbiter_that_makes_the_gpu(box, arb
     """Regression: the GPU's folder was read before the arbiter was asked for, so a sidecar started
     before its arbiter ended at once."""
     arbiter_daemon.stop()
-    shutil.rmtree(box.card)
+    shutil.rmtree(box.gpu_folder)
     sidecar = box.spawn("detector")
     until(lambda: f"waiting for the arbiter at {arbiter_daemon.endpoint}" in sidecar.log)
     arbiter_daemon.start()
     assert sidecar.detect()["ok"]
     with WireClient(arbiter_daemon.endpoint) as client:
         (lease,) = client.hello("looker", role="observer").ask("status")["leases"]
-    uuid = json.loads((box.card / "gpu.json").read_text())["uuid"]
+    uuid = json.loads((box.gpu_folder / "gpu.json").read_text())["uuid"]
     assert lease["gpu"] == uuid, "the lease is of the GPU that holds the bytes"
 
 

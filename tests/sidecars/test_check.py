@@ -239,8 +239,8 @@ def test_all_is_well_and_nothing_was_downloaded(check: Check, tmp_path: Path) ->
 
 
 def test_every_finding_is_collected(check: Check, tmp_path: Path) -> None:
-    make_gpu(tmp_path / "card", 2 * GIB)
-    gpu = f"fake:{tmp_path / 'card'}"
+    make_gpu(tmp_path / "gpu", 2 * GIB)
+    gpu = f"fake:{tmp_path / 'gpu'}"
     closed = DETECTOR.replace("mit", "proprietary")
     code, findings, _ = check(closed, "--device", gpu, "--footprint", "2GiB", adapter=make_adapter)
     assert (code, bad(findings)) == (2, {"license", "weights", "gpu"})

@@ -111,7 +111,7 @@ class Host:
             "--name", self.kind.name,
             "--rskill", str(self.configs / self.kind.rskill / "rskill.yaml"),
             "--configs", str(self.configs), "--footprint", "1GB,1GB,100MB",
-            "--device", f"fake:{self.arbiter.card}", "--min-residency-s", "0", "--nice", "0",
+            "--device", f"fake:{self.arbiter.gpu_folder}", "--min-residency-s", "0", "--nice", "0",
         ]  # fmt: skip
         environ = {**self.arbiter.environ, "OMP_NUM_THREADS": "1"}
         with (self.arbiter.runtime / f"{self.kind.name}.log").open("ab") as log:
@@ -155,7 +155,7 @@ class Host:
         return found
 
     def used(self) -> int:
-        probe = FakeProbe([self.arbiter.card])
+        probe = FakeProbe([self.arbiter.gpu_folder])
         return probe.sample(probe.gpus()[0].id).used_bytes
 
     @contextmanager
@@ -226,7 +226,7 @@ def host(request: pytest.FixtureRequest, configs: Path) -> Iterator[Host]:
         host.answer()
         yield host
         host.close()
-        report = check_log((arbiter.card / "log.jsonl").read_text())
+        report = check_log((arbiter.gpu_folder / "log.jsonl").read_text())
         assert (report.problems, report.oom_events) == ([], 0)
     finally:
         if host.process.poll() is None:
@@ -327,7 +327,7 @@ def test_a_process_killed_at_any_state_is_an_error_and_the_next_request_loads_ag
         os.kill(host.model(), signal.SIGKILL)
     lost(running)
     host.unload()
-    with fakegpu_folder.locked(host.arbiter.card):  # while it loads: its first byte waits
+    with fakegpu_folder.locked(host.arbiter.gpu_folder):  # while it loads: its first byte waits
         loading = host.send({"op": "load"})
         until(lambda: host.state() == "loading" and len(children(host.keeper())) == 1)
         os.kill(host.model(), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""What a model looks at is of now: a picture that waited for the card is not looked at. A real
+"""What a model looks at is of now: a picture that waited for the GPU is not looked at. A real
 sidecar beside a real daemon, asked by the reasoner's tools."""
 
 import asyncio
@@ -41,7 +41,7 @@ class Camera:
 
 
 def test_an_answer_is_not_about_a_picture_from_before_a_long_load(box) -> None:
-    """Regression: the scene model waited for the card and loaded for minutes, and then told of the
+    """Regression: the scene model waited for the GPU and loaded for minutes, and then told of the
     picture it had been sent before."""
     sidecar = box.start("vlm")
     (sidecar.folder / "slow_load").touch()

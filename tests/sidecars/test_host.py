@@ -151,7 +151,7 @@ def test_a_failed_start_takes_everything_back_and_can_be_tried_again(box, arbite
 
 
 def test_a_load_that_can_not_even_be_taken_back_keeps_no_lease(box, arbiter):
-    """Regression: after a fault of the card emptying its caches fails too, and the lease was
+    """Regression: after a fault of the GPU emptying its caches fails too, and the lease was
     renewed for ever for a load that no request ended."""
     (box.runtime / "detector-model").mkdir()
     switches = [box.runtime / "detector-model" / f"fail_{step}" for step in ("load", "unload")]
@@ -172,7 +172,7 @@ def test_an_out_of_memory_while_loading_rolls_back_and_is_reported(box, arbiter)
     request = sidecar.send_detect()
     until(lambda: box.used() == 100 * MB)  # granted, and its context is there
     stowaway = {"pid": os.getpid(), "name": "browser", "allocated_bytes": 6 * GB}
-    replace(box.card / "browser.json", json.dumps(stowaway))
+    replace(box.gpu_folder / "browser.json", json.dumps(stowaway))
     (box.runtime / "detector-model" / "slow_load").unlink()
     failed = sidecar.client.reply(request, PATIENCE_S)
     assert failed["code"] == "oom"
@@ -182,7 +182,7 @@ def test_an_out_of_memory_while_loading_rolls_back_and_is_reported(box, arbiter)
     assert failed["details"]["capacity_bytes"] == 8 * 2**30
     assert sidecar.state() == "unloaded"
     assert "oom" in {event["kind"] for event in arbiter.ask("history")["events"]}
-    (box.card / "browser.json").unlink()
+    (box.gpu_folder / "browser.json").unlink()
     assert sidecar.detect()["ok"]
 
 
@@ -271,7 +271,7 @@ def test_the_arbiter_may_be_killed_between_two_requests(box, arbiter_daemon, arb
 
 
 def replace(path, text):
-    """In one step: others read the card meanwhile."""
+    """In one step: others read the GPU meanwhile."""
     fresh = path.with_name(".new")
     fresh.write_text(text)
     fresh.rename(path)

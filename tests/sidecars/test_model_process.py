@@ -51,15 +51,15 @@ class Place:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.card = folder / "fakegpu"
-        make_gpu(self.card, 8 * 2**30, release_lag_s=0.01)
+        self.gpu_folder = folder / "fakegpu"
+        make_gpu(self.gpu_folder, 8 * 2**30, release_lag_s=0.01)
         self.made: list[ModelProcesses] = []
 
     def processes(self, steady: int = GB, adapter: AdapterFor | None = None) -> ModelProcesses:
         footprint = Footprint(load_peak_bytes=steady, steady_bytes=steady, residue_bytes=GB // 10)
         settings = Settings(
             "eye", parse_manifest(MANIFEST), Weights("test/eye"), footprint,
-            f"ipc://{self.folder}/eye.sock", f"fake:{self.card}", None
+            f"ipc://{self.folder}/eye.sock", f"fake:{self.gpu_folder}", None
         )  # fmt: skip
         echo = functools.partial(echo_for, self.folder)
         made = ModelProcesses(settings, adapter or echo, no_log)
@@ -70,7 +70,7 @@ class Place:
         return await self.processes(steady).start()
 
     def used(self) -> int:
-        probe = FakeProbe([self.card])
+        probe = FakeProbe([self.gpu_folder])
         return probe.sample(probe.gpus()[0].id).used_bytes
 
 

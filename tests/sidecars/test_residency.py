@@ -113,7 +113,7 @@ def settings(daemon):
     manifest = parse_manifest(MANIFEST)
     return Settings(
         "eye", manifest, Weights("test/eye", local=False), footprint, "ipc://nobody",
-        f"fake:{daemon.card}", daemon.endpoint
+        f"fake:{daemon.gpu_folder}", daemon.endpoint
     )  # fmt: skip
 
 

@@ -151,9 +151,9 @@ def test_without_an_entry_the_manifest_counts_and_without_both_nobody_guesses():
 
 
 def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
-    make_gpu(tmp_path / "card", 8 * 2**30)
+    make_gpu(tmp_path / "gpu", 8 * 2**30)
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "/run/x")
-    monkeypatch.setenv("VRAM_FAKE_GPU", str(tmp_path / "card"))
+    monkeypatch.setenv("VRAM_FAKE_GPU", str(tmp_path / "gpu"))
     found = settings(
         "--name",
         "detector",
@@ -169,15 +169,15 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
         "ipc:///run/x/detector.sock",
         "ipc:///run/x/arbiter.sock",
     )
-    assert found.device == f"fake:{tmp_path / 'card'}"
+    assert found.device == f"fake:{tmp_path / 'gpu'}"
     assert found.weights == Weights("a/b", "rev")
     spec = found.lease_spec()
     assert (spec.consumer, spec.model_id, spec.revision) == ("detector", "test/model", "rev")
     assert (spec.priority, spec.evictable, spec.footprint.load_peak_bytes) == (70, False, 2 * 10**9)
     assert (found.gpu, leased_gpu(found.device)) == (
         None,
-        FakeProbe([tmp_path / "card"]).gpus()[0].id,
-    ), "the card that is charged is the card that is leased"
+        FakeProbe([tmp_path / "gpu"]).gpus()[0].id,
+    ), "the GPU that is charged is the GPU that is leased"
     alone = settings(
         "--name",
         "d",

@@ -13,8 +13,8 @@ from collections.abc import Awaitable, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 
-from tests.support.simulation.card import SimOutOfMemory
 from tests.support.simulation.clock import ProcessLoop
+from tests.support.simulation.device import SimOutOfMemory
 from tests.support.simulation.world import Entitlement, SimProcess, World
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._session import Session
@@ -79,7 +79,7 @@ class SimClient(AsyncClient):
         return self._session.now()
 
     def may_load(self, lease: AsyncLease) -> bool:
-        """What a careful holder asks before it puts more on the card: is the lease still mine, by
+        """What a careful holder asks before it puts more on the GPU: is the lease still mine, by
         my own clock too?"""
         record = self.protocol.holdings.held.get(lease.lease_id)
         return record is not None and self.now() < self.protocol.holdings.fence_at(record)
@@ -106,7 +106,7 @@ class Ask:
 
 @dataclass(slots=True)
 class Holding:
-    """A granted lease with what its process put on the card for it."""
+    """A granted lease with what its process put on the GPU for it."""
 
     client: SimClient
     process: SimProcess
@@ -263,7 +263,7 @@ class Consumer(Program):
         chance, choice = self.world.clock.chance, self.random.choice
         peak = choice(SIZES)
         steady = peak if chance(0.5) else max(peak // 2, self.residue_bytes)
-        gpus = ["any", *(str(info.index) for info in self.world.gpus), *self.world.cards]
+        gpus = ["any", *(str(info.index) for info in self.world.gpus), *self.world.devices]
         return checked_spec(
             {
                 "consumer": self.process.name,
@@ -390,7 +390,7 @@ class Consumer(Program):
     async def _load(self, holding: Holding) -> bool:
         """In steps, context first; the last step is the temporary peak. False: given up or
         failed."""
-        card, key = self.world.cards[holding.gpu], self.process.key
+        device, key = self.world.devices[holding.gpu], self.process.key
         footprint = holding.lease.spec.footprint
         load_s = self.random.uniform(0.05, 1.2)
         fails = self.world.clock.chance(self.character.fails_to_load)
@@ -406,13 +406,13 @@ class Consumer(Program):
                 if step < LOAD_STEPS - 1
                 else weights - 2 * (weights // LOAD_STEPS)
             )
-            reused = min(part, card.held.get((key, "leak"), 0))  # its allocator has these already
-            missing = self.residue_bytes - card.held.get((key, "context"), 0)
+            reused = min(part, device.held.get((key, "leak"), 0))  # its allocator has these already
+            missing = self.residue_bytes - device.held.get((key, "context"), 0)
             try:
-                card.rename(key, "leak", holding.lease.lease_id, reused)
+                device.rename(key, "leak", holding.lease.lease_id, reused)
                 if missing > 0:
-                    card.allocate(key, "context", missing)
-                card.allocate(key, holding.lease.lease_id, part - reused)
+                    device.allocate(key, "context", missing)
+                device.allocate(key, holding.lease.lease_id, part - reused)
             except SimOutOfMemory as error:
                 await self._report_oom(holding, part, error)
                 return False
@@ -421,29 +421,33 @@ class Consumer(Program):
     async def _report_oom(self, holding: Holding, wanted: int, error: SimOutOfMemory) -> None:
         """Somebody holds what was granted to us: legal only for stowaways, liars and growers."""
         self.cast.ooms += 1
-        card = self.world.cards[holding.gpu]
-        strange = [block for block in card.blocks() if block.tag in ("stranger", "excess")]
+        device = self.world.devices[holding.gpu]
+        strange = [block for block in device.blocks() if block.tag in ("stranger", "excess")]
         if not strange and not self.world.distrusted:
             self.world.fail(
                 f"{self.process.name} was granted {holding.lease.lease_id} and met: {error}"
             )
         await holding.lease.oom(
-            wanted, card.held.get((self.process.key, holding.lease.lease_id), 0)
+            wanted, device.held.get((self.process.key, holding.lease.lease_id), 0)
         )
 
     async def _settle(self, holding: Holding) -> int | None:
         """Drop the temporary peak; perhaps take more than was declared. Returns what is to be
         reported."""
-        card, key, chance = self.world.cards[holding.gpu], self.process.key, self.world.clock.chance
+        device, key, chance = (
+            self.world.devices[holding.gpu],
+            self.process.key,
+            self.world.clock.chance,
+        )
         lease_id, footprint = holding.lease.lease_id, holding.lease.spec.footprint
         steady = max(0, footprint.steady_bytes - self.residue_bytes)
-        card.free(key, lease_id, card.held.get((key, lease_id), 0) - steady)
+        device.free(key, lease_id, device.held.get((key, lease_id), 0) - steady)
         await asyncio.sleep(0)
         grows, hides = chance(self.character.grows), chance(self.character.hides)
         if grows or hides:
             extra = int(footprint.steady_bytes * self.random.uniform(0.05, 0.4))
             try:
-                card.allocate(key, "excess", extra)
+                device.allocate(key, "excess", extra)
             except SimOutOfMemory:
                 extra = 0
             if grows:
@@ -471,14 +475,14 @@ class Consumer(Program):
         )  # nobody is there who could refuse
         if used and holding.lease.state != "gone" and not alone:
             self.world.fail(f"{holding.lease.lease_id} unloads while {used} use it")
-        card, key = self.world.cards[holding.gpu], self.process.key
+        device, key = self.world.devices[holding.gpu], self.process.key
         await self.pause(0.5)
         tag = holding.lease.lease_id
         if self.world.clock.chance(self.character.leaks):
-            card.rename(key, tag, "leak", card.held.get((key, tag), 0) // 3)
+            device.rename(key, tag, "leak", device.held.get((key, tag), 0) // 3)
             self.world.faults["leak"] += 1
-        card.free(key, tag)
-        card.free(key, "excess")
+        device.free(key, tag)
+        device.free(key, "excess")
         holding.over = True
         self.cast.evicted += 1
 
@@ -549,7 +553,7 @@ class Operator(Program):
                 await self.pause(1.0)
         while not await self._do(
             "resume"
-        ):  # an operator before this one may have died with the card drained
+        ):  # an operator before this one may have died with the GPU drained
             await self.pause(1.0)
 
     async def _do(self, action: str, target: str = "") -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from tests.sim.sim_clients import Cast, Program
-from tests.support.simulation.card import ProbeFaults, SimOutOfMemory
+from tests.support.simulation.device import ProbeFaults, SimOutOfMemory
 from tests.support.simulation.wire import QUEUE_MAX, WireFaults
 from tests.support.simulation.world import World
 from vram_arbiter.schemas import defaults as d
@@ -53,7 +53,7 @@ class Nemesis:
             (5, self.stowaway),
             (4, self.delay_messages),
             (4, self.duplicate_messages),
-            (4, self.slow_card),
+            (4, self.slow_device),
             (2, self.suspend),
             (1, self.power_cut),
         ]
@@ -88,9 +88,9 @@ class Nemesis:
         world.wire.faults = WireFaults()
         for faults in world.machine.probe_faults.values():
             self._heal(faults)
-        for card in world.cards.values():
-            card.lag_s = min(card.lag_s, 0.1)
-            card.free(STRANGER, "stranger")
+        for device in world.devices.values():
+            device.lag_s = min(device.lag_s, 0.1)
+            device.free(STRANGER, "stranger")
         for process in world.processes.values():
             if process.alive and process.loop.frozen:
                 process.loop.thaw()
@@ -240,7 +240,7 @@ class Nemesis:
         for index in range(len(self.slots)):
             self.clock.after(self.random.uniform(2.0, 5.0), partial(self._respawn, index, None))
 
-    # -- cards and probes
+    # -- GPUs and probes
     def _spoil(self, spoil: Callable[[ProbeFaults], None]) -> None:
         faults = self.random.choice(list(self.world.machine.probe_faults.values()))
         spoil(faults)
@@ -259,7 +259,7 @@ class Nemesis:
         self._spoil(spoil)
 
     def lag_probe(self) -> None:
-        """Shows the card as it was: also what has been taken meanwhile is not there yet."""
+        """Shows the GPU as it was: also what has been taken meanwhile is not there yet."""
 
         def spoil(faults: ProbeFaults) -> None:
             faults.behind_s = self.random.choice((0.05, 0.5, 1.5))
@@ -299,17 +299,17 @@ class Nemesis:
         self._spoil(spoil)
 
     def stowaway(self) -> None:
-        card = self.random.choice(list(self.world.cards.values()))
-        if card.held.get((STRANGER, "stranger")):
-            card.free(STRANGER, "stranger")
+        device = self.random.choice(list(self.world.devices.values()))
+        if device.held.get((STRANGER, "stranger")):
+            device.free(STRANGER, "stranger")
             return
         try:
-            card.allocate(
+            device.allocate(
                 STRANGER, "stranger", self.random.choice((100 * d.MIB, 700 * d.MIB, 3 * d.GIB))
             )
         except SimOutOfMemory:
             self.clock.say("no room for a stowaway")
 
-    def slow_card(self) -> None:
-        card = self.random.choice(list(self.world.cards.values()))
-        card.lag_s = self.random.choice((0.0, 0.1, 0.8, 1.5))
+    def slow_device(self) -> None:
+        device = self.random.choice(list(self.world.devices.values()))
+        device.lag_s = self.random.choice((0.0, 0.1, 0.8, 1.5))

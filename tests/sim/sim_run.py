@@ -77,7 +77,7 @@ def run_seed(seed: int, lines_max: int | None = TRACE_LINES) -> Report:
 def _run(seed: int, lines_max: int | None) -> Report:
     began = time.perf_counter()
     with state_folder() as folder:
-        world = World(seed, folder, cards=2 if seed % 3 == 2 else 1, lines_max=lines_max)
+        world = World(seed, folder, gpus=2 if seed % 3 == 2 else 1, lines_max=lines_max)
         cast = Cast(world)
         failure = ""
         try:
@@ -179,16 +179,16 @@ def _status(world: World) -> str:
 
 
 def _let_a_residue_go(world: World, cast: Cast) -> None:
-    """What idle processes keep on the card (their contexts) can be all that is in the way, and only
+    """What idle processes keep on the GPU (their contexts) can be all that is in the way, and only
     their exit frees it."""
     for ask in cast.asks:
         if ask.outcome or not ask.process.alive:
             continue
         others = 0
-        for card in world.cards.values():
+        for device in world.devices.values():
             keeps = [
                 b
-                for b in card.blocks()
+                for b in device.blocks()
                 if b.tag in ("context", "leak") and b.process != ask.process.key
             ]
             others = max(others, sum(block.count for block in keeps))

@@ -9,9 +9,9 @@ import pytest
 
 from tests.sim.sim_clients import SimClient
 from tests.sim.sim_run import run_seed, summary
-from tests.support.simulation.card import Device, SimOutOfMemory
 from tests.support.simulation.clock import Clock, new_loop
 from tests.support.simulation.daemon import Happening
+from tests.support.simulation.device import Device, SimOutOfMemory
 from tests.support.simulation.world import Entitlement, SimFailure, World
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import GIB
@@ -56,7 +56,7 @@ def granted(*leases: tuple[ProcessKey, int, bool]) -> Iterator[Entitlement]:
         yield Entitlement(process, f"L1-{number}", GPU, size, 0, exclusive)
 
 
-def test_more_granted_than_the_card_has_is_a_breach_that_names_the_seed(tmp_path: Path) -> None:
+def test_more_granted_than_the_gpu_has_is_a_breach_that_names_the_seed(tmp_path: Path) -> None:
     made = world_with_daemon(tmp_path)
     made.entitlements = lambda: granted((A, 5 * GIB, False), (B, 4 * GIB, False))
     made.clock.after(0.0, made.touch)
@@ -69,10 +69,10 @@ def test_more_granted_than_the_card_has_is_a_breach_that_names_the_seed(tmp_path
 
 def test_freed_memory_that_is_not_back_yet_counts(tmp_path: Path) -> None:
     made = world_with_daemon(tmp_path)
-    card = made.cards[GPU]
-    card.lag_s = 10.0
-    card.allocate(A, "L0-1", 5 * GIB)
-    card.free(A, "L0-1")
+    device = made.devices[GPU]
+    device.lag_s = 10.0
+    device.allocate(A, "L0-1", 5 * GIB)
+    device.free(A, "L0-1")
     made.entitlements = lambda: granted((B, 4 * GIB, False))
     made.clock.after(0.0, made.touch)
     with pytest.raises(SimFailure, match="granted or occupied"):
@@ -116,17 +116,17 @@ def test_a_frozen_process_catches_up_and_a_dead_one_never_does() -> None:
     assert happened == ["late"]
 
 
-def test_the_card_refuses_what_it_has_not_got_and_gives_back_late() -> None:
+def test_the_gpu_refuses_what_it_has_not_got_and_gives_back_late() -> None:
     clock = Clock(1)
-    card = Device(clock, GPU, 8 * GIB, 0)
-    card.lag_s = 1.0
-    card.allocate(A, "x", 6 * GIB)
-    card.free(A, "x")
+    device = Device(clock, GPU, 8 * GIB, 0)
+    device.lag_s = 1.0
+    device.allocate(A, "x", 6 * GIB)
+    device.free(A, "x")
     with pytest.raises(SimOutOfMemory):
-        card.allocate(B, "x", 4 * GIB)
+        device.allocate(B, "x", 4 * GIB)
     clock.run_until(clock.now + 1.0)
-    card.allocate(B, "x", 4 * GIB)
-    assert card.used_bytes() == 4 * GIB
+    device.allocate(B, "x", 4 * GIB)
+    assert device.used_bytes() == 4 * GIB
 
 
 # -- clients
@@ -201,15 +201,15 @@ def test_a_wait_to_come_back_outlives_the_daemon(tmp_path: Path) -> None:
         lease = await parked_slowly(client, 5 * GIB, parked, park_bytes=5 * GIB, independent=True)
         await lease.park()
         other = await parked_slowly(client, 5 * GIB, parked, consumer="other", model_id="other")
-        card, key = made.cards[GPU], client.process.key
-        card.allocate(key, other.lease_id, 5 * GIB)
+        device, key = made.devices[GPU], client.process.key
+        device.allocate(key, other.lease_id, 5 * GIB)
         async with other.use():
             back = asyncio.ensure_future(lease.reacquire())
             await asyncio.sleep(0.5)
             made.clock.after(0.0, made.kill_daemon)
             made.clock.after(0.1, made.start_daemon)
             await asyncio.sleep(3.0)
-        card.free(key, other.lease_id)
+        device.free(key, other.lease_id)
         await other.wait_gone()
         await back
 

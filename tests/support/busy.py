@@ -14,12 +14,12 @@ PROBE_FAILURE = "the driver hangs"
 
 
 def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDriver:
-    """Four consumers that load, use, release, cancel, report and die, on a card that lags and
+    """Four consumers that load, use, release, cancel, report and die, on a GPU that lags and
     sometimes cannot be read."""
     random = Random(seed)
     driver = CoreDriver(settings={"policy": policy})
-    driver.card.lag_s = 0.03
-    driver.card.overhead_bytes = 200 * MIB
+    driver.device.lag_s = 0.03
+    driver.device.overhead_bytes = 200 * MIB
     people = {name: driver.consumer(name) for name in ("detector", "vlm", "grab", "chat")}
     held: dict[LeaseId, Consumer] = {}
     for _ in range(steps):
@@ -42,7 +42,7 @@ def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDri
                         held[lease] = person
                         person.specs[lease] = driver.arbiter.inspect().leases[lease].spec
             case 3:
-                driver.card.failing = "" if driver.card.failing else PROBE_FAILURE
+                driver.device.failing = "" if driver.device.failing else PROBE_FAILURE
             case 4 if random.random() < 0.3:
                 person.die()
                 people[name] = driver.consumer(name)

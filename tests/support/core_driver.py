@@ -1,13 +1,13 @@
-"""Drive the sans-IO core by hand: a clock that only moves when told, simulated cards that answer
+"""Drive the sans-IO core by hand: a clock that only moves when told, simulated GPUs that answer
 `Sample`, a journal in a dict.
 
-For tests of the core and of whatever stands on it. Knows nothing of sockets or real cards; never
+For tests of the core and of whatever stands on it. Knows nothing of sockets or real GPUs; never
 sleeps.
 
     driver = CoreDriver(capacity_bytes=8 * GIB)
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(load_peak_bytes=3 * GIB)
-    vlm.load(lease)                        # bytes appear on the card, `ready` is sent
+    vlm.load(lease)                        # bytes appear on the GPU, `ready` is sent
     driver.until(lambda: driver.state(lease) == "held")
 """
 
@@ -83,8 +83,8 @@ START_S = 1000.0
 
 
 @dataclass(slots=True)
-class SimCard:
-    """A card that shows what it was told. Bytes that are given up come back `lag_s` later."""
+class SimDevice:
+    """A GPU that shows what it was told. Bytes that are given up come back `lag_s` later."""
 
     gpu: GpuId
     total_bytes: int
@@ -149,19 +149,19 @@ class SimCard:
 
 
 class CoreDriver:
-    """One core, its cards, its journal, and everything that it ever said."""
+    """One core, its GPUs, its journal, and everything that it ever said."""
 
     def __init__(
         self,
         capacity_bytes: int = 8 * d.GIB,
         *,
-        cards: int = 1,
+        gpus: int = 1,
         reserve_bytes: int = d.RESERVE_BYTES,
         settings: Mapping[str, Any] | None = None,
         start: bool = True,
     ) -> None:
         self.now = START_S
-        gpus = tuple(
+        infos = tuple(
             GpuInfo(
                 GpuId(f"GPU-{index}"),
                 index,
@@ -170,10 +170,10 @@ class CoreDriver:
                 reserve_bytes,
                 total_bytes=capacity_bytes,
             )
-            for index in range(cards)
+            for index in range(gpus)
         )
-        self.cards = {info.id: SimCard(info.id, capacity_bytes) for info in gpus}
-        self.settings = Settings(epoch=1, gpus=gpus, **(settings or {}))
+        self.devices = {info.id: SimDevice(info.id, capacity_bytes) for info in infos}
+        self.settings = Settings(epoch=1, gpus=infos, **(settings or {}))
         self.arbiter = Arbiter(self.settings, self.now)
         self.effects: list[Effect] = []
         self.events: list[tuple[float, Event]] = []
@@ -187,9 +187,9 @@ class CoreDriver:
             self.advance(0.01)  # the first reading
 
     @property
-    def card(self) -> SimCard:
-        """The first card."""
-        return next(iter(self.cards.values()))
+    def device(self) -> SimDevice:
+        """The first GPU."""
+        return next(iter(self.devices.values()))
 
     # -- time and events
     def post(self, event: Event) -> list[Effect]:
@@ -221,9 +221,9 @@ class CoreDriver:
                 case JournalDelete():
                     self.journal.pop(effect.key, None)
                 case Sample():
-                    card = self.cards[effect.gpu]
-                    if not card.silent:
-                        self._readings.append((self.now + card.reading_s, card.read(self.now)))
+                    device = self.devices[effect.gpu]
+                    if not device.silent:
+                        self._readings.append((self.now + device.reading_s, device.read(self.now)))
                 case _:
                     pass
         self.effects += performed
@@ -267,7 +267,7 @@ class CoreDriver:
         return self.now - began
 
     def shrink(self, gpu: GpuId, capacity_bytes: int) -> None:
-        """Another, smaller card is in the place of this one from the next `restart` on."""
+        """Another, smaller GPU is in the place of this one from the next `restart` on."""
         gpus = tuple(
             replace(info, capacity_bytes=capacity_bytes, total_bytes=capacity_bytes)
             if info.id == gpu
@@ -275,7 +275,7 @@ class CoreDriver:
             for info in self.settings.gpus
         )
         self.settings = replace(self.settings, gpus=gpus)
-        self.cards[gpu].total_bytes = capacity_bytes
+        self.devices[gpu].total_bytes = capacity_bytes
 
     def restart(self, *, epoch: int = 2, keep_journal: bool = True) -> None:
         """kill -9 of the daemon: a new core, the journal's records, no memory of anything else."""
@@ -296,8 +296,8 @@ class CoreDriver:
         process = ProcessKey(pid, 7 * pid)
         client = ClientId(f"c{pid}")
         person = Consumer(self, name, process, client, priority, uid)
-        for card in self.cards.values():
-            card.names[process] = name
+        for device in self.devices.values():
+            device.names[process] = name
         person.connect()
         return person
 
@@ -356,7 +356,7 @@ class CoreDriver:
         ]
 
     def gpu(self, index: int = 0) -> dict[str, Any]:
-        """The card as `status` shows it."""
+        """The GPU as `status` shows it."""
         shown: dict[str, Any] = self.status()["gpus"][index]
         return shown
 
@@ -364,7 +364,7 @@ class CoreDriver:
 @dataclass(slots=True)
 class Consumer:
     """A process that leases, as its client library would: remembers its tokens, answers for its
-    bytes on the card."""
+    bytes on the GPU."""
 
     driver: CoreDriver
     name: str
@@ -388,10 +388,10 @@ class Consumer:
         return self.driver.post(ClientLeft(self.client, reason))
 
     def die(self) -> list[Effect]:
-        """kill -9: the bytes go back to the card after its lag, the kernel says that the process is
+        """kill -9: the bytes go back to the GPU after its lag, the kernel says that the process is
         gone."""
-        for card in self.driver.cards.values():
-            card.set(self.process, 0, self.driver.now)
+        for device in self.driver.devices.values():
+            device.set(self.process, 0, self.driver.now)
         return self.driver.post(ProcessDied(self.process))
 
     # -- requests
@@ -648,12 +648,12 @@ class Consumer:
 
     # -- as a cooperative holder
     def hold(self, count: int, *, gpu: GpuId | None = None) -> None:
-        """Bytes of this process on a card from now on."""
-        card = self.driver.card if gpu is None else self.driver.cards[gpu]
-        card.set(self.process, count, self.driver.now)
+        """Bytes of this process on a GPU from now on."""
+        device = self.driver.device if gpu is None else self.driver.devices[gpu]
+        device.set(self.process, count, self.driver.now)
 
     def load(self, lease: LeaseId, measured_bytes: int | None = None) -> list[Effect]:
-        """Load: the steady bytes appear on the lease's card, then `ready`."""
+        """Load: the steady bytes appear on the lease's GPU, then `ready`."""
         view = self.driver.view(lease)
         if view is None:
             raise AssertionError(f"{lease} is over")

@@ -1,18 +1,18 @@
 """Independent checker of leases: three witnesses that never spoke to each other must tell one
 story.
 
-The card's allocation log says who held which bytes when; the history says what the arbiter decided;
+The GPU's allocation log says who held which bytes when; the history says what the arbiter decided;
 the consumers' own traces say what they were told and did. From these follow the rules below; the
 core's code is not used, its mistakes are what is looked for. `fakegpu_check` comes first and proves
-that the card's log is sound in itself.
+that the GPU's log is sound in itself.
 
 Rules (their names stand in `Finding.rule`):
-  entitled   bytes are only put on the card under a lease: after its grant, before its end
+  entitled   bytes are only put on the GPU under a lease: after its grant, before its end
   refused    whoever has a grant finds room for what it was granted
   exclusive  nobody else has bytes beyond its context while an exclusive lease has, nor the other
   way round
   in_use     nothing is unloaded while it is in use
-  loading    one load at a time per card
+  loading    one load at a time per GPU
   tokens     tokens only grow, across restarts too
   expired    only a holder that was hindered loses its lease by time
   stuck      every wait ends in bounded time
@@ -30,7 +30,7 @@ from typing import Any
 from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TOLERANCE_BYTES
 
 SLACK_S = 0.005
-"""Between the clocks of history (wall) and of card and traces (monotonic)."""
+"""Between the clocks of history (wall) and of GPU and traces (monotonic)."""
 UNSEEN_S = 2.5
 """A stowaway younger than the oldest reading that may carry a grant cannot have been seen."""
 NOISE_BYTES = RESERVE_BYTES + VERIFY_TOLERANCE_BYTES
@@ -126,7 +126,7 @@ def check_leases(
     wall_minus_monotonic_s: float = 0.0,
     stuck_s: float = STUCK_S,
 ) -> Story:
-    """Judge one card's log with the history of its arbiter and the traces of its consumers.
+    """Judge one GPU's log with the history of its arbiter and the traces of its consumers.
 
     `outages`: when the test itself had killed or stopped the arbiter, until it ran again.
     """
@@ -137,7 +137,7 @@ def check_leases(
     known = {claim.lease_id: claim for mine in claims.values() for claim in mine}
     _check_history(story, events, times, known, hindrances)
     _check_tokens(story, events, times, traces)
-    _check_card(story, read_lines([log]), claims, traces, hindrances, _kept(events, times, traces))
+    _check_gpu(story, read_lines([log]), claims, traces, hindrances, _kept(events, times, traces))
     _check_uses(story, read_lines([log]), traces)
     _check_waits(story, traces, hindrances, outages, stuck_s)
     return story
@@ -217,7 +217,7 @@ def _check_history(
     claims: Mapping[str, Claim],
     hindrances: Sequence[Hindrance],
 ) -> None:
-    loading: dict[str, dict[str, str]] = defaultdict(dict)  # card → lease → consumer
+    loading: dict[str, dict[str, str]] = defaultdict(dict)  # GPU → lease → consumer
     uses: dict[str, set[str]] = defaultdict(set)  # as far as they began since the daemon did
     epoch = seq = 0
     for event, t in zip(events, times, strict=True):
@@ -313,23 +313,23 @@ def _hindered(hindrances: Sequence[Hindrance], pid: int, t: float, back_s: float
     )
 
 
-# -- card
+# -- GPU
 @dataclass(slots=True)
 class _Held:
     """Bytes of one process as the log tells them. `floor` is what belongs to no lease: its context
     and what it leaked."""
 
-    on_card: int = 0
+    on_gpu: int = 0
     floor: int = 0
     leaked: int = 0
     grew_at: float = float("-inf")
 
     @property
     def own(self) -> int:
-        return max(0, self.on_card - self.floor)
+        return max(0, self.on_gpu - self.floor)
 
 
-def _check_card(
+def _check_gpu(
     story: Story,
     lines: Sequence[Line],
     claims: Mapping[int, Sequence[Claim]],
@@ -363,7 +363,7 @@ def _check_card(
             mine.floor += line["bytes"]
             mine.leaked += line["bytes"]
         if pid:
-            mine.on_card = line["process_bytes"]
+            mine.on_gpu = line["process_bytes"]
         if op in ("context", "alloc") and line["delta"] > 0:
             mine.grew_at = t
         if pid not in consumers or op not in ("context", "alloc", "oom"):
@@ -396,10 +396,10 @@ def _unfilled_bytes(
     at: float,
 ) -> int:
     """What living processes were charged outside their leases at that time and did not have on the
-    card."""
+    GPU."""
     charged = {pid: count for t, pid, count in kept if t <= at and dead.get(pid, at) >= at}
     return sum(
-        max(0, count - (held[pid].on_card if pid in held else 0)) for pid, count in charged.items()
+        max(0, count - (held[pid].on_gpu if pid in held else 0)) for pid, count in charged.items()
     )
 
 
@@ -407,21 +407,21 @@ def _check_refusal(
     story: Story, line: Line, claim: Claim, held: Mapping[int, _Held], uninvited: set[int]
 ) -> None:
     for pid in uninvited:
-        if held[pid].on_card and held[pid].grew_at >= claim.since - UNSEEN_S:
+        if held[pid].on_gpu and held[pid].grew_at >= claim.since - UNSEEN_S:
             story.refusals_excused += 1
             return
     mine = held[claim.pid]
     if (
         mine.leaked
-        and mine.on_card + line["bytes"] - mine.leaked <= claim.bytes < mine.on_card + line["bytes"]
+        and mine.on_gpu + line["bytes"] - mine.leaked <= claim.bytes < mine.on_gpu + line["bytes"]
     ):
         story.refusals_excused += 1  # what it leaked before is in its own way
         return
-    others = {pid: h.on_card for pid, h in held.items() if h.on_card and pid != claim.pid}
+    others = {pid: h.on_gpu for pid, h in held.items() if h.on_gpu and pid != claim.pid}
     story.bad(
         "refused",
         line["t"],
-        f"{claim.name} was granted {claim.bytes} under {claim.lease_id}, holds {mine.on_card} and "
+        f"{claim.name} was granted {claim.bytes} under {claim.lease_id}, holds {mine.on_gpu} and "
         "finds no room for "
         f"{line['bytes']}; others hold {others}",
     )

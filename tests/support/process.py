@@ -28,7 +28,7 @@ class ArbiterProcess:
     again on the same state.
 
     The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the
-    simulated card `fakegpu/` and `arbiter.log`. `environ` is what clients need to find it.
+    simulated GPU `fakegpu/` and `arbiter.log`. `environ` is what clients need to find it.
     `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with
     variables or a program of its own.
     """
@@ -63,8 +63,8 @@ class ArbiterProcess:
         return self.runtime / "state"
 
     @property
-    def card(self) -> Path:
-        """Folder of the simulated card (`--gpu fake:SIZE`)."""
+    def gpu_folder(self) -> Path:
+        """Folder of the simulated GPU (`--gpu fake:SIZE`)."""
         return self.runtime / "fakegpu"
 
     @property

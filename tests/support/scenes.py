@@ -23,12 +23,12 @@ def held(
     return person, lease
 
 
-def hidden_card(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
-    """A card of 8 GiB as it is from the first reading on: with or without a list of processes, late
+def hidden_gpu(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
+    """A GPU of 8 GiB as it is from the first reading on: with or without a list of processes, late
     by so much."""
     driver = CoreDriver(8 * GIB, start=False)
-    driver.card.lists_processes = lists
-    driver.card.lag_s = lag_s
+    driver.device.lists_processes = lists
+    driver.device.lag_s = lag_s
     driver.advance(0.01)
     return driver
 
@@ -45,7 +45,7 @@ def charge(driver: CoreDriver, lease: LeaseId) -> int:
 
 
 def place(driver: CoreDriver, lease: LeaseId) -> str | None:
-    """The card that it is on."""
+    """The GPU that it is on."""
     gpu: str | None = shown(driver, lease)["gpu"]
     return gpu
 

@@ -15,7 +15,7 @@ from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.errors import CODES, VramError
 
 DYING_S = 1.5
-"""A process that held gigabytes of a card hangs up long before the kernel says that it has
+"""A process that held gigabytes of a GPU hangs up long before the kernel says that it has
 ended."""
 
 

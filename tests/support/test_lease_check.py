@@ -19,7 +19,7 @@ class Scene:
     """Three witnesses, written by hand; time passes by one second a line."""
 
     t: float = 0.0
-    card: list[dict[str, Any]] = field(default_factory=list)
+    log: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
     traces: list[dict[str, Any]] = field(default_factory=list)
     hindrances: list[Hindrance] = field(default_factory=list)
@@ -51,7 +51,7 @@ class Scene:
             "bytes": size,
             "delta": change,
         }
-        self.card.append({**line, "process_bytes": self.held[pid]})
+        self.log.append({**line, "process_bytes": self.held[pid]})
 
     def grant(self, pid: int, gib: float, *, exclusive: bool = False) -> str:
         """Asked, granted, told, loaded, ready."""
@@ -72,7 +72,7 @@ class Scene:
         self.trace(pid, "over", lease_id=lease)
 
     def judge(self) -> Story:
-        log = "".join(json.dumps(line) + "\n" for line in self.card)
+        log = "".join(json.dumps(line) + "\n" for line in self.log)
         return check_leases(log, self.history, self.traces, self.hindrances, outages=self.outages)
 
 
@@ -136,7 +136,7 @@ def unloads_in_use_by_its_own_word(scene: Scene) -> None:
     scene.trace(B, "unload", lease_id="L1-2")
 
 
-def unloads_in_use_by_the_card(scene: Scene) -> None:
+def unloads_in_use_by_the_gpu(scene: Scene) -> None:
     scene.trace(B, "in_use", lease_id="L1-2")
     scene.op(B, "free", 6, 0)
     scene.trace(B, "idle", lease_id="L1-2")
@@ -186,7 +186,7 @@ def falls_over(scene: Scene) -> None:
         ("exclusive", beside_an_exclusive_lease),
         ("exclusive", exclusive_beside_a_dying_one),
         ("in_use", unloads_in_use_by_its_own_word),
-        ("in_use", unloads_in_use_by_the_card),
+        ("in_use", unloads_in_use_by_the_gpu),
         ("in_use", unloads_in_use_by_the_history),
         ("loading", two_loads_at_once),
         ("tokens", a_token_again),
@@ -255,7 +255,7 @@ def test_a_killed_waiter_is_not_stuck() -> None:
 def beside_what_is_on_its_way(
     left_gib: float, *, charged_gib: float, declared_gib: float = 0.25, ended: str = ""
 ) -> list[str]:
-    """B is granted a card to itself when this much of A's is still there, and IDLE is charged a
+    """B is granted a GPU to itself when this much of A's is still there, and IDLE is charged a
     context that it never put there."""
     scene = Scene()
     for pid in (A, B, IDLE):

@@ -124,7 +124,7 @@ class WireClient:
         return self.ask("acquire", spec=wanted, **fields)
 
     def granted(self, consumer: str, load_peak_bytes: int, **spec: Any) -> dict[str, Any]:
-        """`acquire`, and wait for the grant, which a daemon that has just begun to read its card
+        """`acquire`, and wait for the grant, which a daemon that has just begun to read its GPU
         gives later; the lease."""
         reply = self.acquire(consumer, load_peak_bytes, **spec)
         assert reply["ok"], reply

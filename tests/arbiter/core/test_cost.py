@@ -25,7 +25,7 @@ from vram_arbiter.schemas.ids import (
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
 
-CARD = GpuId("GPU-0")
+GPU = GpuId("GPU-0")
 FEW, MANY = 5, 500
 SIZE = 4096
 
@@ -35,7 +35,7 @@ class Counted:
     that each event took."""
 
     def __init__(self, leases: int, *, listed: bool) -> None:
-        gpu = GpuInfo(CARD, 0, "card", d.GIB, 0)
+        gpu = GpuInfo(GPU, 0, "gpu", d.GIB, 0)
         self.core = Arbiter(Settings(epoch=1, gpus=(gpu,), leases_per_client_max=MANY), 0.0)
         self.listed = listed
         self.now = 1.0
@@ -72,7 +72,7 @@ class Counted:
         return RequestId(self.requests)
 
     def reading(self) -> ev.MemorySampled:
-        return ev.MemorySampled(CARD, self.now, 0, d.GIB, () if self.listed else None)
+        return ev.MemorySampled(GPU, self.now, 0, d.GIB, () if self.listed else None)
 
     def hello(self, client: ClientId, process: ProcessKey, instance: str) -> None:
         self.tell(ev.ClientConnected(client, process, 0, str(client), instance))

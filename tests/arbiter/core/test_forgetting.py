@@ -40,7 +40,7 @@ def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_
     assert after.pop("ended") <= before.pop("ended") + 300 <= ENDED_REMEMBERED
     assert after.pop("nonces") <= before.pop("nonces") + 300
     assert after == before
-    assert core.gpus[driver.card.gpu].queue.head is None
+    assert core.gpus[driver.device.gpu].queue.head is None
 
 
 def test_consumers_of_ever_new_names_are_remembered_up_to_a_number() -> None:

@@ -72,7 +72,7 @@ def beside_exclusive(b: Broken) -> None:
 
 
 def beside_exclusive_debt(b: Broken) -> None:
-    b.driver.card.silent = True
+    b.driver.device.silent = True
     b.held.spec = replace(b.held.spec, mode="exclusive")
     b.driver.post(ProcessDied(b.held.process))
     b.core.turn.granted.append((Token(1, 99), b.gpu.info.id))

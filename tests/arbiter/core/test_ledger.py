@@ -1,4 +1,4 @@
-"""Bytes of one card: folding of residues, debts, evidence, stowaways."""
+"""Bytes of one GPU: folding of residues, debts, evidence, stowaways."""
 
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_of
@@ -12,7 +12,7 @@ GPU = GpuId("GPU-0")
 
 def ledger() -> GpuLedger:
     return GpuLedger(
-        GpuInfo(GPU, 0, "card", capacity_bytes=1000, reserve_bytes=100), tolerance_bytes=10
+        GpuInfo(GPU, 0, "gpu", capacity_bytes=1000, reserve_bytes=100), tolerance_bytes=10
     )
 
 

@@ -1,6 +1,6 @@
-"""A rule machine drives the core against the physical card and a small ledger of its own: whatever
+"""A rule machine drives the core against the physical GPU and a small ledger of its own: whatever
 happens in whatever order, as long as holders load only what they were granted and leave when asked,
-the card never overflows, every byte that somebody holds is charged, tokens grow, no wake-up is
+the GPU never overflows, every byte that somebody holds is charged, tokens grow, no wake-up is
 lost, and everybody is served in the end, within a bound, however many arrive after him.
 
 What has to hold is looked at after every event, not only after every rule. Rules are enabled only
@@ -78,7 +78,7 @@ def some(*states: LeaseState) -> Callable[["Leases"], bool]:
 
 
 class Leases(RuleBasedStateMachine):
-    """Model: what each process holds on the card by its own doing; `mine` are the leases as their
+    """Model: what each process holds on the GPU by its own doing; `mine` are the leases as their
     processes know them."""
 
     @initialize(
@@ -89,8 +89,8 @@ class Leases(RuleBasedStateMachine):
     )
     def start(self, lag: float, lists: bool, crowd: bool, wishes: list[Wish]) -> None:
         self.driver = CoreDriver(CAPACITY, settings={"host_ram_budget_bytes": 3 * d.GIB})
-        self.driver.card.lag_s = lag
-        self.driver.card.lists_processes = lists
+        self.driver.device.lag_s = lag
+        self.driver.device.lists_processes = lists
         self.crowd = crowd  # newcomers keep arriving while the last waiters are served
         self.people = [self.driver.consumer(f"p{n}") for n in range(PEOPLE)]
         self.mine: dict[LeaseId, Consumer] = {}
@@ -185,9 +185,9 @@ class Leases(RuleBasedStateMachine):
         self.mine[lease].ready(lease)
 
     def show(self, process: ProcessKey) -> None:
-        """Put on the card what the process holds."""
+        """Put on the GPU what the process holds."""
         count = max(sum(self.loaded[process].values()), self.context[process])
-        self.driver.card.set(process, count, self.driver.now)
+        self.driver.device.set(process, count, self.driver.now)
 
     def unload(self, lease: LeaseId) -> None:
         person = self.mine[lease]
@@ -282,7 +282,7 @@ class Leases(RuleBasedStateMachine):
     # -- what the world does
     @rule(seconds=st.sampled_from([0.002, 0.02, 0.3, 0.3, 2.0, 35.0]))
     def wait(self, seconds: float) -> None:
-        if self.having(LOADING):  # the card is read twenty times a second then
+        if self.having(LOADING):  # the GPU is read twenty times a second then
             seconds = min(seconds, LOAD_MAX_S)
         self.driver.advance(seconds)
 
@@ -290,13 +290,13 @@ class Leases(RuleBasedStateMachine):
     @rule(count=st.sampled_from([0, 100 * d.MIB, 250 * d.MIB]))
     def stranger(self, count: int) -> None:
         self.breaks("stranger")
-        self.driver.card.set(STRANGER, count, self.driver.now)
+        self.driver.device.set(STRANGER, count, self.driver.now)
 
-    @precondition(lambda self: self.driver.card.failing or self.quiet("probe"))
+    @precondition(lambda self: self.driver.device.failing or self.quiet("probe"))
     @rule()
     def probe(self) -> None:
         self.breaks("probe")
-        self.driver.card.failing = "" if self.driver.card.failing else "probe died"
+        self.driver.device.failing = "" if self.driver.device.failing else "probe died"
 
     @rule(deadline_s=st.sampled_from([5.0, 30.0]), waiters=st.sampled_from([2, 1000]))
     def reload(self, deadline_s: float, waiters: int) -> None:
@@ -328,14 +328,14 @@ class Leases(RuleBasedStateMachine):
 
     # -- what must hold after every event
     def sound(self) -> None:
-        self.card_never_overflows()
+        self.gpu_never_overflows()
         self.every_byte_is_charged()
         self.tokens_grow()
         self.no_lost_wake_up()
         self.waits_end_in_time()
 
-    def card_never_overflows(self) -> None:
-        """What is on the card, and what those may put there who load, fits."""
+    def gpu_never_overflows(self) -> None:
+        """What is on the GPU, and what those may put there who load, fits."""
         coming = 0
         for lease in self.having(LOADING):
             person = self.mine[lease]
@@ -343,16 +343,16 @@ class Leases(RuleBasedStateMachine):
             if self.loaded.get(person.process):
                 coming += peak
             else:  # its context is part of the peak
-                coming += max(0, peak - self.driver.card.held.get(person.process, 0))
-        assert sum(self.driver.card.shown(self.driver.now).values()) + coming <= CAPACITY
+                coming += max(0, peak - self.driver.device.held.get(person.process, 0))
+        assert sum(self.driver.device.shown(self.driver.now).values()) + coming <= CAPACITY
 
     def every_byte_is_charged(self) -> None:
         """The ledger of the core never has less for a process than the process holds. Where the
-        card lists nobody, what one holds is known as exactly only as what an empty card may show.
+        GPU lists nobody, what one holds is known as exactly only as what an empty GPU may show.
         """
         (gpu,) = self.driver.arbiter.inspect().gpus.values()
         unsure = (
-            0 if self.driver.card.lists_processes else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
+            0 if self.driver.device.lists_processes else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
         )
         for process, leases in self.loaded.items():
             held = max(sum(leases.values()), self.context[process])
@@ -400,8 +400,8 @@ class Leases(RuleBasedStateMachine):
         """
         if not hasattr(self, "driver"):
             return
-        self.driver.card.failing = ""
-        self.driver.card.set(STRANGER, 0, self.driver.now)
+        self.driver.device.failing = ""
+        self.driver.device.set(STRANGER, 0, self.driver.now)
         waiting = set(self.having(QUEUED))
         began = self.driver.now
         turn = 0

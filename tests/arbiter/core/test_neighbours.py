@@ -12,14 +12,14 @@ def test_1_freed_is_not_free_yet() -> None:
     """llama-swap#97, ollama#9160, comfyui-mcp#2050: the next load starts before the driver returns
     the memory."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.5
+    driver.device.lag_s = 1.5
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     det.unload(lease)
     while driver.state(waiter) == "queued":
         assert driver.gpu()["charged_bytes"] == 5 * GIB
         driver.advance(0.01)
-    assert sum(driver.card.shown(driver.now).values()) == 0, (
+    assert sum(driver.device.shown(driver.now).values()) == 0, (
         "nothing of it is left when the next one is told to load"
     )
 
@@ -29,7 +29,7 @@ def test_1_a_failed_poll_prints_nothing_and_frees_nothing() -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     det.unloading(lease)
-    driver.card.failing = "timeout"
+    driver.device.failing = "timeout"
     det.hold(0)
     det.release(lease)
     driver.advance(60.0)
@@ -67,7 +67,7 @@ def test_5_and_small_ones_do_not_starve_the_big_one() -> None:
 
 
 def test_8_two_loads_at_once_mis_measure_each_other() -> None:
-    """vLLM#55827, #56830, ollama#13235: so one card loads one model at a time, even if both fit."""
+    """vLLM#55827, #56830, ollama#13235: so one GPU loads one model at a time, even if both fit."""
     driver = CoreDriver(8 * GIB)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = a.acquire(2 * GIB), b.acquire(2 * GIB)
@@ -92,7 +92,7 @@ def test_9_a_busy_model_is_never_evicted() -> None:
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
-def test_13_two_claims_of_six_on_a_card_of_eight() -> None:
+def test_13_two_claims_of_six_on_a_gpu_of_eight() -> None:
     """taOS#1992: both pass."""
     driver = CoreDriver(8 * GIB)
     first = driver.consumer("a").acquire(6 * GIB, evictable=False)
@@ -106,7 +106,7 @@ def test_13_two_claims_of_six_on_a_card_of_eight() -> None:
 
 
 def test_13_leases_are_not_subtracted_from_a_free_figure_that_includes_them() -> None:
-    """taOS#3010, #3026: 3 resident and 4 wanted fit on 8, however often the card is read."""
+    """taOS#3010, #3026: 3 resident and 4 wanted fit on 8, however often the GPU is read."""
     driver = CoreDriver(8 * GIB)
     held(driver, "a", 3)
     driver.advance(10.0)
@@ -126,11 +126,11 @@ def test_13_a_renewal_never_resurrects() -> None:
 
 def test_13_a_probe_failure_is_not_free_memory() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.failing = "NVML_ERROR_UNKNOWN"
+    driver.device.failing = "NVML_ERROR_UNKNOWN"
     driver.advance(1.1)
     waiter = driver.consumer("a").acquire(1 * GIB)
     driver.advance(10.0)
     assert driver.state(waiter) == "queued"
     assert "cannot be read" in driver.gpu()["blocked"]["text"]
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)

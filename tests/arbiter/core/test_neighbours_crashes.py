@@ -1,5 +1,5 @@
 """What users of the neighbours complain about: a program that crashes in its load, is started
-again, and takes the card each time. Number 17."""
+again, and takes the GPU each time. Number 17."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ def crashed(driver: CoreDriver, times: int) -> None:
         crash(driver)
 
 
-def test_17_a_crash_loop_does_not_take_the_card_for_every_try() -> None:
+def test_17_a_crash_loop_does_not_take_the_gpu_for_every_try() -> None:
     """Berth's gateway backs off 15 s → 5 min with the same cause. Here the one that works stays,
     and the one that crashes is told why."""
     driver = CoreDriver(8 * GIB)

@@ -14,7 +14,7 @@ GIB, MIB = d.GIB, d.MIB
 
 
 def alternate(driver: CoreDriver, seconds: float) -> int:
-    """Two consumers with a request a second each, on a card for one of them. Returns how often they
+    """Two consumers with a request a second each, on a GPU for one of them. Returns how often they
     switched."""
     people = {name: driver.consumer(name) for name in ("a", "b")}
     leases: dict[str, LeaseId] = {}
@@ -42,7 +42,7 @@ def test_4_two_models_that_are_wanted_alike_do_not_load_all_the_time() -> None:
 
 
 @pytest.mark.parametrize("priority", [0, 50])
-def test_4_an_idle_holder_does_not_keep_a_card_for_minutes(priority: int) -> None:
+def test_4_an_idle_holder_does_not_keep_a_gpu_for_minutes(priority: int) -> None:
     """aprender#3986: a lock held for 25 minutes at 97 % idle, six waiters. Whatever was learnt, the
     wait has a bound."""
     learnt = {
@@ -143,7 +143,7 @@ def test_10_nothing_that_comes_back_or_grows_touches_a_pinned_model() -> None:
 
 
 def test_16_parked_is_charged_as_parked_and_resumed_as_resumed() -> None:
-    """Berth v0.4.0-rc.3: a resumed waiter was charged the whole card, and a hold waited with
+    """Berth v0.4.0-rc.3: a resumed waiter was charged the whole GPU, and a hold waited with
     nothing to drain."""
     driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 16 * GIB})
     vlm, lease = held(driver, "vlm", 3, park_bytes=3 * GIB, residue_bytes=450 * MIB)
@@ -152,7 +152,7 @@ def test_16_parked_is_charged_as_parked_and_resumed_as_resumed() -> None:
     assert driver.gpu()["charged_bytes"] == 450 * MIB
     _, other = held(driver, "det", 4)
     assert answer(vlm.reacquire(lease))["state"] == "loading", (
-        "3 fit beside 4: there is nothing to drain"
+        "3 fit beside 4: nothing has to be revoked"
     )
     assert (charge(driver, lease), driver.gpu()["charged_bytes"]) == (3 * GIB, 7 * GIB)
     assert driver.state(other) == "held"
@@ -161,7 +161,7 @@ def test_16_parked_is_charged_as_parked_and_resumed_as_resumed() -> None:
 def test_18_a_restore_waits_until_the_room_is_measured() -> None:
     """cuda-checkpoint#44: a restore into memory that is not free yet hangs its process for ever."""
     driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 16 * GIB})
-    driver.card.lag_s = 1.5
+    driver.device.lag_s = 1.5
     vlm, lease = held(driver, "vlm", 5, park_bytes=5 * GIB)
     policy = driver.consumer("policy")
     wanted = policy.acquire(5 * GIB)
@@ -173,7 +173,7 @@ def test_18_a_restore_waits_until_the_room_is_measured() -> None:
     driver.until(lambda: driver.state(wanted) == "revoking")
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading")
-    assert sum(driver.card.shown(driver.now).values()) == 0
+    assert sum(driver.device.shown(driver.now).values()) == 0
 
 
 def test_19_a_model_that_cannot_be_moved_to_host_ram_is_never_told_to() -> None:

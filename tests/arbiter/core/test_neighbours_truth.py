@@ -25,15 +25,15 @@ def test_1_one_reading_with_a_lot_free_is_believed_only_if_the_next_agrees() -> 
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     det.unloading(lease)
     det.release(lease)
-    gpu = driver.card.gpu
-    driver.card.silent = True
+    gpu = driver.device.gpu
+    driver.device.silent = True
     for used in (0, 5 * GIB, 0, 5 * GIB, 0):
         driver.advance(0.01)
         driver.post(MemorySampled(gpu, driver.now, used, 8 * GIB, None))
         assert driver.state(waiter) == "queued"
     driver.advance(0.01)
     driver.post(MemorySampled(gpu, driver.now, 0, 8 * GIB, None))
-    driver.card.silent = False
+    driver.device.silent = False
     det.hold(0)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
@@ -42,7 +42,7 @@ def test_1_one_reading_with_a_lot_free_is_believed_only_if_the_next_agrees() -> 
 def test_1_waiting_for_the_driver_costs_no_more_than_the_driver_takes(lag_s: float) -> None:
     """llama-swap#97: the cure is not a fixed delay that everybody pays."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = lag_s
+    driver.device.lag_s = lag_s
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     det.unload(lease)
@@ -50,7 +50,7 @@ def test_1_waiting_for_the_driver_costs_no_more_than_the_driver_takes(lag_s: flo
     assert lag_s < took <= lag_s + 0.010 + 2 * READING_S
 
 
-def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> None:
+def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_gpu() -> None:
     """And a reading may come in between, before anybody says that it died: those bytes are its own
     still, and no stowaway's."""
     driver = CoreDriver(8 * GIB)
@@ -58,10 +58,10 @@ def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> 
         driver, "det", 4, min_residency_s=60.0
     )  # so that it is not asked to leave meanwhile
     waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
-    driver.card.unlisted.add(det.process)
-    driver.post(driver.card.read(driver.now))
+    driver.device.unlisted.add(det.process)
+    driver.post(driver.device.read(driver.now))
     assert driver.gpu()["stowaway_bytes"] == 0
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det.hold(0)
     det.die()
     took = driver.until(lambda: driver.state(waiter) == "loading", step_s=0.001)
@@ -72,18 +72,18 @@ def test_1_a_dying_process_leaves_the_list_before_its_bytes_leave_the_card() -> 
 
 @pytest.mark.parametrize("outage_s", [0.0, 2.0])
 def test_1_a_dead_holders_bytes_are_waited_for_longer_than_a_verdict_takes(outage_s: float) -> None:
-    """The driver no longer lists it, its bytes come back late, and meanwhile the card may not be
+    """The driver no longer lists it, its bytes come back late, and meanwhile the GPU may not be
     readable: none of that frees them."""
     driver = CoreDriver(8 * GIB, settings={"verify_timeout_s": 1.0})
     det, lease = held(driver, "det", 4, min_residency_s=60.0)
     waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
-    driver.card.unlisted.add(det.process)
-    driver.card.lag_s = 2.5
-    driver.card.failing = "lost" if outage_s else ""
+    driver.device.unlisted.add(det.process)
+    driver.device.lag_s = 2.5
+    driver.device.failing = "lost" if outage_s else ""
     det.hold(0)
     det.die()
     driver.advance(outage_s)
-    driver.card.failing = ""
+    driver.device.failing = ""
     took = outage_s + driver.until(lambda: driver.state(waiter) == "loading", step_s=0.001)
     assert took >= 2.5
     last = [note for note in driver.notes("verified") if note["lease_id"] == lease][-1]
@@ -94,8 +94,8 @@ def test_1_what_nobody_lists_long_after_a_death_is_a_stowaways() -> None:
     driver = CoreDriver(8 * GIB, settings={"verify_timeout_s": 1.0})
     det, lease = held(driver, "det", 4, min_residency_s=60.0)
     waiter = driver.consumer("vlm").acquire(1 * GIB, exclusive=True)
-    driver.card.unlisted |= {det.process, BROWSER}
-    driver.card.set(BROWSER, 4 * GIB, driver.now)
+    driver.device.unlisted |= {det.process, BROWSER}
+    driver.device.set(BROWSER, 4 * GIB, driver.now)
     det.hold(0)
     det.die()
     took = driver.until(lambda: driver.state(waiter) == "loading", limit_s=90.0)
@@ -112,10 +112,10 @@ def test_1_a_holder_that_the_driver_cannot_list_is_not_charged_twice() -> None:
     stowaway all the same."""
     driver = CoreDriver(8 * GIB, reserve_bytes=0)
     det, _ = held(driver, "det", 4)
-    driver.card.unlisted |= {det.process, BROWSER}
+    driver.device.unlisted |= {det.process, BROWSER}
     driver.advance(3.0)
     assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (4 * GIB, 0)
-    driver.card.set(BROWSER, GIB, driver.now)
+    driver.device.set(BROWSER, GIB, driver.now)
     driver.advance(3.0)
     assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (4 * GIB, GIB)
 
@@ -164,8 +164,8 @@ def test_2_what_a_process_keeps_is_learnt() -> None:
 def test_2_stranded_bytes_have_an_owner() -> None:
     """Castwright#1976: 5.4 GB "stranded" were a resident model; what was missing was a name."""
     driver = CoreDriver(8 * GIB)
-    driver.card.names[BROWSER] = "ollama runner"
-    driver.card.set(BROWSER, int(5.4 * GIB), driver.now)
+    driver.device.names[BROWSER] = "ollama runner"
+    driver.device.set(BROWSER, int(5.4 * GIB), driver.now)
     driver.advance(1.5)
     driver.consumer("vlm").acquire(4 * GIB)
     (told,) = driver.why("vlm")["leases"]
@@ -201,8 +201,8 @@ def test_11_a_game_that_starts_is_charged_named_and_makes_idle_models_leave() ->
     _, idle = held(driver, "idle", 3)
     busy, working = held(driver, "busy", 2)
     busy.use_begin(working)
-    driver.card.names[BROWSER] = "game"
-    driver.card.set(BROWSER, 4 * GIB, driver.now)
+    driver.device.names[BROWSER] = "game"
+    driver.device.set(BROWSER, 4 * GIB, driver.now)
     driver.advance(1.5)
     (note,) = driver.notes("stowaway")
     assert (note["name"], note["used_bytes"]) == ("game", 4 * GIB)
@@ -216,19 +216,19 @@ def test_11_a_game_that_starts_is_charged_named_and_makes_idle_models_leave() ->
 def test_11_bytes_that_nobody_is_listed_for_are_reserve_too() -> None:
     """Where the driver lists no processes (LocalAI#7958 and others)."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
-    driver.card.set(BROWSER, 3 * GIB, driver.now)
+    driver.device.lists_processes = False
+    driver.device.set(BROWSER, 3 * GIB, driver.now)
     driver.advance(1.5)
     waiter = driver.consumer("w").acquire(6 * GIB)
     driver.advance(5.0)
     assert driver.state(waiter) == "queued"
-    driver.card.set(BROWSER, 0, driver.now)
+    driver.device.set(BROWSER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
 # -- 12: the manager itself eats VRAM
 def test_12_no_part_of_the_arbiter_loads_cuda() -> None:
-    """llama.cpp#20582: cudaMemGetInfo in the router cost 120-550 MB of every card."""
+    """llama.cpp#20582: cudaMemGetInfo in the router cost 120-550 MB of every GPU."""
     look = (
         "import sys, arbiter.daemon, arbiter.__main__, arbiter.host.gpu.unified\n"
         "maps = open('/proc/self/maps').read()\n"
@@ -247,13 +247,13 @@ def test_13_a_probe_that_fails_between_two_good_readings_does_not_complete_a_ver
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
     det.unloading(lease)
-    driver.card.failing = "NVML_ERROR_UNKNOWN"
+    driver.device.failing = "NVML_ERROR_UNKNOWN"
     det.hold(0)
     det.release(lease)
     driver.advance(0.5)
-    driver.post(ProbeFailed(driver.card.gpu, driver.now, "again"))
+    driver.post(ProbeFailed(driver.device.gpu, driver.now, "again"))
     assert (driver.state(lease), driver.state(waiter)) == ("verifying", "queued")
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
 
 
@@ -263,7 +263,7 @@ def test_13_a_reading_from_before_is_not_newer_because_it_arrives_later() -> Non
     taken = driver.now
     driver.advance(0.5)
     first, _ = held(driver, "a", 5)
-    driver.post(MemorySampled(driver.card.gpu, taken, 0, 8 * GIB, ()))
+    driver.post(MemorySampled(driver.device.gpu, taken, 0, 8 * GIB, ()))
     waiter = driver.consumer("b").acquire(5 * GIB)
     driver.advance(0.01)
     assert driver.state(waiter) == "queued"
@@ -271,7 +271,7 @@ def test_13_a_reading_from_before_is_not_newer_because_it_arrives_later() -> Non
 
 
 def test_13_measured_free_memory_never_overrules_the_ledger() -> None:
-    """A lease that has not loaded yet holds nothing on the card, and all of its bytes in the
+    """A lease that has not loaded yet holds nothing on the GPU, and all of its bytes in the
     ledger."""
     driver = CoreDriver(8 * GIB)
     driver.consumer("a").acquire(6 * GIB, evictable=False)
@@ -286,8 +286,8 @@ def test_13_measured_free_memory_never_overrules_the_ledger() -> None:
 def shared_memory(driver: CoreDriver, gib: float) -> None:
     """The machine itself takes so much of the memory that CPU and GPU share; nobody lists
     processes."""
-    driver.card.lists_processes = False
-    driver.card.set(ProcessKey(1, 1), int(gib * GIB), driver.now)
+    driver.device.lists_processes = False
+    driver.device.set(ProcessKey(1, 1), int(gib * GIB), driver.now)
     driver.advance(1.5)
 
 
@@ -299,7 +299,7 @@ def test_20_on_shared_memory_a_release_is_verified_by_the_total_although_the_tot
     det, lease = held(driver, "det", 3)
     driver.advance(1.5)
     det.unloading(lease)
-    driver.card.set(ProcessKey(1, 1), int(1.5 * GIB) + 150 * MIB, driver.now)
+    driver.device.set(ProcessKey(1, 1), int(1.5 * GIB) + 150 * MIB, driver.now)
     det.hold(0)
     det.release(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=1.0)
@@ -334,26 +334,26 @@ def test_20_what_the_machine_itself_takes_is_not_leased() -> None:
 def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease() -> (
     None
 ):
-    """A storm of faults found it: the card fell by as much as was waited for, because a stowaway
+    """A storm of faults found it: the GPU fell by as much as was waited for, because a stowaway
     had died unseen, and an exclusive lease was granted beside bytes that were still there."""
     driver = CoreDriver(8 * GIB)
     ghost = ProcessKey(9, 9)
-    driver.card.set(ghost, 2 * GIB, driver.now)
+    driver.device.set(ghost, 2 * GIB, driver.now)
     driver.advance(2.0)
     job, lease = held(driver, "job", 2)
     driver.advance(1.0)
-    driver.card.lists_processes = False
-    driver.card.failing = "out"
+    driver.device.lists_processes = False
+    driver.device.failing = "out"
     driver.advance(0.5)
-    driver.card.set(ghost, 0, driver.now)
-    driver.card.failing = ""
-    driver.card.lag_s = 1.0
+    driver.device.set(ghost, 0, driver.now)
+    driver.device.failing = ""
+    driver.device.lag_s = 1.0
     alone = driver.consumer("alone").acquire(GIB, exclusive=True)
     job.unload(lease)
     driver.advance(0.5)
     assert driver.state(alone) == "queued", "two GiB are gone, and not those of the job"
     driver.until(lambda: driver.state(alone) == "loading", limit_s=20.0)
-    assert driver.card.shown(driver.now).get(job.process, 0) == 0
+    assert driver.device.shown(driver.now).get(job.process, 0) == 0
 
 
 def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it() -> None:
@@ -367,15 +367,15 @@ def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it() -> None:
     context = job.specs[lease].footprint.residue_bytes
     job.unloading(lease)
     job.hold(context)
-    driver.card.overhead_bytes = 2 * GIB - context  # freed, not returned
+    driver.device.overhead_bytes = 2 * GIB - context  # freed, not returned
     driver.restart()
     job.connect()
     alone = driver.consumer("alone").acquire(GIB, exclusive=True)
     driver.advance(0.05)
-    driver.post(driver.card.read(driver.now))  # quiet: the rest in it counts
+    driver.post(driver.device.read(driver.now))  # quiet: the rest in it counts
     job.reattach(lease, token)
     job.release(lease, token=token)
     driver.advance(0.5)
-    assert driver.state(alone) == "queued", "the model is still on the card"
-    driver.card.overhead_bytes = 0
+    assert driver.state(alone) == "queued", "the model is still on the GPU"
+    driver.device.overhead_bytes = 0
     driver.until(lambda: driver.state(alone) == "loading", limit_s=20.0)

@@ -122,8 +122,8 @@ def test_4_whoever_waits_long_enough_is_next() -> None:
 
 
 def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
-    """aprender#3986: one lock for the whole card, held for 25 minutes at 97 % idle, six waiters.
-    Bytes are leased, not the card."""
+    """aprender#3986: one lock for the whole GPU, held for 25 minutes at 97 % idle, six waiters.
+    Bytes are leased, not the GPU."""
     driver = CoreDriver(8 * GIB)
     _, idle = held(driver, "idle", 1)
     people = [driver.consumer(f"w{n}") for n in range(6)]
@@ -199,7 +199,7 @@ def test_8_memory_that_comes_back_during_a_load_confuses_neither() -> None:
     """vLLM#56830: asserts if free memory grows while it measures itself. A sibling gives its bytes
     back in the middle of a load."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     leaver, going = held(driver, "leaver", 3)
     loader = driver.consumer("loader")
     loading = loader.acquire(4 * GIB)
@@ -248,7 +248,7 @@ def test_21_a_detector_that_starts_again_at_once_waits_behind_the_policy(pause_s
     """OpenRAL ADR-0050: about 15 ms after it was deactivated, autostart activates it again, into
     the memory that was made free."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 0.2
+    driver.device.lag_s = 0.2
     detector, lease = held(driver, "detector", 5)
     policy = driver.consumer("policy").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")

@@ -152,7 +152,7 @@ def test_a_lease_that_left_is_not_pursued(standby: bool) -> None:
 
 def test_a_slow_verdict_is_no_overstay() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 50.0
+    driver.device.lag_s = 50.0
     det, lease, _ = idle_and_revoked(driver, on_overstay="kill")
     driver.advance(25.0)
     det.unload(lease)

@@ -1,10 +1,10 @@
-"""What was given up a moment ago is still on the card, and is nobody's: it must not hide what the
+"""What was given up a moment ago is still on the GPU, and is nobody's: it must not hide what the
 next one gives back."""
 
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import held, hidden_card
+from tests.support.scenes import held, hidden_gpu
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import PendingFree
@@ -66,7 +66,7 @@ def test_a_holder_that_leaves_the_list_still_explains_what_it_is_booked() -> Non
 # -- what it means for the rest that nobody explains
 @pytest.mark.parametrize("lists", [True, False])
 def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(lists: bool) -> None:
-    books = GpuLedger(GpuInfo(GPU, 0, "card", 1000, 100), 10)
+    books = GpuLedger(GpuInfo(GPU, 0, "gpu", 1000, 100), 10)
 
     def observe(at: float, used: int, pending_bytes: int) -> tuple[int, int | None]:
         sample = reading(at, used) if lists else MemorySampled(GPU, at, used, 1000, None)
@@ -89,14 +89,14 @@ def test_a_rest_that_may_be_going_is_believed_as_far_as_it_was_there_before(list
 @pytest.mark.parametrize("restarts", [False, True])
 def test_a_load_peak_on_its_way_back_hides_nobodys_bytes(restarts: bool) -> None:
     """Regression (storm, seed 7): a release counted as measured while all its bytes were on the
-    card, behind a peak that had ended."""
-    driver = hidden_card(lists=False)
+    GPU, behind a peak that had ended."""
+    driver = hidden_gpu(lists=False)
     small, lease = held(driver, "small", 0.7)
     driver.advance(2.0)
     big = driver.consumer("big")
     other = big.acquire(4 * GIB, 3 * GIB)
     driver.until(lambda: driver.state(other) == "loading")
-    driver.card.lag_s = 2.0
+    driver.device.lag_s = 2.0
     big.hold(4 * GIB)
     big.hold(3 * GIB)
     big.ready(other)
@@ -107,25 +107,25 @@ def test_a_load_peak_on_its_way_back_hides_nobodys_bytes(restarts: bool) -> None
             person.connect()
             person.reattach(mine, token)
     driver.advance(1.5)  # readings while nobody loads or leaves
-    driver.card.lag_s = 5.0
+    driver.device.lag_s = 5.0
     small.unload(lease)
     assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(5.0, abs=0.1)
     assert driver.gpu()["stowaway_bytes"] == 0
 
 
 def test_a_stowaway_that_has_gone_hides_nobodys_bytes() -> None:
-    """Its process is off the list before its bytes are off the card, which then nobody in the list
+    """Its process is off the list before its bytes are off the GPU, which then nobody in the list
     explains."""
     driver = CoreDriver(8 * GIB)
     small, lease = held(driver, "small", 1)
-    driver.card.set(STRANGER, 2 * GIB, driver.now)
+    driver.device.set(STRANGER, 2 * GIB, driver.now)
     driver.advance(2.0)
-    driver.card.unlisted.add(STRANGER)
+    driver.device.unlisted.add(STRANGER)
     driver.advance(1.5)
     assert driver.gpu()["stowaway_bytes"] == 0
-    driver.card.lag_s = 3.0
+    driver.device.lag_s = 3.0
     small.unload(lease)
-    driver.card.set(STRANGER, 0, driver.now - 2.9)
+    driver.device.set(STRANGER, 0, driver.now - 2.9)
     assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(3.0, abs=0.1)
 
 
@@ -133,9 +133,9 @@ def test_a_stowaway_that_has_gone_hides_nobodys_bytes() -> None:
 def without_lists(
     stranger_gib: float, *leases_gib: float
 ) -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
-    """A card that tells totals only: a stowaway that was there first, and leases that are held."""
-    driver = hidden_card(lists=False)
-    driver.card.set(STRANGER, int(stranger_gib * GIB), driver.now)
+    """A GPU that tells totals only: a stowaway that was there first, and leases that are held."""
+    driver = hidden_gpu(lists=False)
+    driver.device.set(STRANGER, int(stranger_gib * GIB), driver.now)
     driver.advance(2.0)
     found = [held(driver, f"holder-{index}", gib) for index, gib in enumerate(leases_gib)]
     driver.advance(2.0)
@@ -146,9 +146,9 @@ def test_an_unnamed_stowaway_that_leaves_hides_no_release() -> None:
     """Regression (storm, seed 11): 2.4 GiB of two stowaways went, and so 750 MiB of a lease counted
     as measured while all were there."""
     driver, [(small, lease)] = without_lists(3, 0.75)
-    driver.card.lag_s = 3.0
+    driver.device.lag_s = 3.0
     small.unload(lease)
-    driver.card.set(STRANGER, 0, driver.now - 2.9)
+    driver.device.set(STRANGER, 0, driver.now - 2.9)
     assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(3.0, abs=0.1)
 
 
@@ -156,9 +156,9 @@ def test_the_doubt_ends_with_the_time_for_a_verdict() -> None:
     """All that is known is a total: who holds what is left, a stowaway or the one that was to
     leave, it cannot say."""
     driver, [(small, lease)] = without_lists(3, 0.75)
-    driver.card.lag_s = 60.0
+    driver.device.lag_s = 60.0
     small.unload(lease)
-    driver.card.set(STRANGER, 0, driver.now - 59.9)
+    driver.device.set(STRANGER, 0, driver.now - 59.9)
     assert driver.until(lambda: driver.state(lease) == "over") == pytest.approx(
         d.VERIFY_TIMEOUT_S, abs=0.6
     )
@@ -167,7 +167,7 @@ def test_the_doubt_ends_with_the_time_for_a_verdict() -> None:
 def test_when_all_that_nobody_named_is_gone_there_is_no_doubt() -> None:
     driver, [(small, lease)] = without_lists(3, 0.75)
     small.unload(lease)
-    driver.card.set(STRANGER, 0, driver.now)
+    driver.device.set(STRANGER, 0, driver.now)
     assert driver.until(lambda: driver.state(lease) == "over") < 0.2
 
 
@@ -185,13 +185,13 @@ def test_releases_beside_a_desktop_that_nobody_lists_explain_each_other(apart_s:
 def test_a_stowaway_that_takes_less_than_the_tolerance_with_it_raises_no_doubt() -> None:
     driver, [(small, lease)] = without_lists(3, 0.75)
     small.unload(lease)
-    driver.card.set(STRANGER, 3 * GIB - d.VERIFY_TOLERANCE_BYTES, driver.now)
+    driver.device.set(STRANGER, 3 * GIB - d.VERIFY_TOLERANCE_BYTES, driver.now)
     assert driver.until(lambda: driver.state(lease) == "over") < 0.2
 
 
 def test_a_stowaway_that_takes_a_byte_more_raises_the_doubt() -> None:
     driver, [(small, lease)] = without_lists(3, 0.75)
     small.unload(lease)
-    driver.card.set(STRANGER, 3 * GIB - d.VERIFY_TOLERANCE_BYTES - 1, driver.now)
+    driver.device.set(STRANGER, 3 * GIB - d.VERIFY_TOLERANCE_BYTES - 1, driver.now)
     driver.advance(1.0)
     assert driver.state(lease) != "over"

@@ -1,4 +1,4 @@
-"""The loop that the product exists for: detector, VLM and policy on one card of 8 GiB."""
+"""The loop that the product exists for: detector, VLM and policy on one GPU of 8 GiB."""
 
 from tests.support.core_driver import Consumer, CoreDriver, refusal
 from vram_arbiter.schemas import defaults as d
@@ -41,9 +41,9 @@ class Robot:
 def test_find_navigate_grab_and_find_again() -> None:
     robot = Robot()
     driver = robot.driver
-    driver.card.lag_s = 0.8  # the driver gives memory back late
+    driver.device.lag_s = 0.8  # the driver gives memory back late
 
-    # the VLM is resident and idle; the detector needs the card
+    # the VLM is resident and idle; the detector needs the GPU
     vlm = robot.loaded(robot.vlm, VLM)
     ready_at = driver.now
     detector = robot.acquire(robot.detector, DETECTOR)
@@ -54,7 +54,7 @@ def test_find_navigate_grab_and_find_again() -> None:
     robot.vlm.unload(vlm)
     assert driver.state(detector) == "queued", "released is not free"
     took = driver.until(lambda: driver.state(detector) == "loading")
-    assert took >= driver.card.lag_s, "granted only when the bytes were measured gone"
+    assert took >= driver.device.lag_s, "granted only when the bytes were measured gone"
     assert driver.notes("verified")[-1]["verdict"] == "verified"
     robot.detector.load(detector)
     assert driver.notes("switch")[-1]["evicted"][0]["consumer"] == "vlm"

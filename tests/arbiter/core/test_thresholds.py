@@ -20,7 +20,7 @@ BUDGET = 8 * GIB - d.RESERVE_BYTES
 def kept(driver: CoreDriver, who: Consumer) -> int:
     """What the journal has of the residue of a process, which is what is charged for it."""
     record = driver.journal.get(f"residue:{who.process}:GPU-0", {"residue_bytes": 0})
-    account = driver.arbiter.inspect().gpus[driver.card.gpu].ledger.accounts.get(who.process)
+    account = driver.arbiter.inspect().gpus[driver.device.gpu].ledger.accounts.get(who.process)
     assert (0 if account is None else account.retained_bytes) == record["residue_bytes"]
     return int(record["residue_bytes"])
 
@@ -49,7 +49,7 @@ def test_a_leftover_falls_by_more_than_the_tolerance_or_not_at_all(less: int, af
 
 
 @pytest.mark.parametrize(("shown", "after"), [(0, 0), (1, 450 * MIB), (100 * MIB, 450 * MIB)])
-def test_only_who_is_neither_connected_nor_on_the_card_has_no_context(
+def test_only_who_is_neither_connected_nor_on_the_gpu_has_no_context(
     shown: int, after: int
 ) -> None:
     driver = CoreDriver(8 * GIB)
@@ -63,7 +63,7 @@ def test_only_who_is_neither_connected_nor_on_the_card_has_no_context(
     assert kept(driver, person) == after
 
 
-def test_a_context_that_is_not_on_the_card_is_kept_until_all_have_come_back() -> None:
+def test_a_context_that_is_not_on_the_gpu_is_kept_until_all_have_come_back() -> None:
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
     other, lease = held(driver, "other", 1)
@@ -81,21 +81,21 @@ def test_a_context_that_is_not_on_the_card_is_kept_until_all_have_come_back() ->
 def test_a_reading_that_began_when_a_residue_was_charged_says_nothing_of_it() -> None:
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 2 * GIB)
-    driver.card.silent = True
+    driver.device.silent = True
     charged_at = driver.now
     driver.restart()
     for taken_at, after in ((charged_at, 2 * GIB), (charged_at + 0.0001, 0)):
-        driver.post(MemorySampled(driver.card.gpu, taken_at, 0, 8 * GIB, ()))
+        driver.post(MemorySampled(driver.device.gpu, taken_at, 0, 8 * GIB, ()))
         assert kept(driver, person) == after
 
 
 def test_what_a_dead_process_kept_is_measured_away_twice_as_any_bytes() -> None:
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
-    driver.card.silent = True
+    driver.device.silent = True
     person.die()
     for n, after in ((1, 450 * MIB), (2, 0)):
-        driver.post(MemorySampled(driver.card.gpu, driver.now + n / 100, 0, 8 * GIB, ()))
+        driver.post(MemorySampled(driver.device.gpu, driver.now + n / 100, 0, 8 * GIB, ()))
         assert kept(driver, person) == after
 
 
@@ -111,8 +111,8 @@ def test_one_that_has_a_lease_does_not_keep_others_residues_from_falling() -> No
 # -- others that grew
 def stranger(driver: CoreDriver, pid: int, count: int) -> None:
     key = ProcessKey(pid, 7 * pid)
-    driver.card.names[key] = f"p{9 - pid}"
-    driver.card.set(key, count, driver.now)
+    driver.device.names[key] = f"p{9 - pid}"
+    driver.device.set(key, count, driver.now)
 
 
 def culprits(driver: CoreDriver) -> list[tuple[int, str, int]]:
@@ -144,13 +144,13 @@ def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_tha
     driver = CoreDriver(8 * GIB)
     det, _ = held(driver, "det", 3)
     held(driver, "other", 1)
-    driver.card.failing = "the driver hangs"
+    driver.device.failing = "the driver hangs"
     driver.restart()
     driver.post(ProcessDied(det.process))
-    driver.card.set(det.process, 0, driver.now)
-    driver.card.overhead_bytes = 2 * GIB
+    driver.device.set(det.process, 0, driver.now)
+    driver.device.overhead_bytes = 2 * GIB
     stranger(driver, 9, 500 * MIB)
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.advance(30.0)
     assert culprits(driver) == [(9, "p0", 500 * MIB)]
 
@@ -160,7 +160,7 @@ def test_a_process_without_a_figure_has_not_grown() -> None:
     det, lease = held(driver, "det", 4)
     det.unloading(lease)
     driver.advance(0.5)
-    driver.card.silent = True
+    driver.device.silent = True
     det.release(lease)
     uses = (
         ProcessUse(ProcessKey(8, 8), "silent", None),
@@ -168,15 +168,15 @@ def test_a_process_without_a_figure_has_not_grown() -> None:
     )
     for _ in range(25):
         driver.advance(0.5)
-        driver.post(MemorySampled(driver.card.gpu, driver.now, GIB, 8 * GIB, uses))
+        driver.post(MemorySampled(driver.device.gpu, driver.now, GIB, 8 * GIB, uses))
     assert culprits(driver) == [(9, "browser", GIB)]
 
 
-# -- waiting for a load on another card
-def two_cards() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
-    """An idle holder on the first card; somebody loads on the second, where there is room for one
+# -- waiting for a load on another GPU
+def two_gpus() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
+    """An idle holder on the first GPU; somebody loads on the second, where there is room for one
     more."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, idle = held(driver, "idle", 6, gpu="0")
     slow = driver.consumer("slow")
     loading = slow.acquire(3 * GIB, gpu="1")
@@ -185,7 +185,7 @@ def two_cards() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
 
 
 def test_a_load_elsewhere_is_waited_for_as_long_as_a_holder_that_was_asked() -> None:
-    driver, idle, _, loading = two_cards()
+    driver, idle, _, loading = two_gpus()
     granted_at = driver.arbiter.inspect().leases[loading].granted_at
     driver.consumer("w").acquire(4 * GIB)
     driver.advance(granted_at + d.REVOKE_DEADLINE_S - 0.001 - driver.now)
@@ -197,26 +197,26 @@ def test_a_load_elsewhere_is_waited_for_as_long_as_a_holder_that_was_asked() -> 
 @pytest.mark.parametrize(
     "trouble", ["it cannot be read", "pressure", "it has not been read since a suspend"]
 )
-def test_a_load_on_a_card_in_trouble_is_not_waited_for(trouble: str) -> None:
-    driver, idle, _, _ = two_cards()
-    card = list(driver.cards.values())[1]
+def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
+    driver, idle, _, _ = two_gpus()
+    device = list(driver.devices.values())[1]
     if trouble == "pressure":
-        card.set(ProcessKey(9, 9), 7 * GIB, driver.now)
+        device.set(ProcessKey(9, 9), 7 * GIB, driver.now)
     elif trouble == "it cannot be read":
-        card.failing = "the driver hangs"
+        device.failing = "the driver hangs"
     else:
-        card.silent = True
+        device.silent = True
         driver.post(Resumed(60.0))
     driver.advance(1.5)
     if trouble == "pressure":
         assert driver.gpu(1)["pressure_bytes"] > 0
-        card.set(ProcessKey(9, 9), 0, driver.now)
+        device.set(ProcessKey(9, 9), 0, driver.now)
     driver.consumer("w").acquire(4 * GIB)
     assert driver.state(idle) == "revoking"
 
 
 def test_a_gang_that_loads_is_not_waited_for() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, idle = held(driver, "idle", 6, gpu="0")
     for name in ("a", "b"):
         driver.consumer(name).acquire(1 * GIB, gpu="1", gang=("g", 2))
@@ -323,7 +323,7 @@ def test_what_a_process_shows_of_its_peak_may_be_what_is_kept_for_its_next_membe
     first, second = (who.acquire(3 * GIB, 1 * GIB, gang=("g", 3)) for _ in range(2))
     third.acquire(3 * GIB, gang=("g", 3))
     ready_with((who, first), 5 * GIB + 1, 1 * GIB)
-    assert driver.state(second) == "queued", "the card has no room for its peak"
+    assert driver.state(second) == "queued", "the GPU has no room for its peak"
     who.hold(3500 * MIB)
     driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
 
@@ -361,8 +361,8 @@ def test_the_headroom_goes_to_the_loading_member_and_the_rest_of_it_stays_for_th
     ]
 
 
-def test_a_gang_over_two_cards_keeps_no_bytes_for_a_member_elsewhere() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_gang_over_two_gpus_keeps_no_bytes_for_a_member_elsewhere() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     a, b, c = (driver.consumer(name) for name in "abc")
     a.acquire(3 * GIB, gang=("g", 3), gpu="0")
     b.acquire(3 * GIB, gang=("g", 3), gpu="1")
@@ -424,13 +424,13 @@ def test_a_residue_of_the_journal_takes_what_room_there_is(room: int) -> None:
     key = f"lease:{lease}"
     driver.journal[key] = {**driver.journal[key], "charge_bytes": BUDGET - room}
     driver.restart()
-    account = driver.arbiter.inspect().gpus[driver.card.gpu].ledger.accounts.get(person.process)
+    account = driver.arbiter.inspect().gpus[driver.device.gpu].ledger.accounts.get(person.process)
     found = (0, 0) if account is None else (account.retained_bytes, account.retained_floor_bytes)
     assert found == (room, room)
     assert (f"residue:{person.process}:GPU-0" in driver.journal) == bool(room)
 
 
-def test_what_a_restart_found_is_told_and_what_is_of_a_card_that_is_gone_is_taken_out() -> None:
+def test_what_a_restart_found_is_told_and_what_is_of_a_gpu_that_is_gone_is_taken_out() -> None:
     driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
     _, lease = held(driver, "a", 1)

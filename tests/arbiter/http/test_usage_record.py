@@ -96,7 +96,7 @@ def test_many_consumers_are_bounded() -> None:
 def test_the_parts_of_a_gpu_add_up(driver: CoreDriver) -> None:
     """A charge is its consumer's until the holder releases, then pending free, then gone but for
     what the process retains. The parts are what the ledger charges, each time."""
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB, residue_bytes=450 * MIB)
     det.load(lease)

@@ -19,10 +19,10 @@ def shipped(name: str) -> Scenario:
 
 
 def scenario_of(
-    consumers: str, *, seconds: float = 120, lag_s: float = 0.5, card: str = "8GiB", more: str = ""
+    consumers: str, *, seconds: float = 120, lag_s: float = 0.5, gpu: str = "8GiB", more: str = ""
 ) -> Scenario:
     text = (
-        f"about: test\nseconds: {seconds}\ncards: [{{capacity: {card}, release_lag_s: "
+        f"about: test\nseconds: {seconds}\ncards: [{{capacity: {gpu}, release_lag_s: "
         f"{lag_s}}}]\n{more}\nconsumers:\n"
     )
     return load_scenario(text + consumers, "test.yaml")
@@ -47,7 +47,7 @@ def story(outcome: Outcome, *kinds: str) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("policy", SCHEDULING)
-def test_no_policy_of_the_engine_overfills_a_card(policy: str) -> None:
+def test_no_policy_of_the_engine_overfills_a_gpu(policy: str) -> None:
     made = shipped("small-behind-large")
     outcome = under(made, policy)
     assert outcome.total.ooms == 0
@@ -71,7 +71,7 @@ def test_a_switch_waits_for_the_safe_point_and_for_the_memory() -> None:
     ]
     at = {(note.kind, note.about.consumer): when for when, note in outcome.timeline if note.about}
     assert at["use_ended", "left"] <= at["unloading", "left"]
-    assert at["granted", "right"] - at["released", "left"] >= 0.5  # the card's lag
+    assert at["granted", "right"] - at["released", "left"] >= 0.5  # the GPU's lag
     assert outcome.switches == 1
     assert outcome.of("right").wait_s(1.0) == pytest.approx(at["ready", "right"] - 1.0)
 

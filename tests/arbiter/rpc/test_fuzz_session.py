@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from tests.support.connections import KeptConnection, peer_of
-from tests.support.core_driver import SimCard
+from tests.support.core_driver import SimDevice
 from tests.support.engine_state import state_of
 from tests.support.full_check import check_arbiter
 from tests.support.hostile import Forger, pack
@@ -68,7 +68,7 @@ class Recording:
 
 @dataclass
 class RealCore:
-    """The core with its executor, a card that shows nothing, a journal in a dict, and time that
+    """The core with its executor, a GPU that shows nothing, a journal in a dict, and time that
     moves when told."""
 
     plant: "Plant"
@@ -77,7 +77,7 @@ class RealCore:
 
     def __post_init__(self) -> None:
         info = GpuInfo(GPU, 0, "simulated", 8 * d.GIB, d.RESERVE_BYTES)
-        self.card = SimCard(GPU, 8 * d.GIB)
+        self.device = SimDevice(GPU, 8 * d.GIB)
         self.arbiter = Arbiter(Settings(epoch=1, gpus=(info,)), self.plant.now)
         self.executor = Executor(
             self.plant.outbox,
@@ -138,7 +138,7 @@ class RealCore:
 
     def _sample(self, gpu: GpuId) -> None:
         self.plant.now += 0.001
-        self.post(self.card.read(self.plant.now))
+        self.post(self.device.read(self.plant.now))
 
     def advance(self, seconds: float) -> None:
         end = self.plant.now + seconds

@@ -265,7 +265,7 @@ def test_a_resize_that_was_answered_or_is_on_the_way_is_said_once(link: Wire, fi
     assert len(link.said("resize")) == (1 if first == "silent" else 0)
 
 
-def test_a_resize_ends_when_the_lease_leaves_the_card(link: Wire) -> None:
+def test_a_resize_ends_when_the_lease_leaves_the_gpu(link: Wire) -> None:
     """Regression: the arbiter drops a growth whose lease unloads and says nothing of it; `resize`
     never returned."""
     record = link.hold()

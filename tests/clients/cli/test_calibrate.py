@@ -366,9 +366,9 @@ print("has worked")
 class Watched(FakeGpu):
     """A simulated GPU that tells a program in a folder which sizes, in MiB, were read."""
 
-    def __init__(self, card: Path, seen: Path) -> None:
-        super().__init__(card)
-        self.folder, self.seen = card, seen
+    def __init__(self, fake_folder: Path, seen: Path) -> None:
+        super().__init__(fake_folder)
+        self.folder, self.seen = fake_folder, seen
 
     def read(self) -> Reading:
         reading = super().read()
@@ -378,35 +378,35 @@ class Watched(FakeGpu):
 
 
 @pytest.fixture
-def card(tmp_path: Path) -> Path:
+def fake_folder(tmp_path: Path) -> Path:
     make_gpu(tmp_path / "gpu", 8 * GIB, release_lag_s=0.0)
     return tmp_path / "gpu"
 
 
 @pytest.fixture
-def gpu(card: Path) -> Watched:
-    (card.parent / "seen").mkdir()
-    return Watched(card, card.parent / "seen")
+def gpu(fake_folder: Path) -> Watched:
+    (fake_folder.parent / "seen").mkdir()
+    return Watched(fake_folder, fake_folder.parent / "seen")
 
 
 def command(gpu: Watched, program: str = PROGRAM) -> list[str]:
     return [sys.executable, "-c", program, str(gpu.seen)]
 
 
-def hide(card: Path) -> None:
-    config = fakegpu.parse_config((card / fakegpu.GPU_FILE).read_text())
+def hide(fake_folder: Path) -> None:
+    config = fakegpu.parse_config((fake_folder / fakegpu.GPU_FILE).read_text())
     hidden = config.model_copy(update={"faults": fakegpu.Faults(hide_processes=True)})
-    (card / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(hidden))
+    (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(hidden))
 
 
 @pytest.mark.e2e
 @pytest.mark.anyio
 @pytest.mark.parametrize("listed", [True, False], ids=["listed", "hidden"])
 async def test_a_program_under_observation(
-    listed: bool, gpu: Watched, card: Path, capfd: pytest.CaptureFixture[str]
+    listed: bool, gpu: Watched, fake_folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     if not listed:
-        hide(card)
+        hide(fake_folder)
     measured = await measure_program(gpu, QUICK, command(gpu), None, print)
     assert measured.basis.listed is listed
     assert measured.figures == Figures(
@@ -422,7 +422,7 @@ async def test_a_program_under_observation(
 
 @pytest.mark.e2e
 @pytest.mark.anyio
-async def test_programs_without_figures(gpu: Watched, card: Path) -> None:
+async def test_programs_without_figures(gpu: Watched, fake_folder: Path) -> None:
     async def run(program: str, pace: Pace = QUICK) -> CalibrationFailed:
         with pytest.raises(CalibrationFailed) as caught:
             await measure_program(gpu, pace, command(gpu, program), None, print)
@@ -435,7 +435,7 @@ async def test_programs_without_figures(gpu: Watched, card: Path) -> None:
     assert "no bytes" in (await run("pass")).message
     with pytest.raises(CalibrationFailed, match="cannot start"):
         await measure_program(gpu, QUICK, ["/no/such/program"], None, print)
-    hide(card)
+    hide(fake_folder)
     disturbed = await run(STOWAWAY, replace(QUICK, limit_s=1.0))
     assert "another program used it meanwhile" in disturbed.message
 
@@ -444,9 +444,9 @@ STOWAWAY = """
 import os
 from pathlib import Path
 
-card = Path(os.environ["VRAM_FAKE_GPU"])
-(card / "other.new").write_text('{"pid": 1, "context_bytes": 1000000000}')
-(card / "other.new").rename(card / "other.json")
+folder = Path(os.environ["VRAM_FAKE_GPU"])
+(folder / "other.new").write_text('{"pid": 1, "context_bytes": 1000000000}')
+(folder / "other.new").rename(folder / "other.json")
 """
 """Leaves a gigabyte of a process of nobody's concern."""
 
@@ -507,7 +507,7 @@ def calibrate(
 ) -> Callable[..., int]:
     """`vramctl calibrate` in this process, beside a real daemon."""
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", str(arbiter_daemon.runtime))
-    monkeypatch.setenv(fakegpu.FOLDER_VARIABLE, str(arbiter_daemon.card))
+    monkeypatch.setenv(fakegpu.FOLDER_VARIABLE, str(arbiter_daemon.gpu_folder))
     return lambda *words: run_main(["calibrate", *FLAGS, *words])
 
 
@@ -601,11 +601,11 @@ def test_refused_before_anything_is_measured(
     words: list[str],
     code: int,
     said: str,
-    card: Path,
+    fake_folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv(fakegpu.FOLDER_VARIABLE, str(card))
+    monkeypatch.setenv(fakegpu.FOLDER_VARIABLE, str(fake_folder))
     monkeypatch.chdir(Path(__file__).parents[3])
     try:
         found = run_main(["calibrate", *words])

@@ -321,7 +321,7 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))\n"
         "FakeMemory(Path(sys.argv[1]), 'job', 0).allocate('x', 2 << 30); signal.pause()"
     )
-    command = [sys.executable, "-c", holder, str(arbiter_daemon.card)]
+    command = [sys.executable, "-c", holder, str(arbiter_daemon.gpu_folder)]
     spec = RunSpec(command, "job", 1 << 30, "any", 40, None, False, "priority", None)
 
     class Signals:

@@ -91,7 +91,7 @@ def server(
 ) -> Iterator[tuple[Running, int]]:
     """A stand-in server of 4 GiB under `vramctl run`, and its pid."""
     port = str(next(PORTS))
-    command = [*SERVER, str(arbiter.card), str(4 << 30), HOST, port, *broken]
+    command = [*SERVER, str(arbiter.gpu_folder), str(4 << 30), HOST, port, *broken]
     urls = [option.replace("URL", f"http://{HOST}:{port}") for option in options]
     with running(arbiter, "--on-evict", action, *urls, "--", *command) as run:
         yield run, int(run.line())

@@ -83,7 +83,7 @@ def test_status_says_what_is_wrong_with_the_daemons_own_files() -> None:
     assert text.status_lines(STATUS | {"problems": problems})[1] == f"  {problems[0]}"
 
 
-def test_status_of_a_card_in_trouble() -> None:
+def test_status_of_a_gpu_in_trouble() -> None:
     processes = [
         {"pid": 8, "name": "Xorg", "used_bytes": 200 * MIB, "residue_bytes": 0, "stowaway": True},
         {

@@ -65,7 +65,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             "--rskill",
             f"{SKILLS[1]}/rskill.yaml",
             "--device",
-            f"fake:{arbiter_daemon.card}",
+            f"fake:{arbiter_daemon.gpu_folder}",
         )
         think = (
             "vram-reasoner",
@@ -123,7 +123,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
                     0
                 ] < 0.5
 
-                # somebody needs the card: it leaves, and says *evicted* to whoever still speaks of
+                # somebody needs the GPU: it leaves, and says *evicted* to whoever still speaks of
                 # the old lease
                 granted = await asyncio.to_thread(
                     arbiter.acquire, "vla", 6 * GB, wait_timeout_s=60.0
@@ -160,5 +160,5 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
     assert told["source"] == "reward_model"
     assert told["data"]["progress"][-1] < 0.5, "nothing has been grabbed"
     assert told["data"]["success"][-1] < 0.5
-    report = check_log((arbiter_daemon.card / "log.jsonl").read_text())
+    report = check_log((arbiter_daemon.gpu_folder / "log.jsonl").read_text())
     assert (report.problems, report.oom_events) == ([], 0)

@@ -1,4 +1,4 @@
-"""Frames of the simulator through a (simulated) card: a real arbiter, sidecar and runner; under a
+"""Frames of the simulator through a (simulated) GPU: a real arbiter, sidecar and runner; under a
 lease, and the arm keeps still.
 """
 
@@ -30,7 +30,7 @@ def passthrough_programs(arbiter_daemon: ArbiterProcess, tmp_path: Path) -> Iter
         "--rskill",
         str(RSKILL),
         "--device",
-        f"fake:{arbiter_daemon.card}",
+        f"fake:{arbiter_daemon.gpu_folder}",
     ]
     runner = ["sim", "--seed", "1", "--skills", str(RSKILL)]
     log = tmp_path / "programs.log"
@@ -73,7 +73,7 @@ async def one_goal(daemon: ArbiterProcess, sidecar: Forked) -> None:
         assert after == pytest.approx(before, abs=0.03)
 
 
-def test_frames_pass_the_card_under_a_lease_and_nothing_moves(
+def test_frames_pass_the_gpu_under_a_lease_and_nothing_moves(
     arbiter_daemon: ArbiterProcess, passthrough_programs: list[Forked]
 ) -> None:
     asyncio.run(asyncio.wait_for(one_goal(arbiter_daemon, passthrough_programs[0]), 280))

@@ -1,7 +1,7 @@
 """A grab goal through the real parts: daemon, policy sidecar with the shipped checkpoint, runner
 with the simulator.
 
-One use spans the goal: a rival that needs the whole card waits for the goal's end, not for a moment
+One use spans the goal: a rival that needs the whole GPU waits for the goal's end, not for a moment
 between two chunks.
 """
 
@@ -60,14 +60,14 @@ async def grab_beside_rival(arbiter: ArbiterProcess, programs: GrabPrograms) -> 
         told = [(e["kind"], e.get("reason")) for e in (await rival.history()).events]
         assert state == "held", f"no goal runs before its policy is ready: {told}"
         assert uses >= 1, "the goal is one use; an op under way is another"
-        whole_card = LeaseSpec(
+        whole_gpu = LeaseSpec(
             consumer="rival",
             model_id="big",
             footprint=Footprint(
                 load_peak_bytes=6_000_000_000, steady_bytes=6_000_000_000, residue_bytes=0
             ),
         )
-        waiting = asyncio.create_task(rival.acquire(whole_card))
+        waiting = asyncio.create_task(rival.acquire(whole_gpu))
         result = await grab.result(60)
         assert result["status"] == "succeeded", result
         assert result["data"]["withheld"] == 0

@@ -700,7 +700,7 @@ def test_a_goal_that_is_over_before_its_policy_is_there_takes_the_load_back(
     wanted: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Regressions: the sidecar went on and made others leave the card for a goal that had been
+    """Regressions: the sidecar went on and made others leave the GPU for a goal that had been
     canceled; also one that was called back from standby, or left in that moment, and said neither
     `waiting` nor `loading`.
     """

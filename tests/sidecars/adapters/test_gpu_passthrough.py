@@ -1,4 +1,4 @@
-"""Frames through the card: nothing moves, nothing is made up, no card is an error at the start."""
+"""Frames through the GPU: nothing moves, nothing is made up, no GPU is an error at the start."""
 
 import tempfile
 from pathlib import Path
@@ -45,7 +45,7 @@ def adapter() -> GpuPassthroughAdapter:
     made = make_adapter(manifest, resolve(str(manifest.weights_uri), CONFIGS))
     assert isinstance(made, GpuPassthroughAdapter)
     made.prepare()
-    made.place("cpu")  # what a simulated card computes on
+    made.place("cpu")  # what a simulated GPU computes on
     return made
 
 
@@ -107,7 +107,7 @@ def test_without_cameras_there_is_nothing_to_pass_on() -> None:
 
 
 @pytest.mark.parametrize("device", ["none", "cuda"])
-def test_without_a_card_it_does_not_start(
+def test_without_a_gpu_it_does_not_start(
     device: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Regression: a program that called `main` kept the sidecar's folder as its temporary
@@ -115,11 +115,11 @@ def test_without_a_card_it_does_not_start(
     import torch
 
     if device == "cuda" and torch.cuda.is_available():
-        pytest.skip("this machine has a card")
+        pytest.skip("this machine has a GPU")
     before = tempfile.gettempdir()
     flags = ["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"]
     assert main([*flags, "--endpoint", f"ipc://{tmp_path}/passthrough.sock"]) == 1
     assert tempfile.gettempdir() == before
     said = capsys.readouterr().err
-    assert "card" in said or "GPU" in said
+    assert "GPU" in said
     assert "fake:FOLDER" in said

@@ -6,7 +6,7 @@ from vram_arbiter.schemas.errors import NoGpu
 
 
 @pytest.mark.heavy
-def test_without_a_card_it_says_what_to_do():
+def test_without_a_gpu_it_says_what_to_do():
     torch = pytest.importorskip("torch")
     from vram_arbiter.sidecars.device.cuda import CudaMemory
 

@@ -1,4 +1,4 @@
-"""The writer on a simulated card: real processes, real files, real kills; the daemon's reader and
+"""The writer on a simulated GPU: real processes, real files, real kills; the daemon's reader and
 the checker look on."""
 
 import os
@@ -54,17 +54,17 @@ sys.stdin.read()
 
 
 @pytest.fixture
-def card_folder(tmp_path):
+def gpu_folder(tmp_path):
     make_gpu(tmp_path, 8 * GIB, release_lag_s=0.2)
     return tmp_path
 
 
 @pytest.fixture
-def start_child(card_folder):
+def start_child(gpu_folder):
     children = []
 
     def start(code, *arguments):
-        command = [sys.executable, "-c", code, str(card_folder), *arguments]
+        command = [sys.executable, "-c", code, str(gpu_folder), *arguments]
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         children.append(child)
         return child
@@ -75,13 +75,13 @@ def start_child(card_folder):
         child.communicate()
 
 
-def used(card_folder):
-    probe = FakeProbe([card_folder])
+def used(gpu_folder):
+    probe = FakeProbe([gpu_folder])
     return probe.sample(probe.gpus()[0].id).used_bytes
 
 
 def seconds_until(condition, deadline_s=60.0):
-    """Wait until a condition on the card's files holds; returns how long it took."""
+    """Wait until a condition on the GPU's files holds; returns how long it took."""
     began, pause = time.monotonic(), threading.Event()
     while not condition():
         assert time.monotonic() < began + deadline_s, "it did not happen in time"
@@ -89,42 +89,42 @@ def seconds_until(condition, deadline_s=60.0):
     return time.monotonic() - began
 
 
-def test_racing_processes_never_exceed_the_capacity(tmp_path, start_child, card_folder):
-    make_gpu(card_folder, 1 * GIB, release_lag_s=0.01)
+def test_racing_processes_never_exceed_the_capacity(tmp_path, start_child, gpu_folder):
+    make_gpu(gpu_folder, 1 * GIB, release_lag_s=0.01)
     children = [start_child(CONTENDER, str(seed)) for seed in range(4)]
     refused = [int(child.communicate(timeout=60)[0]) for child in children]
     assert sum(refused) > 0, "the race was not tight enough to show anything"
-    seconds_until(lambda: used(card_folder) == 0)
-    report = check_log((card_folder / "log.jsonl").read_text())
+    seconds_until(lambda: used(gpu_folder) == 0)
+    report = check_log((gpu_folder / "log.jsonl").read_text())
     assert report.problems == []
     assert report.oom_events == sum(refused)
     assert 0.5 * GIB < report.peak_bytes <= GIB
 
 
-def test_a_killed_process_gives_its_memory_back_after_the_lag(start_child, card_folder):
+def test_a_killed_process_gives_its_memory_back_after_the_lag(start_child, gpu_folder):
     holder = start_child(HOLDER)
     assert holder.stdout.readline() == "ready\n"
-    assert used(card_folder) == 4 * GIB + 450 * MIB
+    assert used(gpu_folder) == 4 * GIB + 450 * MIB
     with pytest.raises(SimulatedOutOfMemory):
-        FakeMemory(card_folder, "other", 0).allocate("w", 5 * GIB)
+        FakeMemory(gpu_folder, "other", 0).allocate("w", 5 * GIB)
     os.kill(holder.pid, signal.SIGKILL)
-    assert seconds_until(lambda: used(card_folder) == 0) >= 0.2, (
+    assert seconds_until(lambda: used(gpu_folder) == 0) >= 0.2, (
         "it came back before the lag was over"
     )
-    FakeMemory(card_folder, "other", 0).allocate("w", 5 * GIB)
-    assert check_log((card_folder / "log.jsonl").read_text()).problems == []
+    FakeMemory(gpu_folder, "other", 0).allocate("w", 5 * GIB)
+    assert check_log((gpu_folder / "log.jsonl").read_text()).problems == []
 
 
-def test_a_zombie_holds_nothing(start_child, card_folder):
+def test_a_zombie_holds_nothing(start_child, gpu_folder):
     holder = start_child(HOLDER)
     holder.stdout.readline()
     os.kill(holder.pid, signal.SIGKILL)  # not reaped: it stays as a zombie
-    seconds_until(lambda: used(card_folder) == 0)
+    seconds_until(lambda: used(gpu_folder) == 0)
     assert holder.poll() is not None
 
 
-def test_the_life_of_one_model(card_folder):
-    memory = FakeMemory(card_folder, "model", 450 * MIB)
+def test_the_life_of_one_model(gpu_folder):
+    memory = FakeMemory(gpu_folder, "model", 450 * MIB)
     assert memory.used_bytes() == 0
     block = memory.allocate("weights", 3 * GIB)
     peak = memory.allocate("shard", GIB)
@@ -136,13 +136,13 @@ def test_the_life_of_one_model(card_folder):
     )
     memory.empty_cache()
     assert memory.used_bytes() == 450 * MIB
-    seconds_until(lambda: used(card_folder) == 450 * MIB)
+    seconds_until(lambda: used(gpu_folder) == 450 * MIB)
     memory.close()
-    seconds_until(lambda: used(card_folder) == 0)
+    seconds_until(lambda: used(gpu_folder) == 0)
 
 
-def test_an_out_of_memory_while_filling_leaves_nothing_behind(card_folder):
-    memory = FakeMemory(card_folder, "model", 0)
+def test_an_out_of_memory_while_filling_leaves_nothing_behind(gpu_folder):
+    memory = FakeMemory(gpu_folder, "model", 0)
     with pytest.raises(OutOfMemory):
         fill(memory, "weights", 9 * GIB, bytes_per_s=None)
     memory.empty_cache()
@@ -156,8 +156,8 @@ def test_filling_is_throttled():
     assert sum(slept) == pytest.approx(3.0)
 
 
-def test_threads_of_one_process_do_not_lose_each_others_bytes(card_folder):
-    memory = FakeMemory(card_folder, "model", 0)
+def test_threads_of_one_process_do_not_lose_each_others_bytes(gpu_folder):
+    memory = FakeMemory(gpu_folder, "model", 0)
     threads = [
         threading.Thread(target=lambda: [memory.allocate("w", MIB) for _ in range(20)])
         for _ in range(4)
@@ -169,6 +169,6 @@ def test_threads_of_one_process_do_not_lose_each_others_bytes(card_folder):
     assert memory.used_bytes() == 80 * MIB
 
 
-def test_there_must_be_a_card(tmp_path):
+def test_there_must_be_a_gpu(tmp_path):
     with pytest.raises(NoGpu, match="--gpu fake:8GiB"):
         FakeMemory(tmp_path / "none", "model")

@@ -1,5 +1,5 @@
 """The daemon under simulation: the real core, inbox, sessions, codec, executor and journal, on a
-simulated loop, wire, clock and card.
+simulated loop, wire, clock and GPU.
 
 It can be killed between any two effects of any event: before a record is written, after it and
 before the reply is sent, after that. What is in the journal stays; what the sockets had not handed
@@ -14,8 +14,8 @@ from typing import Any
 import msgpack
 
 from tests.support.full_check import check_arbiter
-from tests.support.simulation.card import Device, ProbeFaults, SimProber
 from tests.support.simulation.clock import Clock, new_loop
+from tests.support.simulation.device import Device, ProbeFaults, SimProber
 from tests.support.simulation.wire import Line, SimWire
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
@@ -58,11 +58,11 @@ class Happening:
 
 @dataclass(slots=True)
 class Machine:
-    """What outlives the daemon: cards, processes, the state folder, the boot."""
+    """What outlives the daemon: GPUs, processes, the state folder, the boot."""
 
     clock: Clock
     wire: SimWire
-    cards: dict[GpuId, Device]
+    devices: dict[GpuId, Device]
     folder: Path
     settings: Callable[[int], Settings]
     probe_faults: dict[GpuId, ProbeFaults]
@@ -123,7 +123,9 @@ class SimDaemon:
             self._slept,
             sample=lambda gpu: self._prober.sample(gpu),
         )
-        self._prober = SimProber(clock, self.loop, machine.cards, machine.probe_faults, self._post)
+        self._prober = SimProber(
+            clock, self.loop, machine.devices, machine.probe_faults, self._post
+        )
         self.sessions = SessionTable(
             SessionSettings(
                 epoch=epoch,

@@ -1,4 +1,4 @@
-"""The simulated card as physics has it, and the probe through which the daemon sees it.
+"""The simulated GPU as physics has it, and the probe through which the daemon sees it.
 
 `Device` knows who really holds what; the arbiter never reads it. `SimProber` has the contract of
 `arbiter.host.prober.Prober` and can fail, hang, lag and lie.
@@ -16,7 +16,7 @@ HISTORY_S = 2.0  # how far back a lagging probe can look
 
 
 class SimOutOfMemory(Exception):
-    """The card is full."""
+    """The GPU is full."""
 
 
 @dataclass(slots=True)
@@ -30,7 +30,7 @@ class Block:
 
 
 class Device:
-    """One card. What is freed is shown, and cannot be used by anyone, until `lag_s` later."""
+    """One GPU. What is freed is shown, and cannot be used by anyone, until `lag_s` later."""
 
     def __init__(self, clock: Clock, gpu: GpuId, total_bytes: int, overhead_bytes: int) -> None:
         self.clock = clock
@@ -46,7 +46,7 @@ class Device:
         self._past: list[tuple[float, dict[ProcessKey, int]]] = []
 
     def allocate(self, process: ProcessKey, tag: str, count: int) -> None:
-        """Raises SimOutOfMemory where the card has not so many bytes left."""
+        """Raises SimOutOfMemory where the GPU has not so many bytes left."""
         free = self.total_bytes - self.used_bytes()
         if count > free:
             raise SimOutOfMemory(f"{count} wanted, {free} of {self.total_bytes} free on {self.gpu}")
@@ -87,7 +87,7 @@ class Device:
                 self.free(process, tag)
 
     def blocks(self) -> list[Block]:
-        """Everything that occupies the card now, also what was freed and is not back yet."""
+        """Everything that occupies the GPU now, also what was freed and is not back yet."""
         found: dict[tuple[ProcessKey, str], int] = dict(self.held)
         for _, process, tag, count in self._lagging():
             found[process, tag] = found.get((process, tag), 0) + count
@@ -115,7 +115,7 @@ class Device:
         return self.late
 
     def _changed(self, what: str) -> None:
-        self.clock.say(f"card {self.gpu}: {what}, {self.used_bytes()} used")
+        self.clock.say(f"GPU {self.gpu}: {what}, {self.used_bytes()} used")
         now = self.clock.now
         self._past.append((now, self.by_process()))
         while len(self._past) > 1 and self._past[1][0] < now - HISTORY_S:
@@ -124,11 +124,11 @@ class Device:
 
 @dataclass(slots=True)
 class ProbeFaults:
-    """How a card's readings go wrong. All off: honest, within a few milliseconds."""
+    """How a GPU's readings go wrong. All off: honest, within a few milliseconds."""
 
     failing: str = ""
     hanging: bool = False
-    behind_s: float = 0.0  # shows the card as it was
+    behind_s: float = 0.0  # shows the GPU as it was
     unlisted: bool = False  # no process list
     unnamed_bytes: bool = False  # a list without bytes
     factor: float = 1.0  # > 1: says that more is used than is; < 1: less
@@ -139,18 +139,18 @@ class ProbeFaults:
 
 
 class SimProber:
-    """Readings of all cards, one at a time for each: idle → reading → idle, or reading → stuck."""
+    """Readings of all GPUs, one at a time each: idle → reading → idle, or reading → stuck."""
 
     def __init__(
         self,
         clock: Clock,
         loop: ProcessLoop,
-        cards: dict[GpuId, Device],
+        devices: dict[GpuId, Device],
         faults: dict[GpuId, ProbeFaults],
         post: Callable[[Event], None],
     ) -> None:
         self._readers = {
-            gpu: _Reader(clock, loop, card, faults[gpu], post) for gpu, card in cards.items()
+            gpu: _Reader(clock, loop, device, faults[gpu], post) for gpu, device in devices.items()
         }
 
     def sample(self, gpu: GpuId) -> None:
@@ -162,14 +162,14 @@ class _Reader:
         self,
         clock: Clock,
         loop: ProcessLoop,
-        card: Device,
+        device: Device,
         faults: ProbeFaults,
         post: Callable[[Event], None],
     ) -> None:
-        self._clock, self._loop, self._card, self._faults, self._post = (
+        self._clock, self._loop, self._device, self._faults, self._post = (
             clock,
             loop,
-            card,
+            device,
             faults,
             post,
         )
@@ -202,30 +202,30 @@ class _Reader:
         self._clock.at(looks_at, look)  # the reading thread does not stop with the loop
 
     def _look(self, taken_at: float) -> Event:
-        faults, card = self._faults, self._card
+        faults, device = self._faults, self._device
         if faults.failing:
-            return ProbeFailed(card.gpu, self._clock.now, faults.failing)
+            return ProbeFailed(device.gpu, self._clock.now, faults.failing)
         seen = (
-            card.by_process_at(self._clock.now - faults.behind_s)
+            device.by_process_at(self._clock.now - faults.behind_s)
             if faults.behind_s
-            else card.by_process()
+            else device.by_process()
         )
         used = min(
-            card.total_bytes, int((card.overhead_bytes + sum(seen.values())) * faults.factor)
+            device.total_bytes, int((device.overhead_bytes + sum(seen.values())) * faults.factor)
         )
         processes = None
         if not faults.unlisted:
             processes = tuple(
                 ProcessUse(
                     process,
-                    card.names.get(process, f"p{process.pid}"),
+                    device.names.get(process, f"p{process.pid}"),
                     None if faults.unnamed_bytes else count,
                 )
                 for process, count in sorted(seen.items())
                 if process not in faults.blind_to
-                and not (faults.forgets_the_dead and process in card.dead)
+                and not (faults.forgets_the_dead and process in device.dead)
             )
-        return MemorySampled(card.gpu, taken_at, used, card.total_bytes, processes)
+        return MemorySampled(device.gpu, taken_at, used, device.total_bytes, processes)
 
     def _done(self, outcome: Event) -> None:
         self._state = "idle"
@@ -235,7 +235,7 @@ class _Reader:
 
     def _expired(self) -> None:
         self._state = "stuck"
-        self._post(ProbeFailed(self._card.gpu, self._clock.now, "no answer in time"))
+        self._post(ProbeFailed(self._device.gpu, self._clock.now, "no answer in time"))
         self._wait_for_return()
 
     def _wait_for_return(self) -> None:
@@ -248,4 +248,4 @@ class _Reader:
     def _still_stuck(self) -> None:
         self._complaining = False
         if self._state == "stuck":
-            self._post(ProbeFailed(self._card.gpu, self._clock.now, "the reading still hangs"))
+            self._post(ProbeFailed(self._device.gpu, self._clock.now, "the reading still hangs"))

@@ -1,4 +1,4 @@
-"""The simulated machine: processes that live, hang and die, cards, a wire, and a daemon that can be
+"""The simulated machine: processes that live, hang and die, GPUs, a wire, and a daemon that can be
 killed and started again.
 
 Clients are brought by the caller (the daemon's tree must not import them): a client opens a `Link`
@@ -7,8 +7,8 @@ what must hold whatever happens; the first breach ends the run:
 
     * the core never raises (its own invariants are on), and no task of anybody fails
     * tokens grow over all grants, also across restarts
-    * on the physical card: what processes were granted or still occupy never exceeds the capacity,
-    and nobody shares an exclusive card
+    * on the physical GPU: what processes were granted or still occupy never exceeds the capacity,
+    and nobody shares an exclusive GPU
     * no lost wake-up: whenever the core rests, the head of a queue does not fit
 """
 
@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.engine_state import state_of
-from tests.support.simulation.card import Device, ProbeFaults
 from tests.support.simulation.clock import TRACE_LINES, Clock, ProcessLoop, new_loop
 from tests.support.simulation.daemon import Happening, Machine, SimDaemon
+from tests.support.simulation.device import Device, ProbeFaults
 from tests.support.simulation.wire import Link, SimWire
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
@@ -52,7 +52,7 @@ class SimFailure(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Entitlement:
-    """A lease as its holder believes it: what it may put on the card now."""
+    """A lease as its holder believes it: what it may put on the GPU now."""
 
     process: ProcessKey
     lease_id: str
@@ -87,7 +87,7 @@ class World:
         seed: int,
         folder: Path,
         *,
-        cards: int = 1,
+        gpus: int = 1,
         capacity_bytes: int = CAPACITY_BYTES,
         settings: Mapping[str, Any] = QUICK,
         lines_max: int | None = TRACE_LINES,
@@ -97,9 +97,9 @@ class World:
         self.wire = SimWire(self.clock)
         self.gpus = tuple(
             GpuInfo(GpuId(f"GPU-{index}"), index, f"simulated {index}", capacity_bytes)
-            for index in range(cards)
+            for index in range(gpus)
         )
-        self.cards = {
+        self.devices = {
             info.id: Device(self.clock, info.id, capacity_bytes, OVERHEAD_BYTES)
             for info in self.gpus
         }
@@ -107,10 +107,10 @@ class World:
         self.machine = Machine(
             self.clock,
             self.wire,
-            self.cards,
+            self.devices,
             folder,
             lambda epoch: Settings(epoch=epoch, gpus=self.gpus, **overrides),
-            {gpu: ProbeFaults() for gpu in self.cards},
+            {gpu: ProbeFaults() for gpu in self.devices},
         )
         self.daemon: SimDaemon | None = None
         self.processes: dict[ProcessKey, SimProcess] = {}
@@ -157,8 +157,8 @@ class World:
         )
         self.processes[key] = process
         self.machine.alive[pid] = key
-        for card in self.cards.values():
-            card.names[key] = name
+        for device in self.devices.values():
+            device.names[key] = name
         self.clock.say(f"process {name} {key} starts")
         return process
 
@@ -186,8 +186,8 @@ class World:
             callback()
         if self.machine.alive.get(process.key.pid) == process.key:
             del self.machine.alive[process.key.pid]
-        for card in self.cards.values():
-            card.bury(process.key)
+        for device in self.devices.values():
+            device.bury(process.key)
         seen = self.clock.random.uniform(*DEATH_SEEN_S)
         self.clock.after(seen, lambda: self._tell_death(process.key))
         self.touch()
@@ -212,14 +212,14 @@ class World:
         return self.daemon is not None and not self.daemon.loop.dead
 
     def reboot(self) -> None:
-        """Power cut: every process is gone, the cards are empty, the boot id is new. The journal's
+        """Power cut: every process is gone, the GPUs are empty, the boot id is new. The journal's
         file survives."""
         self.kill_daemon("power cut")
         for process in list(self.processes.values()):
             self.kill(process)
-        for card in self.cards.values():
-            card.held.clear()
-            card.late.clear()
+        for device in self.devices.values():
+            device.held.clear()
+            device.late.clear()
         self.machine.boot += 1
 
     def _core_failed(self, error: BaseException) -> None:
@@ -227,13 +227,13 @@ class World:
 
     # -- what must hold
     def touch(self) -> None:
-        """Somebody's belief or bytes changed: look at the cards after this step."""
+        """Somebody's belief or bytes changed: look at the GPUs after this step."""
         self._touched = True
 
     def _after_step(self) -> None:
         if self._touched:
             self._touched = False
-            self._check_cards()
+            self._check_devices()
         history = self.machine.history
         while self._notes_seen < len(history):
             self._check_note(history[self._notes_seen])
@@ -255,8 +255,8 @@ class World:
             self.fail(f"token {token} was granted after {self._last_token}")
         self._last_token = token
 
-    def _check_cards(self) -> None:
-        granted: dict[GpuId, list[Entitlement]] = {gpu: [] for gpu in self.cards}
+    def _check_devices(self) -> None:
+        granted: dict[GpuId, list[Entitlement]] = {gpu: [] for gpu in self.devices}
         for entitlement in self.entitlements():
             if entitlement.gpu not in granted:
                 self.fail(
@@ -265,10 +265,10 @@ class World:
                 )
                 return
             granted[entitlement.gpu].append(entitlement)
-        for gpu, card in self.cards.items():
-            self._check_card(card, granted[gpu])
+        for gpu, device in self.devices.items():
+            self._check_device(device, granted[gpu])
 
-    def _check_card(self, card: Device, granted: list[Entitlement]) -> None:
+    def _check_device(self, device: Device, granted: list[Entitlement]) -> None:
         """Granted or still occupied: per lease the larger of the two, and one context for each
         process. What a process did not free counts towards its next lease: its allocator hands it
         out again.
@@ -276,7 +276,7 @@ class World:
         held: dict[tuple[ProcessKey, str], int] = {}
         contexts: dict[ProcessKey, int] = {}
         leaks: dict[ProcessKey, int] = {}
-        for block in card.blocks():
+        for block in device.blocks():
             if block.tag == "context":
                 contexts[block.process] = block.count
             elif block.tag == "leak":
@@ -293,15 +293,15 @@ class World:
             promised = sum(count for (owner, _), count in weights.items() if owner == process)
             there = sum(count for (owner, _), count in held.items() if owner == process)
             total += max(promised, there + leaks.get(process, 0))
-        if total > card.total_bytes and not self.distrusted:
+        if total > device.total_bytes and not self.distrusted:
             self.fail(
-                f"{card.gpu}: {total} bytes are granted or occupied, it has {card.total_bytes}: "
-                f"{weights}, contexts {contexts}, leaks {leaks}"
+                f"{device.gpu}: {total} bytes are granted or occupied, it has "
+                f"{device.total_bytes}: {weights}, contexts {contexts}, leaks {leaks}"
             )
         for exclusive in (e for e in granted if e.exclusive):
             others = [e.lease_id for e in granted if e.lease_id != exclusive.lease_id]
             if others:
-                self.fail(f"{card.gpu}: {others} beside the exclusive {exclusive.lease_id}")
+                self.fail(f"{device.gpu}: {others} beside the exclusive {exclusive.lease_id}")
 
     def _check_wake_up(self, daemon: SimDaemon) -> None:
         core = state_of(daemon.core)

@@ -1,7 +1,7 @@
 """A rule machine over gangs: yields, gangs and circles in any order, with deaths and restarts in
 between.
 
-Holders that load only what they were granted never overfill the card, every waiter is served in the
+Holders that load only what they were granted never overfill the GPU, every waiter is served in the
 end, and nothing stays charged when all processes are gone.
 """
 
@@ -23,15 +23,15 @@ SIZES = [450 * d.MIB, 1 * d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_
 
 
 class Gangs(RuleBasedStateMachine):
-    """Model: what each process has put on the card."""
+    """Model: what each process has put on the GPU."""
 
     leases = Bundle("leases")
 
     @initialize(lag=st.sampled_from([0.0, 0.03, 0.8]), lists=st.booleans())
     def start(self, lag: float, lists: bool) -> None:
         self.driver = CoreDriver(CAPACITY, start=False)
-        self.driver.card.lag_s = lag
-        self.driver.card.lists_processes = lists
+        self.driver.device.lag_s = lag
+        self.driver.device.lists_processes = lists
         self.driver.advance(0.01)  # the first reading
         self.people = [self.driver.consumer(f"p{n}") for n in range(5)]
         self.mine: dict[LeaseId, Consumer] = {}
@@ -124,10 +124,10 @@ class Gangs(RuleBasedStateMachine):
 
     def show(self, process: ProcessKey) -> None:
         count = max(sum(self.loaded.get(process, {}).values()), self.context.get(process, 0))
-        self.driver.card.set(process, count, self.driver.now)
+        self.driver.device.set(process, count, self.driver.now)
 
     def fits(self) -> None:
-        shown = self.driver.card.shown(self.driver.now)
+        shown = self.driver.device.shown(self.driver.now)
         assert sum(shown.values()) <= CAPACITY, (shown, self.driver.status())
 
     @rule(lease=leases, who=st.integers(0, 4))

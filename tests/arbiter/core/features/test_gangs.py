@@ -1,4 +1,4 @@
-"""Gangs: together or not at all, one after the other on a card, and what becomes of the rest when
+"""Gangs: together or not at all, one after the other on a GPU, and what becomes of the rest when
 one of them fails."""
 
 from typing import Any
@@ -219,23 +219,23 @@ def test_nobody_of_a_gang_is_backfilled_alone(driver: CoreDriver) -> None:
 
 def test_measured_memory_that_is_not_there_keeps_a_gang_waiting(driver: CoreDriver) -> None:
     person, lease = held(driver, "other", 3)
-    driver.card.silent = True
+    driver.device.silent = True
     driver.advance(3.0)
     a, b = Member(driver, "a", 2), Member(driver, "b", 2)
     assert states_of(a, b) == ["queued", "queued"], "the reading is too old"
-    driver.card.silent = False
+    driver.device.silent = False
     driver.until(lambda: a.state == "loading", limit_s=3.0)
     del person, lease
 
 
-# -- several cards
-def test_a_model_over_two_cards_is_a_gang_of_two_leases() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+# -- several GPUs
+def test_a_model_over_two_gpus_is_a_gang_of_two_leases() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     who = driver.consumer("p")
     first = who.acquire(6 * GIB, gang=("g", 2), gpu="0")
     second = who.acquire(6 * GIB, gang=("g", 2), gpu="1")
     assert (driver.state(first), driver.state(second)) == ("loading", "loading"), (
-        "serial per card only"
+        "serial per GPU only"
     )
     who.load(first)
     who.load(second)
@@ -243,15 +243,15 @@ def test_a_model_over_two_cards_is_a_gang_of_two_leases() -> None:
 
 
 def test_members_that_may_be_anywhere_are_spread_so_that_all_fit() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     a = Member(driver, "a", 6)
     b = Member(driver, "b", 2, gpu="0")
     assert states_of(a, b) == ["loading", "loading"]
     assert driver.view(a.lease)["gpu"] == "GPU-1"  # type: ignore[index]
 
 
-def test_both_cards_are_emptied_or_none() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_both_gpus_are_emptied_or_none() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     idle, first = held(driver, "idle", 5, gpu="0")
     busy, second = held(driver, "busy", 5, gpu="1", priority=90)
     busy.use_begin(second)
@@ -262,13 +262,13 @@ def test_both_cards_are_emptied_or_none() -> None:
     assert (driver.state(first), driver.state(second)) == ("revoking", "revoking")
     idle.unload(first)
     driver.advance(1.0)
-    assert states_of(a, b) == ["queued", "queued"], "one card is free, the other is not"
+    assert states_of(a, b) == ["queued", "queued"], "one GPU is free, the other is not"
     busy.unload(second)
     driver.until(lambda: states_of(a, b) == ["loading", "loading"])
 
 
-def test_an_exclusive_member_wants_a_card_of_its_own() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_an_exclusive_member_wants_a_gpu_of_its_own() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     a = Member(driver, "a", 2, exclusive=True)
     b = Member(driver, "b", 2)
     assert states_of(a, b) == ["loading", "loading"]
@@ -283,7 +283,7 @@ def test_an_exclusive_member_wants_a_card_of_its_own() -> None:
 
 def test_a_search_without_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gang_module, "SEARCH_MAX", 1)
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     Member(driver, "a", 6)
     assert (
         refusal(driver.consumer("b").try_acquire(6 * GIB, gang=("g", 2))).code
@@ -328,7 +328,7 @@ def test_a_member_that_waits_for_its_turn_and_gives_up_gives_its_bytes_back(
 def test_nobody_of_an_unfinished_gang_is_evicted(driver: CoreDriver) -> None:
     a, b = pair(driver)
     a.load()
-    driver.card.set(ProcessKey(9, 9), 5 * GIB, driver.now)
+    driver.device.set(ProcessKey(9, 9), 5 * GIB, driver.now)
     driver.advance(2.0)
     assert driver.gpu()["pressure_bytes"] > 0
     assert states_of(a, b) == ["held", "loading"]
@@ -366,14 +366,14 @@ def test_somebody_who_grew_meanwhile_is_asked_to_leave_or_the_gang_breaks(
             assert codes(driver, b) == ["gang_broken"]
 
 
-def test_an_unreadable_card_makes_the_next_member_wait(driver: CoreDriver) -> None:
+def test_an_unreadable_gpu_makes_the_next_member_wait(driver: CoreDriver) -> None:
     a, b = pair(driver)
-    driver.card.failing = "NVML_ERROR_UNKNOWN"
+    driver.device.failing = "NVML_ERROR_UNKNOWN"
     driver.advance(1.1)
     a.load()
     driver.advance(1.0)
     assert b.state == "queued"
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.until(lambda: b.state == "loading", limit_s=3.0)
 
 
@@ -464,23 +464,23 @@ def test_refusals_of_a_gang_reach_who_has_only_just_asked(driver: CoreDriver) ->
 
 
 def test_memory_that_nobody_can_explain_is_not_free_for_a_gang(driver: CoreDriver) -> None:
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     other, lease = held(driver, "other", 1)
-    driver.card.set(ProcessKey(9, 9), 4 * GIB, driver.now)  # it appears while somebody unloads
+    driver.device.set(ProcessKey(9, 9), 4 * GIB, driver.now)  # it appears while somebody unloads
     other.unloading(lease)
     driver.advance(1.5)
     a, b = Member(driver, "a", 3), Member(driver, "b", 2)
     driver.advance(1.5)
     assert states_of(a, b) == ["queued", "queued"]
     assert driver.blocked() == "not_free"
-    driver.card.set(ProcessKey(9, 9), 0, driver.now)
+    driver.device.set(ProcessKey(9, 9), 0, driver.now)
     driver.until(lambda: a.state == "loading", limit_s=2.0)
 
 
-def test_an_idle_card_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
-    """Two exclusive members and one card that can be emptied: the other one's holder is of higher
+def test_an_idle_gpu_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
+    """Two exclusive members and one GPU that can be emptied: the other one's holder is of higher
     priority."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, lease = held(driver, "busy", 2, gpu="1", priority=90)
     busy.use_begin(lease)
     _, idle = held(driver, "idle", 2, gpu="0")
@@ -492,10 +492,10 @@ def test_an_idle_card_beside_a_busy_one_is_no_place_for_half_a_gang() -> None:
     assert (driver.state(idle), driver.state(lease)) == ("revoking", "revoking")
 
 
-def test_a_gang_goes_ahead_of_a_waiter_for_which_another_card_is_being_emptied() -> None:
+def test_a_gang_goes_ahead_of_a_waiter_for_which_another_gpu_is_being_emptied() -> None:
     """Regression: only the head of the queue was asked for its turn, so a gang waited although its
     room was free."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, lease = held(driver, "busy", 5, gpu="0", priority=90)
     busy.use_begin(lease)
     _, idle = held(driver, "idle", 5, gpu="1")

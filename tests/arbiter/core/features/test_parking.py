@@ -1,4 +1,4 @@
-"""Parked leases: off the card, weights in host RAM within one budget, charged the residue there and
+"""Parked leases: off the GPU, weights in host RAM within one budget, charged the residue there and
 nothing twice."""
 
 from dataclasses import replace
@@ -115,7 +115,7 @@ def test_who_declared_nothing_cannot_park_and_who_exits_keeps_nothing() -> None:
 
 
 # -- away and back
-def test_parked_it_is_charged_its_residue_on_the_card_and_its_weights_in_ram() -> None:
+def test_parked_it_is_charged_its_residue_on_the_gpu_and_its_weights_in_ram() -> None:
     driver = driver_with()
     vlm, lease, policy, wanted = parked(driver)
     view = driver.view(lease)
@@ -133,7 +133,7 @@ def test_parked_it_is_charged_its_residue_on_the_card_and_its_weights_in_ram() -
     assert driver.gpu()["charged_bytes"] == 5 * GIB, (
         "the load peak with the residue folded, as ever"
     )
-    assert ram(driver) == 5 * GIB, "the copy is there until the weights are on the card"
+    assert ram(driver) == 5 * GIB, "the copy is there until the weights are on the GPU"
     vlm.load(lease)
     assert ram(driver) == 0
     assert "parked_bytes" not in (driver.view(lease) or {})
@@ -284,7 +284,7 @@ def test_a_release_that_was_lost_is_made_up_for() -> None:
     assert ram(driver) == 5 * GIB
 
 
-def test_after_a_restart_its_holder_says_that_it_parked_and_not_an_empty_card() -> None:
+def test_after_a_restart_its_holder_says_that_it_parked_and_not_an_empty_gpu() -> None:
     driver = driver_with()
     vlm, lease, _, _ = revoked_vlm(driver)
     token = vlm.token(lease)

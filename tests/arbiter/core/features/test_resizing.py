@@ -1,4 +1,4 @@
-"""A held lease that shrinks when the card agrees, and grows when it is its turn."""
+"""A held lease that shrinks when the GPU agrees, and grows when it is its turn."""
 
 import pytest
 
@@ -17,9 +17,9 @@ GIB, MIB = d.GIB, d.MIB
 
 # -- shrinking
 @pytest.mark.parametrize("lists", [True, False])
-def test_a_shrink_is_believed_when_the_card_agrees(lists: bool) -> None:
+def test_a_shrink_is_believed_when_the_gpu_agrees(lists: bool) -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = lists
+    driver.device.lists_processes = lists
     vlm, lease = held(driver, "vlm", 6, evictable=False)
     vlm.use_begin(lease)
     vlm.hold(4 * GIB)
@@ -46,7 +46,7 @@ def test_a_shrink_is_believed_when_the_card_agrees(lists: bool) -> None:
 def test_a_shrink_that_did_not_happen_changes_nothing(lists: bool) -> None:
     """Triton, vLLM: unload frees 82 of 4,764 MiB."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = lists
+    driver.device.lists_processes = lists
     vlm, lease = held(driver, "vlm", 6)
     vlm.resize(lease, 4 * GIB)
     driver.advance(9.9)
@@ -58,9 +58,9 @@ def test_a_shrink_that_did_not_happen_changes_nothing(lists: bool) -> None:
     assert driver.notes("resized")[-1]["changed_bytes"] == 0, "they did not come back in time"
 
 
-def test_a_shrink_on_a_lagging_card_waits_for_it() -> None:
+def test_a_shrink_on_a_lagging_gpu_waits_for_it() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.5
+    driver.device.lag_s = 1.5
     vlm, lease = held(driver, "vlm", 6)
     vlm.hold(4 * GIB)
     vlm.resize(lease, 4 * GIB)
@@ -72,7 +72,7 @@ def test_a_shrink_on_a_lagging_card_waits_for_it() -> None:
 def test_a_failing_probe_shrinks_nobody() -> None:
     driver = CoreDriver(8 * GIB)
     vlm, lease = held(driver, "vlm", 6)
-    driver.card.failing = "NVML_ERROR_UNKNOWN"
+    driver.device.failing = "NVML_ERROR_UNKNOWN"
     vlm.hold(4 * GIB)
     vlm.resize(lease, 4 * GIB)
     driver.advance(20.0)
@@ -85,8 +85,8 @@ def test_what_it_held_before_it_shrank_is_no_drift(lists: bool) -> None:
     """Regression: it was compared with the new size, noted as drift, and the next load was charged
     the old one."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = lists
-    driver.card.lag_s = 0.5
+    driver.device.lists_processes = lists
+    driver.device.lag_s = 0.5
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(6 * GIB)
     vlm.load(lease, None if lists else 6 * GIB)
@@ -120,7 +120,7 @@ def test_a_holder_that_keeps_what_it_said_to_give_back_drifts() -> None:
 @pytest.mark.parametrize("residue", [0, 2 * GIB])
 def test_the_holders_own_word_follows_its_size(residue: int) -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(2 * GIB, residue_bytes=residue)
     vlm.load(lease, GIB if residue else 2 * GIB)

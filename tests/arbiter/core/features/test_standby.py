@@ -72,7 +72,7 @@ def test_cancel_on_the_way_to_standby_is_heard() -> None:
     det, lease = held(driver, "det", 5, standby=True)
     driver.consumer("policy").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det.unload(lease)
     assert driver.state(lease) == "verifying"
     assert answer(det.cancel(lease)) == {"state": "verifying"}
@@ -112,7 +112,7 @@ def test_it_never_delays_a_waiter() -> None:
     assert (why["state"], why["back"], why["ahead"]) == ("standby", "behind", "big")
 
 
-def test_it_waits_until_the_card_has_been_quiet() -> None:
+def test_it_waits_until_the_gpu_has_been_quiet() -> None:
     """Between two goals the policy is away for a moment only."""
     driver = CoreDriver(8 * GIB)
     _, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
@@ -158,7 +158,7 @@ def test_once_used_it_has_its_residency() -> None:
 def all_away(
     driver: CoreDriver, boss_gib: float, **wanted: tuple[float, dict[str, Any]]
 ) -> dict[str, tuple[Consumer, LeaseId]]:
-    """Several on standby, in this order of leaving, and the card is empty again; nobody is back
+    """Several on standby, in this order of leaving, and the GPU is empty again; nobody is back
     before a second of quiet."""
     people = {
         name: held(driver, name, gib, standby=True, min_residency_s=1.0, **spec)
@@ -197,7 +197,7 @@ def test_the_order_is_priority_then_who_left_first() -> None:
 def test_a_small_one_does_not_take_the_place_of_the_one_before_it() -> None:
     driver = CoreDriver(8 * GIB)
     people = all_away(driver, 7, det=(5.2, {}), tiny=(2.4, {}))
-    driver.card.set(ProcessKey(9, 9), 1 * GIB, driver.now)
+    driver.device.set(ProcessKey(9, 9), 1 * GIB, driver.now)
     other, resident = stay(driver, 2)
     driver.advance(20.0)
     assert driver.state(people["det"][1]) == "standby", "5.2 do not fit beside 2 and a stowaway"
@@ -263,36 +263,36 @@ def test_pressure_sends_on_standby_too_and_lets_back_when_it_is_over() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     game = driver.consumer("game")
-    driver.card.set(game.process, 4 * GIB, driver.now)
+    driver.device.set(game.process, 4 * GIB, driver.now)
     driver.until(lambda: driver.state(lease) == "revoking", limit_s=5.0)
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "standby")
     driver.advance(5.0)
     assert driver.state(lease) == "standby"
-    driver.card.set(game.process, 0, driver.now)
+    driver.device.set(game.process, 0, driver.now)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
 
 
-def test_a_blocked_card_brings_nobody_back() -> None:
+def test_a_blocked_gpu_brings_nobody_back() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease, policy, wanted = sent_away(driver)
     policy.unload(wanted)
-    driver.card.failing = "NVML_ERROR_UNKNOWN"
+    driver.device.failing = "NVML_ERROR_UNKNOWN"
     driver.advance(20.0)
     assert driver.state(lease) == "standby"
     (why,) = driver.why("det")["leases"]
     assert (why["back"], why["block"]["code"]) == ("blocked", "unreadable")
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
 
 
 def test_the_reading_has_to_agree_before_it_comes_back() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     _, lease, policy, wanted = sent_away(driver)
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading")
-    assert sum(driver.card.shown(driver.now).values()) == 0
+    assert sum(driver.device.shown(driver.now).values()) == 0
 
 
 # -- wanted now
@@ -362,7 +362,7 @@ def test_reacquire_of_what_is_not_coming_back_is_refused() -> None:
 
 
 def test_reacquire_that_can_never_fit_changes_nothing() -> None:
-    """It was granted once; after a restart there is a smaller card."""
+    """It was granted once; after a restart there is a smaller GPU."""
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")
@@ -372,7 +372,7 @@ def test_reacquire_that_can_never_fit_changes_nothing() -> None:
     driver.until(lambda: driver.state(wanted) == "loading")
     token = det.token(lease)
     policy.die()
-    driver.shrink(driver.card.gpu, 4 * GIB)
+    driver.shrink(driver.device.gpu, 4 * GIB)
     driver.restart()
     det.connect()
     answer(det.reattach(lease, token, away=True))

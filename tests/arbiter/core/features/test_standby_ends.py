@@ -1,4 +1,4 @@
-"""What ends or changes a lease on standby: its holder, its process, an operator; several cards; its
+"""What ends or changes a lease on standby: its holder, its process, an operator; several GPUs; its
 invariants."""
 
 from collections.abc import Callable
@@ -89,7 +89,7 @@ def test_an_operators_word_outweighs_the_engines() -> None:
     """The engine asked it to leave, then an operator evicts it: at any step of its way out."""
     for steps in range(3):
         driver = CoreDriver(8 * GIB)
-        driver.card.lag_s = 0.3
+        driver.device.lag_s = 0.3
         det, lease = held(driver, "det", 5, standby=True)
         policy = driver.consumer("policy")
         wanted = policy.acquire(5 * GIB)
@@ -158,9 +158,9 @@ def test_a_pin_on_standby_holds_after_the_return() -> None:
     assert (driver.state(lease), driver.state(again)) == ("held", "queued")
 
 
-# -- several cards, invariants
-def test_it_may_come_back_on_another_card() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+# -- several GPUs, invariants
+def test_it_may_come_back_on_another_gpu() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     det, lease = held(driver, "det", 5, standby=True)
     other, second = held(driver, "other", 5)
     policy = driver.consumer("policy")

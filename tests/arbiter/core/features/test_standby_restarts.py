@@ -127,7 +127,7 @@ def test_a_restart_does_not_let_a_revoke_outrun_the_uses_of_others() -> None:
 
 def test_a_restart_during_the_measurement() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det, lease = held(driver, "det", 5, standby=True)
     driver.consumer("policy").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
@@ -162,7 +162,7 @@ def test_a_release_that_was_lost_is_made_up_for() -> None:
     assert len(driver.notes("standby")) == 1
 
 
-def test_after_a_restart_its_holder_says_that_it_left_and_not_an_empty_card() -> None:
+def test_after_a_restart_its_holder_says_that_it_left_and_not_an_empty_gpu() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     driver.consumer("policy").acquire(5 * GIB)

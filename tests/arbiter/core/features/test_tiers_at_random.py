@@ -20,15 +20,15 @@ BUDGET = CAPACITY - d.RESERVE_BYTES
 
 
 class Crowd:
-    """Four processes with one lease each at a time, and what each holds on its card by its own
+    """Four processes with one lease each at a time, and what each holds on its GPU by its own
     doing."""
 
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)
         settings = {"host_ram_budget_bytes": 6 * GIB, "thrash_hold_max_s": 3.0}
-        self.driver = CoreDriver(CAPACITY, cards=self.draw.choice([1, 2]), settings=settings)
-        for card in self.driver.cards.values():
-            card.lag_s = self.draw.choice([0.0, 0.1])
+        self.driver = CoreDriver(CAPACITY, gpus=self.draw.choice([1, 2]), settings=settings)
+        for device in self.driver.devices.values():
+            device.lag_s = self.draw.choice([0.0, 0.1])
         self.people = [self.driver.consumer(f"p{n}") for n in range(4)]
         self.leases: dict[LeaseId, Consumer] = {}
 
@@ -99,7 +99,7 @@ class Crowd:
     def has_grown(self, person: Consumer, lease: LeaseId) -> bool:
         view = self.driver.view(lease)
         assert view is not None
-        held = self.driver.cards[view["gpu"]].held[person.process]
+        held = self.driver.devices[view["gpu"]].held[person.process]
         return bool(view["charge_bytes"] >= person.specs[lease].footprint.steady_bytes > held)
 
     def resize(self, person: Consumer, lease: LeaseId, charge: int) -> None:
@@ -126,11 +126,11 @@ class Crowd:
             if lease is not None:
                 self.order(lease, "evict")
         elif chance < 0.1:
-            card = self.draw.choice(list(self.driver.cards.values()))
-            card.failing = "" if card.failing else "probe died"
+            device = self.draw.choice(list(self.driver.devices.values()))
+            device.failing = "" if device.failing else "probe died"
         elif chance < 0.12:  # somebody without a lease comes, goes, or gives back a part
-            card = self.draw.choice(list(self.driver.cards.values()))
-            card.set(STRANGER, self.draw.choice([0, GIB, 3 * GIB]), self.driver.now)
+            device = self.draw.choice(list(self.driver.devices.values()))
+            device.set(STRANGER, self.draw.choice([0, GIB, 3 * GIB]), self.driver.now)
         elif chance < 0.14:
             lease = self.mine(self.draw.choice(self.people))
             if lease is not None:
@@ -171,8 +171,8 @@ class Crowd:
 
     def check(self) -> None:
         check_arbiter(self.driver.arbiter)
-        for card in self.driver.cards.values():
-            shown = card.shown(self.driver.now)
+        for device in self.driver.devices.values():
+            shown = device.shown(self.driver.now)
             assert sum(count for process, count in shown.items() if process != STRANGER) <= BUDGET
         status = self.driver.status()
         assert status["host_ram"]["parked_bytes"] == sum(
@@ -187,9 +187,9 @@ def live_at_random(seed: int, steps: int) -> tuple[Crowd, collections.Counter[st
         crowd.step(crowd.draw.choice(crowd.people))
         crowd.driver.advance(crowd.draw.choice([0.01, 0.1, 0.6, 3.0]))
         crowd.check()
-    for card in crowd.driver.cards.values():
-        card.failing = ""
-        card.set(STRANGER, 0, crowd.driver.now)
+    for device in crowd.driver.devices.values():
+        device.failing = ""
+        device.set(STRANGER, 0, crowd.driver.now)
     for lease in crowd.leases:
         if crowd.driver.state(lease) != "over":
             crowd.order(lease, "unpin")

@@ -68,7 +68,7 @@ def test_another_consumer_or_model_learns_for_itself() -> None:
 
 def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     driver.advance(1.5)
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
@@ -132,7 +132,7 @@ def test_within_the_tolerance_nobody_drifts() -> None:
     assert "drift_bytes" not in (driver.view(lease) or {})
 
 
-def test_while_somebody_loads_the_card_is_read_twenty_times_a_second() -> None:
+def test_while_somebody_loads_the_gpu_is_read_twenty_times_a_second() -> None:
     driver = CoreDriver(8 * GIB)
     driver.consumer("det").acquire(2 * GIB)
     driver.advance(0.1)
@@ -179,7 +179,7 @@ def test_a_process_with_two_leases_teaches_nothing() -> None:
     assert max(footprints["det det-model"].get("load_peak", [1 * GIB])) == 1 * GIB
 
 
-def test_what_was_learnt_never_asks_for_more_than_a_whole_card() -> None:
+def test_what_was_learnt_never_asks_for_more_than_a_whole_gpu() -> None:
     driver = CoreDriver(
         8 * GIB, settings={"footprints": {"det det-model": {"load_peak": [9 * GIB]}}}
     )
@@ -190,7 +190,7 @@ def test_what_was_learnt_never_asks_for_more_than_a_whole_card() -> None:
 
 def test_a_refusal_says_that_the_figure_was_learnt() -> None:
     settings = {"footprints": {"det det-model": {"steady": [6 * GIB]}}}
-    driver = CoreDriver(8 * GIB, cards=2, settings=settings)
+    driver = CoreDriver(8 * GIB, gpus=2, settings=settings)
     driver.shrink(GpuId("GPU-1"), 4 * GIB)
     driver.restart(keep_journal=False)
     refused = refusal(driver.consumer("det").try_acquire(2 * GIB, gpu="1"))

@@ -1,4 +1,4 @@
-"""The sub-tables of a card's residents follow every change; the full invariant check compares them
+"""The sub-tables of a GPU's residents follow every change; the full invariant check compares them
 with the leases."""
 
 from tests.support import full_check
@@ -10,7 +10,7 @@ from vram_arbiter.schemas.ids import GpuId
 
 
 def crowd(count: int) -> tuple[Residents, list[Lease]]:
-    """A card of small held leases of one process."""
+    """A GPU of small held leases of one process."""
     driver = CoreDriver(8 * d.GIB)
     holder = driver.consumer("a")
     ids = []
@@ -39,7 +39,7 @@ def test_a_reading_sees_what_happened_before_it_began() -> None:
     assert list(residents.recent) == [two.id]
 
 
-def test_who_fills_the_card_since_a_moment() -> None:
+def test_who_fills_the_gpu_since_a_moment() -> None:
     """Loads now, or became ready later, whatever it does since; whoever was ready before is not
     even looked at."""
     residents, (one, two, three, four) = crowd(4)

@@ -20,8 +20,8 @@ def test_status_shows_holders_first_then_the_queue_in_order() -> None:
     busy.use_begin(lease)
     driver.consumer("late").acquire(5 * GIB)
     driver.consumer("urgent").acquire(5 * GIB, priority=90)
-    driver.card.names[ProcessKey(9, 9)] = "browser"
-    driver.card.set(ProcessKey(9, 9), 100 * MIB, driver.now)
+    driver.device.names[ProcessKey(9, 9)] = "browser"
+    driver.device.set(ProcessKey(9, 9), 100 * MIB, driver.now)
     driver.advance(1.5)
     status = driver.status()
     assert [view["consumer"] for view in status["leases"]] == ["busy", "urgent", "late"]
@@ -80,7 +80,7 @@ def test_why_of_a_resident_lease_says_what_it_is_doing() -> None:
 
 def test_why_follows_the_way_of_the_holder() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det, lease = held(driver, "det", 5.3, min_residency_s=2.0)
     det.use_begin(lease)
     det.use_begin(lease, "u2")
@@ -181,7 +181,7 @@ def test_why_when_only_measurements_are_missing() -> None:
 def test_why_names_relief_of_pressure_and_a_victim_of_somebody_else() -> None:
     driver = CoreDriver(8 * GIB)
     calm, lease = held(driver, "calm", 5)
-    driver.card.set(ProcessKey(9, 9), 3 * GIB, driver.now)
+    driver.device.set(ProcessKey(9, 9), 3 * GIB, driver.now)
     driver.until(lambda: driver.state(lease) == "revoking", limit_s=2.0)
     assert why(driver, "calm")["text"] == "calm: it was revoked for relief of pressure, idle"
     assert calm.name == "calm"

@@ -102,10 +102,10 @@ def test_one_that_waits_for_its_turn_names_who_loads() -> None:
 
 def test_a_member_whose_memory_is_missing_says_until_when() -> None:
     driver = CoreDriver(start=False)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     driver.advance(0.01)
     policy, first, _, _ = gang(driver)
-    driver.card.set(ProcessKey(9, 9), 3 * GIB, driver.now)
+    driver.device.set(ProcessKey(9, 9), 3 * GIB, driver.now)
     driver.advance(1.5)
     policy.load(first)
     driver.advance(2.0)
@@ -158,8 +158,8 @@ def test_the_context_of_a_members_process_is_told_from_what_is_kept_for_it() -> 
     ]
 
 
-def test_a_gang_over_two_cards_tells_each_member_its_own_card() -> None:
-    driver = CoreDriver(cards=2)
+def test_a_gang_over_two_gpus_tells_each_member_its_own_gpu() -> None:
+    driver = CoreDriver(gpus=2)
     left, lease = held(driver, "left", 5, gpu="0")
     right, _ = held(driver, "right", 5, gpu="1")
     left.use_begin(lease)
@@ -206,7 +206,7 @@ def test_a_member_that_waits_for_the_rest_after_a_restart_knows_until_when() -> 
 def test_what_a_dead_holder_left_is_a_debt() -> None:
     driver = CoreDriver()
     dead, lease = held(driver, "dead", 5)
-    driver.card.lag_s = 5.0
+    driver.device.lag_s = 5.0
     dead.die()
     driver.consumer("w").acquire(5 * GIB)
     assert blockers(driver, "w")[0][2:] == (5.0, "debt", "is over, its bytes are being measured")

@@ -20,16 +20,16 @@ def test_what_is_charged_and_measured_by_consumer() -> None:
     held(driver, "vlm", 3)
     driver.consumer("policy").acquire(4 * GIB)
     stowaway = ProcessKey(99, 1)
-    driver.card.set(stowaway, 64 * MIB, driver.now)
-    driver.card.set(person.process, 2 * GIB + MIB, driver.now)
+    driver.device.set(stowaway, 64 * MIB, driver.now)
+    driver.device.set(person.process, 2 * GIB + MIB, driver.now)
     driver.advance(1.1)
     figures = driver.arbiter.figures()
     assert figures.waiters == 1
-    (card,) = figures.gpus
-    assert (card.gpu, card.capacity_bytes) == ("GPU-0", 8 * GIB)
-    assert card.charged == {"det": 3 * GIB, "vlm": 3 * GIB}
-    assert card.used_bytes == 6 * GIB + 65 * MIB
-    assert card.measured == {
+    (gpu,) = figures.gpus
+    assert (gpu.gpu, gpu.capacity_bytes) == ("GPU-0", 8 * GIB)
+    assert gpu.charged == {"det": 3 * GIB, "vlm": 3 * GIB}
+    assert gpu.used_bytes == 6 * GIB + 65 * MIB
+    assert gpu.measured == {
         "det": 3 * GIB + MIB,
         "vlm": 3 * GIB,
         STOWAWAYS: 64 * MIB,
@@ -42,34 +42,34 @@ def test_residues_have_no_consumer_and_shared_processes_both() -> None:
     both, _ = held(driver, "vlm", 1)
     both.name = "helper"
     held(driver, "helper", 1, person=both)
-    driver.card.set(both.process, 2 * GIB, driver.now)
+    driver.device.set(both.process, 2 * GIB, driver.now)
     person.unload(lease)
-    driver.card.set(person.process, 512 * MIB, driver.now)
+    driver.device.set(person.process, 512 * MIB, driver.now)
     driver.until(lambda: driver.state(lease) == "over")
     driver.advance(1.1)
-    (card,) = driver.arbiter.figures().gpus
-    assert card.charged == {"vlm": GIB, "helper": GIB, RESIDUES: 512 * MIB}
-    assert card.used_bytes == 2 * GIB + 512 * MIB
-    assert card.measured == {"helper+vlm": 2 * GIB, RESIDUES: 512 * MIB}
+    (gpu,) = driver.arbiter.figures().gpus
+    assert gpu.charged == {"vlm": GIB, "helper": GIB, RESIDUES: 512 * MIB}
+    assert gpu.used_bytes == 2 * GIB + 512 * MIB
+    assert gpu.measured == {"helper+vlm": 2 * GIB, RESIDUES: 512 * MIB}
 
 
-def test_a_card_that_cannot_be_read_shows_no_bytes() -> None:
+def test_a_gpu_that_cannot_be_read_shows_no_bytes() -> None:
     driver = CoreDriver(8 * GIB, start=False)
     assert driver.arbiter.figures().gpus[0].measured is None, "not read yet"
     driver.advance(0.01)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     held(driver, "det", 2)
     assert driver.arbiter.figures().gpus[0].measured == {UNATTRIBUTED: 2 * GIB}
-    driver.card.lists_processes, driver.card.knows_bytes = True, False
+    driver.device.lists_processes, driver.device.knows_bytes = True, False
     driver.advance(1.1)
     assert driver.arbiter.figures().gpus[0].measured == {UNATTRIBUTED: 2 * GIB}, (
         "listed, without their bytes"
     )
-    driver.card.failing = "lost"
+    driver.device.failing = "lost"
     driver.advance(1.1)
-    (card,) = driver.arbiter.figures().gpus
-    assert (card.measured, card.used_bytes) == (None, None)
-    assert card.charged == {"det": 2 * GIB}
+    (gpu,) = driver.arbiter.figures().gpus
+    assert (gpu.measured, gpu.used_bytes) == (None, None)
+    assert gpu.charged == {"det": 2 * GIB}
 
 
 def test_pressure_a_drain_and_the_time_of_the_reading() -> None:
@@ -82,14 +82,14 @@ def test_pressure_a_drain_and_the_time_of_the_reading() -> None:
         person.client, driver.next_request(), "drain", "", "operator", "maintenance"
     )
     driver.post(event)
-    driver.card.set(person.process, 8 * GIB, driver.now)
+    driver.device.set(person.process, 8 * GIB, driver.now)
     driver.advance(1.1)
     figures = driver.arbiter.figures()
-    (card,) = figures.gpus
+    (gpu,) = figures.gpus
     assert figures.drained
-    assert card.pressure_bytes == driver.gpu()["pressure_bytes"] > 0
-    assert card.read_at is not None
-    assert driver.now - 1.1 <= card.read_at <= driver.now
+    assert gpu.pressure_bytes == driver.gpu()["pressure_bytes"] > 0
+    assert gpu.read_at is not None
+    assert driver.now - 1.1 <= gpu.read_at <= driver.now
 
 
 # -- traces
@@ -130,7 +130,7 @@ def test_a_lease_that_is_called_back_belongs_to_the_caller() -> None:
 
 def test_one_that_is_called_back_while_it_is_measured_too() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     det, lease = held(driver, "det", 5, standby=True)
     det.traceparent = HIS
     policy = driver.consumer("policy")

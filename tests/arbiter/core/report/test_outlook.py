@@ -69,8 +69,8 @@ def test_several_are_asked_together_when_the_last_of_them_may_be() -> None:
 
 def test_nobody_is_asked_where_nobody_could_make_room() -> None:
     driver = CoreDriver()
-    driver.card.names[ProcessKey(9, 9)] = "game"
-    driver.card.set(ProcessKey(9, 9), 5 * GIB, driver.now)
+    driver.device.names[ProcessKey(9, 9)] = "game"
+    driver.device.set(ProcessKey(9, 9), 5 * GIB, driver.now)
     driver.advance(1.5)
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
@@ -93,7 +93,7 @@ def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:
     gone.unload(lease)
     driver.advance(1.0)
     held(driver, "holder", 5)
-    driver.card.lag_s = 5.0
+    driver.device.lag_s = 5.0
     gone.die()
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
@@ -120,14 +120,14 @@ def test_a_holder_on_its_way_out() -> None:
     holder.use_end(lease)
     holder.unloading(lease)
     assert only(driver)["text"] == "waits for holder to release, it is being evicted"
-    driver.card.lag_s = 20.0
+    driver.device.lag_s = 20.0
     holder.hold(0)
     holder.release(lease)
     step = only(driver)
     assert (step["action"], step["lease_id"]) == ("measure", lease)
     assert 0 <= step["in_s"] <= 0.05
     assert "a verdict comes in 10.0 s at the latest" in step["text"]
-    driver.card.silent = True  # no reading comes, so the verdict is late
+    driver.device.silent = True  # no reading comes, so the verdict is late
     driver.advance(11)
     assert "until its bytes are measured gone" in only(driver)["text"]
 
@@ -155,9 +155,9 @@ def test_a_load_under_way() -> None:
     assert only(known)["in_s"] == pytest.approx(3.5, abs=0.1)
 
 
-def test_a_card_that_cannot_be_read_and_one_that_shows_no_room() -> None:
+def test_a_gpu_that_cannot_be_read_and_one_that_shows_no_room() -> None:
     driver = CoreDriver()
-    driver.card.failing = "hangs"
+    driver.device.failing = "hangs"
     driver.advance(1.5)
     driver.consumer("w").acquire(3 * GIB)
     step = only(driver)
@@ -168,7 +168,7 @@ def test_a_card_that_cannot_be_read_and_one_that_shows_no_room() -> None:
     assert 0 < step["in_s"] <= d.PROBE_PERIOD_S
 
     silent = CoreDriver()
-    silent.card.silent = True
+    silent.device.silent = True
     silent.advance(3)
     silent.consumer("w").acquire(3 * GIB)
     assert only(silent)["text"].endswith("the ledger has room, the GPU has to show it")

@@ -26,7 +26,7 @@ def pages(driver: CoreDriver, limit: int) -> list[list[dict[str, Any]]]:
 def crowd() -> CoreDriver:
     """Two GPUs on which somebody loads, a lease on standby, waiters for one GPU and for both, and a
     member of a gang that is not complete."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     sleeper, first, second = (driver.consumer(name) for name in ("sleeper", "first", "second"))
     away = sleeper.acquire(7 * GIB, gpu="0", standby=True)
     sleeper.load(away)

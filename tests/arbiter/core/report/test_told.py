@@ -47,7 +47,7 @@ def test_a_lease_as_it_is_shown(exclusive: bool, mode: str) -> None:
     assert (view["charge_bytes"], view["pid"]) == (2 * GIB, person.process.pid)
 
 
-def test_a_card_as_it_is_shown() -> None:
+def test_a_gpu_as_it_is_shown() -> None:
     driver = CoreDriver(8 * GIB)
     held(driver, "det", 2)
     shown = driver.gpu()
@@ -206,13 +206,13 @@ def test_a_denial_is_noted_with_its_reason() -> None:
     assert (note["code"], note["reason"]) == ("wait_timeout", push["error"]["message"])
 
 
-def test_pressure_and_outages_are_noted_with_their_card() -> None:
+def test_pressure_and_outages_are_noted_with_their_gpu() -> None:
     driver = CoreDriver(8 * GIB)
     held(driver, "det", 5)
-    driver.card.set(ProcessKey(9, 9), 3 * GIB, driver.now)
+    driver.device.set(ProcessKey(9, 9), 3 * GIB, driver.now)
     driver.advance(2.0)
     assert driver.notes("pressure")[0]["gpu"] == "GPU-0"
-    driver.card.failing = "the driver is gone"
+    driver.device.failing = "the driver is gone"
     driver.advance(2.0)
     note = only(driver.notes("probe_failed"))
     assert (note["gpu"], note["reason"]) == ("GPU-0", "the driver is gone")
@@ -345,8 +345,8 @@ def test_an_adopted_lease_says_where_it_comes_from() -> None:
 # -- waiting beside what nobody owns
 def test_a_small_one_may_pass_where_nobody_has_an_account() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
-    driver.card.set(ProcessKey(9, 9), 4 * GIB, driver.now)
+    driver.device.lists_processes = False
+    driver.device.set(ProcessKey(9, 9), 4 * GIB, driver.now)
     driver.advance(2.0)
     large = driver.consumer("large").acquire(6 * GIB)
     small = driver.consumer("small").acquire(1 * GIB)
@@ -365,7 +365,7 @@ def test_the_head_says_what_keeps_the_engine_from_asking() -> None:
 
 def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     gone, left = held(driver, "gone", 3, residue_bytes=450 * MIB)
     gone.unload(left)
     driver.until(lambda: driver.state(left) == "over")
@@ -387,8 +387,8 @@ def test_a_gang_beside_a_pin_waits_for_its_end() -> None:
     driver.until(lambda: driver.state(first) == "loading")
 
 
-def test_a_gang_that_has_asked_on_one_card_asks_nobody_on_the_other_as_well() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_gang_that_has_asked_on_one_gpu_asks_nobody_on_the_other_as_well() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, stays = held(driver, "stays", 5, gpu="0", min_residency_s=5.0)
     leaves, asked = held(driver, "leaves", 5, gpu="1")
     leaves.use_begin(asked)
@@ -433,9 +433,9 @@ def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant() -> None:
     arbiter, age_s = driver.arbiter, driver.settings.sample_max_age_s
     driver.consumer("det")
     assert arbiter.stale(driver.now) == []
-    driver.card.silent = True
-    assert arbiter.stale(driver.now + age_s + 0.1) == [driver.card.gpu]
-    driver.post(ProbeFailed(driver.card.gpu, driver.now + age_s, "no answer"))
+    driver.device.silent = True
+    assert arbiter.stale(driver.now + age_s + 0.1) == [driver.device.gpu]
+    driver.post(ProbeFailed(driver.device.gpu, driver.now + age_s, "no answer"))
     assert arbiter.stale(driver.now + age_s + 0.1) == [], "a failed reading is news as well"
 
 

@@ -366,7 +366,7 @@ def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fenc
     """What it holds beyond its context is less than a reading can be off: its bytes are "gone"
     while all of them are there. So it is where a lease of 2 GiB put no more than that on the GPU:
     what counts is what a reading could see leave, not what is charged."""
-    driver.card.lists_processes = lists
+    driver.device.lists_processes = lists
     det, lease = held_bytes(driver, "det", charged, residue_bytes=450 * MIB, ttl_s=10.0)
     det.hold(500 * MIB)
     driver.restart()
@@ -375,7 +375,7 @@ def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fenc
     waiter = driver.consumer("policy").acquire(1 * GIB, exclusive=True)
     took = driver.until(lambda: driver.state(waiter) == "loading")
     assert 14.9 <= took <= 15.1, "its ttl, and the grace"
-    assert det.process in driver.card.held
+    assert det.process in driver.device.held
 
 
 def test_who_is_given_up_while_it_loads_may_load_on_until_it_fences_itself(

@@ -177,8 +177,8 @@ def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(14.9)
     assert driver.state(lease) == "held"
-    driver.card.held.clear()
-    driver.card.set(driver.consumer("x").process, 1 * GIB, driver.now)
+    driver.device.held.clear()
+    driver.device.set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
     assert driver.notes("serving")
     assert driver.journal.keys() == {f"lease:{waiter}"}
@@ -193,7 +193,7 @@ def test_whoever_has_not_come_back_is_named() -> None:
     assert [name.split(" ")[0] for name in block["names"]] == ["m0", "m1", "m2"]
     assert (block["code"], block["more"]) == ("recovering", 2)
     driver = CoreDriver(8 * GIB)
-    driver.card.set(driver.consumer("x").process, 1 * GIB, driver.now)
+    driver.device.set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.post(Recovered({}))
     block = driver.gpu()["blocked"]
     assert (block["code"], block.get("names")) == ("recovering", None), "they are not known"
@@ -204,7 +204,7 @@ def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> No
     det, lease, _ = held_with_token(driver, "det", 5)
     driver.restart()
     waiter = driver.consumer("vlm").acquire(5 * GIB)
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det.die()
     assert driver.status()["phase"] == "serving"
     assert driver.state(waiter) == "queued"
@@ -213,15 +213,15 @@ def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> No
     assert driver.state(lease) == "over"
 
 
-def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
-    """A reading that says that the card is empty may lie, and a model may sleep in host RAM. Nobody
+def test_an_empty_gpu_takes_no_lease_from_a_living_holder() -> None:
+    """A reading that says that the GPU is empty may lie, and a model may sleep in host RAM. Nobody
     has to be waited for there, that is all."""
     driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5, ttl_s=10.0)
     loader = driver.consumer("loader")
     loading = loader.acquire(1 * GIB)
     driver.until(lambda: driver.state(loading) == "loading")
-    driver.card.held.clear()
+    driver.device.held.clear()
     driver.restart()
     assert driver.status()["phase"] == "serving"
     assert (driver.state(lease), driver.state(loading)) == ("held", "loading")
@@ -241,10 +241,10 @@ def test_an_empty_card_takes_no_lease_from_a_living_holder() -> None:
     assert driver.state(lease) == "held"
 
 
-def test_who_does_not_come_back_to_an_empty_card_is_given_up_in_time() -> None:
+def test_who_does_not_come_back_to_an_empty_gpu_is_given_up_in_time() -> None:
     driver = CoreDriver(8 * GIB)
     _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
-    driver.card.held.clear()
+    driver.device.held.clear()
     driver.restart()
     waiter = driver.consumer("w").acquire(5 * GIB)
     assert driver.state(lease) == "held"
@@ -274,10 +274,10 @@ def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer
 
 def test_verifications_and_debts_go_on_after_the_restart() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 3.0
+    driver.device.lag_s = 3.0
     det, lease, token = held_with_token(driver, "det", 4, residue_bytes=450 * MIB)
     vlm, other, _ = held_with_token(driver, "vlm", 2)
-    driver.card.set(driver.consumer("x").process, 200 * MIB, driver.now)
+    driver.device.set(driver.consumer("x").process, 200 * MIB, driver.now)
     det.unload(lease)
     vlm.die()
     assert {record["state"] for record in driver.journal.values()} == {"verifying", "debt"}
@@ -341,7 +341,7 @@ def test_a_lost_journal_believes_holders_for_a_while() -> None:
     assert f"lease:{lease}" in driver.journal
 
 
-def test_adopting_more_than_the_card_has_is_pressure_not_a_crash() -> None:
+def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5)
     driver.restart(keep_journal=False)
@@ -358,9 +358,9 @@ def test_a_lease_that_shrank_just_before_the_restart_is_not_taken_for_gone() -> 
     """Regression: a resize that is not journaled made a nearly empty GPU look as if a larger lease
     had gone."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     det, lease, token = held_with_token(driver, "det", 1)
-    small = 330 * MIB  # as much as an empty card may show
+    small = 330 * MIB  # as much as an empty GPU may show
     det.hold(small)
     det.resize(lease, small)
     driver.restart()  # before any reading
@@ -371,21 +371,21 @@ def test_a_lease_that_shrank_just_before_the_restart_is_not_taken_for_gone() -> 
     assert driver.gpu()["charged_bytes"] >= small
 
 
-def test_a_lost_journal_and_an_empty_card_serve_at_once() -> None:
+def test_a_lost_journal_and_an_empty_gpu_serve_at_once() -> None:
     driver = CoreDriver(8 * GIB)
     driver.restart(keep_journal=False)
     assert driver.status()["phase"] == "serving"
     assert driver.consumer("det").acquire(5 * GIB)
 
 
-def test_one_empty_card_of_two_is_not_enough() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
-    driver.cards[GpuId("GPU-1")].set(driver.consumer("x").process, 1 * GIB, driver.now)
+def test_one_empty_gpu_of_two_is_not_enough() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
+    driver.devices[GpuId("GPU-1")].set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.restart(keep_journal=False)
     assert driver.status()["phase"] == "recovering"
 
 
-def test_records_of_a_card_that_is_gone_are_dropped() -> None:
+def test_records_of_a_gpu_that_is_gone_are_dropped() -> None:
     driver = CoreDriver(8 * GIB)
     record = ResidueRecord(pid=1, start_ticks=1, gpu="GPU-old", residue_bytes=5)
     effects = driver.post(Recovered({"residue:1@1:GPU-old": record}))
@@ -409,23 +409,23 @@ def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> Non
     driver = CoreDriver(8 * GIB)
     det, lease, _ = held_with_token(driver, "det", 5)
     other = driver.consumer("other")
-    driver.card.set(other.process, 1 * GIB, driver.now)
+    driver.device.set(other.process, 1 * GIB, driver.now)
     driver.advance(1.5)
     det.hold(4 * GIB)
     det.release(lease)
     records = dict(driver.journal)
     again = CoreDriver(8 * GIB, start=False)
-    again.card.names[other.process] = "other"
-    again.card.set(other.process, 6 * GIB, again.now)
+    again.device.names[other.process] = "other"
+    again.device.set(other.process, 6 * GIB, again.now)
     again.post(Recovered(records_of(records)))
     again.advance(11.0)
     (note,) = again.notes("verified")
     assert (note["verdict"], note["before_bytes"]) == ("verified", None), (
-        "the stowaway explains the card"
+        "the stowaway explains the GPU"
     )
 
 
-def test_records_that_a_full_disk_kept_may_say_more_than_the_card_has() -> None:
+def test_records_that_a_full_disk_kept_may_say_more_than_the_gpu_has() -> None:
     """They used to break the invariant on bytes at the start, and the whole journal was put aside
     for it."""
     driver = CoreDriver(8 * GIB)

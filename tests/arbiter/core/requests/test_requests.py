@@ -113,7 +113,7 @@ def test_beside_a_pinned_holder_a_request_waits(driver: CoreDriver, spec: dict[s
     driver.until(lambda: driver.state(second) == "loading")
 
 
-def test_an_unknown_card_is_named(driver: CoreDriver) -> None:
+def test_an_unknown_gpu_is_named(driver: CoreDriver) -> None:
     refused = refusal(driver.consumer("det").try_acquire(1 * GIB, gpu="7"))
     assert (refused.code, refused.details["known"]) == ("unknown_gpu", ["GPU-0"])
     assert driver.consumer("a").acquire(1 * GIB, gpu="0")
@@ -144,7 +144,7 @@ def test_a_wait_has_a_bound_and_says_who_was_in_the_way(driver: CoreDriver) -> N
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     held = det.acquire(5 * GIB, evictable=False)
     det.load(held)
-    driver.card.failing = "probe died"
+    driver.device.failing = "probe died"
     driver.advance(1.5)
     lease = vlm.acquire(2 * GIB, wait_timeout_s=5.0)
     driver.advance(4.9)

@@ -36,13 +36,13 @@ def test_nothing_is_granted_on_a_reading_from_before() -> None:
     driver = CoreDriver(8 * GIB)
     person = driver.consumer("a")
     driver.advance(0.01)
-    driver.card.failing = "the driver wakes up too"
+    driver.device.failing = "the driver wakes up too"
     effects = driver.post(Resumed(NIGHT_S))
-    assert Sample(driver.card.gpu) in effects
+    assert Sample(driver.device.gpu) in effects
     lease = person.acquire(2 * GIB)
     assert driver.state(lease) == "queued"
     assert driver.gpu()["blocked"]
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.until(lambda: driver.state(lease) == "loading")
 
 
@@ -50,13 +50,13 @@ def test_a_reading_that_began_before_the_night_does_not_count() -> None:
     driver = CoreDriver(8 * GIB)
     began = driver.now
     driver.advance(0.5)
-    driver.card.silent = True
+    driver.device.silent = True
     driver.post(Resumed(NIGHT_S))
-    driver.post(MemorySampled(driver.card.gpu, began, 0, 8 * GIB, ()))
+    driver.post(MemorySampled(driver.device.gpu, began, 0, 8 * GIB, ()))
     assert driver.gpu()["measured_used_bytes"] is None
     waiter = driver.consumer("a").acquire(GIB)
     assert driver.state(waiter) == "queued"
-    driver.post(MemorySampled(driver.card.gpu, driver.now, 0, 8 * GIB, ()))
+    driver.post(MemorySampled(driver.device.gpu, driver.now, 0, 8 * GIB, ()))
     assert driver.state(waiter) == "loading"
 
 
@@ -70,7 +70,7 @@ def test_a_verification_begins_again() -> None:
     """Its time is up by what it waited for before; the readings of a new day decide, with the whole
     time for them."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1000.0
+    driver.device.lag_s = 1000.0
     person, lease = held(driver, "a", 5, ttl_s=10.0)
     person.unload(lease)
     driver.advance(driver.settings.verify_timeout_s + 1)
@@ -84,8 +84,8 @@ def test_a_verification_begins_again() -> None:
     before = len(driver.notes("verified"))
     driver.advance(driver.settings.verify_timeout_s - 1)
     assert len(driver.notes("verified")) == before, "no verdict of yesterday is repeated"
-    driver.card.set(other.process, 0, driver.now)
-    driver.card.lag_s = 0.0
+    driver.device.set(other.process, 0, driver.now)
+    driver.device.lag_s = 0.0
     driver.until(lambda: newest(driver, "verified")["resolved"], limit_s=2000.0, step_s=0.5)
     assert driver.state(second) == "over"
 
@@ -131,10 +131,10 @@ def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:
 
 
 def test_what_was_there_before_the_night_has_to_come_back_before_a_dead_holder_is_gone() -> None:
-    """Regression (storm, seed 11): nobody had read the card since, so a context that another had
+    """Regression (storm, seed 11): nobody had read the GPU since, so a context that another had
     never made hid what the dead one left."""
     driver = CoreDriver(8 * GIB, start=False)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     driver.advance(0.01)
     idle = driver.consumer("idle")
     unused = idle.acquire(GIB, residue_bytes=450 * d.MIB)
@@ -142,8 +142,8 @@ def test_what_was_there_before_the_night_has_to_come_back_before_a_dead_holder_i
     driver.until(lambda: driver.state(unused) == "over")
     person, lease = held(driver, "a", 0.4, ttl_s=10.0)
     driver.advance(1.5)
-    driver.card.lag_s = 3.0
-    driver.card.set(person.process, 0, driver.now)
+    driver.device.lag_s = 3.0
+    driver.device.set(person.process, 0, driver.now)
     driver.post(Resumed(NIGHT_S))
     driver.post(ProcessDied(person.process))
     waiter = driver.consumer("b").acquire(GIB, exclusive=True)

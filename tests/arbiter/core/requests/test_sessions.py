@@ -15,10 +15,10 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 GIB = d.GIB
 
 
-def test_a_first_client_makes_the_card_be_read_if_the_reading_is_old() -> None:
+def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old() -> None:
     driver = CoreDriver(8 * GIB)
     driver.advance(60.0)
-    assert driver.arbiter.next_deadline() is None, "nobody is interested: the card is left alone"
+    assert driver.arbiter.next_deadline() is None, "nobody is interested: the GPU is left alone"
     det = driver.consumer("det")
     assert [type(e).__name__ for e in det.connect()] == [], "the reading for its hello is under way"
     driver.advance(0.01)
@@ -89,7 +89,7 @@ def test_pushes_go_to_another_living_connection_of_the_process() -> None:
 
 def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     held = det.acquire(5 * GIB)
     det.load(held)
@@ -233,9 +233,9 @@ def test_strangers_to_the_core_die_unmourned() -> None:
     assert driver.state(LeaseId("L1-1")) == "over"
 
 
-def test_who_owns_bytes_of_a_card_and_who_is_connected() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
-    first, second = driver.cards
+def test_who_owns_bytes_of_a_gpu_and_who_is_connected() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
+    first, second = driver.devices
     det, watcher = driver.consumer("det"), driver.consumer("watcher")
     assert driver.arbiter.owners(first) == frozenset(), "nobody holds a lease"
     assert driver.arbiter.clients() == {det.process, watcher.process}

@@ -107,7 +107,7 @@ LEARNT = {name: {"load_s": 6.0, "unload_s": 1.0, "verify_s": 1.0} for name in ("
 
 
 class Pair:
-    """Two consumers that each need the whole card, again and again."""
+    """Two consumers that each need the whole GPU, again and again."""
 
     def __init__(self, **settings: Any) -> None:
         self.driver = CoreDriver(8 * GIB, settings={"learnt": LEARNT, **settings})

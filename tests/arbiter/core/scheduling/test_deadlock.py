@@ -91,8 +91,8 @@ def test_a_use_that_closes_the_circle_ends_the_wait_by_push(driver: CoreDriver) 
     assert driver.state(own) in ("held", "revoking")
 
 
-def test_a_circle_of_three_over_two_cards() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_circle_of_three_over_two_gpus() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     a, _ = using(driver, "a", 5, gpu="0")
     b, _ = using(driver, "b", 5, gpu="1")
     c, third = using(driver, "c", 2, gpu="1")
@@ -179,7 +179,7 @@ def test_a_pinned_holder_is_a_wait_and_no_circle(driver: CoreDriver) -> None:
 def test_what_waits_for_a_residue_or_a_stowaway_is_left_alone(driver: CoreDriver) -> None:
     from vram_arbiter.schemas.ids import ProcessKey
 
-    driver.card.set(ProcessKey(9, 9), 4 * GIB, driver.now)
+    driver.device.set(ProcessKey(9, 9), 4 * GIB, driver.now)
     driver.advance(2.0)
     job, _ = using(driver, "job", 1)
     assert driver.state(job.acquire(5 * GIB)) == "queued", "the stowaway may go any time"
@@ -199,18 +199,16 @@ def test_a_process_that_waits_and_uses_nothing_is_in_no_circle(driver: CoreDrive
 
 
 def test_a_process_that_can_be_served_elsewhere_is_in_no_circle() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     job, _ = using(driver, "job", 5, gpu="0")
     using(driver, "other", 5, gpu="1")
-    assert driver.state(job.acquire(5 * GIB)) == "queued", (
-        "the other card's holder will end its use"
-    )
+    assert driver.state(job.acquire(5 * GIB)) == "queued", "the other GPU's holder will end its use"
 
 
 def test_a_debt_is_on_its_way_back(driver: CoreDriver) -> None:
     job, _ = using(driver, "job", 2)
     other, _ = idle(driver, "other", 5)
-    driver.card.lag_s = 5.0
+    driver.device.lag_s = 5.0
     other.die()
     wanted = job.acquire(5 * GIB)
     assert driver.state(wanted) == "queued"
@@ -237,7 +235,7 @@ def test_uses_that_come_back_after_a_restart_are_looked_at_too(driver: CoreDrive
 
 
 def test_who_only_waits_for_a_circle_is_not_the_one_to_be_refused() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     a, _ = using(driver, "a", 5, gpu="0")
     b, theirs = idle(driver, "b", 5, gpu="1", min_residency_s=600.0)
     c, _ = using(driver, "c", 1, gpu="1")

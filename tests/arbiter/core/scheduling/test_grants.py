@@ -1,5 +1,5 @@
-"""Who gets the card next: serial loads, head and backfill, the measurement as second gate,
-pressure, several cards."""
+"""Who gets the GPU next: serial loads, head and backfill, the measurement as second gate,
+pressure, several GPUs."""
 
 import pytest
 
@@ -94,10 +94,10 @@ def test_an_exclusive_waiter_never_passes() -> None:
 
 # -- exclusive
 @pytest.mark.parametrize("end", ["death", "expiry"])
-def test_the_debt_of_an_exclusive_holder_keeps_the_card_to_itself(end: str) -> None:
+def test_the_debt_of_an_exclusive_holder_keeps_the_gpu_to_itself(end: str) -> None:
     """Whoever would fit beside its bytes waits all the same until they are measured gone."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     alone, lease = held(driver, "alone", 2, exclusive=True, ttl_s=5.0)
     waiter = driver.consumer("w").acquire(1 * GIB, priority=d.PRIORITY - 1)
     if end == "death":
@@ -107,7 +107,7 @@ def test_the_debt_of_an_exclusive_holder_keeps_the_card_to_itself(end: str) -> N
         driver.until(lambda: bool(driver.notes("expired")))
         alone.hold(0)
     driver.until(lambda: driver.state(waiter) == "loading")
-    assert not driver.card.shown(driver.now)
+    assert not driver.device.shown(driver.now)
 
 
 def test_residues_may_stay_beside_an_exclusive_lease() -> None:
@@ -137,20 +137,20 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     ]
 
 
-def test_the_card_may_say_no_where_the_ledger_says_yes() -> None:
+def test_the_gpu_may_say_no_where_the_ledger_says_yes() -> None:
     """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are
     not free either."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     det, lease = held(driver, "det", 1)
-    driver.card.set(STRANGER, 4 * GIB, driver.now)
+    driver.device.set(STRANGER, 4 * GIB, driver.now)
     det.unloading(lease)
     driver.advance(1.5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(1.5)
     assert driver.state(waiter) == "queued"
     assert driver.blocked() == "not_free"
-    driver.card.set(STRANGER, 0, driver.now)
+    driver.device.set(STRANGER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
 
 
@@ -173,7 +173,7 @@ def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
     """Regression: the peak that a loader gave up with `ready` was believed free on a reading from
     before it was there."""
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1.5})
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     det = driver.consumer("det")
     first = det.acquire(6 * GIB, 2 * GIB)
     driver.advance(0.1)
@@ -189,7 +189,7 @@ def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
 
 def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_gone() -> None:
     """Regression: its debt kept its bytes charged, but a neighbour came in while its hung holder
-    was still on the card."""
+    was still on the GPU."""
     driver = CoreDriver(8 * GIB)
     hung = driver.consumer("hung")
     lease = hung.acquire(2 * GIB, exclusive=True, ttl_s=2.0)
@@ -209,7 +209,7 @@ def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
     _, other_lease = held(driver, "other", 4)
     busy, busy_lease = held(driver, "busy", 1)
     busy.use_begin(busy_lease)
-    driver.card.set(STRANGER, 2 * GIB, driver.now)
+    driver.device.set(STRANGER, 2 * GIB, driver.now)
     waiter = driver.consumer("w")
     driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
     assert driver.notes("stowaway")[-1]["used_bytes"] == 2 * GIB
@@ -233,10 +233,10 @@ def test_pressure_that_cannot_be_covered_asks_every_idle_holder() -> None:
     _, small = held(driver, "small", 1)
     busy, busy_lease = held(driver, "busy", 6)
     busy.use_begin(busy_lease)
-    driver.card.set(STRANGER, 3 * GIB, driver.now)
+    driver.device.set(STRANGER, 3 * GIB, driver.now)
     driver.until(lambda: driver.state(small) == "revoking", limit_s=2.0)
     assert driver.state(busy_lease) == "held"
-    driver.card.total_bytes = 16 * GIB
+    driver.device.total_bytes = 16 * GIB
 
 
 def test_a_holder_above_its_charge_is_pressure_not_a_stowaway() -> None:
@@ -263,12 +263,12 @@ def test_ready_with_more_than_granted_is_pressure_and_no_violation() -> None:
     b.use_begin(first, token=a.token(first))
     b.load(second, 5 * GIB)
     assert driver.gpu()["pressure_bytes"] > 0
-    assert driver.state(second) == "revoking", "it is idle, and the card is too full"
+    assert driver.state(second) == "revoking", "it is idle, and the GPU is too full"
 
 
-# -- several cards
-def test_any_takes_the_first_card_where_it_fits_without_asking() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+# -- several GPUs
+def test_any_takes_the_first_gpu_where_it_fits_without_asking() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     a, b = driver.consumer("a"), driver.consumer("b")
     first = a.acquire(5 * GIB)
     second = b.acquire(5 * GIB)
@@ -278,8 +278,8 @@ def test_any_takes_the_first_card_where_it_fits_without_asking() -> None:
     ]
 
 
-def test_any_empties_the_cheaper_card_only() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_any_empties_the_cheaper_gpu_only() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     dear, dear_lease = held(driver, "dear", 5, priority=80, gpu="0")
     cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
     person = driver.consumer("w")
@@ -295,8 +295,8 @@ def test_any_empties_the_cheaper_card_only() -> None:
     assert dear.driver is driver
 
 
-def test_any_waits_for_room_that_comes_on_another_card() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_any_waits_for_room_that_comes_on_another_gpu() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, stays = held(driver, "stays", 5, gpu="0", min_residency_s=1.0)
     goes, going = held(driver, "goes", 5, gpu="1")
     goes.unloading(going)
@@ -309,8 +309,8 @@ def test_any_waits_for_room_that_comes_on_another_card() -> None:
     assert driver.state(stays) == "held"
 
 
-def test_the_dearer_card_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_the_dearer_gpu_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, dear = held(driver, "dear", 5, priority=80, gpu="0")
     cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
     cheap.use_begin(cheap_lease)
@@ -320,7 +320,7 @@ def test_the_dearer_card_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None
     assert driver.state(waiter) == "queued"
 
 
-def test_readings_of_unknown_cards_and_late_ones_are_dropped() -> None:
+def test_readings_of_unknown_gpus_and_late_ones_are_dropped() -> None:
     driver = CoreDriver(8 * GIB)
     assert driver.post(MemorySampled(GpuId("GPU-9"), driver.now, 0, 1, None)) == []
     driver.post(MemorySampled(GpuId("GPU-0"), driver.now, 123, 8 * GIB, ()))

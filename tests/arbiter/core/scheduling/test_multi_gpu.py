@@ -1,5 +1,5 @@
-"""Several cards: a lease is placed on one of them and never split, every card has its own queue,
-and no card waits for another's sake."""
+"""Several GPUs: a lease is placed on one of them and never split, every GPU has its own queue,
+and no GPU waits for another's sake."""
 
 import random
 
@@ -21,7 +21,7 @@ ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
     ("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)]
 )
 def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, lease = held(driver, "a", 5, gpu=selector)
     assert place(driver, lease) == wanted
     assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [
@@ -29,15 +29,15 @@ def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> 
     ]
 
 
-def test_an_unknown_card_is_named_with_those_that_are_there() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_an_unknown_gpu_is_named_with_those_that_are_there() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     refused = refusal(driver.consumer("a").try_acquire(1 * GIB, gpu="GPU-7"))
     assert (refused.code, refused.details["known"]) == ("unknown_gpu", [ZERO, ONE])
 
 
 def test_a_lease_is_never_split() -> None:
-    """12 GiB are free on two cards, 7 on each is all that one lease can ever have."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    """12 GiB are free on two GPUs, 7 on each is all that one lease can ever have."""
+    driver = CoreDriver(8 * GIB, gpus=2)
     assert refusal(driver.consumer("a").try_acquire(9 * GIB)).code == "vram_insufficient"
     _, lease = held(driver, "b", 7)
     assert sum(1 for n in (0, 1) if driver.gpu(n)["charged_bytes"]) == 1
@@ -45,14 +45,14 @@ def test_a_lease_is_never_split() -> None:
     assert {place(driver, lease), place(driver, other)} == {ZERO, ONE}
 
 
-def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_model_over_two_gpus_is_two_leases_of_one_process() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     big = driver.consumer("big")
     halves = [
         big.acquire(6 * GIB, gpu=str(n), key=f"half {n}", residue_bytes=GIB // 2) for n in (0, 1)
     ]
     assert [driver.state(half) for half in halves] == ["loading", "loading"], (
-        "one load a card, not one in all"
+        "one load a GPU, not one in all"
     )
     for half in halves:
         big.load(half)
@@ -60,7 +60,7 @@ def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
     big.unload(halves[0])
     driver.until(lambda: driver.state(halves[0]) == "over")
     assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [GIB // 2, 6 * GIB], (
-        "a context a card"
+        "a context a GPU"
     )
     big.die()
     driver.until(
@@ -68,24 +68,24 @@ def test_a_model_over_two_cards_is_two_leases_of_one_process() -> None:
     )
 
 
-def test_pins_are_in_the_way_on_their_own_card_only() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_pins_are_in_the_way_on_their_own_gpu_only() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     held(driver, "pinned", 5, gpu="0", evictable=False)
     waiter = driver.consumer("a").acquire(5 * GIB, gpu="0")
     _, lease = held(driver, "b", 5)
     assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
 
 
-def test_exclusive_means_alone_on_its_card() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_exclusive_means_alone_on_its_gpu() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, alone = held(driver, "alone", 2, exclusive=True, evictable=False)
     _, other = held(driver, "other", 2)
     assert (place(driver, alone), place(driver, other)) == (ZERO, ONE)
 
 
 # -- queues
-def test_a_waiter_for_one_card_does_not_hold_up_another() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_waiter_for_one_gpu_does_not_hold_up_another() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, lease = held(driver, "busy", 6, gpu="0")
     busy.use_begin(lease)
     waits = driver.consumer("w").acquire(6 * GIB, gpu="0", priority=90)
@@ -93,8 +93,8 @@ def test_a_waiter_for_one_card_does_not_hold_up_another() -> None:
     assert (driver.state(waits), place(driver, free)) == ("queued", ONE)
 
 
-def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both_queues() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_whoever_waits_for_any_takes_the_first_gpu_that_is_free_and_leaves_both_queues() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     people = [held(driver, f"busy{n}", 6, gpu=str(n)) for n in (0, 1)]
     for person, lease in people:
         person.use_begin(lease)
@@ -105,14 +105,14 @@ def test_whoever_waits_for_any_takes_the_first_card_that_is_free_and_leaves_both
     people[1][0].unload(people[1][1])
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=2.0)
     assert place(driver, waiter) == ONE
-    assert driver.state(people[0][1]) == "held", "nobody is asked in vain on the other card"
+    assert driver.state(people[0][1]) == "held", "nobody is asked in vain on the other GPU"
     assert all(gpu.queue.head is None for gpu in driver.arbiter.inspect().gpus.values())
 
 
-def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_other() -> None:
-    """Regression: the head of both queues held up the other card while its victim finished a long
+def test_while_one_gpu_is_emptied_for_the_head_the_next_one_is_served_on_the_other() -> None:
+    """Regression: the head of both queues held up the other GPU while its victim finished a long
     use."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, used = held(driver, "busy", 6, gpu="0", priority=10)
     idle, unused = held(driver, "idle", 6, gpu="1", evictable=False)
     busy.use_begin(used)
@@ -125,29 +125,29 @@ def test_while_one_card_is_emptied_for_the_head_the_next_one_is_served_on_the_ot
     assert idle.driver is driver
 
 
-def test_the_head_that_is_placed_elsewhere_does_not_keep_a_card_from_the_next() -> None:
-    """Regression: with `any` at the head, a waiter for card 1 waited until card 0 had been
+def test_the_head_that_is_placed_elsewhere_does_not_keep_a_gpu_from_the_next() -> None:
+    """Regression: with `any` at the head, a waiter for GPU 1 waited until GPU 0 had been
     emptied."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     first, a = held(driver, "a", 6, gpu="0", priority=10)
     second, b = held(driver, "b", 6, gpu="1", priority=20)
     first.use_begin(a)
     second.use_begin(b)
     head = driver.consumer("head").acquire(6 * GIB)
-    assert (driver.state(a), driver.state(b)) == ("revoking", "held"), "the cheaper card"
+    assert (driver.state(a), driver.state(b)) == ("revoking", "held"), "the cheaper GPU"
     other = driver.consumer("other").acquire(6 * GIB, gpu="1")
     driver.until(lambda: driver.state(b) == "revoking", limit_s=0.1)
     second.use_end(b)
     second.unload(b)
     driver.until(lambda: "loading" in (driver.state(other), driver.state(head)), limit_s=1.0)
     placed = head if driver.state(head) == "loading" else other
-    assert place(driver, placed) == ONE, "whoever it is, the free card is used at once"
+    assert place(driver, placed) == ONE, "whoever it is, the free GPU is used at once"
 
 
 def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None:
     """It is the head here: no backfill has to let it pass, and nothing is spared for a waiter that
-    comes to another card."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    comes to another GPU."""
+    driver = CoreDriver(8 * GIB, gpus=2)
     first, a = held(driver, "a", 6, gpu="0", priority=10)
     second, b = held(driver, "b", 4, gpu="1", priority=90)
     first.use_begin(a)
@@ -159,8 +159,8 @@ def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None
     assert (place(driver, other), driver.state(head)) == (ONE, "queued")
 
 
-def test_two_heads_that_are_placed_elsewhere_leave_the_card_to_nobody() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_two_heads_that_are_placed_elsewhere_leave_the_gpu_to_nobody() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     first, a = held(driver, "a", 3, gpu="0", priority=10)
     second, b = held(driver, "b", 3, gpu="0", priority=10)
     third, c = held(driver, "c", 6, gpu="1", priority=90)
@@ -177,9 +177,9 @@ def test_two_heads_that_are_placed_elsewhere_leave_the_card_to_nobody() -> None:
     driver.until(lambda: driver.state(waiting[0]) == "loading", limit_s=2.0)
 
 
-def test_a_holder_that_outstays_on_one_card_frees_its_waiter_for_another() -> None:
-    """Regression: once somebody was asked on card 0, no other card was ever considered."""
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_holder_that_outstays_on_one_gpu_frees_its_waiter_for_another() -> None:
+    """Regression: once somebody was asked on GPU 0, no other GPU was ever considered."""
+    driver = CoreDriver(8 * GIB, gpus=2)
     stuck, a = held(driver, "stuck", 6, gpu="0", priority=10)
     later, b = held(driver, "later", 6, gpu="1", priority=20, min_residency_s=5.0)
     stuck.use_begin(a)
@@ -188,17 +188,17 @@ def test_a_holder_that_outstays_on_one_card_frees_its_waiter_for_another() -> No
     assert driver.state(a) == "revoking"
     later.use_end(b)
     driver.advance(20.0)
-    assert driver.state(b) == "held", "one card is being emptied: nothing is evicted in vain"
+    assert driver.state(b) == "held", "one GPU is being emptied: nothing is evicted in vain"
     driver.until(lambda: driver.state(b) == "revoking", limit_s=15.0)
     later.unload(b)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
     assert place(driver, waiter) == ONE
 
 
-def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None:
-    """The bytes of the victim stay on card 0 as a residue that nobody expected: card 1 is emptied
+def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_gpu() -> None:
+    """The bytes of the victim stay on GPU 0 as a residue that nobody expected: GPU 1 is emptied
     then."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     leaky, a = held(driver, "leaky", 6, gpu="0", priority=10)
     _, b = held(driver, "b", 6, gpu="1", priority=20)
     waiter = driver.consumer("w").acquire(6 * GIB)
@@ -210,9 +210,9 @@ def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_card() -> None
 
 
 # -- at once, and without asking
-def test_what_fits_on_the_other_card_goes_there_and_nobody_is_asked() -> None:
-    """The first card could be emptied, its holder is idle; the second is free."""
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_what_fits_on_the_other_gpu_goes_there_and_nobody_is_asked() -> None:
+    """The first GPU could be emptied, its holder is idle; the second is free."""
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, idle = held(driver, "idle", 6, gpu="0", priority=1)
     lease = driver.consumer("w").acquire(6 * GIB)
     assert (driver.state(lease), place(driver, lease)) == ("loading", ONE)
@@ -221,9 +221,9 @@ def test_what_fits_on_the_other_card_goes_there_and_nobody_is_asked() -> None:
 
 
 def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
-    """Regression: the idle holder of the first card was thrown out for the seconds that a load on
+    """Regression: the idle holder of the first GPU was thrown out for the seconds that a load on
     the second took."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, idle = held(driver, "idle", 6, gpu="0")
     loads = driver.consumer("loads")
     loading = loads.acquire(1 * GIB, gpu="1")
@@ -237,7 +237,7 @@ def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
 
 
 def test_a_load_without_end_is_not_waited_for_for_ever() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     holder, idle = held(driver, "idle", 6, gpu="0")
     stuck = driver.consumer("stuck").acquire(1 * GIB, gpu="1")
     lease = driver.consumer("w").acquire(6 * GIB)
@@ -248,8 +248,8 @@ def test_a_load_without_end_is_not_waited_for_for_ever() -> None:
     assert (place(driver, lease), driver.state(stuck)) == (ZERO, "loading")
 
 
-def test_one_that_names_its_card_waits_for_it_beside_an_empty_one() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_one_that_names_its_gpu_waits_for_it_beside_an_empty_one() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, lease = held(driver, "busy", 6, gpu="1", priority=90)
     busy.use_begin(lease)
     waiter = driver.consumer("w").acquire(6 * GIB, gpu="GPU-1")
@@ -263,8 +263,8 @@ def test_one_that_names_its_card_waits_for_it_beside_an_empty_one() -> None:
 
 
 # -- order and ageing
-def test_whoever_came_first_is_first_on_every_card() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_whoever_came_first_is_first_on_every_gpu() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     people = [held(driver, f"busy{n}", 6, gpu=str(n), priority=90) for n in (0, 1)]
     for person, lease in people:
         person.use_begin(lease)
@@ -285,10 +285,10 @@ def test_whoever_came_first_is_first_on_every_card() -> None:
     )
 
 
-def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
+def test_a_waiter_for_any_gpu_ages_on_all_of_them() -> None:
     """Both holders are in use and above it; it is let to ask the lower one first, when it has aged
     to that."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     leases = []
     for index, priority in ((0, 56), (1, 54)):
         person, lease = held(driver, f"busy{index}", 6, gpu=str(index), priority=priority)
@@ -301,14 +301,12 @@ def test_a_waiter_for_any_card_ages_on_all_of_them() -> None:
     driver.advance(0.2)
     assert [driver.state(lease) for lease in leases] == ["held", "revoking"]
     driver.advance(3 * step_s)
-    assert [driver.state(lease) for lease in leases] == ["held", "revoking"], "one card is enough"
+    assert [driver.state(lease) for lease in leases] == ["held", "revoking"], "one GPU is enough"
     assert driver.state(waiter) == "queued"
 
 
-def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_other_has_aged() -> (
-    None
-):
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_newcomer_of_higher_priority_overtakes_on_its_gpu_only_until_the_other_has_aged() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, lease = held(driver, "busy", 6, gpu="1", priority=99)
     busy.use_begin(lease)
     _, fills = held(driver, "fills", 6, gpu="0", evictable=False)
@@ -323,7 +321,7 @@ def test_a_newcomer_of_higher_priority_overtakes_on_its_card_only_until_the_othe
 
 # -- gangs
 def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     busy, lease = held(driver, "busy", 6, gpu="0", priority=10)
     there, used = held(driver, "there", 3, gpu="1", priority=90)
     there.use_begin(used)
@@ -338,9 +336,9 @@ def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
     assert [place(driver, member) for member in members] == [ONE, ONE]
 
 
-def test_a_gang_over_two_cards_waits_for_both_of_which_one_cannot_be_read() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
-    driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
+def test_a_gang_over_two_gpus_waits_for_both_of_which_one_cannot_be_read() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
+    driver.devices[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
     driver.advance(1.5)
     members = [
         driver.consumer(f"m{n}").acquire(6 * GIB, gpu=str(n), gang=("pair", 2)) for n in (0, 1)
@@ -348,13 +346,13 @@ def test_a_gang_over_two_cards_waits_for_both_of_which_one_cannot_be_read() -> N
     driver.advance(10.0)
     assert [driver.state(member) for member in members] == ["queued", "queued"]
     assert driver.gpu(0)["charged_bytes"] == 0, "nothing is kept for half a gang"
-    driver.cards[ONE].failing = ""
+    driver.devices[ONE].failing = ""
     driver.until(lambda: [driver.state(m) for m in members] == ["loading", "loading"], limit_s=2.0)
 
 
 # -- standby
 def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
-    """A detector that left card 0 for a policy which is there now; card 1 is in use, and by nobody
+    """A detector that left GPU 0 for a policy which is there now; GPU 1 is in use, and by nobody
     who may be asked."""
     filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
     det, lease = held(driver, "det", 5, gpu=selector, standby=True)
@@ -373,17 +371,17 @@ def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
 
 
 @pytest.mark.parametrize(("selector", "wanted"), [("any", ONE), ("0", None), ("GPU-0", None)])
-def test_standby_returns_to_the_cards_that_its_selector_names(
+def test_standby_returns_to_the_gpus_that_its_selector_names(
     selector: str, wanted: GpuId | None
 ) -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     det, lease = on_standby(driver, selector)
     driver.advance(10.0)
     assert place(driver, lease) == wanted
     policy = next(iter(driver.arbiter.inspect().gpus[ZERO].residents.values()))
     if wanted is None:
         driver.post(ProcessDied(policy.process))
-        for one in driver.cards.values():
+        for one in driver.devices.values():
             one.set(policy.process, 0, driver.now)
         driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
         assert place(driver, lease) == ZERO
@@ -391,16 +389,16 @@ def test_standby_returns_to_the_cards_that_its_selector_names(
     assert driver.state(lease) == "held"
 
 
-def test_a_waiter_for_one_card_keeps_nobody_from_returning_to_another() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_waiter_for_one_gpu_keeps_nobody_from_returning_to_another() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, lease = on_standby(driver, "any")
     waiter = driver.consumer("w").acquire(5 * GIB, gpu="0", priority=10)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
     assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
 
 
-def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_standby_does_not_return_to_a_gpu_that_cannot_be_read() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")
@@ -409,7 +407,7 @@ def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
     driver.until(lambda: driver.state(wanted) == "loading")
     policy.load(wanted)
     filler.unload(fills)
-    driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
+    driver.devices[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
     driver.advance(20.0)
     assert driver.state(lease) == "standby"
     policy.unload(wanted)
@@ -417,10 +415,10 @@ def test_standby_does_not_return_to_a_card_that_cannot_be_read() -> None:
     assert place(driver, lease) == ZERO
 
 
-# -- cards that fail, drains
-def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
-    driver.cards[ZERO].failing = "NVML_ERROR_GPU_IS_LOST"
+# -- GPUs that fail, drains
+def test_a_gpu_that_cannot_be_read_blocks_itself_only() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
+    driver.devices[ZERO].failing = "NVML_ERROR_GPU_IS_LOST"
     driver.advance(1.5)
     anywhere = driver.consumer("a").acquire(5 * GIB)
     driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
@@ -428,13 +426,13 @@ def test_a_card_that_cannot_be_read_blocks_itself_only() -> None:
     there = driver.consumer("b").acquire(5 * GIB, gpu="0")
     driver.advance(10.0)
     assert driver.state(there) == "queued"
-    driver.cards[ZERO].failing = ""
+    driver.devices[ZERO].failing = ""
     driver.until(lambda: driver.state(there) == "loading", limit_s=2.0)
 
 
-def test_a_card_whose_reading_hangs_blocks_itself_only() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
-    driver.cards[ONE].silent = True
+def test_a_gpu_whose_reading_hangs_blocks_itself_only() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
+    driver.devices[ONE].silent = True
     driver.advance(5.0)
     there = driver.consumer("there").acquire(5 * GIB, gpu="1")
     here = driver.consumer("here").acquire(5 * GIB)
@@ -446,17 +444,17 @@ def test_a_card_whose_reading_hangs_blocks_itself_only() -> None:
     )
 
 
-def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
+def test_a_gpu_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
     """Unplugged in the middle: what was held there stays charged there, and whoever may go
     elsewhere does."""
-    driver = CoreDriver(8 * GIB, cards=2)
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, b = held(driver, "b", 5, gpu="1")
     a, freed = held(driver, "a", 5, gpu="0")
-    driver.cards[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
+    driver.devices[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
     driver.advance(1.5)
     waiter = driver.consumer("w").acquire(5 * GIB)
     assert (driver.state(freed), driver.state(b)) == ("revoking", "held"), (
-        "it is made room on the card that lives"
+        "it is made room on the GPU that lives"
     )
     a.unload(freed)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
@@ -464,24 +462,24 @@ def test_a_card_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
     assert driver.gpu(1)["charged_bytes"] == 5 * GIB
 
 
-def test_pressure_on_one_card_asks_nobody_on_another() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_pressure_on_one_gpu_asks_nobody_on_another() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     _, a = held(driver, "a", 6, gpu="0")
     _, b = held(driver, "b", 6, gpu="1")
-    driver.cards[ZERO].set(driver.consumer("game").process, 4 * GIB, driver.now)
+    driver.devices[ZERO].set(driver.consumer("game").process, 4 * GIB, driver.now)
     driver.until(lambda: driver.state(a) == "revoking", limit_s=5.0)
     assert driver.state(b) == "held"
 
 
-def test_verifications_are_per_card() -> None:
-    """The bytes that one card gets back do not prove that another did."""
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_verifications_are_per_gpu() -> None:
+    """The bytes that one GPU gets back do not prove that another did."""
+    driver = CoreDriver(8 * GIB, gpus=2)
     big = driver.consumer("big")
     halves = [big.acquire(6 * GIB, gpu=str(n), key=f"half {n}") for n in (0, 1)]
     for half in halves:
         big.load(half)
     driver.advance(0.01)
-    driver.cards[ONE].lag_s = 3.0
+    driver.devices[ONE].lag_s = 3.0
     for half in halves:
         big.unload(half)
     driver.until(lambda: driver.state(halves[0]) == "over", limit_s=1.0)
@@ -491,8 +489,8 @@ def test_verifications_are_per_card() -> None:
 
 
 # -- restarts
-def test_a_restart_keeps_every_lease_on_its_card() -> None:
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_a_restart_keeps_every_lease_on_its_gpu() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
     people = [held(driver, f"p{n}", 5, gpu=str(n)) for n in (0, 1)]
     tokens = [person.token(lease) for person, lease in people]
     driver.restart()
@@ -504,14 +502,14 @@ def test_a_restart_keeps_every_lease_on_its_card() -> None:
 
 
 @pytest.mark.parametrize("lists", [True, False])
-def test_without_a_journal_a_lease_is_found_on_the_card_that_shows_its_process(lists: bool) -> None:
-    """Regression: with `any` it was charged to the first card, and its own was granted again."""
-    driver = CoreDriver(8 * GIB, cards=2)
+def test_without_a_journal_a_lease_is_found_on_the_gpu_that_shows_its_process(lists: bool) -> None:
+    """Regression: with `any` it was charged to the first GPU, and its own was granted again."""
+    driver = CoreDriver(8 * GIB, gpus=2)
     held(driver, "first", 5, gpu="0")
     person, lease = held(driver, "second", 5)
     assert place(driver, lease) == ONE
     token = person.token(lease)
-    for one in driver.cards.values():
+    for one in driver.devices.values():
         one.lists_processes = lists
     driver.restart(keep_journal=False)
     person.connect()
@@ -522,10 +520,10 @@ def test_without_a_journal_a_lease_is_found_on_the_card_that_shows_its_process(l
 
 # -- at random
 @pytest.mark.parametrize("seed", range(8))
-def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -> None:
+def test_whatever_happens_no_gpu_overflows_and_everybody_is_served(seed: int) -> None:
     draw = random.Random(seed)
-    driver = CoreDriver(8 * GIB, cards=3)
-    for one in driver.cards.values():
+    driver = CoreDriver(8 * GIB, gpus=3)
+    for one in driver.devices.values():
         one.lag_s = draw.choice([0.0, 0.2])
     people = [driver.consumer(f"p{n}") for n in range(5)]
     mine: dict[LeaseId, Consumer] = {}
@@ -546,7 +544,7 @@ def test_whatever_happens_no_card_overflows_and_everybody_is_served(seed: int) -
         for lease in live:
             step(driver, draw, person, lease)
         driver.advance(draw.choice([0.01, 0.3, 2.0]))
-        for one in driver.cards.values():
+        for one in driver.devices.values():
             assert sum(one.shown(driver.now).values()) <= 8 * GIB
     for _ in range(400):
         waiting = [lease for lease in mine if driver.state(lease) == "queued"]

@@ -1,5 +1,5 @@
-"""On which cards a lease may be, and what that becomes when pins end, daemons restart and
-cards go."""
+"""On which GPUs a lease may be, and what that becomes when pins end, daemons restart and
+GPUs go."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,11 +18,11 @@ ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 
 @pytest.fixture
 def two_gpus() -> CoreDriver:
-    return CoreDriver(8 * GIB, cards=2)
+    return CoreDriver(8 * GIB, gpus=2)
 
 
 def busy_and_pinned(two_gpus: CoreDriver) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
-    """Card 0 is in use above everybody, card 1 is pinned."""
+    """GPU 0 is in use above everybody, GPU 1 is pinned."""
     busy, used = held(two_gpus, "busy", 6, gpu="0", priority=99)
     busy.use_begin(used)
     keeper, pinned = held(two_gpus, "keeper", 6, gpu="1", evictable=False)
@@ -31,8 +31,8 @@ def busy_and_pinned(two_gpus: CoreDriver) -> tuple[Consumer, LeaseId, Consumer, 
 
 # -- pins that end
 @pytest.mark.parametrize("end", ["release", "death", "unpin"])
-def test_a_card_whose_pin_ended_is_a_place_for_who_waits(two_gpus: CoreDriver, end: str) -> None:
-    """Regression: whoever came while it was pinned waited for the other card only, for hours beside
+def test_a_gpu_whose_pin_ended_is_a_place_for_who_waits(two_gpus: CoreDriver, end: str) -> None:
+    """Regression: whoever came while it was pinned waited for the other GPU only, for hours beside
     an empty one."""
     _, _, keeper, pinned = busy_and_pinned(two_gpus)
     if end == "unpin":
@@ -61,17 +61,17 @@ def order_lease(two_gpus: CoreDriver, action: str, lease: LeaseId) -> None:
     two_gpus.post(OperatorAsked(ops.client, two_gpus.next_request(), action, lease, "ops", "test"))
 
 
-def test_whoever_names_another_card_or_is_too_large_waits_only_where_it_may_be(
+def test_whoever_names_another_gpu_or_is_too_large_waits_only_where_it_may_be(
     two_gpus: CoreDriver,
 ) -> None:
     busy_and_pinned(two_gpus)
     named = two_gpus.consumer("named").acquire(5 * GIB, gpu="0")
-    any_card = two_gpus.consumer("any").acquire(7 * GIB)
+    any_gpu = two_gpus.consumer("any").acquire(7 * GIB)
     waiting = two_gpus.arbiter.inspect().waiting
-    assert (waiting[named].request.gpus, waiting[any_card].request.gpus) == ((ZERO,), (ZERO, ONE))
+    assert (waiting[named].request.gpus, waiting[any_gpu].request.gpus) == ((ZERO,), (ZERO, ONE))
 
 
-def test_a_growth_stays_on_its_card(two_gpus: CoreDriver) -> None:
+def test_a_growth_stays_on_its_gpu(two_gpus: CoreDriver) -> None:
     _, _, keeper, pinned = busy_and_pinned(two_gpus)
     small, lease = held(two_gpus, "small", 1)
     assert place(two_gpus, lease) == ZERO
@@ -88,7 +88,7 @@ def test_a_growth_stays_on_its_card(two_gpus: CoreDriver) -> None:
 def gone_for_policy(
     two_gpus: CoreDriver, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
-    """On standby, since a policy that is used on card 0."""
+    """On standby, since a policy that is used on GPU 0."""
     det, lease = held(two_gpus, "det", 5, standby=True, **spec)
     policy = two_gpus.consumer("policy")
     wanted = policy.acquire(5 * GIB, gpu="0")
@@ -100,7 +100,7 @@ def gone_for_policy(
     return det, lease, policy, wanted
 
 
-def test_a_card_that_was_pinned_when_it_asked_is_one_to_come_back_to(two_gpus: CoreDriver) -> None:
+def test_a_gpu_that_was_pinned_when_it_asked_is_one_to_come_back_to(two_gpus: CoreDriver) -> None:
     """Regression: where it may come back to was where it could have been granted when it asked."""
     keeper, pinned = held(two_gpus, "keeper", 6, gpu="1", evictable=False)
     _, lease, _, _ = gone_for_policy(two_gpus)
@@ -111,8 +111,8 @@ def test_a_card_that_was_pinned_when_it_asked_is_one_to_come_back_to(two_gpus: C
     assert place(two_gpus, lease) == ONE
 
 
-def test_after_a_restart_it_comes_back_to_any_card_still(two_gpus: CoreDriver) -> None:
-    """Regression: a lease that was held when the daemon restarted could come back to its own card
+def test_after_a_restart_it_comes_back_to_any_gpu_still(two_gpus: CoreDriver) -> None:
+    """Regression: a lease that was held when the daemon restarted could come back to its own GPU
     only."""
     det, lease = held(two_gpus, "det", 5, standby=True)
     other, fills = held(two_gpus, "other", 6, gpu="1")
@@ -133,12 +133,12 @@ def test_after_a_restart_it_comes_back_to_any_card_still(two_gpus: CoreDriver) -
     assert place(two_gpus, lease) == ONE
 
 
-def test_a_lease_that_is_away_from_a_card_that_is_gone_ends(two_gpus: CoreDriver) -> None:
-    """Regression: `status` and `why` of a lease without any card ended the daemon."""
+def test_a_lease_that_is_away_from_a_gpu_that_is_gone_ends(two_gpus: CoreDriver) -> None:
+    """Regression: `status` and `why` of a lease without any GPU ended the daemon."""
     det, lease, _, wanted = gone_for_policy(two_gpus, gpu="GPU-0")
     token = det.token(lease)
     two_gpus.settings = replace(two_gpus.settings, gpus=two_gpus.settings.gpus[1:])
-    del two_gpus.cards[ZERO]
+    del two_gpus.devices[ZERO]
     two_gpus.restart()
     assert two_gpus.state(lease) == "over"
     assert f"lease:{lease}" not in two_gpus.journal
@@ -153,7 +153,7 @@ def test_a_lease_that_is_away_from_a_card_that_is_gone_ends(two_gpus: CoreDriver
     assert place(two_gpus, other) == ONE, "the daemon grants"
 
 
-def test_one_that_is_too_large_for_a_card_keeps_nobody_from_returning_to_it(
+def test_one_that_is_too_large_for_a_gpu_keeps_nobody_from_returning_to_it(
     two_gpus: CoreDriver,
 ) -> None:
     """Regression: it counted as the one before them there, for whom room had to be kept."""

@@ -106,7 +106,7 @@ def test_lru_leaves_holders_in_use_for_last() -> None:
 
 
 @pytest.mark.parametrize(("policy", "asked"), [("default", 0), ("one_model", 1)])
-def test_one_model_empties_the_card_even_where_both_fit(policy: str, asked: int) -> None:
+def test_one_model_empties_the_gpu_even_where_both_fit(policy: str, asked: int) -> None:
     room = Room(policy)
     room.hold("first", 2)
     second = room.wait("second", 2)

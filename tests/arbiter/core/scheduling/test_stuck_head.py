@@ -28,14 +28,14 @@ def held_after_peak(
 def stowaway(driver: CoreDriver, gib: float) -> None:
     """Somebody without a lease holds this much from now on; the next background reading
     shows it."""
-    driver.card.set(STRANGER, int(gib * GIB), driver.now)
+    driver.device.set(STRANGER, int(gib * GIB), driver.now)
     driver.advance(1.1)
 
 
 def stuck(gib: float = 5, by: float = 4, *, lists: bool = True) -> tuple[CoreDriver, LeaseId]:
-    """A card of 8 GiB (7.6 to give), a stowaway on it, and a head that would fit if it went."""
+    """A GPU of 8 GiB (7.6 to give), a stowaway on it, and a head that would fit if it went."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = lists
+    driver.device.lists_processes = lists
     stowaway(driver, by)
     head = driver.consumer("head").acquire(int(gib * GIB))
     driver.advance(0.1)
@@ -220,7 +220,7 @@ def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
 
 def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
@@ -339,7 +339,7 @@ def away() -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
     driver.until(lambda: driver.state(wanted) == "loading")
     policy.load(wanted)
     driver.advance(0.1)
-    driver.card.set(STRANGER, 4 * GIB, driver.now)
+    driver.device.set(STRANGER, 4 * GIB, driver.now)
     policy.unload(wanted)  # contested: the stowaway's bytes came as its own went
     driver.until(lambda: driver.state(wanted) == "over", limit_s=15.0)
     return driver, people

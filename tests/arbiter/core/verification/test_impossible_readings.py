@@ -1,4 +1,4 @@
-"""A reading that cannot be true says nothing: its GPU is unknown. A driver that called a card of 8
+"""A reading that cannot be true says nothing: its GPU is unknown. A driver that called a GPU of 8
 GiB one of 2^60 bytes, or -1 bytes used, made room for grants that did not exist."""
 
 from dataclasses import replace
@@ -37,7 +37,7 @@ def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(
 ) -> None:
     """Regression: a changed capacity, -1 or 2^60 bytes used were believed."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lies = lie
+    driver.device.lies = lie
     driver.advance(3.0)
     waiter = driver.consumer("waiter").acquire(GIB)
     driver.advance(3.0)
@@ -48,17 +48,17 @@ def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(
     assert [note["reason"] in gpu["blocked"]["text"] for note in driver.notes("probe_failed")] == [
         True
     ], "once"
-    driver.card.lies = {}
+    driver.device.lies = {}
     driver.until(lambda: driver.state(waiter) == "loading")
     assert len(driver.notes("probe_ok")) == 1
 
 
 def test_a_first_reading_that_cannot_be_true_is_no_measure_for_later_ones() -> None:
     driver = CoreDriver(8 * GIB, start=False)
-    driver.card.lies = {"total_bytes": 1 << 60}
+    driver.device.lies = {"total_bytes": 1 << 60}
     driver.advance(0.1)
     assert "impossible reading" in driver.gpu()["blocked"]["text"]
-    driver.card.lies = {}
+    driver.device.lies = {}
     driver.advance(3.0)
     assert driver.gpu()["blocked"] is None
 
@@ -68,21 +68,21 @@ def test_bytes_are_not_measured_gone_by_an_impossible_reading() -> None:
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB)
     det.load(lease)
-    driver.card.lies = {"used_bytes": -(1 << 40), "processes": ()}
+    driver.device.lies = {"used_bytes": -(1 << 40), "processes": ()}
     det.die()
     driver.advance(2.0)
     assert driver.gpu()["charged_bytes"] == 5 * GIB
-    driver.card.lies = {}
+    driver.device.lies = {}
     driver.advance(3.0)
     assert driver.gpu()["charged_bytes"] == 0
 
 
-def test_an_empty_card_that_cannot_be_true_accounts_for_no_holder_after_a_restart() -> None:
+def test_an_empty_gpu_that_cannot_be_true_accounts_for_no_holder_after_a_restart() -> None:
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB)
     det.load(lease)
-    driver.card.lies = {"used_bytes": -1}
+    driver.device.lies = {"used_bytes": -1}
     driver.restart()
     driver.advance(2.0)
     assert driver.status()["phase"] == "recovering"
@@ -90,11 +90,11 @@ def test_an_empty_card_that_cannot_be_true_accounts_for_no_holder_after_a_restar
 
 def test_a_little_more_than_everything_is_the_drivers_rounding() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lies = {"used_bytes": 8 * GIB + d.MIB, "total_bytes": 8 * GIB - d.MIB}
+    driver.device.lies = {"used_bytes": 8 * GIB + d.MIB, "total_bytes": 8 * GIB - d.MIB}
     driver.advance(2.0)
     assert driver.gpu()["measured_used_bytes"] == 8 * GIB + d.MIB
-    sample = MemorySampled(driver.card.gpu, driver.now, 0, 8 * GIB, None)
-    driver.card.lies = {"used_bytes": 0, "total_bytes": 8 * GIB, "processes": None}
+    sample = MemorySampled(driver.device.gpu, driver.now, 0, 8 * GIB, None)
+    driver.device.lies = {"used_bytes": 0, "total_bytes": 8 * GIB, "processes": None}
     driver.post(sample)
     assert driver.gpu()["measured_used_bytes"] == 0
 
@@ -105,10 +105,10 @@ def test_a_reading_is_compared_with_what_is_leased_out_where_the_whole_is_not_kn
     driver = CoreDriver(8 * GIB)
     (info,) = driver.settings.gpus
     driver.settings = replace(driver.settings, gpus=(replace(info, total_bytes=0),))
-    driver.card.lies = {"total_bytes": 4 * GIB}
+    driver.device.lies = {"total_bytes": 4 * GIB}
     driver.restart(keep_journal=False)
     driver.advance(1.0)
     assert f"{8 * GIB} are leased out" in driver.notes("probe_failed")[-1]["reason"]
-    driver.card.lies = {"total_bytes": 16 * GIB}
+    driver.device.lies = {"total_bytes": 16 * GIB}
     driver.advance(2.0)
     assert driver.gpu()["measured_used_bytes"] == 0

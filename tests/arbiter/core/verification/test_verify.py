@@ -22,7 +22,7 @@ def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
 
 
 def total_only(driver: CoreDriver) -> None:
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     driver.advance(1.5)
 
 
@@ -56,7 +56,7 @@ def pauses(driver: CoreDriver, began: float) -> list[float]:
 @pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
 def test_memory_that_comes_back_is_noticed_within_ten_milliseconds(lag_s: float) -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = lag_s
+    driver.device.lag_s = lag_s
     det, lease = held(driver, "det", 5)
     det.unload(lease)
     took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
@@ -65,7 +65,7 @@ def test_memory_that_comes_back_is_noticed_within_ten_milliseconds(lag_s: float)
 
 def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.card.lag_s = 7.0
+    driver.device.lag_s = 7.0
     det, lease = held(driver, "det", 5)
     driver.advance(0.1)  # the last of the readings that follow a load
     det.unload(lease)
@@ -83,7 +83,7 @@ def test_a_consumer_that_is_known_to_take_longer_is_looked_at_densely_for_longer
     driver = CoreDriver(
         8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}, "probe_period_s": 1000.0}
     )
-    driver.card.lag_s = 4.2
+    driver.device.lag_s = 4.2
     det, lease = held(driver, "det", 5)
     driver.advance(0.1)
     det.unload(lease)
@@ -93,9 +93,9 @@ def test_a_consumer_that_is_known_to_take_longer_is_looked_at_densely_for_longer
     assert set(pauses(driver, began)[1:-1]) == {5.0}, "for half as long again as it took before"
 
 
-def test_a_card_that_is_slow_to_read_is_not_read_all_the_time() -> None:
+def test_a_gpu_that_is_slow_to_read_is_not_read_all_the_time() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.card.lag_s, driver.card.reading_s = 1.0, 0.025
+    driver.device.lag_s, driver.device.reading_s = 1.0, 0.025
     det, lease = held(driver, "det", 5)
     driver.advance(0.1)
     det.unload(lease)
@@ -107,7 +107,7 @@ def test_a_card_that_is_slow_to_read_is_not_read_all_the_time() -> None:
 def test_readings_do_not_pile_up_where_one_takes_longer_than_the_pause() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
     det, lease = held(driver, "det", 5)
-    driver.card.reading_s = 0.030
+    driver.device.reading_s = 0.030
     before = len(driver.effects)
     det.unload(lease)
     driver.advance(0.029)
@@ -120,7 +120,7 @@ def test_one_good_reading_is_not_enough() -> None:
     det, lease = held(driver, "det", 5)
     det.unload(lease)
     driver.advance(0.0031)
-    driver.card.set(STRANGER, GIB, driver.now)
+    driver.device.set(STRANGER, GIB, driver.now)
     driver.advance(0.1)
     assert driver.state(lease) == "verifying", "the next one does not agree"
 
@@ -132,7 +132,7 @@ def test_no_reading_from_before_the_release_counts() -> None:
     det.hold(0)
     driver.post(MemorySampled(GPU, driver.now, 0, 8 * GIB, ()))
     det.release(lease)
-    driver.card.silent = True
+    driver.device.silent = True
     for _ in range(3):
         driver.post(MemorySampled(GPU, driver.now, 0, 8 * GIB, ()))
     assert driver.state(lease) == "verifying"
@@ -145,7 +145,7 @@ def test_no_reading_from_before_the_release_counts() -> None:
 
 def test_a_death_under_measurement_starts_the_dense_readings_anew() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.card.lag_s = 1.0
+    driver.device.lag_s = 1.0
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unloading(lease)
     det.hold(450 * MIB)
@@ -215,7 +215,7 @@ def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes() -> None:
     driver.advance(1.5)
     second = driver.consumer("b").acquire(2 * GIB)
     driver.until(lambda: driver.state(second) == "loading")
-    driver.card.lag_s = 3.0
+    driver.device.lag_s = 3.0
     a.die()
     assert driver.until(lambda: bool(driver.notes("verified")), step_s=0.001) == pytest.approx(
         3.0, abs=0.05
@@ -225,7 +225,7 @@ def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes() -> None:
 
 def test_lists_tell_a_load_from_what_has_not_gone_though_there_is_no_list_of_before() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     driver.advance(1.5)
     a, first = held(driver, "a", 1)
     driver.advance(1.5)
@@ -233,7 +233,7 @@ def test_lists_tell_a_load_from_what_has_not_gone_though_there_is_no_list_of_bef
     second = b.acquire(2 * GIB)
     driver.until(lambda: driver.state(second) == "loading")
     a.unloading(first)
-    driver.card.lists_processes = True
+    driver.device.lists_processes = True
     a.hold(0)
     b.hold(2 * GIB)
     a.release(first)
@@ -243,7 +243,7 @@ def test_lists_tell_a_load_from_what_has_not_gone_though_there_is_no_list_of_bef
 
 def test_without_a_comparable_reading_the_ledger_bound_decides() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.card.lists_processes = False
+    driver.device.lists_processes = False
     det = driver.consumer("det")
     driver.advance(2.5)
     lease = det.acquire(5 * GIB)
@@ -299,8 +299,8 @@ def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
     det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
     waiter = driver.consumer("w").acquire(7 * GIB)
     det.unloading(lease)
-    driver.card.names[STRANGER] = "browser"
-    driver.card.set(STRANGER, 1 * GIB, driver.now)
+    driver.device.names[STRANGER] = "browser"
+    driver.device.set(STRANGER, 1 * GIB, driver.now)
     det.hold(100 * MIB)
     det.release(lease)
     driver.advance(11.0)
@@ -311,7 +311,7 @@ def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
     assert driver.state(waiter) == "queued"
     assert driver.gpu()["stowaway_bytes"] == 1 * GIB
     assert "browser (holds bytes without a lease)" in driver.why("w")["leases"][0]["text"]
-    driver.card.set(STRANGER, 0, driver.now)
+    driver.device.set(STRANGER, 0, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
@@ -319,8 +319,8 @@ def test_what_nobody_in_the_list_explains_is_not_charged_to_who_is_in_it() -> No
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
     det.unloading(lease)
-    driver.card.unlisted.add(STRANGER)
-    driver.card.set(STRANGER, 1 * GIB, driver.now)
+    driver.device.unlisted.add(STRANGER)
+    driver.device.set(STRANGER, 1 * GIB, driver.now)
     det.hold(100 * MIB)
     det.release(lease)
     driver.advance(11.0)
@@ -331,7 +331,7 @@ def test_what_nobody_in_the_list_explains_is_not_charged_to_who_is_in_it() -> No
 
 def test_a_dead_process_that_the_driver_still_lists_stays_charged() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 15.0
+    driver.device.lag_s = 15.0
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
     det.die()
@@ -344,7 +344,7 @@ def test_a_dead_process_that_the_driver_still_lists_stays_charged() -> None:
     assert driver.state(lease) == "over"
 
 
-def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_the_card() -> None:
+def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_the_gpu() -> None:
     driver = CoreDriver(8 * GIB)
     total_only(driver)
     a, first = held(driver, "a", 2)
@@ -368,7 +368,7 @@ def test_no_reading_means_unknown_and_frees_nothing() -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
     det.unloading(lease)
-    driver.card.failing = "driver hangs"
+    driver.device.failing = "driver hangs"
     det.hold(0)
     det.release(lease)
     driver.advance(20.0)
@@ -376,25 +376,25 @@ def test_no_reading_means_unknown_and_frees_nothing() -> None:
     assert len(driver.notes("probe_failed")) == 1
     assert (driver.state(lease), driver.state(waiter)) == ("verifying", "queued")
     assert driver.gpu()["measured_used_bytes"] is None
-    driver.card.failing = ""
+    driver.device.failing = ""
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
     assert len(driver.notes("probe_ok")) == 1
 
 
 def test_a_probe_that_never_answers_is_asked_again_and_again() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.silent = True
+    driver.device.silent = True
     driver.advance(3.0)
     waiter = driver.consumer("w").acquire(5 * GIB)
     driver.advance(5.0)
     assert driver.state(waiter) == "queued"
-    driver.card.silent = False
+    driver.device.silent = False
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
 def test_a_list_without_byte_counts_is_no_evidence() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.knows_bytes = False
+    driver.device.knows_bytes = False
     det, lease = held(driver, "det", 5)
     driver.advance(1.0)
     det.unloading(lease)
@@ -404,7 +404,7 @@ def test_a_list_without_byte_counts_is_no_evidence() -> None:
     assert verdicts(driver) == [("residue", True)]
 
 
-def test_a_failed_reading_of_an_unknown_card_is_ignored() -> None:
+def test_a_failed_reading_of_an_unknown_gpu_is_ignored() -> None:
     driver = CoreDriver(8 * GIB)
     assert driver.post(ProbeFailed(GpuId("GPU-9"), driver.now, "no")) == []
 
@@ -443,7 +443,7 @@ def test_a_lease_that_expires_while_it_loads_was_never_seen_complete() -> None:
 
 # -- residues and their processes
 def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
-    """A process that said bye and is neither connected nor on the card any more keeps nothing."""
+    """A process that said bye and is neither connected nor on the GPU any more keeps nothing."""
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unload(lease)
@@ -461,7 +461,7 @@ def test_a_residue_of_a_process_listed_without_bytes_stays_until_a_reading_shows
     """Regression: WSL2 lists processes without their bytes, and the next reading after the verdict
     took that for none."""
     driver = CoreDriver(8 * GIB)
-    driver.card.knows_bytes = False
+    driver.device.knows_bytes = False
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unloading(lease)
     det.hold(2 * GIB)
@@ -498,7 +498,7 @@ def test_two_debts_of_one_dead_process_are_measured_together() -> None:
 
 def test_two_releases_at_different_times_are_polled_each_at_its_own_pace() -> None:
     driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.card.lag_s = 0.2
+    driver.device.lag_s = 0.2
     a, first = held(driver, "a", 2)
     b, second = held(driver, "b", 3)
     a.unload(first)

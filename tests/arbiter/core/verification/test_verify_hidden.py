@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import held, hidden_card
+from tests.support.scenes import held, hidden_gpu
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -29,11 +29,11 @@ def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_b
     granted again after ten seconds."""
     driver = CoreDriver(8 * GIB)
     if since == "always":
-        driver.card.unlisted.add(ProcessKey(101, 707))
+        driver.device.unlisted.add(ProcessKey(101, 707))
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     driver.advance(1.5)
     waiter = driver.consumer("w").acquire(6 * GIB)
-    driver.card.unlisted.add(det.process)
+    driver.device.unlisted.add(det.process)
     det.unloading(lease)
     det.release(lease)
     driver.advance(11.0)
@@ -56,7 +56,7 @@ def test_its_death_frees_what_it_kept() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(6 * GIB, exclusive=True)
-    driver.card.unlisted.add(det.process)
+    driver.device.unlisted.add(det.process)
     det.unloading(lease)
     det.release(lease)
     driver.advance(30.0)
@@ -68,11 +68,11 @@ def test_its_death_frees_what_it_kept() -> None:
 
 def test_what_it_gave_back_and_somebody_else_took_is_that_ones() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.unlisted.add(ProcessKey(101, 707))
+    driver.device.unlisted.add(ProcessKey(101, 707))
     det, lease = held(driver, "det", 5)
     det.unloading(lease)
     det.hold(0)
-    driver.card.set(BROWSER, GIB, driver.now)
+    driver.device.set(BROWSER, GIB, driver.now)
     det.release(lease)
     driver.advance(11.0)
     assert verdicts(driver) == [("contested", True)]
@@ -82,11 +82,11 @@ def test_what_it_gave_back_and_somebody_else_took_is_that_ones() -> None:
 
 def test_less_is_charged_where_a_part_of_it_was_visibly_taken() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.unlisted.add(ProcessKey(101, 707))
+    driver.device.unlisted.add(ProcessKey(101, 707))
     det, lease = held(driver, "det", 5)
     det.unloading(lease)
     det.hold(2 * GIB)
-    driver.card.set(BROWSER, GIB, driver.now)
+    driver.device.set(BROWSER, GIB, driver.now)
     det.release(lease)
     driver.advance(11.0)
     assert verdicts(driver) == [("residue", True)]
@@ -95,12 +95,12 @@ def test_less_is_charged_where_a_part_of_it_was_visibly_taken() -> None:
 
 def test_one_that_expired_in_its_load_is_charged_for_what_nobody_explains() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.unlisted.add(ProcessKey(101, 707))
+    driver.device.unlisted.add(ProcessKey(101, 707))
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, ttl_s=10.0)
     driver.until(lambda: driver.state(lease) == "loading")
     det.hold(3 * GIB)
-    driver.card.set(BROWSER, GIB, driver.now)
+    driver.device.set(BROWSER, GIB, driver.now)
     driver.advance(30.0)
     assert verdicts(driver) == [("residue", True)]
     assert driver.gpu()["charged_bytes"] == 3 * GIB
@@ -108,9 +108,9 @@ def test_one_that_expired_in_its_load_is_charged_for_what_nobody_explains() -> N
 
 def test_where_the_list_has_no_bytes_all_of_it_stays_charged() -> None:
     driver = CoreDriver(8 * GIB)
-    driver.card.unlisted.add(ProcessKey(101, 707))
-    driver.card.knows_bytes = False
-    driver.card.set(BROWSER, GIB, driver.now)
+    driver.device.unlisted.add(ProcessKey(101, 707))
+    driver.device.knows_bytes = False
+    driver.device.set(BROWSER, GIB, driver.now)
     driver.advance(1.5)
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, ttl_s=10.0)
@@ -141,7 +141,7 @@ def test_two_that_nobody_lists_change_places() -> None:
     """What the one loads while the other leaves is not the other's; what it held before is no
     growth of its."""
     driver = CoreDriver(10 * GIB)
-    driver.card.unlisted |= {ProcessKey(pid, 7 * pid) for pid in (101, 102, 103)}
+    driver.device.unlisted |= {ProcessKey(pid, 7 * pid) for pid in (101, 102, 103)}
     held(driver, "stays", 2)
     det, lease = held(driver, "det", 4)
     change_places(driver, det, lease)
@@ -150,14 +150,14 @@ def test_two_that_nobody_lists_change_places() -> None:
 
 
 def test_one_that_comes_onto_the_list_has_not_grown() -> None:
-    """Its bytes were on the card before, so they do not make up for what another one keeps."""
+    """Its bytes were on the GPU before, so they do not make up for what another one keeps."""
     driver = CoreDriver(8 * GIB)
-    driver.card.unlisted |= {ProcessKey(101, 707), ProcessKey(102, 714)}
+    driver.device.unlisted |= {ProcessKey(101, 707), ProcessKey(102, 714)}
     held(driver, "other", 3)
     det, lease = held(driver, "det", 3)
     driver.advance(1.5)
     det.unloading(lease)
-    driver.card.unlisted.discard(ProcessKey(101, 707))
+    driver.device.unlisted.discard(ProcessKey(101, 707))
     det.release(lease)
     driver.advance(11.0)
     assert verdicts(driver) == [("residue", True)]
@@ -176,13 +176,13 @@ def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
     """Regression: growth within a charge counted twice, as allowed and as taken, so a dead holder's
     bytes were granted again."""
     driver = CoreDriver(8 * GIB)
-    driver.card.lag_s = 15.0
+    driver.device.lag_s = 15.0
     other, _ = held(driver, "other", 4)
     other.hold(2 * GIB)
     driver.advance(20.0)
     other.hold(2 * GIB)
     det, _ = held(driver, "det", 2)
-    driver.card.unlisted.add(det.process)
+    driver.device.unlisted.add(det.process)
     det.die()
     other.hold(4 * GIB)
     driver.advance(14.0)
@@ -196,14 +196,14 @@ def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
 def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
     driver = CoreDriver(8 * GIB)
     det, _ = held(driver, "det", 3)
-    ledger = driver.arbiter.inspect().gpus[driver.card.gpu].ledger
+    ledger = driver.arbiter.inspect().gpus[driver.device.gpu].ledger
     assert (
         ledger.charged_to(ProcessKey(det.process.pid, 0))
         == ledger.charged_to(det.process)
         == 3 * GIB
     )
     assert ledger.charged_to(BROWSER) == 0
-    reading = driver.card.read(driver.now)
+    reading = driver.device.read(driver.now)
     assert isinstance(reading, MemorySampled)
     assert ledger.unlisted_bytes(reading) == 0
     assert (
@@ -214,9 +214,9 @@ def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
 
 # -- what the rule machines found by night
 def test_a_lender_that_never_held_anything_keeps_nothing() -> None:
-    """Regression (families, seed 20778062350): a card that was empty all the time showed a residue
+    """Regression (families, seed 20778062350): a GPU that was empty all the time showed a residue
     of 4.3 GB, because so much was charged."""
-    driver = hidden_card(lists=False)
+    driver = hidden_gpu(lists=False)
     lender = driver.consumer("lender")
     lease = lender.acquire(int(4.3e9), exclusive=True)
     driver.until(lambda: driver.state(lease) == "loading")
@@ -231,10 +231,10 @@ def test_a_lender_that_never_held_anything_keeps_nothing() -> None:
 def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves: bool) -> None:
     """Regression (leases, seed 20778062337): what had become ready since the reading began counted
     as on it, in place of what was going."""
-    driver = hidden_card(lists=False)
+    driver = hidden_gpu(lists=False)
     small, lease = held(driver, "small", 0.5)
     driver.advance(1.0)
-    driver.card.lag_s = 2.0
+    driver.device.lag_s = 2.0
     newcomer = driver.consumer("newcomer")
     wanted = newcomer.acquire(1 * GIB)
     driver.until(lambda: driver.state(wanted) == "loading")
@@ -252,7 +252,7 @@ def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves:
 def test_what_its_own_process_loads_hides_no_release() -> None:
     """Regression: after a restart a load of the same process counted as present already and
     verified a release early (seed 20778062337)."""
-    driver = hidden_card(lists=False, lag_s=2.0)
+    driver = hidden_gpu(lists=False, lag_s=2.0)
     person, lease = held(driver, "person", 0.5)
     driver.advance(1.0)
     wanted = person.acquire(1 * GIB, key="another")
@@ -269,9 +269,9 @@ def test_what_its_own_process_loads_hides_no_release() -> None:
 
 
 def test_what_a_process_keeps_is_restored_beside_its_lease() -> None:
-    """Regression (rule machine, seed 500085): a card that leases fill has room for contexts all the
+    """Regression (rule machine, seed 500085): a GPU that leases fill has room for contexts all the
     same, which lie within their leases."""
-    driver = hidden_card(lists=False)
+    driver = hidden_gpu(lists=False)
     small, first = held(driver, "small", 0.5, residue_bytes=450 * MIB)
     small.unload(first)
     driver.until(lambda: driver.state(first) == "over")

@@ -91,7 +91,7 @@ class Driver:
         return [SimpleNamespace(pid=pid, usedGpuMemory=size) for pid, size in listed]
 
 
-def gpu(**changes):
+def a_gpu(**changes):
     return {
         "uuid": "GPU-1",
         "index": 0,
@@ -102,7 +102,7 @@ def gpu(**changes):
 
 
 def test_the_drivers_reserve_is_neither_used_nor_there():
-    probe = NvmlProbe(Driver(gpu(uuid=b"GPU-1", name=b"NVIDIA GPU")))
+    probe = NvmlProbe(Driver(a_gpu(uuid=b"GPU-1", name=b"NVIDIA GPU")))
     (found,) = probe.gpus()
     assert (found.id, found.name) == ("GPU-1", "NVIDIA GPU")
     assert (found.total_bytes, found.reserved_bytes) == (8 * GIB - GIB // 4, GIB // 4)
@@ -111,20 +111,20 @@ def test_the_drivers_reserve_is_neither_used_nor_there():
 
 
 def test_an_old_driver_counts_its_reserve_as_used():
-    probe = NvmlProbe(Driver(gpu(old=True)))
+    probe = NvmlProbe(Driver(a_gpu(old=True)))
     reading = probe.sample(GpuId("GPU-1"))
     assert (reading.used_bytes, reading.total_bytes) == (GIB + GIB // 4, 8 * GIB)
 
 
 def test_gpus_come_in_the_drivers_order_under_their_uuids():
-    probe = NvmlProbe(Driver(gpu(uuid="GPU-b", index=1), gpu(uuid="GPU-a", index=0)))
+    probe = NvmlProbe(Driver(a_gpu(uuid="GPU-b", index=1), a_gpu(uuid="GPU-a", index=0)))
     assert [found.id for found in probe.gpus()] == ["GPU-a", "GPU-b"]
 
 
 def test_a_process_with_compute_and_graphics_counts_once_and_unknown_stays_unknown():
     me = os.getpid()
     probe = NvmlProbe(
-        Driver(gpu(compute=[(me, 300), (2**22 + 1, None)], graphics=[(me, 300), (2**22 + 2, 5)]))
+        Driver(a_gpu(compute=[(me, 300), (2**22 + 1, None)], graphics=[(me, 300), (2**22 + 2, 5)]))
     )
     processes = probe.sample(GpuId("GPU-1")).processes
     assert processes is not None
@@ -141,13 +141,13 @@ def test_a_process_with_compute_and_graphics_counts_once_and_unknown_stays_unkno
 
 
 def test_where_processes_cannot_be_listed_the_total_still_counts():
-    probe = NvmlProbe(Driver(gpu(graphics=NotSupported("Not Supported"))))
+    probe = NvmlProbe(Driver(a_gpu(graphics=NotSupported("Not Supported"))))
     reading = probe.sample(GpuId("GPU-1"))
     assert (reading.used_bytes, reading.processes) == (GIB, None)
 
 
 def test_a_gpu_that_fell_off_the_bus_is_a_failed_reading():
-    handle = gpu()
+    handle = a_gpu()
     probe = NvmlProbe(Driver(handle))
     handle["memory_error"] = NVMLError("GPU is lost")
     with pytest.raises(ProbeFailed, match="GPU is lost"):
@@ -162,11 +162,11 @@ def test_no_driver_no_gpu_unknown_gpu():
         NvmlProbe(empty)
     assert empty.shutdowns == 1
     with pytest.raises(UnknownGpu):
-        NvmlProbe(Driver(gpu())).sample(GpuId("GPU-2"))
+        NvmlProbe(Driver(a_gpu())).sample(GpuId("GPU-2"))
 
 
 def test_one_gpu_that_fails_does_not_disturb_the_other():
-    lost, fine = gpu(), gpu(uuid="GPU-2", index=1, used=5)
+    lost, fine = a_gpu(), a_gpu(uuid="GPU-2", index=1, used=5)
     driver = Driver(lost, fine)
     probe = NvmlProbe(driver)
     lost["memory_error"] = NVMLError("GPU is lost")
@@ -182,12 +182,12 @@ def test_one_gpu_that_fails_does_not_disturb_the_other():
 def test_a_list_whose_pids_mean_nothing_here_is_no_evidence(tmp_path):
     (tmp_path / "self" / "ns").mkdir(parents=True)
     os.symlink("pid:[4026532999]", tmp_path / "self" / "ns" / "pid")
-    probe = NvmlProbe(Driver(gpu(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
+    probe = NvmlProbe(Driver(a_gpu(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
     assert probe.sample(GpuId("GPU-1")).processes is None
 
 
 def test_closing_twice_is_harmless():
-    driver = Driver(gpu())
+    driver = Driver(a_gpu())
     probe = NvmlProbe(driver)
     probe.close()
     probe.close()

@@ -80,7 +80,7 @@ def stops(scene: Scene) -> None:
 
 
 def cannot_be_read(scene: Scene) -> None:
-    scene.driver.card.failing = "the driver does not answer"
+    scene.driver.device.failing = "the driver does not answer"
     held_by_a_consumer(scene)
 
 
@@ -91,7 +91,7 @@ def held_by_a_consumer(scene: Scene) -> None:
 
 def takes_what_it_was_not_given(scene: Scene) -> None:
     held(scene.driver, "det", 5)
-    scene.driver.card.set(ProcessKey(77, 1), 4 * GIB, scene.driver.now)
+    scene.driver.device.set(ProcessKey(77, 1), 4 * GIB, scene.driver.now)
     scene.driver.advance(5.0)
 
 
@@ -104,7 +104,7 @@ def waits_for_ever(scene: Scene) -> None:
 
 def frees_nothing(scene: Scene) -> None:
     det, lease = held(scene.driver, "det", 5)
-    scene.driver.card.silent = True
+    scene.driver.device.silent = True
     det.release(lease)
     scene.driver.advance(11.0)
 

@@ -135,7 +135,7 @@ def test_a_grant_at_once_is_a_load_inside_an_acquire(driver: CoreDriver, heard: 
 
 
 def test_a_handover_is_one_trace_with_every_part_of_it(driver: CoreDriver, heard: Listener) -> None:
-    driver.card.lag_s = 0.5
+    driver.device.lag_s = 0.5
     det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     heard.exporter.clear()
@@ -163,7 +163,7 @@ def test_a_handover_is_one_trace_with_every_part_of_it(driver: CoreDriver, heard
     assert {parent_of(span) for span in (queue, evict, load)} == {acquire.context.span_id}
     assert parent_of(verify) == evict.context.span_id
     assert seconds(evict) == pytest.approx(4.0, abs=0.1)
-    assert seconds(verify) == pytest.approx(0.5, abs=0.1), "the lag of the card"
+    assert seconds(verify) == pytest.approx(0.5, abs=0.1), "the lag of the GPU"
     assert seconds(queue) == pytest.approx(seconds(evict), abs=0.1)
     assert seconds(acquire) == pytest.approx(seconds(queue) + 2.0, abs=0.1)
     assert [event.name.rpartition(".")[2] for event in evict.events] == [
@@ -351,7 +351,7 @@ def test_a_growth_is_an_acquire_until_the_lease_has_its_new_size(
 def test_an_unresolved_verdict_is_an_event_of_its_verification(
     driver: CoreDriver, heard: Listener
 ) -> None:
-    driver.card.lag_s = (
+    driver.device.lag_s = (
         15.0  # the driver lists a dead process for longer than a verification takes its time
     )
     det, _ = held(driver, "det", 5)
@@ -370,7 +370,7 @@ def test_a_bad_verdict_fails_the_verification(driver: CoreDriver, heard: Listene
     det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
     driver.consumer("policy").acquire(7 * GIB)
     det.unloading(lease)
-    driver.card.set(ProcessKey(99, 1), GIB, driver.now)
+    driver.device.set(ProcessKey(99, 1), GIB, driver.now)
     det.hold(100 * MIB)
     det.release(lease)
     driver.advance(11.0)
@@ -566,7 +566,7 @@ def test_gauges_show_the_present_and_nothing_that_is_old(
     assert heard.numbers("vram_arbiter.lease.waiters") == {(): 0}, "the loop looks once a second"
     ticks.later.pop()()
     assert heard.numbers("vram_arbiter.lease.waiters") == {(): 1}
-    driver.card.failing = "lost"
+    driver.device.failing = "lost"
     driver.advance(1.1)
     ticks.later.pop()()
     assert heard.numbers("vram_arbiter.gpu.measured") == {}, "unknown is no number"
@@ -584,9 +584,9 @@ def test_gauges_show_the_present_and_nothing_that_is_old(
 def test_the_sum_over_consumers_is_what_the_gpu_holds(
     driver: CoreDriver, heard: Listener, ticks: Ticks
 ) -> None:
-    """A series with consumer "" for the whole card doubled every `sum()`."""
+    """A series with consumer "" for the whole GPU doubled every `sum()`."""
     held(driver, "det", 2)
-    driver.card.overhead_bytes = 300 * MIB
+    driver.device.overhead_bytes = 300 * MIB
     driver.advance(1.1)
     heard.metrics.watch(ticks, lambda: Picture(driver.arbiter.figures()))  # type: ignore[arg-type]
     by_consumer = heard.numbers("vram_arbiter.gpu.measured")
