@@ -24,17 +24,17 @@ from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-CARD = GpuId("GPU-0")
+GPU = GpuId("GPU-0")
 STEP_S = 0.001
 PER_CLIENT = 50
 
 
 class Bench:
-    """A core with `leases` holders, all in use, on a full card, and `waiters` of whom none fits."""
+    """A core with `leases` holders, all in use, on a full GPU, and `waiters` of whom none fits."""
 
     def __init__(self, leases: int, waiters: int) -> None:
         self.capacity = leases * SLIVER
-        gpu = GpuInfo(CARD, 0, "bench", self.capacity, 0)
+        gpu = GpuInfo(GPU, 0, "bench", self.capacity, 0)
         settings = Settings(
             epoch=1, gpus=(gpu,), leases_per_client_max=PER_CLIENT, verify_tolerance_bytes=0
         )
@@ -74,13 +74,13 @@ class Bench:
         )
         for effect in effects:
             if isinstance(effect, Push) and isinstance(effect.body, GrantedPush):
-                raise RuntimeError("nobody fits on this card")
+                raise RuntimeError("nobody fits on this GPU")
         if any(isinstance(effect, Sample) for effect in effects):
             self.read()
         return effects
 
     def read(self) -> None:
-        self.handle(ev.MemorySampled(CARD, self.now, 0, self.capacity, None))
+        self.handle(ev.MemorySampled(GPU, self.now, 0, self.capacity, None))
 
     def acquire(self, client: ClientId, size: int) -> LeaseId:
         spec = LeaseSpec(
@@ -99,7 +99,7 @@ class Bench:
         return lease
 
     def mix(self, rounds: int) -> None:
-        """What a busy card sees: renewals, uses, waiters that come and give up, readings."""
+        """What a busy GPU sees: renewals, uses, waiters that come and give up, readings."""
         dice = random.Random(7)
         held = list(self.tokens)
         for _ in range(rounds):

@@ -1,6 +1,6 @@
 """SIGKILL of a holder: how long after its parent could reap it the next one is granted.
 
-The victim holds the card's loading slot with nothing on the card yet, so the kernel's and the
+The victim holds the GPU's loading slot with nothing on the GPU yet, so the kernel's and the
 driver's part is as small as it gets.
 """
 

@@ -1,7 +1,7 @@
 """An eviction split into what the arbiter adds, what the holder takes and what the driver takes to
 give memory back.
 
-Two clients of 5 GiB on a simulated card of 8 GiB. The holder's bytes lie on the card as a process
+Two clients of 5 GiB on a simulated GPU of 8 GiB. The holder's bytes lie on the GPU as a process
 file; when it unloads it writes when they come back. The arbiter's part is from the waiter's acquire
 to the holder's `revoke`, plus from the memory's return to the grant.
 """
@@ -68,19 +68,19 @@ def evict(daemon: ArbiterProcess, peers: list[Peer], lag_s: float) -> tuple[floa
     return (asked - start) * 1e6, (released - asked) * 1e6, noticed * 1e6
 
 
-def put(card: Path, size: int) -> None:
-    """This process holds so many bytes on the card."""
-    _write(card, fakegpu.ProcessFile(**_me(), allocated_bytes=size))
+def put(gpu_folder: Path, size: int) -> None:
+    """This process holds so many bytes on the GPU."""
+    _write(gpu_folder, fakegpu.ProcessFile(**_me(), allocated_bytes=size))
 
 
-def give_back(card: Path, lag_s: float) -> float:
+def give_back(gpu_folder: Path, lag_s: float) -> float:
     """They are on their way back; returns when they are there (monotonic seconds)."""
     back_at = time.monotonic() + lag_s
     if lag_s:
         returning = (fakegpu.Returning(bytes=5 * GIB, due_s=back_at),)
-        _write(card, fakegpu.ProcessFile(**_me(), returning=returning))
+        _write(gpu_folder, fakegpu.ProcessFile(**_me(), returning=returning))
     else:
-        _write(card, fakegpu.ProcessFile(**_me()))
+        _write(gpu_folder, fakegpu.ProcessFile(**_me()))
     return back_at
 
 
@@ -89,9 +89,9 @@ def _me() -> dict[str, object]:
     return {"pid": os.getpid(), "start_ticks": ticks, "name": "bench"}
 
 
-def _write(card: Path, mine: fakegpu.ProcessFile) -> None:
+def _write(gpu_folder: Path, mine: fakegpu.ProcessFile) -> None:
     name = fakegpu.file_name(ProcessKey(mine.pid, mine.start_ticks))
-    with locked(card):
-        temporary = card / f".{name}.bench"
+    with locked(gpu_folder):
+        temporary = gpu_folder / f".{name}.bench"
         temporary.write_text(mine.model_dump_json())
-        temporary.rename(card / name)
+        temporary.rename(gpu_folder / name)

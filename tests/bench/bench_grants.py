@@ -1,7 +1,7 @@
 """A grant, and acquire + release, of a client that is alone: against a bare round trip and against
 Redis.
 
-Before each one the card is quiet: what the release before has left to be measured is no part of the
+Before each one the GPU is quiet: what the release before has left to be measured is no part of the
 next grant. `bench_throughput` has what that costs when there is no pause.
 """
 

@@ -1,6 +1,6 @@
 """From one client's release to the next one's grant, with 2 to 10,000 in the queue.
 
-The subject is the queue, as with any lock: leases of 4 KiB that wait for the card's one loading
+The subject is the queue, as with any lock: leases of 4 KiB that wait for the GPU's one loading
 slot, so nothing has to be measured gone before the next grant. What a handover of real bytes takes
 is in `bench_eviction`.
 """

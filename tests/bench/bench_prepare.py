@@ -129,8 +129,8 @@ def main() -> int:
     options = parser.parse_args()
     with arbiter(SHIPPED + NO_HOLD + HOST_RAM) as daemon:
         path = daemon.gpu_folder / fakegpu.GPU_FILE
-        card = fakegpu.FakeGpuConfig.model_validate_json(path.read_text(encoding="utf-8"))
-        slow = card.model_copy(update={"throttle_bytes_per_s": COPY_BYTES_PER_S})
+        config = fakegpu.FakeGpuConfig.model_validate_json(path.read_text(encoding="utf-8"))
+        slow = config.model_copy(update={"throttle_bytes_per_s": COPY_BYTES_PER_S})
         path.write_text(fakegpu.dump_config(slow), encoding="utf-8")
         rows = asyncio.run(_measure(daemon, options.rounds))
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from tests.bench.bench_crowd import rss_bytes
 from tests.bench.harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, environ, in_turns, pause
 
 QUIET_AFTER_S = 11.0
-"""The card is read in the background until 10 s after the last client."""
+"""The GPU is read in the background until 10 s after the last client."""
 STATUS = (
     "import sys; sys.argv[1:] = ['status']; from vram_arbiter.clients.cli.main import main; main()"
 )

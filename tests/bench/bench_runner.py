@@ -2,7 +2,7 @@
 `out/bench/runner.json`.
 
 Real processes: arbiter, simulator with physics, cameras and video as in the demo, and two sidecars
-with the shipped checkpoints that do not fit the card together, so that each load throws the other
+with the shipped checkpoints that do not fit the GPU together, so that each load throws the other
 out. One run has stretches with nothing beside and stretches with one switch after the other; the
 runner itself notes when each tick began (`--timings`), and ticks are told apart by the stretch in
 which they began.

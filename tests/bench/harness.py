@@ -328,7 +328,7 @@ class Peer:
 
     def settle(self) -> None:
         """Until nobody has a lease and nothing is measured any more: the next acquire finds a quiet
-        card, and cores awake."""
+        GPU, and cores awake."""
         while self.ask("status")["leases"]:
             pass
 

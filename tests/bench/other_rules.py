@@ -63,7 +63,7 @@ OLLAMA_RECOVERED = 0.8
 OLLAMA_PATIENCE_S = 5.0
 
 
-class OneCardOnly(CallerError):
+class OneGpuOnly(CallerError):
     """The ports know one GPU."""
 
     code = "bad_request"
@@ -87,12 +87,12 @@ class _Model:
 class Rules(ABC):
     """Bookkeeping that the ports share; `_serve` decides."""
 
-    def __init__(self, cards: Sequence[GpuPlan]) -> None:
-        if len(cards) != 1:
-            raise OneCardOnly(
+    def __init__(self, gpus: Sequence[GpuPlan]) -> None:
+        if len(gpus) != 1:
+            raise OneGpuOnly(
                 "the ports of other programs' rules know one GPU", hint="compare on one GPU"
             )
-        self._card = cards[0]
+        self._gpu = gpus[0]
         self._now = 0.0
         self._out: list[Effect] = []
         self._models: dict[LeaseId, _Model] = {}  # in the order of their loading
@@ -154,8 +154,8 @@ class Rules(ABC):
     def _asked(self, event: AcquireRequested) -> None:
         self._serial += 1
         model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
-        if event.spec.footprint.steady_bytes > self._card.total_bytes:
-            size, total = event.spec.footprint.steady_bytes, self._card.total_bytes
+        if event.spec.footprint.steady_bytes > self._gpu.total_bytes:
+            size, total = event.spec.footprint.steady_bytes, self._gpu.total_bytes
             refusal = TooLarge(event.spec.consumer, size, size, total, 0)
             self._out.append(Refuse(event.client, event.request, refusal))
             return
@@ -171,7 +171,7 @@ class Rules(ABC):
             state="queued" if model.state == "queued" else "loading",
             consumer=spec.consumer,
             model=spec.model,
-            gpu=self._card.info.id,
+            gpu=self._gpu.info.id,
             mode="shared",
             priority=spec.priority,
             evictable=spec.evictable,
@@ -182,7 +182,7 @@ class Rules(ABC):
         )
 
     def _note(self, body: AnyNote, model: _Model) -> None:
-        about = About(LeaseId(model.id), model.spec.consumer, self._card.info.id)
+        about = About(LeaseId(model.id), model.spec.consumer, self._gpu.info.id)
         self._out.append(Note(body, about))
 
     def _switch(self, model: _Model) -> SwitchNote:
@@ -241,8 +241,8 @@ class Unmanaged(Rules):
 class OllamaRules(Rules):
     """ollama: one pending request at a time."""
 
-    def __init__(self, cards: Sequence[GpuPlan]) -> None:
-        super().__init__(cards)
+    def __init__(self, gpus: Sequence[GpuPlan]) -> None:
+        super().__init__(gpus)
         self._leaving: _Model | None = None
         self._released_at: float | None = None  # it has gone; its memory is awaited
         self._used_before = 0
@@ -260,7 +260,7 @@ class OllamaRules(Rules):
         head = self._queue[0]
         if any(model.state == "loading" for model in self._models.values()):
             return  # loads are not mixed; the end of this one returns here
-        free = self._card.total_bytes - max(
+        free = self._gpu.total_bytes - max(
             self._used_bytes,
             sum(model.spec.footprint.steady_bytes for model in self._models.values()),
         )
@@ -268,7 +268,7 @@ class OllamaRules(Rules):
             len(self._models) < OLLAMA_MODELS and head.spec.footprint.steady_bytes <= free
         ):
             self._load(head)
-            self._out.append(Sample(self._card.info.id))
+            self._out.append(Sample(self._gpu.info.id))
             return
         idle = [model for model in self._models.values() if not model.uses and not model.owed]
         self._leaving = (idle or list(self._models.values()))[0]
@@ -289,7 +289,7 @@ class OllamaRules(Rules):
             return True
         if self._timer is None:
             self._timer = self._now + OLLAMA_POLL_S
-            self._out.append(Sample(self._card.info.id))
+            self._out.append(Sample(self._gpu.info.id))
         return False
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.bench.other_rules import RULES, OneCardOnly, outcomes_of, under
+from tests.bench.other_rules import RULES, OneGpuOnly, outcomes_of, under
 from vram_arbiter.arbiter.lab import compare
 from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
@@ -14,8 +14,8 @@ TWO = """
 """
 
 
-def scenario_of(consumers: str, *, lag_s: float = 0.5, cards: str = "8GiB") -> Scenario:
-    listed = ", ".join(f"{{capacity: {size}, release_lag_s: {lag_s}}}" for size in cards.split())
+def scenario_of(consumers: str, *, lag_s: float = 0.5, gpus: str = "8GiB") -> Scenario:
+    listed = ", ".join(f"{{capacity: {size}, release_lag_s: {lag_s}}}" for size in gpus.split())
     text = f"about: test\nseconds: 120\ncards: [{listed}]\nconsumers:\n{consumers}"
     return load_scenario(text, "test.yaml")
 
@@ -41,15 +41,15 @@ def test_llama_swap_starts_the_next_before_the_memory_is_back() -> None:
 
 
 def test_llama_swap_holds_one_model_even_where_two_fit() -> None:
-    outcome = run(scenario_of(TWO, cards="24GiB", lag_s=0.0), "llama_swap_rules")
+    outcome = run(scenario_of(TWO, gpus="24GiB", lag_s=0.0), "llama_swap_rules")
     assert outcome.switches == 5
-    assert run(scenario_of(TWO, cards="24GiB")).switches == 0
+    assert run(scenario_of(TWO, gpus="24GiB")).switches == 0
 
 
 def test_ollama_waits_for_the_memory_and_loads_beside_what_fits() -> None:
     outcome = run(scenario_of(TWO, lag_s=1.0), "ollama_rules")
     assert (outcome.total.ooms, outcome.total.unserved, outcome.switches) == (0, 0, 5)
-    assert run(scenario_of(TWO, cards="24GiB"), "ollama_rules").switches == 0
+    assert run(scenario_of(TWO, gpus="24GiB"), "ollama_rules").switches == 0
 
 
 def test_ollama_goes_on_after_five_seconds_anyway() -> None:
@@ -75,8 +75,8 @@ def test_a_request_that_never_fits_is_denied_at_once(rules: str) -> None:
 
 
 def test_the_ports_know_one_gpu() -> None:
-    made = scenario_of(TWO, cards="8GiB 8GiB")
+    made = scenario_of(TWO, gpus="8GiB 8GiB")
     for rules in RULES:
-        with pytest.raises(OneCardOnly):
+        with pytest.raises(OneGpuOnly):
             run(made, rules)
     assert [outcome.policy for outcome in outcomes_of(scenario_of(TWO))][-3:] == list(RULES)
