@@ -173,9 +173,9 @@ async def _episode(
     http: HttpAddress | None,
     out: Path,
 ) -> JsonObject:
-    card = runtime / "fakegpu"
+    folder = runtime / "fakegpu"
     if gpu.startswith("fake:"):
-        make_gpu(card, parse_bytes(gpu.removeprefix("fake:")))
+        make_gpu(folder, parse_bytes(gpu.removeprefix("fake:")))
     watch = Watch(time.monotonic(), time.time() - time.monotonic())
     async with contextlib.AsyncExitStack() as stack:
         runner = await stack.enter_async_context(RunnerClient(f"ipc://{runtime}/runner.sock"))
@@ -202,7 +202,7 @@ async def _episode(
         truth = await runner.ground_truth()
         seconds = time.monotonic() - watch.start_s
     await programs.stop("runner")  # finishes the video
-    story = _story(card, gpu, programs.pids(), watch)
+    story = _story(folder, gpu, programs.pids(), watch)
     outcome = (
         json.loads(result_file.read_text())
         if result_file.exists()
