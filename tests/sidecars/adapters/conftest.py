@@ -2,11 +2,13 @@
 read back."""
 
 import io
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from vram_arbiter.schemas.manifest import parse_manifest
+from vram_arbiter.schemas.manifest import RSkillManifest, parse_manifest
 from vram_arbiter.sidecars.weights import Weights, resolve
 
 CHAT = (
@@ -18,7 +20,7 @@ CHAT = (
 )
 
 
-def bytes_alphabet():
+def bytes_alphabet() -> list[str]:
     from tokenizers.pre_tokenizers import ByteLevel
 
     return sorted(ByteLevel.alphabet())
@@ -169,14 +171,14 @@ SAVERS = {"owlvit": save_owlvit, "qwen": save_qwen, "act": save_act}
 
 
 @pytest.fixture(scope="session")
-def configs(tmp_path_factory):
+def configs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A configs folder; models are made when first asked for."""
     return tmp_path_factory.mktemp("configs")
 
 
 @pytest.fixture(scope="session")
-def weights(configs):
-    def weights(name: str):
+def weights(configs: Path) -> Callable[[str], Weights]:
+    def weights(name: str) -> Weights:
         folder = configs / "models" / name
         if not folder.exists():
             folder.mkdir(parents=True)
@@ -187,11 +189,13 @@ def weights(configs):
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory):
+def saved(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str, Callable[[Path], None]], Weights]:
     """Saves a family's checkpoint in float32, once, and returns its weights."""
     root = tmp_path_factory.mktemp("saved")
 
-    def saved(family, save):
+    def saved(family: str, save: Callable[[Path], None]) -> Weights:
         folder = root / family
         if not folder.exists():
             folder.mkdir()
@@ -201,7 +205,7 @@ def saved(tmp_path_factory):
     return saved
 
 
-def placed(adapter):
+def placed(adapter: Any) -> Any:
     """Load an adapter's weights and place them on the CPU."""
     adapter.prepare()
     adapter.load("cpu")
@@ -210,8 +214,8 @@ def placed(adapter):
 
 
 @pytest.fixture
-def manifest():
-    def manifest(kind: str, more: str):
+def manifest() -> Callable[[str, str], RSkillManifest]:
+    def manifest(kind: str, more: str) -> RSkillManifest:
         return parse_manifest(
             f"name: test/model\nversion: 0.1.0\nkind: {kind}\nembodiment_tags: [any]\nchunk_size: "
             "1\n"
@@ -223,7 +227,7 @@ def manifest():
 
 
 @pytest.fixture
-def png():
+def png() -> Callable[..., bytes]:
     def png(
         width: int = 80, height: int = 60, colour: tuple[int, int, int] = (200, 30, 30)
     ) -> bytes:
