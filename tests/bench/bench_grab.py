@@ -1,6 +1,6 @@
 """Success of the shipped grab over many seeds, with shapes and kinds of failure.
 
-    python tests/bench/bench_grab.py [--episodes 1000] [--seed 10000] [--table]
+    python -m tests.bench.bench_grab [--episodes 1000] [--seed 10000] [--table]
 
 The runner's own benchmark in this process, and the real sidecar beside it, without arbiter. The
 simulated world waits for the policy, whose answers take as many steps as `prefetch_at` says, so

@@ -1,6 +1,6 @@
 """Steps and standing of the shipped grab, by how early its chunks are asked for.
 
-    python tests/bench/bench_prefetch.py [--episodes 40] [--seed 0] [--cells 0/6 2/6 2/4 5/6]
+    python -m tests.bench.bench_prefetch [--episodes 40] [--seed 0] [--cells 0/6 2/6 2/4 5/6]
         [--latency 0 1 2 3 5] [--real-time]
 
 Real sidecar, real policy on the CPU, no arbiter; each row is one `vram-runner benchmark` over the

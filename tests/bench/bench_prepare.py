@@ -1,7 +1,7 @@
 """Time from the end of the last drive to the first control step of the grab, with and without the
 hint that the grab follows.
 
-    python tests/bench/bench_prepare.py [--rounds 5]
+    python -m tests.bench.bench_prepare [--rounds 5]
 
 Real arbiter, simulator, detector and grab sidecars. The grab stands for a model of 4.3 GB, whose
 weights come from a disk of 2 GB/s and reach the simulated GPU at 6 GB/s, as in the demo; the

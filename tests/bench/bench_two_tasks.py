@@ -1,6 +1,6 @@
 """Two tasks in one world: the demo's programs grab the seed's target, then another object.
 
-    python tests/bench/bench_two_tasks.py [--episodes 10] [--seed 0]
+    python -m tests.bench.bench_two_tasks [--episodes 10] [--seed 0]
 
 All programs of `vramctl demo` on a simulated GPU of 8 GiB, one world after another. A task counts
 when the reasoner reports success and the simulator's truth says that the named object is held.

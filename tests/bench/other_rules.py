@@ -1,5 +1,5 @@
 """Ports of other programs' scheduling rules, against the same consumers and GPUs:
-`python tests/bench/other_rules.py [SCENARIO …]` prints the tables of docs/explanation/policies.md.
+`python -m tests.bench.other_rules [SCENARIO …]` prints the tables of docs/explanation/policies.md.
 
 For comparison only. They get the same events and answer with the same effects as the engine, but
 decide as their originals do, by these sources:

@@ -2,7 +2,7 @@
 stowaways and attackers of the daemon's socket on one simulated GPU, hit at every named step of a
 switch, for as long as is asked. An independent checker judges afterwards.
 
-`make chaos SECONDS=300 SEED=0`, or `python tests/chaos/storm.py --seconds 300 --seed 0 --out
+`make chaos SECONDS=300 SEED=0`, or `python -m tests.chaos.storm --seconds 300 --seed 0 --out
 out/chaos`. Ends with 1 if anything that must not happen happened. What to hit and when is drawn
 from the seed; when exactly it lands is the machine's doing, so a seed chooses the plan, not the
 outcome. Steps are followed through the arbiter's own event stream, never by time.

@@ -1,4 +1,4 @@
-"""Mutation check of the engine: `python tests/mutation/mutation_run.py --sample 300 --out
+"""Mutation check of the engine: `python -m tests.mutation.mutation_run --sample 300 --out
 out/mutation/report.json`.
 
 A mutant is one function of `arbiter/core` with one small change (mutmut's operators: comparisons,

@@ -1,4 +1,4 @@
-"""The rule machines for a night: `python tests/nightly/nightly_run.py --histories 100000`.
+"""The rule machines for a night: `python -m tests.nightly.nightly_run --histories 100000`.
 
 Splits the histories over the cores, in processes of their own and each portion under a seed of its
 own; writes a report with what the histories came by, so that a walk that reaches nothing shows. A
@@ -51,7 +51,7 @@ class Portion:
     def again(self) -> str:
         """The line that tells it again."""
         return (
-            f"python tests/nightly/nightly_run.py --machine {self.machine} --seed {self.seed}"
+            f"python -m tests.nightly.nightly_run --machine {self.machine} --seed {self.seed}"
             f" --histories {self.wanted}"
         )
 

@@ -1,4 +1,4 @@
-"""Runs simulations: `python tests/sim/sim_run.py --seed 7` (one, with its story) or `--seeds 1000`
+"""Runs simulations: `python -m tests.sim.sim_run --seed 7` (one, with its story) or `--seeds 1000`
 (0 … 999 on all cores).
 
 One run: some consumers, runners, an observer and an operator live for a while under faults; then
