@@ -1,6 +1,6 @@
 """A DEALER socket on anyio: messages in and out as maps, and a call when the server hangs up.
 
-libzmq's file descriptor is edge-triggered: the socket is drained after every wake-up, and a send
+libzmq's file descriptor is edge-triggered: the socket is emptied after every wake-up, and a send
 that found something to read wakes the reader. The socket's monitor tells of a hang-up at once,
 where heartbeats would take seconds. The module must not know what messages mean.
 """
@@ -23,7 +23,7 @@ from vram_arbiter.schemas.runtime.trust import Program
 
 log = logging.getLogger(__name__)
 
-DRAIN_MAX: Final = 256  # messages in one go, then other tasks get their turn
+BURST_MAX: Final = 256  # messages in one go, then other tasks get their turn
 RETRY_S: Final = 0.02  # the first pause before another connection is tried …
 RETRY_MAX_S: Final = 0.5  # … and the longest
 UNSENT_MAX: Final = 1000  # messages kept until there is a connection
@@ -139,7 +139,7 @@ class Dealer:
                 tasks.cancel_scope.cancel()
         if refusal is not None:
             raise refusal
-        while self._drain(link):  # its last words
+        while self._hand_on(link):  # its last words
             pass
 
     async def _watch(self, link: Link, reading: anyio.CancelScope) -> None:
@@ -149,16 +149,16 @@ class Dealer:
 
     async def _read(self, link: Link) -> None:
         while True:
-            if self._drain(link):
+            if self._hand_on(link):
                 await anyio.lowlevel.checkpoint()
                 continue
             with anyio.CancelScope() as self._reading:
                 await anyio.wait_readable(link.socket.fileno())
             self._reading = None
 
-    def _drain(self, link: Link) -> bool:
+    def _hand_on(self, link: Link) -> bool:
         """Hand on what is there. True: there may be more."""
-        for _ in range(DRAIN_MAX):
+        for _ in range(BURST_MAX):
             payload = link.receive()
             if payload is None:
                 return False
