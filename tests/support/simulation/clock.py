@@ -211,4 +211,4 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
 def new_loop(clock: Clock, name: str) -> ProcessLoop:
     """Return the loop of a new process."""
-    return ProcessLoop(clock, name)  # type: ignore[abstract]  # only the stub's methods are abstract
+    return ProcessLoop(clock, name)  # type: ignore[abstract]  # only stub methods are
