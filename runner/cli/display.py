@@ -6,8 +6,10 @@ import argparse
 import asyncio
 import contextlib
 from collections import Counter
+from pathlib import Path
 from typing import Protocol
 
+from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Robot
 from vram_arbiter.runner.display.display import Display, Tee
@@ -37,6 +39,8 @@ def check_display_flag(args: argparse.Namespace) -> None:
         from vram_arbiter.runner.display.stream import check_display
 
         check_display(args.display)
+        if args.display.endswith(".rrd"):
+            check_output("--display", Path(args.display))
 
 
 def display_runner[R: Robot](

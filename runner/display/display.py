@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded, TickSink
+from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.world import WorldState
 
 log = logging.getLogger(__name__)
@@ -158,14 +159,22 @@ class Display:
     def _main(self) -> None:
         try:
             stream = self._make()
-            while (item := self._next()) is not False:
-                self._show(stream, item)
-            stream.close()
+            try:
+                while (item := self._next()) is not False:
+                    self._show(stream, item)
+            finally:
+                stream.close()
+        except VramError as error:
+            log.error("nothing more is displayed: %s", error)
+            self._stop()
         except Exception:
             log.exception("nothing more is displayed")
-            with self._changed:
-                self._broken = True
-                self._queue.clear()
+            self._stop()
+
+    def _stop(self) -> None:
+        with self._changed:
+            self._broken = True
+            self._queue.clear()
 
     def _next(self) -> _Shown | _Ended | _Leases | bool | None:
         """Return the next item; None when there was none for a while, False at the end."""

@@ -6,6 +6,7 @@ and `dataset`, not lerobot.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,24 @@ EPISODE_GAP_S = 1.0  # between two episodes on the timeline `time`
 def export(root: Path, out: Path, episode: int | None = None) -> int:
     """Write the dataset, or one episode of it, to `out`; return the number of frames.
 
+    An older file at `out` stays until the new one is complete.
     Raises ConfigError for a folder or a file that cannot be read, BadRequest for a missing episode.
     """
-    stream = RerunStream(str(out), root.name)
+    episodes = read_episodes(root, episode)
+    part = out.with_name(f".{out.stem}.{os.getpid()}.rrd")
+    try:
+        frames = _write(part, root.name, episodes)
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
+    return frames
+
+
+def _write(out: Path, name: str, episodes: Iterator[EpisodeRows]) -> int:
+    stream = RerunStream(str(out), name)
     begins_s, frames = 0.0, 0
     try:
-        for rows in read_episodes(root, episode):
+        for rows in episodes:
             frames += _show(stream, rows, begins_s)
             begins_s += rows.rows[-1]["timestamp"] + EPISODE_GAP_S
     finally:

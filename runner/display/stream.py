@@ -7,6 +7,7 @@ on the timelines `time` and `tick`. Must not know threads, robots or sockets.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,6 +22,8 @@ APPLICATION = "vram-runner"
 RERUN = "rerun"
 JPEG_QUALITY = 85
 GIB = 1 << 30
+SPAWN_S = 30.0  # a viewer opens its window and its port
+ANSWER_S = 5.0
 
 
 def check_display(target: str) -> None:
@@ -35,25 +38,47 @@ def check_display(target: str) -> None:
 class RerunStream:
     """One recording. `target`: `rerun` starts a viewer, `rerun+http://…/proxy` connects to one, a
     path ending in `.rrd` is written. Calls on one thread.
+
+    Raises ConfigError for a viewer that does not answer.
     """
 
     def __init__(self, target: str, name: str) -> None:
         import rerun
 
+        rerun.unregister_shutdown()  # at exit it waits for ever for a viewer that hangs
         self._rerun = rerun
         self._stream = rerun.RecordingStream(APPLICATION, recording_id=None)
         self._stream.send_recording_name(name)
         if target == RERUN:
             self._stream.spawn(memory_limit="10%", hide_welcome_screen=True)
+            self._reach("the Rerun viewer does not start", SPAWN_S)
         elif target.endswith(".rrd"):
             self._stream.save(target)
         else:
             self._stream.connect_grpc(target)
+            self._reach(f"no Rerun viewer answers at {target}", 0.0)
+
+    def _reach(self, failure: str, within_s: float) -> None:
+        give_up = time.monotonic() + within_s
+        while True:
+            try:
+                return self._stream.flush(timeout_sec=ANSWER_S)
+            except RuntimeError as error:
+                if time.monotonic() < give_up:
+                    continue
+                self._stream.disconnect()
+                raise ConfigError(
+                    f"{failure}: {error}", hint="start `rerun`, or write a file: --display FILE.rrd"
+                ) from error
 
     def close(self) -> None:
-        """Finish the file, or send the rest to the viewer."""
-        self._stream.flush(timeout_sec=5.0)
-        self._stream.disconnect()
+        """Finish the file, or send the rest to the viewer. Raises ConfigError if it is lost."""
+        try:
+            self._stream.flush(timeout_sec=ANSWER_S)
+        except RuntimeError as error:
+            raise ConfigError(f"the viewer did not take everything: {error}") from error
+        finally:
+            self._stream.disconnect()
 
     # -- what is shown
     def at(self, time_s: float, tick: int | None = None) -> None:

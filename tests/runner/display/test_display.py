@@ -1,5 +1,7 @@
 """The live view: it never holds the control thread up, and a Rerun file has everything it shows."""
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -106,3 +108,52 @@ def test_a_display_that_is_none_is_refused_before_a_world_begins(
 ) -> None:
     assert main(["sim", "--no-arbiter", "--display", "foxglove"]) == 2
     assert "expected rerun, rerun+http://HOST:PORT/proxy or FILE.rrd" in capsys.readouterr().err
+
+
+@pytest.mark.heavy
+def test_a_viewer_that_is_not_there_is_said_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    """The runner reported it when it ended, with a traceback, and its process then hung."""
+    pytest.importorskip("rerun", reason="needs the viz extra")
+    from vram_arbiter.runner.display.stream import RerunStream
+
+    nobody = "rerun+http://127.0.0.1:1/proxy"  # no program listens there
+    display = Display(lambda: RerunStream(nobody, "bench"), lambda: None)
+    until(lambda: f"no Rerun viewer answers at {nobody}" in caplog.text)
+    display.close()
+    assert "write a file: --display FILE.rrd" in caplog.text
+    assert "Traceback" not in caplog.text
+
+
+SHOW_TO_A_HANGING_VIEWER = """
+import socket, sys
+from vram_arbiter.runner.display import display as module
+from vram_arbiter.runner.display.stream import RerunStream
+
+hanging = socket.create_server(("127.0.0.1", 0))
+module.CLOSE_S = 3.0
+target = f"rerun+http://127.0.0.1:{hanging.getsockname()[1]}/proxy"
+shown = module.Display(lambda: RerunStream(target, "bench"), lambda: None)
+shown.close()
+print("closed")
+"""
+
+
+@pytest.mark.heavy
+def test_a_viewer_that_hangs_does_not_keep_the_process() -> None:
+    """At exit Rerun waited without limit for a viewer that takes connections and reads nothing."""
+    pytest.importorskip("rerun", reason="needs the viz extra")
+    ended = subprocess.run(
+        [sys.executable, "-c", SHOW_TO_A_HANGING_VIEWER],
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert "closed" in ended.stdout
+
+
+@pytest.mark.heavy
+def test_a_file_that_cannot_be_written_is_refused_before_a_world_begins(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The log said it from the view's thread, and the run went on without a file."""
+    (folder := tmp_path / "run.rrd").mkdir()
+    assert main(["sim", "--no-arbiter", "--display", str(folder)]) == 2
+    assert f"--display {folder} cannot be written" in capsys.readouterr().err

@@ -280,6 +280,7 @@ def test_the_committed_dataset_is_pushed_whole(
 def test_a_recording_is_exported_for_the_rerun_viewer(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """A wrong dataset or episode overwrote an older export with an empty one."""
     pytest.importorskip("rerun", reason="needs the viz extra")
     out = tmp_path / "set.rrd"
     assert main(["export", "--dataset", str(root), "--out", str(out)]) == 0
@@ -289,3 +290,5 @@ def test_a_recording_is_exported_for_the_rerun_viewer(
     assert [rows[name] for name in wanted] == [FRAMES] * 4
     assert main(["export", "--dataset", str(root), "--out", str(out), "--episode", "7"]) == 1
     assert "there is no episode 7" in capsys.readouterr().err
+    assert main(["export", "--dataset", str(tmp_path / "none"), "--out", str(out)]) == 2
+    assert (rows_of(out), list(tmp_path.iterdir())) == (rows, [out])
