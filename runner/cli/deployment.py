@@ -143,12 +143,10 @@ def unkept(file: DeploymentFile, parts: Parts, catalogue: Catalogue) -> tuple[st
     the emergency stop's listener keeps.
     """
     heard = "safety.e_stop_topic (" if listened_topic(file.robot) else None
-    found = dict.fromkeys(
-        text for text in parts.gate.unkept if heard is None or not text.startswith(heard)
-    )
+    found = dict.fromkeys(parts.gate.unkept)
     for manifest in catalogue.executable():
         found |= dict.fromkeys(parts.gate.for_skill(manifest, ()).unkept)
-    return tuple(found)
+    return tuple(text for text in found if heard is None or not text.startswith(heard))
 
 
 def contracts(parts: Parts, catalogue: Catalogue) -> list[str]:

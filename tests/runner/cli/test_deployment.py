@@ -491,8 +491,11 @@ def test_a_continuous_detector_is_checked_against_the_installed_ones(dry_run: Dr
 
 
 def test_a_topic_that_stops_the_robot_is_named_and_not_told_as_unkept(dry_run: DryRun) -> None:
+    """With a skill for the robot's body the topic was named as listened to and as not kept."""
     pytest.importorskip("cyclonedds")
-    out = dry_run(TWIN + "safety: {e_stop_topic: /cell/e_stop, deadman_required: true}\n")[1]
+    asked = TWIN + "safety: {e_stop_topic: /cell/e_stop, deadman_required: true}\n"
+    out = dry_run(asked, skills=NAVIGATE.parent / "so101-move")[1]
+    assert "skill     vram-arbiter/so101-move 0.1.0 (apache-2.0)" in out.splitlines()
     assert "estop     also by /cell/e_stop (std_msgs/Bool)" in out.splitlines()
     assert "NOT KEPT  safety.deadman_required" in out
     assert "NOT KEPT  safety.e_stop_topic" not in out
