@@ -1,6 +1,8 @@
-"""Temporary folder of one test run: its own, and empty at the end.
+"""Folders of one test run: its own, and empty at the end.
 
 A pytest plugin. Whatever the tests and their programs leave in TMPDIR fails the run, with its name.
+Each worker has a runtime folder of its own: a program that a test runs without naming sockets once
+met the developer's runner at the default ones.
 """
 
 import os
@@ -11,12 +13,15 @@ from pathlib import Path
 
 import pytest
 
+from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
+
 _KEY = pytest.StashKey[Path]()
 _FAILED = pytest.StashKey[bool]()
 OF_TESTS = "p"
 """Folder of `tmp_path`."""
-KEPT = (OF_TESTS, "torchinductor_*")
-"""What may lie there at the end: `tmp_path`, and the cache of torch's compiler."""
+RUNTIME = "run-"
+KEPT = (OF_TESTS, f"{RUNTIME}*", "torchinductor_*")
+"""What may lie there at the end: `tmp_path`, runtime folders, and the cache of torch's compiler."""
 
 
 def _is_worker() -> bool:
@@ -34,6 +39,8 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["TMPDIR"] = tempfile.tempdir = str(made)
         # Short: the path of a socket in `tmp_path` holds 107 bytes.
         config.option.basetemp = config.option.basetemp or str(made / OF_TESTS)
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+    os.environ[RUNTIME_VARIABLE] = f"{tempfile.gettempdir()}/{RUNTIME}{worker}"
 
 
 @pytest.hookimpl(trylast=True)
