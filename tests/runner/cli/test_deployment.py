@@ -494,7 +494,7 @@ def test_a_topic_that_stops_the_robot_is_named_and_not_told_as_unkept(dry_run: D
     """With a skill for the robot's body the topic was named as listened to and as not kept."""
     pytest.importorskip("cyclonedds")
     asked = TWIN + "safety: {e_stop_topic: /cell/e_stop, deadman_required: true}\n"
-    out = dry_run(asked, skills=NAVIGATE.parent / "so101-move")[1]
+    out = dry_run(asked, skills=NAVIGATE.parents[1] / "so101-move")[1]
     assert "skill     vram-arbiter/so101-move 0.1.0 (apache-2.0)" in out.splitlines()
     assert "estop     also by /cell/e_stop (std_msgs/Bool)" in out.splitlines()
     assert "NOT KEPT  safety.deadman_required" in out
