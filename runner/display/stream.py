@@ -62,7 +62,8 @@ class RerunStream:
         give_up = time.monotonic() + within_s
         while True:
             try:
-                return self._stream.flush(timeout_sec=ANSWER_S)
+                self._stream.flush(timeout_sec=ANSWER_S)
+                return
             except RuntimeError as error:
                 if time.monotonic() < give_up:
                     continue
