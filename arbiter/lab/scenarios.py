@@ -28,7 +28,7 @@ def workload_of(scenario: Scenario) -> Workload:
             gpu.release_lag_s,
             tuple(_others(scenario, index)),
         )
-        for index, gpu in enumerate(scenario.cards)
+        for index, gpu in enumerate(scenario.gpus)
     ]
     plans: dict[str, Plan] = {}
     later: dict[str, list[Job]] = {}
@@ -59,7 +59,7 @@ def _most(scenario: Scenario) -> int:
 
 def _others(scenario: Scenario, index: int) -> Iterator[tuple[float, str, int]]:
     for stowaway in scenario.stowaways:
-        if stowaway.card == index:
+        if stowaway.gpu == index:
             yield stowaway.from_s, stowaway.name, stowaway.bytes
             if stowaway.to_s is not None:
                 yield stowaway.to_s, stowaway.name, 0

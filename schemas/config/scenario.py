@@ -129,7 +129,7 @@ class Stowaway(_Part):
     """Since when."""
     to_s: Seconds | None = None
     """Until when. Null: the end."""
-    card: Annotated[int, Field(ge=0)] = 0
+    gpu: Annotated[int, Field(ge=0)] = 0
     """Index of the GPU."""
 
 
@@ -142,7 +142,7 @@ class Scenario(_Part):
     """How long."""
     seed: int = 0
     """Of everything that is drawn."""
-    cards: Annotated[tuple[ScenarioGpu, ...], Field(min_length=1, max_length=16)]
+    gpus: Annotated[tuple[ScenarioGpu, ...], Field(min_length=1, max_length=16)]
     consumers: Annotated[dict[Name, ScenarioConsumer], Field(min_length=1, max_length=256)]
     stowaways: tuple[Stowaway, ...] = ()
 
@@ -153,18 +153,18 @@ class Scenario(_Part):
             if other is not None and other not in self.consumers:
                 raise ValueError(f"consumers.{name}.arrivals.after: there is no consumer {other!r}")
             if consumer.gpu != "any" and not (
-                consumer.gpu.isdecimal() and int(consumer.gpu) < len(self.cards)
+                consumer.gpu.isdecimal() and int(consumer.gpu) < len(self.gpus)
             ):
                 raise ValueError(
                     f"consumers.{name}.gpu: {consumer.gpu!r} is not a GPU; write 0 to "
-                    f"{len(self.cards) - 1} or any"
+                    f"{len(self.gpus) - 1} or any"
                 )
             if (consumer.steady or 0) > consumer.load_peak:
                 raise ValueError(f"consumers.{name}.steady is larger than its load_peak")
         for stowaway in self.stowaways:
-            if stowaway.card >= len(self.cards):
+            if stowaway.gpu >= len(self.gpus):
                 raise ValueError(
-                    f"stowaways: {stowaway.name} is on GPU {stowaway.card}, which is not there"
+                    f"stowaways: {stowaway.name} is on GPU {stowaway.gpu}, which is not there"
                 )
         return self
 
@@ -178,7 +178,7 @@ class _Keys(Mapping[Path, Collection[str]]):
             for name in consumers:
                 self._found["consumers", name] = list(ScenarioConsumer.model_fields)
                 self._found["consumers", name, "arrivals"] = list(Arrivals.model_fields)
-        for key, part in (("cards", ScenarioGpu), ("stowaways", Stowaway)):
+        for key, part in (("gpus", ScenarioGpu), ("stowaways", Stowaway)):
             items = data.get(key) if isinstance(data, dict) else None
             for index in range(len(items) if isinstance(items, list) else 0):
                 self._found[key, index] = list(part.model_fields)

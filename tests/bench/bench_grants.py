@@ -46,9 +46,9 @@ def run(suite: Suite) -> None:
         found = in_turns(rounds, calls)
     suite.time(FLOOR, found[FLOOR], "200 bytes each way, validated")
     suite.compare("ping", found["ping"], found[FLOOR], "F", None)
-    suite.compare("grant: acquire on a free card", found["grant"], found[FLOOR], "F", 1.5)
+    suite.compare("grant: acquire on a free GPU", found["grant"], found[FLOOR], "F", 1.5)
     suite.compare(
-        "grant: acquire on a free card, by p99",
+        "grant: acquire on a free GPU, by p99",
         found["grant"],
         found[FLOOR],
         "F's p99",

@@ -16,7 +16,7 @@ TWO = """
 
 def scenario_of(consumers: str, *, lag_s: float = 0.5, gpus: str = "8GiB") -> Scenario:
     listed = ", ".join(f"{{capacity: {size}, release_lag_s: {lag_s}}}" for size in gpus.split())
-    text = f"about: test\nseconds: 120\ncards: [{listed}]\nconsumers:\n{consumers}"
+    text = f"about: test\nseconds: 120\ngpus: [{listed}]\nconsumers:\n{consumers}"
     return load_scenario(text, "test.yaml")
 
 

@@ -22,7 +22,7 @@ def scenario_of(
     consumers: str, *, seconds: float = 120, lag_s: float = 0.5, gpu: str = "8GiB", more: str = ""
 ) -> Scenario:
     text = (
-        f"about: test\nseconds: {seconds}\ncards: [{{capacity: {gpu}, release_lag_s: "
+        f"about: test\nseconds: {seconds}\ngpus: [{{capacity: {gpu}, release_lag_s: "
         f"{lag_s}}}]\n{more}\nconsumers:\n"
     )
     return load_scenario(text + consumers, "test.yaml")
@@ -52,7 +52,7 @@ def test_no_policy_of_the_engine_overfills_a_gpu(policy: str) -> None:
     outcome = under(made, policy)
     assert outcome.total.ooms == 0
     assert outcome.total.unserved == 0
-    assert outcome.peak_bytes <= made.cards[0].capacity - made.cards[0].reserve
+    assert outcome.peak_bytes <= made.gpus[0].capacity - made.gpus[0].reserve
 
 
 def test_the_same_scenario_gives_the_same_outcome() -> None:

@@ -20,7 +20,7 @@ SHIPPED = sorted((ROOT / "configs" / "scenarios").glob("*.yaml"))
 SMALL = """\
 about: one
 seconds: 10
-cards:
+gpus:
   - capacity: 8GiB
 consumers:
   a:
@@ -45,13 +45,13 @@ def test_the_defaults_of_a_small_one() -> None:
         (1.0, 1.0),
         True,
     )
-    assert scenario.cards[0].release_lag_s == 0.5
+    assert scenario.gpus[0].release_lag_s == 0.5
 
 
 @pytest.mark.parametrize("model", [Scenario, ScenarioGpu, ScenarioConsumer, Arrivals, Stowaway])
 def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> None:
     silent = {name for name, field in model.model_fields.items() if not field.description}
-    assert silent <= {"cards", "consumers", "stowaways", "name"}
+    assert silent <= {"gpus", "consumers", "stowaways", "name"}
 
 
 @pytest.mark.parametrize(
@@ -67,8 +67,8 @@ def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> N
             "every: 5",
             "s.yaml:9: consumers.a.arrivals.every: unknown key; did you mean every_s?",
         ),
-        ("capacity: 8GiB", "capacity: lots", "s.yaml:4: cards[0].capacity: "),
-        ("capacity: 8GiB", "capacity: 8GiB\n    lag: 1", "s.yaml:5: cards[0].lag: unknown key"),
+        ("capacity: 8GiB", "capacity: lots", "s.yaml:4: gpus[0].capacity: "),
+        ("capacity: 8GiB", "capacity: 8GiB\n    lag: 1", "s.yaml:5: gpus[0].lag: unknown key"),
         (
             "every_s: 5",
             "every_s: 5, per_minute: 3",
@@ -82,7 +82,7 @@ def test_every_key_that_is_not_plain_says_what_it_is(model: type[Scenario]) -> N
             "consumers.a.steady is larger than its load_peak",
         ),
         ("seconds: 10", "seconds: -1", "s.yaml:2: seconds: "),
-        ("about: one", "about: one\nstowaways: [{name: x, bytes: 1, card: 1}]", "x is on GPU 1"),
+        ("about: one", "about: one\nstowaways: [{name: x, bytes: 1, gpu: 1}]", "x is on GPU 1"),
         ("about: one\n", "", "about: is missing"),
         ("about: one", "about: [", "not valid YAML"),
     ],
