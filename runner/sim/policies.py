@@ -83,7 +83,8 @@ def policy_of(name: str) -> Policy:
     where = name.removeprefix(SCRIPTED)
     if not name.startswith(SCRIPTED) or not where:
         raise ConfigError(
-            f"unknown policy {name!r}", hint="random, scripted:MODULE or scripted:FILE.py"
+            f"unknown policy {name!r}",
+            hint="random, scripted:MODULE, scripted:FILE.py, or expert in so101",
         )
     make = getattr(_load(where), "make", None)
     if not callable(make):

@@ -26,6 +26,7 @@ _PUSHT = GymConfig.model_validate(
             "observation_height": 96,
             "visualization_width": 384,
             "visualization_height": 384,
+            "max_episode_steps": 300,
         },
         "state": "agent_pos",
         "joints": ["x", "y"],  # of the pusher, in the environment's own pixels
@@ -36,7 +37,10 @@ _PUSHT = GymConfig.model_validate(
 )
 _ALOHA = GymConfig.model_validate(
     {
-        "kwargs": {"obs_type": "pixels_agent_pos"},
+        "kwargs": {
+            "obs_type": "pixels_agent_pos",
+            "max_episode_steps": 400,  # gym-aloha itself ends an episode after 300
+        },
         "state": "agent_pos",
         "joints": _BOTH_ARMS,
         "actions": _BOTH_ARMS,
