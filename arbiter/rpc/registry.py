@@ -49,7 +49,7 @@ class Decisions(Protocol):
     def why(self, consumer: str) -> WhyReply: ...
 
 
-class Connection(Protocol):
+class PeerConnection(Protocol):
     """One peer's connection (`schemas.runtime.connection.Connection`), as sessions need it."""
 
     @property
@@ -104,7 +104,7 @@ class Session:
     """One connection after its hello, and after its loss if the engine still knows its client."""
 
     client: ClientId
-    connection: Connection
+    connection: PeerConnection
     peer: Peer
     role: Role
     name: str
@@ -145,7 +145,7 @@ class Registry:
         self._watched: dict[ProcessKey, _Watched] = {}
 
     # -- in
-    def open(self, connection: Connection, hello: w.Hello, now: float) -> Session:
+    def open(self, connection: PeerConnection, hello: w.Hello, now: float) -> Session:
         """Make the session of a hello, or raise what refuses it.
 
         1. A process that can be seen. 2. Its role. 3. Room. 4. A watch on the process. 5. The

@@ -14,8 +14,8 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.log import RefusalLog
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.arbiter.rpc.registry import (
-    Connection,
     Decisions,
+    PeerConnection,
     Registry,
     Session,
     SessionSettings,
@@ -125,7 +125,7 @@ class SessionTable:
         ).view()
 
     # -- in
-    def connected(self, connection: Connection) -> None:
+    def connected(self, connection: PeerConnection) -> None:
         """A peer has finished the handshake; it is a stranger until its hello."""
         now, peer = self._clock(), connection.peer
         shared = self._process_budgets.get((peer.uid, peer.process))
@@ -140,7 +140,7 @@ class SessionTable:
         rate = float(self._settings.rate_per_client_per_s)
         self._budgets[connection.serial] = Budget(rate, rate, now), shared
 
-    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+    def received(self, connection: PeerConnection, payload: bytes | bytearray | Oversize) -> bool:
         """One message. Never raises for anything that a peer can send. False: its sender is over
         its rate.
 
@@ -190,7 +190,7 @@ class SessionTable:
             self._refuse(connection, session, request_id, error.view())
         return True
 
-    def disconnected(self, connection: Connection, reason: str) -> None:
+    def disconnected(self, connection: PeerConnection, reason: str) -> None:
         """A connection has ended."""
         del self._budgets[connection.serial]
         self._registry.lost(ClientId(f"c{connection.serial}"))
@@ -229,7 +229,7 @@ class SessionTable:
 
     # -- steps
     def _charge(
-        self, connection: Connection, payload: bytes | bytearray | Oversize, now: float
+        self, connection: PeerConnection, payload: bytes | bytearray | Oversize, now: float
     ) -> bool:
         """Charge a request to a connection and its process. False: one of them has nothing left,
         and nothing is charged.
@@ -254,7 +254,7 @@ class SessionTable:
 
     def _refuse(
         self,
-        connection: Connection,
+        connection: PeerConnection,
         session: Session | None,
         request_id: int | None,
         error: ErrorView,

@@ -60,7 +60,12 @@ from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic
 from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.config.robot import RobotEnvironment
-from vram_arbiter.schemas.errors import ConfigError, RunnerUnreachable, VramError
+from vram_arbiter.schemas.errors import (
+    AlreadyRunning,
+    ConfigError,
+    RunnerUnreachable,
+    VramError,
+)
 from vram_arbiter.schemas.goals import ResultPush
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint, runtime_dir
@@ -124,7 +129,7 @@ class Deploy:
 
     async def run(self) -> int:
         """Check, then print the plan or carry it out."""
-        check_endpoint(self._endpoint)
+        taken = self._taken()
         if self._args.push_to_hub is not None and self._file.robot.save_dir is None:
             raise ConfigError("--push-to-hub is for a file with save_dir")
         check_display_flag(self._args)
@@ -137,7 +142,7 @@ class Deploy:
         if self._file.robot.vla is not None:
             self._task_skill = skill_named(self._file.robot.vla, check.executable())
         if self._args.dry_run:
-            print(printable_lines(plan(self._file, parts, check, self._facts(check))))
+            print(printable_lines(plan(self._file, parts, check, [*self._facts(check), *taken])))
             print("dry run: nothing was opened")
             return 0
         for text in (*unkept(self._file, parts, check), *unused(self._file.robot)):
@@ -199,6 +204,17 @@ class Deploy:
         check_sidecars(sidecars_given(self._args.sidecar), manifests)
         makers = self._make_makers(parts, arbiter)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
+
+    def _taken(self) -> list[tuple[str, str]]:
+        """Check the endpoint; return a line of the plan where a dry run finds it in use, as by the
+        runner that this file is to replace. Raises ConfigError, AlreadyRunning."""
+        try:
+            check_endpoint(self._endpoint)
+        except AlreadyRunning as error:
+            if not self._args.dry_run:
+                raise
+            return [("TAKEN", str(error))]
+        return []
 
     def _facts(self, catalogue: Catalogue) -> list[tuple[str, str]]:
         given = sidecars_given(self._args.sidecar)

@@ -2,6 +2,7 @@
 fits the robot, the dry run.
 """
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -14,12 +15,14 @@ from vram_arbiter.runner.__main__ import main, parse
 from vram_arbiter.runner.cli.deployment import make_parts, read_deployment
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.folders import LockFile
 
 pytestmark = pytest.mark.heavy  # the SO-101's kinematics
 
 ROOT = Path(__file__).parents[3]
 NAVIGATE = ROOT / "configs/rskills/so101-navigate/rskill.yaml"
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
+TWIN_FILE = ROOT / "configs/robots/so101-twin.yaml"
 TWIN = "robot_id: bench\nhal: {adapter: so101_kinematic}\n"
 GRAB_TASK = "task: {id: grab, instruction: grab it}\nvla: {id: vram-arbiter/so101-grab}\n"
 
@@ -27,8 +30,7 @@ DryRun = Callable[..., tuple[int, str, str]]
 
 
 def test_the_shipped_twin_passes(capsys: pytest.CaptureFixture[str]) -> None:
-    file = ROOT / "configs/robots/so101-twin.yaml"
-    assert main(["deploy", "--config", str(file), "--dry-run"]) == 0
+    assert main(["deploy", "--config", str(TWIN_FILE), "--dry-run"]) == 0
     assert "safety    workspace_box_min_xyz" in capsys.readouterr().out
 
 
@@ -61,6 +63,25 @@ def licensed(tmp_path: Path, licence: str, manifest: Path = NAVIGATE) -> Path:
     )
     (folder / "rskill.yaml").write_text(text, encoding="utf-8")
     return folder
+
+
+def test_a_new_file_can_be_tried_dry_beside_the_running_robot(
+    capsys: pytest.CaptureFixture[str], short_folder: Path
+) -> None:
+    """The dry run was refused exactly where an operator needs it: for the sockets of the runner
+    that the file is to replace."""
+    socket = short_folder / "runner.sock"
+    taken = LockFile(Path(f"{socket}.lock"), f"ipc://{socket}", "a server")
+    words = ["deploy", "--config", str(TWIN_FILE), "--endpoint", f"ipc://{socket}"]
+    taken.acquire()
+    try:
+        assert main([*words, "--dry-run"]) == 0
+        assert f"TAKEN     a server (pid {os.getpid()}) already uses" in capsys.readouterr().out
+        assert main(words) == 1
+        assert "stop it first" in capsys.readouterr().err
+    finally:
+        taken.release()
+    assert main([*words[:-1], "ipc://relative", "--dry-run"]) == 2, "this one never serves"
 
 
 def test_the_dry_run_says_what_would_run_and_opens_nothing(dry_run: DryRun) -> None:
