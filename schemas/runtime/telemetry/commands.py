@@ -47,7 +47,8 @@ def command(
     variables that make no sense, before any work is done.
     """
     running = Command()
-    installed = otel.set_up(program, environ=environ, attributes=attributes)
+    # the port of a machine-wide variable is a server's; a command asks nothing of it
+    installed = otel.set_up(program, environ=environ, attributes=attributes, port_required=serves)
     if not installed.on:
         yield running
         return

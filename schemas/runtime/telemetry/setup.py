@@ -82,6 +82,7 @@ def set_up(
     prometheus_port: int | None = None,
     sample_ratio: float | None = None,
     attributes: Mapping[str, str] | None = None,
+    port_required: bool = True,
 ) -> Telemetry:
     """Install the SDK if it is asked for. Returns what ends it.
 
@@ -92,6 +93,7 @@ def set_up(
         sample_ratio: share (0 to 1) of the traces that begin in this process. A trace that began
             elsewhere is kept if it was kept there.
         attributes: further attributes of the resource.
+        port_required: False goes on without Prometheus where its port is taken.
 
     A second call in a process returns the first one's result.
 
@@ -106,16 +108,18 @@ def set_up(
     if not planned.on:
         return Telemetry()
     if _installed is None:
-        _installed = _install(service, planned, attributes or {})
+        _installed = _install(service, planned, attributes or {}, port_required)
         atexit.register(_installed)
     return _installed
 
 
-def _install(service: str, planned: Plan, attributes: Mapping[str, str]) -> Telemetry:
+def _install(
+    service: str, planned: Plan, attributes: Mapping[str, str], port_required: bool
+) -> Telemetry:
     """Install all of `planned`, or nothing."""
     ends: list[Callable[[], object]] = []
     try:
-        port = _make(service, planned, attributes, ends)
+        port = _make(service, planned, attributes, port_required, ends)
     except BaseException as error:
         for end in ends:
             end()
@@ -134,6 +138,7 @@ def _make(
     service: str,
     planned: Plan,
     attributes: Mapping[str, str],
+    port_required: bool,
     ends: list[Callable[[], object]],
 ) -> int | None:
     """Return Prometheus's port. What was started is in `ends` at once; providers are set last."""
@@ -160,7 +165,7 @@ def _make(
 
         shippers = [_exporter("logs", name, planned) for name in planned.logs]
         ends.append(logs.install(resource, shippers))
-    readers, port = _readers(planned, ends)
+    readers, port = _readers(planned, port_required, ends)
     if readers:
         meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False)
         ends.append(meters.shutdown)
@@ -200,7 +205,9 @@ def _exporter(signal: Signal, name: str, planned: Plan) -> Any:
     return entry_point(signal, name).load()(**options)
 
 
-def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any], int | None]:
+def _readers(
+    planned: Plan, port_required: bool, ends: list[Callable[[], object]]
+) -> tuple[list[Any], int | None]:
     """Return the readers of metrics and Prometheus's port."""
     from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
 
@@ -218,8 +225,12 @@ def _readers(planned: Plan, ends: list[Callable[[], object]]) -> tuple[list[Any]
     try:
         server = scrapes.ScrapeServer(host, wanted, scrapes.page_of(registry))
     except OSError as error:
+        problem = f"no Prometheus endpoint on {host}:{wanted}: {error}"
+        if not port_required:
+            log.info("%s", problem)
+            return readers, None
         raise ConfigError(
-            f"no Prometheus endpoint on {host}:{wanted}: {error}",
+            problem,
             hint="another program has the port; set OTEL_EXPORTER_PROMETHEUS_PORT or the "
             "configuration",
         ) from error

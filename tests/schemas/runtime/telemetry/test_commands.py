@@ -103,6 +103,33 @@ def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> No
         assert "Traceback" not in done.stderr
 
 
+def test_a_command_goes_on_where_a_server_has_the_port(tmp_path: Path) -> None:
+    """A variable for all programs of the machine: `vramctl evict` and `vram-runner goal` were
+    refused for the port that the runner serves its metrics on."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        environ = {
+            "PYTHONPATH": f"{ROOT}/src:{ROOT}",
+            "PATH": "/usr/bin",
+            "VRAM_ARBITER_RUNTIME": str(tmp_path),
+            "OTEL_METRICS_EXPORTER": "prometheus",
+            "OTEL_EXPORTER_PROMETHEUS_PORT": str(taken.getsockname()[1]),
+        }
+        for argv, code, answer in (
+            (["clients", "drain", "--reason", "x"], 3, "no arbiter"),
+            (
+                ["runner", "goal", "vram-arbiter/so101-grab", "grab", "--wait", "0.1"],
+                1,
+                "no runner",
+            ),
+            (["reasoner", "serve"], 2, "no Prometheus endpoint"),
+        ):
+            done = subprocess.run(
+                [sys.executable, "-m", f"vram_arbiter.{argv[0]}", *argv[1:]],
+                env=environ, capture_output=True, text=True, timeout=WAIT_S,
+            )  # fmt: skip
+            assert (done.returncode, answer in done.stderr) == (code, True), done.stderr
+
+
 def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path) -> None:
     """A variable for all programs of the machine; and the port that it names is the runner's own,
     whose robot shall stop."""
