@@ -245,13 +245,13 @@ async def _read(endpoint: str, cursor: Cursor, runner: Runner) -> None:
                 manager.ready("waiting for an arbiter")
             said = True
             await asyncio.sleep(RETRY_S)
-    said = False
+    started = False
     try:
         async with aclosing(follow(client, cursor)) as batches:
             async for events in batches:
                 runner.put(events, cursor.numbering)
-                if not said and cursor.numbering:
-                    said = True
+                if not started and cursor.numbering:
+                    started = True
                     log.info("delivers events of the arbiter at %s", client.endpoint)
                     manager.ready(f"delivers events of {client.endpoint}")
     finally:
