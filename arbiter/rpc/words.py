@@ -344,10 +344,16 @@ def _why(code: str, by: str = "") -> str:
 
 # -- events
 def event(note: Note) -> JsonObject:
-    """Return the event of a note as history keeps it: plain values, and `reason` in words."""
+    """Return the event of a note as history keeps it: plain values, and `reason` in words. A
+    process that had no lease is named by its `pid`."""
     body, about = note.body, note.about
     reason = _reason(body, about)
     plain = {**({} if about is None else to_map(about)), **to_map(body)}
+    if about is not None and about.lease_id is None:
+        pid, at, _ = about.consumer.partition("@")
+        if at and pid.isdecimal():
+            del plain["consumer"]
+            plain["pid"] = int(pid)
     if reason:
         plain.setdefault("reason", reason)
     return plain

@@ -57,12 +57,19 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "-f", "--follow", action="store_true", help="then each further event, until Ctrl-C"
     )
+    parser.add_argument(
+        "-a",
+        "--all",
+        action="store_true",
+        help="also quiet events, such as uses; --json always has them",
+    )
     arguments.add_json(parser)
     arguments.add_endpoint(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    wanted = Wanted(args.kind, args.consumer, args.since_wall_s, args.limit, args.after)
+    quiet = args.all or args.as_json
+    wanted = Wanted(args.kind, args.consumer, args.since_wall_s, args.limit, args.after, quiet)
     if args.follow:
         return asyncio.run(follow(wanted, as_json=args.as_json, endpoint=args.endpoint))
     return history(wanted, as_json=args.as_json, endpoint=args.endpoint)
@@ -108,9 +115,21 @@ class Wanted:
     since_wall_s: float | None = None
     limit: int = LIMIT
     after: int | None = None
+    quiet: bool = True
+    """Also quiet events; a quiet kind that `kinds` names is always wanted."""
 
     def keeps(self, event: JsonMap) -> bool:
-        """Also what was done to others for a consumer's sake is about it."""
+        """Return whether to show this event. An eviction is about the lease's consumer and about
+        the waiter's."""
+        return self.fits(event) and not self.folds(event)
+
+    def folds(self, event: JsonMap) -> bool:
+        """Return whether this event is left out because it is quiet."""
+        if self.quiet or not text.is_quiet(event):
+            return False
+        return event["kind"] not in text.QUIET_KINDS.intersection(self.kinds)
+
+    def fits(self, event: JsonMap) -> bool:
         about = (event.get("consumer"), event.get("wanted_by"))
         return (
             (not self.kinds or event["kind"] in self.kinds)
@@ -123,7 +142,10 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
     """The newest events that are wanted, or the first ones after a number."""
 
     def shown(reply: Message) -> list[str]:
-        return [text.event_line(event) for event in reply["events"]]
+        lines = [text.event_line(event) for event in reply["events"]]
+        if folded := reply.get("folded"):
+            lines.append(f"({text.plural(folded, 'quiet event')} not shown: --all)")
+        return lines
 
     def question(op: str, fields: JsonMap, where: str | None) -> Message:
         return collect(wanted, where)
@@ -162,13 +184,19 @@ def collect(wanted: Wanted, endpoint: str | None) -> Message:
 
 def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
     found: list[Any] = []
+    folded: list[int] = []  # numbers of quiet events
     while (reply := page(after, PAGE, wanted.kinds, endpoint)).get("ok"):
         events = reply.get("events", [])
-        found += [event for event in events if wanted.keeps(event)]
+        fitting = [event for event in events if wanted.fits(event)]
+        found += [event for event in fitting if not wanted.folds(event)]
+        folded += [event["seq"] for event in fitting if wanted.folds(event)]
         if wanted.after is None:
             found = found[-wanted.limit :]
         if len(events) < PAGE or (wanted.after is not None and len(found) >= wanted.limit):
-            return {**reply, "events": found[: wanted.limit]}
+            shown = found[: wanted.limit]
+            first = shown[0]["seq"] if shown else 0
+            told = {} if wanted.quiet else {"folded": sum(seq > first for seq in folded)}
+            return {**reply, "events": shown, **told}
         after = events[-1]["seq"]
     return reply
 

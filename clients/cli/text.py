@@ -245,6 +245,22 @@ def _footprint_lines(footprint: JsonMap | None) -> list[str]:
 
 
 # -- events
+QUIET_KINDS = frozenset(
+    {"use_began", "use_ended", "use_yielded", "revoke_acked", "reminded", "unloading"}
+)
+"""Steps that other events sum up; `arbiter/http/static/story.js` has the same list."""
+
+
+def is_quiet(event: JsonMap) -> bool:
+    """Return whether people see this event only on request: a step, a load that evicted no lease,
+    or the verdict on a process that had no lease."""
+    if event["kind"] == "switch":
+        return not event.get("switched")
+    if event["kind"] == "verified":
+        return not event.get("lease_id")
+    return event["kind"] in QUIET_KINDS
+
+
 def event_line(event: JsonMap) -> str:
     """One history event: local date and time, kind, consumer and lease, reason, and its other plain
     fields."""

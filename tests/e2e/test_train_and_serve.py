@@ -110,7 +110,7 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
     assert (cell["contestant"], cell["task"], cell["complete"]) == ("lab/act-grab", "grab", True)
     assert (cell["played"], cell["judged"], cell["errors"]) == (1, 1, 0)
     assert cell["mean_steps"] > 0
-    history = vramctl("history", "-c", "grab", environ=environ).stdout
+    history = vramctl("history", "--all", "-c", "grab", environ=environ).stdout
     assert "use_began" in history, history
     used = check_log((arbiter_daemon.gpu_folder / "log.jsonl").read_text())
     assert (used.problems, used.peak_bytes >= 0.6 * GB) == ([], True)

@@ -80,15 +80,18 @@ class Feed:
         with contextlib.suppress(VramError):  # an older arbiter, or one that is away
             newest = (await self.client.history(limit=1)).last_seq
             earlier = await self.client.history(after=max(0, newest - EARLIER))
-            self.events.extend(_line(event) for event in earlier.events)
+            self._tell(*earlier.events)
         while True:
             try:
                 async for event in self.client.subscribe():
-                    self.events.append(_line(event))
+                    self._tell(event)
                     self._happened.set()
             except VramError as error:  # too many subscribers: the status goes on without events
                 self.events.append(f"no events: {_said(error.to_wire())}")
                 await asyncio.sleep(AGAIN_S)
+
+    def _tell(self, *events: JsonMap) -> None:
+        self.events.extend(_line(event) for event in events if not text.is_quiet(event))
 
     async def _poll(self) -> None:
         while True:

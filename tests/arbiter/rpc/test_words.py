@@ -6,8 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.model import refusals as r
 from vram_arbiter.arbiter.rpc import explained, words
+from vram_arbiter.schemas.ids import GpuId, LeaseId
 from vram_arbiter.schemas.wire.codes import Block, Order, Wait, Why
 from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.explained import (
@@ -19,6 +21,7 @@ from vram_arbiter.schemas.wire.explained import (
     NextAction,
     Step,
 )
+from vram_arbiter.schemas.wire.notes import About, VerifiedNote
 from vram_arbiter.schemas.wire.views import BlockView
 
 REFUSALS = sorted(words._ERRORS.keys() - {r.TimedOut}, key=str)
@@ -119,3 +122,13 @@ def test_a_deadlock_is_told_link_by_link() -> None:
         "this wait would never end: job (pid 7) uses job (L1-1) and waits for job (L1-1)"
     )
     assert "`yield`" in told.hint
+
+
+def test_a_process_without_a_lease_is_named_by_its_pid() -> None:
+    """Its verdict named a consumer `1234@567890`, which was offered as a filter of the history."""
+    verdict = VerifiedNote("verified", True, 1.0, None, None, 0, ())
+    told = words.event(Note(verdict, About(None, "1234@567890", GpuId("GPU-0"))))
+    assert told["pid"] == 1234
+    assert "consumer" not in told
+    named = words.event(Note(verdict, About(LeaseId("L1-1"), "1234@567890", GpuId("GPU-0"))))
+    assert named["consumer"] == "1234@567890"

@@ -63,6 +63,24 @@ def test_a_filter_knows_kind_consumer_and_time() -> None:
     assert not Wanted(since_wall_s=100.1).keeps(event)
 
 
+STEP = {"kind": "use_began", "lease_id": "L1-1", "consumer": "detector"}
+LOAD = {"kind": "switch", "lease_id": "L1-1", "consumer": "detector", "switched": False}
+SWITCH = LOAD | {"switched": True}
+PROCESS = {"kind": "verified", "lease_id": None, "pid": 7}
+
+
+def test_quiet_events_are_folded_for_people() -> None:
+    """History listed every use, a `switch` for each plain load, and verdicts on processes without
+    a lease: the dozen lines that mattered stood among hundreds."""
+    folding = Wanted(quiet=False)
+    assert [folding.keeps(event) for event in (STEP, LOAD, PROCESS)] == [False] * 3
+    assert folding.keeps(SWITCH)
+    assert folding.keeps({"kind": "verified", "lease_id": "L1-1"})
+    assert all(Wanted().keeps(event) for event in (STEP, LOAD, PROCESS, SWITCH))
+    assert Wanted(kinds=["use_began"], quiet=False).keeps(STEP)
+    assert not Wanted(kinds=["switch"], quiet=False).keeps(LOAD)
+
+
 class Archive:
     """A daemon's answers: one event a second, with a gap in the numbers."""
 
@@ -117,6 +135,18 @@ def test_since_starts_at_its_time(archive: Archive) -> None:
 def test_after_a_number_come_the_first_that_are_wanted(archive: Archive) -> None:
     found = collect(Wanted(after=990, consumers=["c0"], limit=4), None)["events"]
     assert [event["at_wall_s"] for event in found] == [993.0, 996.0, 999.0, 1002.0]
+
+
+def test_folded_events_are_counted_and_do_not_fill_the_limit(
+    archive: Archive, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for event in archive.events:
+        if event["seq"] not in (7000, 8000):
+            event["kind"] = "use_began"
+    assert history.history(Wanted(limit=2, quiet=False)) == 0
+    *events, count = capsys.readouterr().out.splitlines()
+    assert [line.split()[2] for line in events] == ["granted"] * 2
+    assert count == "(3999 quiet events not shown: --all)"
 
 
 @pytest.mark.e2e

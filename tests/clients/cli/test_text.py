@@ -1,12 +1,16 @@
 """What `vramctl` prints, to the letter."""
 
+import re
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+import vram_arbiter.arbiter.http as page
 from vram_arbiter.clients.cli import text
 from vram_arbiter.schemas.defaults import GIB, MIB
+from vram_arbiter.schemas.wire.notes import NOTES
 
 GPU = {
     "gpu": "GPU-1",
@@ -265,6 +269,13 @@ def test_an_event() -> None:
 def test_fields_of_an_event_have_units(field: dict[str, Any], said: str) -> None:
     """Regression: the history printed `ms=3.51e+03` and no dates."""
     assert text.event_line({"at_wall_s": 0.0, "kind": "verified", **field}).endswith(f"  {said}")
+
+
+def test_the_page_folds_the_kinds_that_vramctl_folds() -> None:
+    story = (Path(page.__path__[0]) / "static/story.js").read_text()
+    listed = re.search(r"const QUIET = new Set\(\[(.*?)\]\);", story, re.DOTALL)
+    assert listed is not None
+    assert set(re.findall(r'"(\w+)"', listed[1])) == text.QUIET_KINDS <= NOTES.keys()
 
 
 def test_since_counts_from_the_grant() -> None:

@@ -219,7 +219,8 @@ def test_status_why_history(client: Client, arbiter_daemon: ArbiterProcess, spec
         {"consumer": "nobody", "leases": []},
     )
 
-    kinds = [line.split()[2] for line in vramctl("history", environ=environ).stdout.splitlines()]
+    told = vramctl("history", "--all", environ=environ).stdout
+    kinds = [line.split()[2] for line in told.splitlines()]
     assert kinds[0] == "started"
     assert [kind for kind in kinds if kind in ("granted", "ready", "switch")] == [
         "granted",
