@@ -29,7 +29,7 @@ _FILES = {
         for name in (
             "page",
             *("gpus", "queue", "evictions", "leases", "history"),
-            *("feed", "chart", "story", "format"),
+            *("feed", "chart", "story", "terms", "format"),
         )
     },
     "/icon.svg": ("icon.svg", "image/svg+xml"),

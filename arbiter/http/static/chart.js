@@ -1,8 +1,7 @@
 // Bars over time of one GPU on a canvas: bytes by consumer, what is measured, and the budget.
 import { bytes, partClass, partName, span } from "/format.js";
 
-const BAR = 3,
-  GAP = 1,
+const BAR = 4,
   LEFT = 44,
   BOTTOM = 16,
   TOP = 6;
@@ -23,14 +22,14 @@ export class Chart {
   }
 
   get columns() {
-    return Math.max(1, Math.floor((this.canvas.clientWidth - LEFT) / (BAR + GAP)));
+    return Math.max(1, Math.floor((this.canvas.clientWidth - LEFT) / BAR));
   }
 
   point(x) {
     this.cursor =
       x === null || x < LEFT
         ? null
-        : Math.min(this.columns - 1, Math.floor((x - LEFT) / (BAR + GAP)));
+        : Math.min(this.columns - 1, Math.floor((x - LEFT) / BAR));
     this.draw();
   }
 
@@ -97,12 +96,12 @@ export class Chart {
     );
     const y = (count) => floor - (count / most) * (floor - TOP);
     const budget = gpu.capacity_bytes - gpu.reserve_bytes;
-    pen.fillStyle = color("soft");
+    pen.fillStyle = color("reserve");
     pen.fillRect(LEFT, y(gpu.capacity_bytes), width - LEFT, y(budget) - y(gpu.capacity_bytes));
     this.axes(pen, color, y, width, floor);
     found.forEach((sample, column) => {
       if (!sample) return;
-      const x = LEFT + column * (BAR + GAP);
+      const x = LEFT + column * BAR;
       let base = 0;
       pen.globalAlpha = this.cursor === null || this.cursor === column ? 1 : 0.55;
       for (const [part, count] of sample.parts) {
@@ -113,7 +112,7 @@ export class Chart {
       pen.globalAlpha = 1;
       if (sample.used !== null) {
         pen.fillStyle = color("ink");
-        pen.fillRect(x, y(sample.used) - 0.75, BAR + GAP, 1.5);
+        pen.fillRect(x, y(sample.used) - 0.75, BAR, 1.5);
       }
     });
     this.tell(found);
@@ -138,7 +137,7 @@ export class Chart {
     }
     pen.textBaseline = "bottom";
     const span_s = this.columns * (this.seconds / this.columns),
-      right = LEFT + this.columns * (BAR + GAP);
+      right = LEFT + this.columns * BAR;
     for (const part of [1, 0.5, 0]) {
       pen.textAlign = part === 1 ? "left" : part ? "center" : "right";
       const text = part ? `−${span(span_s * part)}` : "now";

@@ -25,11 +25,12 @@ export function renderEvictions(feed) {
             : { ...phase, ms: phase.ms ?? 1000 * (phase.end - phase.begin) },
         )
         .map((phase) => ({ ...phase, ms: Math.max(0, phase.ms) }));
+      const whole = phases.reduce((sum, phase) => sum + phase.ms, 0);
       const track = el(
         "div.track",
         ...phases.map((phase) => {
           const part = el(`i.${phase.name}`);
-          part.style.flexGrow = String(Math.max(1, phase.ms));
+          part.style.flexBasis = `${(100 * phase.ms) / Math.max(1, whole)}%`;
           return part;
         }),
       );
@@ -54,7 +55,7 @@ export function renderEvictions(feed) {
         track,
         el(
           "p.quiet",
-          `${text} · ${span(phases.reduce((sum, phase) => sum + phase.ms, 0) / 1000)} in all`,
+          `${text} · ${span(whole / 1000)} in all`,
         ),
       );
       item.dataset.lease = one.lease;

@@ -1,6 +1,7 @@
 // GPU memory: a bar of its parts now, and the chart of the last minutes.
 import { Chart } from "/chart.js";
 import { $, bytes, chip, el, partClass, partName, setText } from "/format.js";
+import { term } from "/terms.js";
 
 const panels = new Map();
 let minutes = 3;
@@ -8,10 +9,20 @@ let minutes = 3;
 function panelOf(gpu) {
   if (panels.has(gpu.index)) return panels.get(gpu.index);
   const title = el("h3"),
-    figures = el("p.figures"),
     block = el("p.block"),
-    bar = el("div.bar"),
-    legend = el("ul.legend");
+    bar = el("div.bar");
+  const [charged, measured, capacity, reserve, free] = Array.from({ length: 5 }, () => el("b"));
+  const figures = el(
+    "p.figures",
+    ...[charged, " ", term("charged"), " · ", measured, " measured · ", capacity, " capacity"],
+  );
+  const fixed = el("li", el("i.chip.reserve"), term("reserve"), " ", reserve);
+  const legend = el(
+    "ul.legend",
+    fixed,
+    el("li", "free ", free),
+    el("li", el("i.chip.mark"), "measured"),
+  );
   const canvas = el("canvas"),
     output = el("output");
   bar.setAttribute("role", "img");
@@ -27,10 +38,11 @@ function panelOf(gpu) {
   const panel = {
     root,
     title,
-    figures,
     block,
     bar,
-    legend,
+    fixed,
+    sums: { charged, measured, capacity, reserve, free },
+    parts: [],
     chart: new Chart(canvas, output, `Memory of GPU ${gpu.index}`),
   };
   panels.set(gpu.index, panel);
@@ -73,14 +85,6 @@ export function renderGpus(feed) {
     const panel = panelOf(gpu),
       parts = partsOf(feed, gpu);
     setText(panel.title, `GPU ${gpu.index} · ${gpu.name}`);
-    panel.figures.replaceChildren(
-      el("b", bytes(gpu.charged_bytes)),
-      " charged · ",
-      el("b", bytes(gpu.measured_used_bytes)),
-      " measured · ",
-      el("b", bytes(gpu.capacity_bytes)),
-      " capacity",
-    );
     setText(panel.block, gpu.blocked ? `Nothing is granted: ${gpu.blocked.text}` : "");
     panel.block.hidden = !gpu.blocked;
     panel.block.classList.toggle(
@@ -89,14 +93,20 @@ export function renderGpus(feed) {
     );
     const used = parts.reduce((sum, [, count]) => sum + count, 0);
     const free = Math.max(0, gpu.capacity_bytes - gpu.reserve_bytes - used);
-    panel.legend.replaceChildren(
-      ...parts.map(([part, count]) =>
-        el("li", chip(part), `${partName(part)} `, el("b", bytes(count))),
-      ),
-      el("li", el("i.chip.reserve"), "reserve ", el("b", bytes(gpu.reserve_bytes))),
-      el("li", "free ", el("b", bytes(free))),
-      el("li", el("i.chip.mark"), "measured"),
+    const sums = {
+      charged: gpu.charged_bytes,
+      measured: gpu.measured_used_bytes,
+      capacity: gpu.capacity_bytes,
+      reserve: gpu.reserve_bytes,
+      free,
+    };
+    for (const [name, count] of Object.entries(sums)) setText(panel.sums[name], bytes(count));
+    // The terms stay in the document, so that a change does not take the focus from them.
+    panel.parts.forEach((item) => item.remove());
+    panel.parts = parts.map(([part, count]) =>
+      el("li", chip(part), `${partName(part)} `, el("b", bytes(count))),
     );
+    panel.fixed.before(...panel.parts);
     const scale = Math.max(gpu.capacity_bytes, used + gpu.reserve_bytes);
     const segment = (name, count) => {
       const made = el(`i.${name}`);

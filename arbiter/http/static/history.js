@@ -1,7 +1,6 @@
 // Events of the history, with filters.
-import { USES } from "/feed.js";
 import { $, chip, clock, el, plural, setText } from "/format.js";
-import { facts } from "/story.js";
+import { facts, isQuiet } from "/story.js";
 
 const SHOWN = 120;
 let shown = SHOWN,
@@ -13,7 +12,7 @@ function fits() {
     consumer = $("consumer").value,
     words = $("text").value.toLowerCase().split(/\s+/).filter(Boolean);
   return (event) =>
-    (kind === "-uses" ? !USES.has(event.kind) : !kind || event.kind === kind) &&
+    (kind === "-quiet" ? !isQuiet(event) : !kind || event.kind === kind) &&
     (!consumer || event.consumer === consumer) &&
     (!words.length || words.every((word) => JSON.stringify(event).toLowerCase().includes(word)));
 }

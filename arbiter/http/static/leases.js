@@ -19,7 +19,7 @@ const CELLS = [
   [".n.label", "uses"],
   [".n.label", "for"],
   [".n.label", "priority"],
-  [".label", "GPU"],
+  [".label", "tier"],
   [".label", "model"],
   [".n.label", "pid"],
   ["", ""],
@@ -44,6 +44,13 @@ function notesOf(lease) {
     .join(" · ");
 }
 
+// Where the weights are.
+function tierOf(feed, lease) {
+  if (lease.state === "parked") return "RAM";
+  const on = feed.status.gpus.find((one) => one.gpu === lease.gpu);
+  return lease.state === "standby" || !on ? "–" : `GPU ${on.index}`;
+}
+
 function rowOf(feed, lease) {
   let row = rows.get(lease.lease_id);
   if (!row) {
@@ -58,15 +65,14 @@ function rowOf(feed, lease) {
   }
   if (row.lease === lease) return row;
   row.lease = lease;
-  const [name, state, charge, uses, , priority, gpu, model, pid, notes] = row.cells;
+  const [name, state, charge, uses, , priority, tier, model, pid, notes] = row.cells;
   name.replaceChildren(chip(lease.consumer), el("span.name", lease.consumer));
   const tone = TONES[lease.state];
   state.replaceChildren(el(`span.badge${tone ? `.${tone}` : ""}`, lease.state));
   setText(charge, bytes(lease.charge_bytes));
   setText(uses, String(lease.uses));
   setText(priority, String(lease.priority));
-  const on = feed.status.gpus.find((one) => one.gpu === lease.gpu);
-  setText(gpu, on ? String(on.index) : (lease.gpu ?? "–"));
+  setText(tier, tierOf(feed, lease));
   setText(model, lease.model);
   setText(pid, String(lease.pid));
   setText(notes, notesOf(lease));

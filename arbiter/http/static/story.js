@@ -28,7 +28,28 @@ const SHOWN_ELSEWHERE = new Set([
   "wait",
   "why",
   "resolved",
+  // of a revoke: in its reason
+  "cause",
+  "wanted_by",
+  "wanted_by_lease",
 ]);
+
+// Steps that other events sum up; `clients/cli/text.py` has the same list.
+const QUIET = new Set([
+  "use_began",
+  "use_ended",
+  "use_yielded",
+  "revoke_acked",
+  "reminded",
+  "unloading",
+]);
+
+// Also quiet: a load that evicted no lease, and the verdict on a process that had no lease.
+export function isQuiet(event) {
+  if (event.kind === "switch") return !event.switched;
+  if (event.kind === "verified") return !event.lease_id;
+  return QUIET.has(event.kind);
+}
 
 // Newest first. A phase lasts until the next one begins; a later phase may begin without the ones
 // between, such as the release of a holder that was killed.
