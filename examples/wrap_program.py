@@ -40,5 +40,13 @@ def run(vram: str, command: list[str]) -> int:
     return code if code >= 0 else 128 - code
 
 
+def main(arguments: list[str]) -> int:
+    if len(arguments) < 2:
+        print("usage: wrap_program.py VRAM PROGRAM [ARGUMENT ...]", file=sys.stderr)
+        print("example: wrap_program.py 5GB python train.py", file=sys.stderr)
+        return 2
+    return run(arguments[0], arguments[1:])
+
+
 if __name__ == "__main__":
-    sys.exit(run(sys.argv[1], sys.argv[2:]))
+    sys.exit(main(sys.argv[1:]))

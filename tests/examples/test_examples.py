@@ -92,6 +92,17 @@ def test_a_wrapped_program_runs_to_its_end(arbiter_daemon: ArbiterProcess) -> No
     assert in_order(["granted", "ready", "released"], kinds(arbiter_daemon, "sh"))
 
 
+def test_wrapping_nothing_says_how(arbiter_daemon: ArbiterProcess) -> None:
+    """Without arguments it ended in an IndexError."""
+    for arguments in ([], ["5GB"]):
+        done = subprocess.run(
+            [sys.executable, str(EXAMPLES / "wrap_program.py"), *arguments],
+            env=environ(arbiter_daemon), capture_output=True, text=True, timeout=LIMIT_S,
+        )  # fmt: skip
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith("usage: wrap_program.py VRAM PROGRAM")
+
+
 def test_a_wrapped_program_is_ended_for_another(arbiter_daemon: ArbiterProcess) -> None:
     wrapper = subprocess.Popen(
         [sys.executable, str(EXAMPLES / "wrap_program.py"), "5GB",
