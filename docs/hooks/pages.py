@@ -30,6 +30,9 @@ ROOT_PAGES = {
     "README.md": "explanation/readme.md",
 }
 SCHEMAS = "schemas/json/"
+# Front matter of pages that the search leaves out: their names are explained on other pages, and
+# the index is loaded and searched by the browser.
+UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n"
 SOURCES = "source"  # folder of the pages that show a file
 LANGUAGES = {".py": "python", ".pl": "perl", ".yaml": "yaml", ".json": "json", ".toml": "toml"}
 
@@ -70,18 +73,21 @@ def shown(target: str) -> str:
     """Return a page with the text of a file."""
     text = (TREE / target).read_text(encoding="utf-8")
     language = LANGUAGES.get(Path(target).suffix, "text")
-    unsearched = "---\nsearch:\n  exclude: true\n---\n"
-    return f"{unsearched}# {Path(target).name}\n\n`{target}`\n\n````{language}\n{text}\n````\n"
+    return f"{UNSEARCHED}# {Path(target).name}\n\n`{target}`\n\n````{language}\n{text}\n````\n"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages of the files outside docs/."""
     for name, place in ROOT_PAGES.items():
         content = (TREE / name).read_text(encoding="utf-8")
+        if name == "CHANGELOG.md":
+            content = UNSEARCHED + content
         files.append(File.generated(config, place, content=content))
     for path in sorted((TREE / SCHEMAS).glob("*.json")):
         place = f"reference/schemas/{path.stem}.md"
-        files.append(File.generated(config, place, content=contracts.schema_page(path)))
+        files.append(
+            File.generated(config, place, content=UNSEARCHED + contracts.schema_page(path))
+        )
     wanted: set[str] = set()
     for file in files.documentation_pages():
         wanted |= targets(file.src_uri, file.content_string)
