@@ -81,8 +81,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--operators-group",
         metavar="GROUP",
-        help="Unix group that may act by hand (evict, pin, drain); without --group it may connect "
-        "as well",
+        help="Unix group that may evict, pin and drain; without --group it may also connect",
     )
     made.add_argument(
         "--http",

@@ -37,7 +37,7 @@ def budget(
             raise ConfigError(
                 f"gpu.reserve_bytes ({format_bytes(reserve)}) leaves nothing of {gpu.name} "
                 f"({format_bytes(capacity)})",
-                hint="lower the reserve or raise the cap",
+                hint="lower the reserve, or raise the cap",
             )
         found.append(
             GpuInfo(

@@ -482,4 +482,4 @@ class Session:
 
 
 def closed() -> ArbiterUnreachable:
-    return ArbiterUnreachable("the client was closed", hint="keep it open while leases are wanted")
+    return ArbiterUnreachable("the client was closed", hint="keep it open while leases are needed")

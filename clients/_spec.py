@@ -31,13 +31,13 @@ def lease_spec(
     if spec is not None:
         if clash := sorted(key for key, value in given.items() if value is not None):
             raise BadRequest(
-                f"a spec was given, and also {', '.join(clash)}",
+                f"a spec was given together with {', '.join(clash)}",
                 hint="give a LeaseSpec, or `vram` and `model`, not both",
             )
         return spec
     if vram is None:
         raise BadRequest(
-            "neither a spec nor `vram` was given", hint="say what is needed, e.g. vram='5.3GB'"
+            "neither a spec nor `vram` was given", hint="state the need, e.g. vram='5.3GB'"
         )
     own = {"consumer": name, "model_id": model or name, "footprint": _footprint(vram)}
     try:

@@ -101,7 +101,7 @@ def _words(error: Exception) -> str:
     if isinstance(error, FileNotFoundError):
         return "its emergency-stop socket does not exist"
     if isinstance(error, ConnectionRefusedError):
-        return "its runner was killed and left the socket over"
+        return "its runner was killed and left the socket behind"
     if isinstance(error, PermissionError):
         return f"uid {os.geteuid()} may not use its socket"
     if isinstance(error, BlockingIOError):
@@ -112,7 +112,7 @@ def _words(error: Exception) -> str:
 def _judged(endpoint: str, latched: Reply, outcome: Reply) -> Stopped:
     if outcome.answer is Answer.NOT_TOLD:
         raise RobotFault(
-            outcome.text, hint=f"{CUT}; the runner goes on trying", details={"endpoint": endpoint}
+            outcome.text, hint=f"{CUT}; the runner keeps trying", details={"endpoint": endpoint}
         )
     if outcome.answer is not Answer.OBEYED:
         raise InternalError(

@@ -69,7 +69,7 @@ class _Portal:
         if self._portal is None or self.inherited:
             what = "closed" if self._portal is None else "made before a fork"
             raise BadState(
-                f"this client was {what}", hint="make one in this process, use it inside `with`"
+                f"this client was {what}", hint="make one in this process, and use it inside `with`"
             )
         future: Future[T] = self._portal.start_task_soon(partial(work, *arguments, **named))
         try:

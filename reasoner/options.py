@@ -35,22 +35,24 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "command",
         nargs="?",
         choices=("serve",),
-        help="serve tasks one after the other, from --submit",
+        help="serve tasks in sequence, from --submit",
     )
     what.add_argument("--task", help='what to do, e.g. "grab the red cube"')
     what.add_argument(
-        "--say", metavar="TEXT", help="tell the planner of a running reasoner something, and end"
+        "--say",
+        metavar="TEXT",
+        help="send a message to the planner of a running reasoner, and exit",
     )
     what.add_argument(
         "--cancel",
         metavar="REASON",
-        help="end the task that a reasoner runs and its goal, and end",
+        help="end the task of a running reasoner and its goal, and exit",
     )
     parser.add_argument(
         "--number",
         type=int,
         metavar="N",
-        help="with --cancel: the task to end, also one that waits (default: the one that runs)",
+        help="with --cancel: the task to end, even if it waits (default: the running one)",
     )
     parser.add_argument(
         "--planner",
@@ -60,22 +62,22 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "BUSY_S} configure them",
     )
     what.add_argument(
-        "--submit", metavar="TASK", help="queue a task at a serving reasoner, and end"
+        "--submit", metavar="TASK", help="queue a task at a serving reasoner, and exit"
     )
     what.add_argument(
         "--tasks",
         action="store_true",
-        help="list the tasks of a serving reasoner, as lines of JSON, and end",
+        help="list the tasks of a serving reasoner, as lines of JSON, and exit",
     )
     what.add_argument(
         "--confirm",
         action="store_true",
-        help="let the motion begin that waits in a running reasoner, and end",
+        help="confirm the waiting motion of a running reasoner, and exit",
     )
     what.add_argument(
         "--deny",
         metavar="REASON",
-        help="refuse the motion that waits in a running reasoner, and end",
+        help="refuse the waiting motion of a running reasoner, and exit",
     )
     parser.add_argument(
         "--require-confirmation",
@@ -91,7 +93,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "--transcript",
         type=Path,
         metavar="FILE",
-        help="append what a language model is asked, answers, and has rejected, as lines of JSON",
+        help="append a language model's requests, answers and rejected answers, as lines of JSON",
     )
     parser.add_argument(
         "--playbook",
@@ -113,7 +115,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         help=LICENSE_HELP,
     )
     parser.add_argument(
-        "--listen", help="where to hear operators (default: ipc://RUNTIME/reasoner.sock)"
+        "--listen", help="socket for operators (default: ipc://RUNTIME/reasoner.sock)"
     )
     parser.add_argument(
         "--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)"
@@ -136,18 +138,18 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         nargs="?",
         const="",
         metavar="ENDPOINT",
-        help="ask a reward model for progress (default endpoint: ipc://RUNTIME/reward.sock);"
+        help="use a reward model to judge progress (default endpoint: ipc://RUNTIME/reward.sock);"
         " without this flag there is none",
     )
     parser.add_argument(
-        "--reward-camera", default="wrist", help="which camera it looks at (default: %(default)s)"
+        "--reward-camera", default="wrist", help="camera of the reward model (default: %(default)s)"
     )
     parser.add_argument("--result", type=Path, help="write the result as JSON into this file")
     parser.add_argument(
         "--history",
         type=Path,
         metavar="FILE",
-        help="with serve: append each task that ended and its result, as lines of JSON",
+        help="with serve: append each finished task and its result, as lines of JSON",
     )
     return parser
 
@@ -160,11 +162,9 @@ def endpoint(given: str | None, name: str) -> str:
 def check_task(task: str, planner: str) -> None:
     """Raise BadRequest for a task that no planner, or not this one, could work with."""
     if not task.strip():
-        raise BadRequest("the task says nothing", hint='e.g. "grab the red cube"')
+        raise BadRequest("the task is empty", hint='e.g. "grab the red cube"')
     if len(task) > TASK_MAX_CHARS:
-        raise BadRequest(
-            f"the task has more than {TASK_MAX_CHARS} characters", hint="say it shorter"
-        )
+        raise BadRequest(f"the task has more than {TASK_MAX_CHARS} characters", hint="shorten it")
     try:
         task.encode()
     except UnicodeEncodeError:

@@ -111,7 +111,7 @@ class QueryOp(_Look):
         if not 1 <= count <= PICTURES_MAX:
             raise ValueError(f"give 1 to {PICTURES_MAX} pictures in image, images and video")
         if bool(self.video) != (self.fps is not None):
-            raise ValueError("video and fps go together")
+            raise ValueError("video and fps belong together")
         return self
 
 

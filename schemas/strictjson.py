@@ -41,7 +41,7 @@ def check(value: Any) -> None:
             elif isinstance(item, list | tuple):
                 below += item
             elif isinstance(item, float) and not math.isfinite(item):
-                raise ValueError(f"{item} is no number that anything could act on")
+                raise ValueError(f"{item} is not a finite number")
             elif isinstance(item, int) and not -(1 << 63) <= item < 1 << 63:
                 raise ValueError("a whole number has more than 64 bits")
             elif isinstance(item, str) and any("\ud800" <= letter <= "\udfff" for letter in item):
@@ -53,7 +53,7 @@ def check(value: Any) -> None:
 
 
 def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no number that anything could act on")
+    raise ValueError(f"{text} is not a finite number")
 
 
 def _finite(text: str) -> float:

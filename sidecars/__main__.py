@@ -218,12 +218,12 @@ def parser() -> argparse.ArgumentParser:
         "--port",
         type=_number(int, 1, 65_535),
         metavar="N",
-        help="serve the endpoint on 127.0.0.1:N, too, for the field's clients; to users who may"
+        help="also serve the endpoint on 127.0.0.1:N, for clients that need a port and users who may"
         " open the socket's file",
     )
     add("--arbiter", metavar="EP", help="default: the arbiter's usual endpoint")
     add("--no-arbiter", action="store_true", help="load at once and stay resident, without a lease")
-    add("--configs", type=Path, metavar="DIR", help="folder that local:// weights are looked up in")
+    add("--configs", type=Path, metavar="DIR", help="folder of local:// weights")
     add(
         "--footprints",
         type=Path,
@@ -263,13 +263,13 @@ def parser() -> argparse.ArgumentParser:
         "--request-timeout-s",
         type=_number(float, 0.1, 86_400),
         default=REQUEST_TIMEOUT_S,
-        help="limit of one request's work in the model: longer work is stuck, and its process "
-        "is ended; default %(default)s",
+        help="limit of one request's work in the model, after which its process is ended; "
+        "default %(default)s",
     )
     add(
         "--idle-release-s",
         type=_number(float, 0.1, 86_400),
-        help="release a model that no request and no goal used for so long, so that one on standby "
+        help="release a model that no request and no goal has used for this long, so that one on standby "
         "returns; default: never",
     )
     add(

@@ -252,7 +252,7 @@ def _away(told: Explanation) -> str:
         case Return.QUIET:
             return f"{where}: comes back in {told.due_s or 0.0:.1f} s if the GPU stays quiet"
         case _:
-            return f"{where}: comes back with the next reading of the GPU, or after those before it"
+            return f"{where}: returns with the next reading of the GPU, or after those before it"
 
 
 # -- steps
@@ -277,13 +277,13 @@ _ACTIONS: Final[Mapping[NextAction, str]] = {
     NextAction.DEADLINE: "waits{when} for {step.consumer} to release",
     NextAction.WAIT: "waits for {step.consumer} to release{when}",
     NextAction.SERVE: "grants again{when}",
-    NextAction.BREAK: "gives gang {step.gang} up{when}",
+    NextAction.BREAK: "gives up gang {step.gang}{when}",
     NextAction.GIVE_UP: "gives up{when}",
 }
 
 _WAITS: Final[Mapping[Because, str]] = {
     Because.NO_VICTIM: "revokes no holder{when}",
-    Because.NOT_BACK: "gives {step.consumer} up{when}",
+    Because.NOT_BACK: "gives up {step.consumer}{when}",
 }
 
 _BECAUSE: Final[Mapping[Because, str]] = {
@@ -291,10 +291,10 @@ _BECAUSE: Final[Mapping[Because, str]] = {
     Because.RESIDENCY: "when its minimum residency ends",
     Because.AGEING: "when the waiter's priority has aged to its own",
     Because.TOGETHER: "when enough may be revoked together",
-    Because.ONE_LOAD: "one loads at a time",
-    Because.KEPT: "its bytes are kept for it, the GPU has to show them",
+    Because.ONE_LOAD: "only one model loads at a time",
+    Because.KEPT: "its bytes are kept for it, but the GPU has to show them",
     Because.UNREADABLE: "nothing is granted on a GPU that cannot be read",
-    Because.MEASUREMENT: "the ledger has room, the GPU has to show it",
+    Because.MEASUREMENT: "the ledger has room, but the GPU has to show it",
     Because.ACCOUNTED: "when every holder has reattached or its time is over",
     Because.INCOMPLETE: "if the rest has not come back",
     Because.SHORT: "if its memory is not free then",
@@ -305,7 +305,7 @@ _BECAUSE: Final[Mapping[Because, str]] = {
     Because.HANGING: "its unloading may hang",
     Because.LEAVING: "it is being evicted",
     Because.DENIED: "after that {step.waiter} is denied",
-    Because.WAITS_ON: "after that {step.waiter} waits on, and the holder's own rule applies",
+    Because.WAITS_ON: "after that {step.waiter} continues to wait, and the holder's own rule applies",
     Because.TIMEOUT: "when its wait timeout is over",
 }
 

@@ -55,7 +55,7 @@ def how_to_operate(operators_gid: int | None) -> str:
         name = str(operators_gid)
     return (
         f"use its user or root, or join the group {name} (wire.operators_group, then log in "
-        "again); looking is open to observers"
+        "again); observers may look"
     )
 
 

@@ -218,8 +218,7 @@ class Registry:
         if not leaving:
             raise LimitExceeded(
                 f"{whose}: {count} connections are open, the limit is {most}",
-                hint="close connections that are not used, or raise limits.sessions_max or "
-                f"limits.{limit}",
+                hint=f"close unused connections, or raise limits.sessions_max or limits.{limit}",
                 details={"limit": limit, "value": most},
             )
         oldest = min(leaving, key=lambda other: (not other.lost, other.heard_at))
@@ -237,7 +236,7 @@ class Registry:
             ):
                 raise LimitExceeded(
                     f"{count} processes are watched, {of_user} of them of uid {peer.uid}",
-                    hint="end processes that use the arbiter no longer, or raise "
+                    hint="end processes that no longer use the arbiter, or raise "
                     "limits.connections_max and LimitNOFILE of the daemon",
                     details={"limit": "connections_max", "value": most},
                 )

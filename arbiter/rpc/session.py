@@ -163,7 +163,7 @@ class SessionTable:
             if session is None:  # 3
                 if not isinstance(request, w.Hello):
                     raise UnknownSession(
-                        f"{op} before hello", hint="say hello first, then re-attach your leases"
+                        f"{op} before hello", hint="say hello first, then reattach your leases"
                     )
                 _check_version(request)
                 self._welcome(self._registry.open(connection, request, now), request)
@@ -374,7 +374,7 @@ def _check_kinds(kinds: Sequence[str]) -> None:
             close = difflib.get_close_matches(kind, _KINDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(_KINDS))}"
             raise BadRequest(
-                f"no event is of the kind {kind[:64]!r}",
+                f"there is no event kind {kind[:64]!r}",
                 hint=hint,
                 details={"known": sorted(_KINDS)},
             )

@@ -36,11 +36,11 @@ WHY: Final[Mapping[Why, str]] = {
     Why.PAUSED: "unloaded while it paused",
     Why.USER_NOT_BACK: "its process did not come back to it after the restart",
     Why.LET_GO: "released by its holder",
-    Why.LET_GO_BEFORE: "released before the restart, says its holder",
+    Why.LET_GO_BEFORE: "released before the restart, according to its holder",
     Why.EXITS: "its process exits",
     Why.BYE: "its client said bye",
     Why.LEAVES: "the lease is unloaded",
-    Why.RESIZED: "another size is asked for",
+    Why.RESIZED: "another size was requested",
 }
 
 
@@ -51,7 +51,7 @@ def error_view(refusal: Refusal) -> ErrorView:
         refusal = replace(refusal, why=explained.worded(refusal.why))
     if isinstance(refusal, r.TargetOver):
         ended = error_view(refusal.ended)
-        return replace(ended, hint="it is over; its story is in `vramctl history`")
+        return replace(ended, hint="it is over; see `vramctl history`")
     words = _ERRORS[type(refusal)]
     message, hint = words(refusal) if callable(words) else _filled(words, refusal)
     return ErrorView(refusal.code, message, hint, to_map(refusal))
@@ -63,13 +63,13 @@ type _Words = tuple[str, str]
 _ACQUIRE = "unload, then acquire again"
 _AGAIN = "ask for all of it again"
 _LOOK = "see `vramctl status`"
-_END_PINNED = "end its program: a pinned holder is never made to leave"
+_END_PINNED = "end its program: a pinned holder is never evicted"
 
 _MISFITS: Final[Mapping[r.Misfit, str]] = {
     r.Misfit.STILL_QUEUED: "it is still queued",
     r.Misfit.NOT_AWAY: "only a lease that is away, or being measured on its way there, is called "
     "back",
-    r.Misfit.GRANTED: "it is granted already, release it",
+    r.Misfit.GRANTED: "it is already granted: release it",
     r.Misfit.NOT_LOADING: "only a loading lease becomes ready",
     r.Misfit.NOT_HELD: "only a held lease can be used",
     r.Misfit.NOT_UNLOADABLE: "only a held lease is unloaded; a loading one is released",
@@ -79,7 +79,7 @@ _MISFITS: Final[Mapping[r.Misfit, str]] = {
     r.Misfit.NO_PARK_BYTES: "it cannot be parked: its spec has no park_bytes",
     r.Misfit.HOLDS_NOTHING: "it holds nothing",
     r.Misfit.NO_SUCH_USE: "it has no use {no.use_id} of yours to yield",
-    r.Misfit.NOT_REATTACHED: "reattach it first, the arbiter was restarted",
+    r.Misfit.NOT_REATTACHED: "the arbiter was restarted: reattach it first",
 }
 
 _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
@@ -99,20 +99,20 @@ _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
     ),
     r.Impractical.NOT_PINNED: ("no operator pinned {no.lease_id}", "nothing to undo"),
     r.Impractical.HOLDER_LIVES: (
-        "the holder of {no.lease_id} was heard of {no.silent_s:.1f} s ago: it is not dead",
+        "the holder of {no.lease_id} was heard from {no.silent_s:.1f} s ago: it is not dead",
         "evict it instead",
     ),
 }  # fmt: skip
 
 _PINNED_HINTS: Final[Mapping[r.Impractical, str]] = {
-    r.Impractical.NOT_PINNED: "its holder asked never to be evicted; that is its own to change",
+    r.Impractical.NOT_PINNED: "its holder asked never to be evicted, and only the holder can change that",
     r.Impractical.HOLDER_LIVES: "end its program: it is pinned",
 }
 """Hints that differ for a lease that is never evicted."""
 
 _LIMITS: Final[Mapping[r.Limit, _Words]] = {
     "waiters_max": (
-        "requests wait", "let some of them be answered first, or raise limits.waiters_max"
+        "requests wait", "wait until some are answered, or raise limits.waiters_max"
     ),
     "leases_per_client_max": (
         "leases are held or asked for", "release some, or raise limits.leases_per_client_max"
@@ -128,7 +128,7 @@ _SHARES: Final[Mapping[r.Share, str]] = {
     r.Share.USER: "of uid {no.uid}",
     r.Share.ALL: "of all users",
     r.Share.HOLDER: "of its holder",
-    r.Share.OTHERS: "of others than its holder",
+    r.Share.OTHERS: "of processes other than its holder",
 }
 
 _GANG_ENDS: Final[Mapping[r.GangEnd, str]] = {
@@ -148,7 +148,11 @@ def _filled(words: _Words, refusal: Refusal) -> _Words:
 
 def _bad_lease_state(no: r.BadLeaseState) -> _Words:
     return _filled(
-        ("{no.lease_id} is {no.state}: " + _MISFITS[no.misfit], "see the lease's story"), no
+        (
+            "{no.lease_id} is {no.state}: " + _MISFITS[no.misfit],
+            "details.story has its last changes",
+        ),
+        no,
     )
 
 
@@ -169,7 +173,7 @@ def _too_large(no: r.TooLarge) -> _Words:
 
 def _revoked(no: r.Revoked) -> _Words:
     told = "" if no.revoked is None else f": {cause(no.revoked)}"
-    leave = "leave; ask for the new size when it is granted again"
+    leave = "unload; request the new size when it is granted again"
     hint = leave if no.wanted == "resize" else "wait until it is granted again"
     return f"{no.consumer} was revoked{told}", hint
 
@@ -204,7 +208,7 @@ def _mismatch(no: r.GangMismatch) -> _Words:
     if no.size != no.asked:
         return f"gang {no.gang} has {no.size} members, not {no.asked}", "agree on one size"
     told = f"all {no.size} members of gang {no.gang} have come"
-    return told, "use an id of its own for each gang"
+    return told, "use a separate id for each gang"
 
 
 def _broken_gang(no: r.BrokenGang) -> _Words:
@@ -226,9 +230,9 @@ def _deadlock(no: r.Deadlock) -> _Words:
 
 
 _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
-    r.NoSession: ("this connection has not said hello", "say hello, then re-attach"),
+    r.NoSession: ("this connection has not said hello", "say hello, then reattach"),
     r.NoLease: (
-        "there is no lease {no.lease_id}", "acquire one; after a restart: re-attach"
+        "there is no lease {no.lease_id}", "acquire one; after a restart: reattach"
     ),
     r.WrongToken: (
         "{no.token} is not the token of {no.lease_id}", "use the token that came with the grant"
@@ -259,7 +263,7 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
     r.LimitReached: _limit,
     r.LoadFails: lambda no: (
         f"{no.consumer} failed {no.failures} times in a row to load {no.model}: {_why(no.cause)}",
-        f"no holder is made to leave for it for {no.retry_in_s:.0f} s more; look at its own log",
+        f"no holder is revoked for it for another {no.retry_in_s:.0f} s; see its own log",
     ),
     r.CancelledRequest: lambda no: (f"{no.lease_id}: {_why(no.why, no.by)}", "acquire again"),
     r.TimedOut: (
@@ -404,7 +408,7 @@ def _reason(body: notes.AnyNote, about: notes.About | None) -> str:
             side = "above" if drift > 0 else "below"
             return f"its {part.replace('_', ' ')} is {side} what it declared"
         case notes.PressureNote(pressure_bytes=over):
-            return "more is held than the budget" if over else "pressure is over"
+            return "more is held than the budget allows" if over else "pressure is over"
         case notes.StowawayNote():
             return "holds bytes without a lease; charged as reserve"
         case (

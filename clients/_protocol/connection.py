@@ -224,7 +224,7 @@ class Connection:
         if self._phase_deadline is not None and now >= self._phase_deadline:
             self.contact_lost("no answer to hello")
         if self.phase == "up" and self._pinged and now >= self._silent_at():
-            self.contact_lost(f"the arbiter said nothing for {now - self._heard_at:.1f} s")
+            self.contact_lost(f"the arbiter was silent for {now - self._heard_at:.1f} s")
         return self.phase == "up"
 
     def ping_if_silent(self, now: float, expects_grants: bool) -> None:
@@ -301,7 +301,7 @@ class Connection:
             reply = from_map(REPLIES[op], message)
         except CodecError as error:
             wrong = f"the arbiter's answer to {op} is not understood: {error}"
-            self._fail(request_id, InternalError(wrong, hint="are both of one version?"), now)
+            self._fail(request_id, InternalError(wrong, hint="do both have the same version?"), now)
             return
         del self._pending[request_id]
         if request.on_reply is not None:

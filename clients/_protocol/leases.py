@@ -253,7 +253,7 @@ class Holdings:
         for record in [r for r in self.held.values() if now >= self.fence_at(r)]:
             silent_s = now - record.confirmed_at
             error = LeaseLost(
-                f"no word from the arbiter on {record.lease_id} for {silent_s:.1f} s: fenced",
+                f"no answer from the arbiter on {record.lease_id} for {silent_s:.1f} s: fenced",
                 hint="unload now; acquire again when the arbiter is back",
                 details={"lease_id": record.lease_id, "silent_s": silent_s},
             )

@@ -46,7 +46,7 @@ class Eviction:
 # -- events for the owner --------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Up:
-    """Greeted and re-attached; requests flow. `epoch` changes with every start of the daemon."""
+    """Greeted and reattached; requests flow. `epoch` changes with every start of the daemon."""
 
     epoch: int
 

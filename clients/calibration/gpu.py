@@ -69,7 +69,7 @@ class FakeGpu:
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(
                 f"the simulated GPU in {self._folder} cannot be read: {error}",
-                hint="stop what uses it and delete the folder; the arbiter makes it anew",
+                hint="stop what uses it and delete the folder; the arbiter creates it again",
             ) from error
         if gpu.config.faults.hide_processes:
             return Reading(gpu.used_bytes, None)
@@ -103,7 +103,7 @@ class NvmlGpu:
             nvml.nvmlDeviceGetMemoryInfo(self._handle)
         except nvml.NVMLError_NotSupported as error:
             raise NoGpu(
-                f"GPU {index} has no memory of its own, so no bytes can be told apart on it",
+                f"GPU {index} has no memory of its own, so its bytes cannot be told apart",
                 hint="write its footprint by hand",
             ) from error
         except nvml.NVMLError as error:

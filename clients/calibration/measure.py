@@ -147,7 +147,7 @@ async def _settled(sampler: Sampler, pace: Pace, *, gone: bool = False) -> int:
         await asyncio.sleep(pace.period_s)
     raise CalibrationFailed(
         f"the program's bytes did not come to rest within {deadline_s - since_s:.0f} s",
-        hint="does it work in the background? measure it with: vramctl calibrate -- COMMAND",
+        hint="if it works in the background, measure it with: vramctl calibrate -- COMMAND",
     )
 
 

@@ -50,7 +50,7 @@ class ObservedProgram:
             how = f"exit code {code}" if code > 0 else signal.Signals(-code).name
             raise CalibrationFailed(
                 f"{self._name} ended with {how}; its last lines:\n{self.tail()}",
-                hint="it has to run to its end, or use --seconds",
+                hint="let it run to its end, or use --seconds",
                 details={"exit_code": code, "log": self.tail()},
             )
 

@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--seconds",
         type=arguments.at_least(1.0),
         metavar="S",
-        help="end COMMAND after so long, for a server (default: it ends by itself)",
+        help="end COMMAND after this time, for a server (default: it ends by itself)",
     )
     add(
         "--name",
@@ -117,21 +117,21 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         type=arguments.at_least(0.05, 60.0),
         default=2.0,
         metavar="S",
-        help="bytes unchanged for so long are at rest (default: %(default)s)",
+        help="bytes are at rest when unchanged for this long (default: %(default)s)",
     )
-    add("--write", type=Path, metavar="FILE", help="put the entry into this footprint file")
+    add("--write", type=Path, metavar="FILE", help="write the entry to this footprint file")
     add("--configs", type=Path, metavar="DIR", help="folder of shipped skills and models")
     add(
         "--allow-noncommercial",
         action="store_true",
         help="measure a model whose license does not allow commercial use",
     )
-    add("--no-arbiter", action="store_true", help="without a lease, where no arbiter runs")
+    add("--no-arbiter", action="store_true", help="measure without a lease, if no arbiter runs")
     add(
         "--wait",
         type=arguments.at_least(0.0),
         metavar="SECONDS",
-        help="give up the wait for the lease after so long (default: never)",
+        help="give up waiting for the lease after this time (default: never)",
     )
     arguments.add_json(parser)
     arguments.add_endpoint(parser)

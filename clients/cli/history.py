@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     )
     parser.add_argument("--kind", action="append", default=[], help="only this kind; repeatable")
     parser.add_argument(
-        "-f", "--follow", action="store_true", help="then each further event, until Ctrl-C"
+        "-f", "--follow", action="store_true", help="then follow new events, until Ctrl-C"
     )
     parser.add_argument(
         "-a",

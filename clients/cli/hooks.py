@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--state",
         type=Path,
         metavar="FILE",
-        help="what was delivered (default: hooks.json in STATE_DIRECTORY, else in "
+        help="file of what was delivered (default: hooks.json in STATE_DIRECTORY, else in "
         f"~/.local/state/{FOLDER})",
     )
     run_parser.add_argument("--log-format", choices=logs.FORMS, default="human")
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
             "--config",
             type=Path,
             metavar="FILE",
-            help=f"the rules (default: {NAME} in CONFIGURATION_DIRECTORY, ~/.config/vram-arbiter "
+            help=f"file of the rules (default: {NAME} in CONFIGURATION_DIRECTORY, ~/.config/vram-arbiter "
             "or /etc/vram-arbiter)",
         )
         arguments.add_endpoint(one)
@@ -112,7 +112,7 @@ def find_config(environ: Mapping[str, str]) -> Path:
             return place
     raise ConfigError(
         f"no rules: there is none of {', '.join(map(str, places))}",
-        hint="write one (`configs/hooks.yaml` shows every key), or name it by --config",
+        hint="write one (`configs/hooks.yaml` shows every key), or name it with --config",
     )
 
 

@@ -51,7 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
             "installation)",
         )
         parser.add_argument(
-            "--operators", metavar="USERS", default="", help="users who may act by hand: alice,bob"
+            "--operators",
+            metavar="USERS",
+            default="",
+            help="users who may evict, pin and drain: alice,bob",
         )
     else:
         parser.add_argument(
@@ -67,9 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         metavar="DIR",
         type=Path,
         default=Path("/"),
-        help="files alone, below this folder: for an image or a package",
+        help="write files only, below this folder: for an image or a package",
     )
-    parser.add_argument("--dry-run", action="store_true", help="show the plan and end")
+    parser.add_argument("--dry-run", action="store_true", help="show the plan and exit")
     parser.add_argument("--yes", action="store_true", help="do not ask")
 
 
@@ -168,5 +171,5 @@ def _perform(steps: Sequence[Step]) -> None:
             step.perform()
         except OSError as error:
             raise InstallFailed(
-                f"{step.what}: {error.strerror}", hint="mend it, then run the command again"
+                f"{step.what}: {error.strerror}", hint="fix it, then run the command again"
             ) from error

@@ -58,7 +58,7 @@ COMMANDS: Mapping[str, Command] = {
     "timeline": Command(
         "timeline.command", "draw GPU memory over time as .png, .html or a Perfetto trace"
     ),
-    "top": Command("top.command", "show everything live on a whole terminal, with operator keys"),
+    "top": Command("top.command", "show everything live on a full screen, with operator keys"),
     "evict": Command("operators", "revoke a lease; a use in flight finishes first"),
     "pin": Command("operators", "protect a lease from eviction until it is unpinned"),
     "unpin": Command("operators", "undo an operator's pin"),
@@ -75,8 +75,10 @@ COMMANDS: Mapping[str, Command] = {
     "hooks": Command("hooks", "run commands and webhooks for events"),
     "mcp": Command("mcp", "serve status, why and history to agents"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
-    "simulate": Command("offline", "simulate a scenario under one policy or more", passes_on=True),
-    "demo": Command("demo", "run find, navigate, grab on a simulated arm inside 8 GiB"),
+    "simulate": Command(
+        "offline", "simulate a scenario under one or more policies", passes_on=True
+    ),
+    "demo": Command("demo", "run find, navigate and grab on a simulated arm in 8 GiB"),
 }
 
 

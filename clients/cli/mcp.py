@@ -31,7 +31,7 @@ CALLS_MAX: Final = 4
 EVENTS_MAX: Final = 500
 
 DESCRIPTIONS = {
-    "mcp": "Serve the arbiter to agents by the Model Context Protocol, on stdin and stdout: tools "
+    "mcp": "Serve the arbiter to agents over the Model Context Protocol, on stdin and stdout: tools "
     "status, why and history, and with --allow the operators' actions evict, drain and resume, "
     "which the arbiter refuses to other users. Ends with its input. Needs the extra `mcp`."
 }

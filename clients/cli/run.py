@@ -77,9 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--wait",
         type=arguments.at_least(0.0),
         metavar="SECONDS",
-        help="give up after so many seconds (default: never)",
+        help="give up after this many seconds (default: never)",
     )
-    parser.add_argument("--exclusive", action="store_true", help="no other model on that GPU")
+    parser.add_argument("--exclusive", action="store_true", help="allow no other model on that GPU")
     parser.add_argument("--pin", action="store_true", help="never end the program to make room")
     parser.add_argument(
         "--on-revoke",
@@ -92,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--grace",
         type=arguments.at_least(0.0),
         metavar="SECONDS",
-        help="from SIGTERM to SIGKILL, or for requests in progress (default: as long as it takes)",
+        help="time from SIGTERM to SIGKILL, or for requests in progress (default: as long as it takes)",
     )
     _add_eviction(parser)
     arguments.add_endpoint(parser)
@@ -118,11 +118,9 @@ def _add_eviction(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--method", choices=METHODS, help="http: method of both requests (default: POST)"
     )
-    group.add_argument("--body", metavar="JSON", help="http: what is sent to --url")
-    group.add_argument("--restore-body", metavar="JSON", help="http: what is sent to --restore-url")
-    group.add_argument(
-        "--allow-remote", action="store_true", help="allow URLs of hosts other than this one"
-    )
+    group.add_argument("--body", metavar="JSON", help="http: body for --url")
+    group.add_argument("--restore-body", metavar="JSON", help="http: body for --restore-url")
+    group.add_argument("--allow-remote", action="store_true", help="allow URLs of other hosts")
     group.add_argument(
         "--timeout",
         type=arguments.at_least(0.1),
@@ -143,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     if not command:
         args.parser.error("expected a program to run: vramctl run --vram 5GiB -- COMMAND")
     if args.pin and args.on_revoke == "term":
-        args.parser.error("--pin and --on-revoke term exclude each other")
+        args.parser.error("--pin and --on-revoke term cannot be combined")
     on_revoke: OnRevoke = "pin" if args.pin else args.on_revoke
     if on_revoke == "pin" and args.on_evict != "end":
         args.parser.error(f"a pinned program is not evicted: leave out --on-evict {args.on_evict}")
@@ -181,7 +179,7 @@ def _action(args: argparse.Namespace) -> Action | None:
         given = getattr(args, option) not in (None, False)
         if given and option not in takes.get(chosen, ("url", "allow_remote", "timeout", "park")):
             flag = option.replace("_", "-")
-            args.parser.error(f"--{flag} has no meaning for --on-evict {chosen}")
+            args.parser.error(f"--{flag} has no effect with --on-evict {chosen}")
     timeout_s = TIMEOUT_S if args.timeout is None else args.timeout
     if server is not None:
         return server(_url(args, "url", server.default_url), timeout_s)
@@ -254,7 +252,7 @@ def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
     if wanted == "any" and len(gpus) > 1:
         raise ConfigError(
             f"there are {len(gpus)} GPUs, and the program must return to the one it was started on",
-            hint="name it by --gpu",
+            hint="name one with --gpu",
         )
 
 

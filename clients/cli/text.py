@@ -59,7 +59,7 @@ def status_lines(status: JsonMap) -> list[str]:
         "· " + plural(status["clients"], "client")
     ]
     if status["phase"] == "recovering":
-        lines.append("  after a restart nothing is granted until every lease is accounted for")
+        lines.append("  restarted: nothing is granted until every lease is accounted for")
     if status.get("drained"):
         lines.append(f"  drained by {status['drained']}; nothing is granted until `vramctl resume`")
     lines += [f"  {problem}" for problem in status.get("problems", ())]
@@ -214,9 +214,9 @@ def by_hand_lines(action: str, reply: JsonMap) -> list[str]:
     """What an operator's action did, and what happens next."""
     if "drained" in reply:
         return [
-            f"drained by {reply['drained']}; what is held is kept"
+            f"drained by {reply['drained']}; holders keep their leases"
             if reply["drained"]
-            else "grants are made again"
+            else "granting resumed"
         ]
     lease = reply.get("lease")
     if lease is None:

@@ -64,7 +64,7 @@ class Deadline:
         left = self._end - time.monotonic()
         if left <= least_s:
             raise ActionFailed(
-                f"{what}: not done within {self.limit_s:g} s", hint="allow more by --timeout"
+                f"{what}: not done within {self.limit_s:g} s", hint="allow more with --timeout"
             )
         return left
 

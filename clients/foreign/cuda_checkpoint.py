@@ -95,7 +95,7 @@ class CheckpointAction:
         except ActionFailed as error:
             broken = self._resume(done)
             raise ActionFailed(
-                error.message + (f"; {broken}" if broken else "; the program runs on"),
+                error.message + (f"; {broken}" if broken else "; the program continues"),
                 hint=error.hint,
                 details=error.details,
             ) from error

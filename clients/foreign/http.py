@@ -61,7 +61,7 @@ def checked_url(url: str, *, remote: bool) -> str:
     if not remote and not _is_here(parts.hostname):
         raise ValueError(
             f"{parts.hostname} is not a loopback host: the program runs on this machine; "
-            "--allow-remote calls it all the same"
+            "--allow-remote calls it anyway"
         )
     return url.rstrip("/")
 
@@ -95,7 +95,7 @@ def answer(request: Request, deadline: Deadline) -> Reply:
                 )
     except TimeoutError as error:
         raise ActionFailed(
-            f"{request}: no answer within {deadline.limit_s:g} s", hint="allow more by --timeout"
+            f"{request}: no answer within {deadline.limit_s:g} s", hint="allow more with --timeout"
         ) from error
     except (OSError, http.client.HTTPException) as error:
         raise ActionFailed(

@@ -239,7 +239,7 @@ class Supervisor:
         try:
             await _in_thread(self._spec.action.restore, self._program.tree())
         except VramError as error:
-            say(f"{error}; its lease is released, and the program goes on without one")
+            say(f"{error}; its lease is released, and the program continues without one")
             await self.lease.release()
             return False
         self._away = False
@@ -283,7 +283,7 @@ class Supervisor:
             await _in_thread(action.free, program.tree())
         except VramError as error:
             self._away = False
-            say(f"{error}; the arbiter measures what the program keeps: vramctl status")
+            say(f"{error}; the arbiter measures what the program retains: vramctl status")
 
     async def _quiesce(self, action: Action) -> None:
         """Wait until no request is in progress, where the program says so, or the grace is over."""
@@ -296,7 +296,7 @@ class Supervisor:
                     told = True
                     await asyncio.sleep(BUSY_POLL_S)
                 return
-        say(f"requests are in progress after {self._spec.grace_s:g} s all the same")
+        say(f"requests are still in progress after {self._spec.grace_s:g} s")
 
     # -- what the arbiter sees
     async def _watch(self) -> None:

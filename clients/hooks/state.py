@@ -72,5 +72,5 @@ class StateFile:
     def _damaged(self, error: Exception) -> ConfigError:
         return ConfigError(
             f"{self._path} cannot be read: {error}",
-            hint="remove it; hooks then begin with the events from now on",
+            hint="remove it; hooks then begin with new events",
         )

@@ -166,7 +166,7 @@ def _address(endpoint: str, program: Program) -> str | bytes:
         if port is None:
             raise ConfigError(
                 f"{endpoint} is refused: only a server on this machine has a user to be checked",
-                hint="write ipc://PATH, or tcp://127.0.0.1:PORT for a server of the field",
+                hint="write ipc://PATH, or tcp://127.0.0.1:PORT for another project's server",
                 details={"endpoint": endpoint},
             )
         return f"tcp://127.0.0.1:{port}"

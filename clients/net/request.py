@@ -26,7 +26,7 @@ DOUBT_S = 0.2
 is one."""
 RETRY_S = 0.02
 HANGS = (
-    "something holds the socket and is silent: look at the arbiter's log, or set "
+    "a program holds the socket but does not answer: look at the arbiter's log, or set "
     "VRAM_ARBITER_ENDPOINT"
 )
 

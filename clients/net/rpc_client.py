@@ -69,7 +69,7 @@ class RpcClient:
         try:
             limit = REQUEST_MAX_BYTES if self.in_order is False else MESSAGE_LIMIT_BYTES
             if not dealer.send({**request, "id": request_id}, limit):
-                raise self._lost("it takes no more requests; restart it")
+                raise self._lost("it accepts no more requests; restart it")
             return await answer.within(timeout_s)
         finally:
             self._waiting.pop(request_id, None)

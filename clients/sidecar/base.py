@@ -276,7 +276,7 @@ class SidecarClient:
         """One request to a server of the field, which looks at it as soon as it is its turn."""
         if token is not None:
             raise BadRequest(
-                f"{self.endpoint} is a server of the field and knows no tokens",
+                f"{self.endpoint} is another project's server and knows no tokens",
                 hint="load() answers with the token of the server that serves now",
             )
         if op == "score":  # pictures are decoded

@@ -57,7 +57,7 @@ def request(family: Family, op: str, fields: JsonMap) -> tuple[str, Message]:
     unsaid = sorted(given.keys() - FIELDS[op] - WITHOUT_EFFECT)
     if unsaid:
         raise BadRequest(
-            f"a server of the field cannot be asked for {op} with {', '.join(unsaid)}",
+            f"another project's server cannot be asked for {op} with {', '.join(unsaid)}",
             hint="leave them out, or serve the model with vram-sidecar",
             details={"fields": unsaid},
         )
@@ -82,7 +82,7 @@ def result(op: str, fields: JsonMap, reply: Any) -> Any:
     if op not in FIELDS:
         return reply
     if not isinstance(reply, dict):
-        raise ModelError(f"{op} was answered with {type(reply).__name__}, not with a map")
+        raise ModelError(f"{op} was answered with {type(reply).__name__}, expected a map")
     if op == "detect" and "detections" not in reply:
         size, query = _size_of(fields.get("image")), str(fields.get("query"))
         return reply | {"detections": grounded(reply.get("answer"), reply.get("norm"), size, query)}
@@ -120,7 +120,7 @@ def _policy_request(op: str, given: Message) -> tuple[str, Message]:
     data = given.get("data") or {}
     if "rtc" in given:
         raise BadRequest(
-            "a server of the field takes no left-over chunk",
+            "another project's server takes no remaining chunk",
             hint="leave rtc out of policy_extras, or serve the policy with vram-sidecar",
             details={"fields": ["rtc"]},
         )
@@ -137,8 +137,8 @@ def _policy_request(op: str, given: Message) -> tuple[str, Message]:
 
 def _unknown(op: str) -> UnknownOp:
     return UnknownOp(
-        f"a server of the field has no {op}",
-        hint="its model is there while it runs; start it with `vramctl run`, which holds its lease"
+        f"another project's server has no {op}",
+        hint="its model is loaded while it runs; start it with `vramctl run`, which holds its lease"
         if op in ("load", "unload")
         else "serve the model with vram-sidecar",
     )
@@ -156,7 +156,7 @@ def _size_of(image: object) -> tuple[int, int]:
 def _raw(images: list[bytes]) -> Message:
     """Return pictures as `score` takes them: raw BGR, one after another. Of more than `SCORED_MAX`
     as many are taken, evenly, the oldest and the newest among them. Raises BadRequest."""
-    extras.need("a reward model of the field", "PIL", extra="reasoner")
+    extras.need("another project's reward model", "PIL", extra="reasoner")
     from PIL import Image
 
     if not images:

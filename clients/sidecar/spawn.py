@@ -93,14 +93,14 @@ class Child:
         if code == -signal.SIGKILL:
             what, hint = (
                 "was killed (SIGKILL)",
-                "if no person did it, the machine's memory was full: see dmesg",
+                "unless a person did it, the machine's memory was full: see dmesg",
             )
         elif code is not None and code < 0:
             what, hint = f"died of {signal.Signals(-code).name}", "see its log"
         else:
             what, hint = f"ended with exit code {code}", "see its log"
         tail = self.log_tail()
-        last = tail.strip().splitlines()[-1] if tail.strip() else "nothing in its log"
+        last = tail.strip().splitlines()[-1] if tail.strip() else "its log is empty"
         return SidecarUnavailable(
             f"the sidecar {what}: {last}",
             hint=hint,

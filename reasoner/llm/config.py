@@ -74,7 +74,7 @@ def _key(environ: Mapping[str, str]) -> str:
     key = environ.get(PREFIX + "API_KEY", "").strip()
     if not (key.isascii() and all(letter.isprintable() for letter in key)):
         raise ConfigError(
-            f"{PREFIX}API_KEY has letters that no key has", hint="printable ASCII on one line"
+            f"{PREFIX}API_KEY has characters that no key has", hint="printable ASCII on one line"
         )
     return key
 

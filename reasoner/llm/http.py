@@ -109,7 +109,7 @@ class JsonHttp:
             if failures >= TRIES_MAX:
                 raise LlmError(
                     f"{shown}: {refused}, {TRIES_MAX} times",
-                    hint="is the server running, and does it keep up?",
+                    hint="is the server running, and fast enough?",
                 )
             pause_s = _pause_s(asked) if refused.after_s is None else refused.after_s
             left_s -= monotonic() - began_s + pause_s

@@ -67,7 +67,7 @@ def add_parser(
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner benchmark`."""
     bench = commands.add_parser(
-        "benchmark", help="success rates of skills and policies, with videos"
+        "benchmark", help="measure success rates of skills and policies, with videos"
     )
     bench.add_argument(
         "--env",
@@ -80,54 +80,57 @@ def add_parser(
         type=Path,
         action="append",
         default=[],
-        help="scene file of so101; may be given several times",
+        help="scene file of so101; repeatable",
     )
     bench.add_argument(
-        "--env-config", type=Path, help="how the gymnasium environment is to be read"
+        "--env-config", type=Path, help="environment file of the gymnasium environment"
     )
     bench.add_argument(
-        "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
+        "--success",
+        metavar="RULE",
+        help="success in a gymnasium environment: info:KEY or return:NUMBER",
     )
     bench.add_argument(
-        "--task", help="in so101: grab or navigate; by default what the skill's actions say"
+        "--task", help="in so101: grab or navigate (default: by the skill's actions)"
     )
     bench.add_argument(
         "--skill",
         action="append",
         default=[],
-        help="an installed skill; may be given several times",
+        help="an installed skill; repeatable",
     )
     bench.add_argument(
         "--policy", action="append", default=[],
         help="random, scripted:MODULE, scripted:FILE.py or, for grabs in so101, expert; repeatable",
     )  # fmt: skip
-    bench.add_argument("--episodes", type=positive_int, default=10, help="seeds a cell; default 10")
-    bench.add_argument("--seed", type=int, default=0, help="the first one")
+    bench.add_argument(
+        "--episodes", type=positive_int, default=10, help="episodes per cell; default 10"
+    )
+    bench.add_argument("--seed", type=int, default=0, help="seed of the first episode")
     bench.add_argument(
         "--max-steps",
         type=positive_int,
-        help="of an episode; default 600, 20 s of the SO-101, or a known environment's own",
+        help="limit of an episode; default 600 (20 s of the SO-101), or a known environment's own",
     )
     bench.add_argument(
         "--parallel", type=positive_int, default=1, metavar="N",
-        help="play N episodes of a cell at once, each in a world of its own; default 1",
+        help="play N episodes of a cell at once, each in its own world; default 1",
     )  # fmt: skip
     time = bench.add_mutually_exclusive_group()
     time.add_argument(
         "--latency-steps", type=not_negative_int, metavar="N",
-        help="a policy's answer takes N control steps; by default as many as it had actions left to"
+        help="a policy's answer takes N control steps; default: as many as it had actions left to"
         " play when it was asked",
     )  # fmt: skip
     time.add_argument(
         "--real-time", action="store_true",
-        help="tick at the world's rate and do not wait for the policy: its latency is this"
-        " machine's",
+        help="tick at the world's rate, with the policy's latency on this machine",
     )  # fmt: skip
     bench.add_argument(
         "--episode-seconds",
         type=positive,
         default=600.0,
-        help="of an episode, on the wall; default 600",
+        help="wall time limit of an episode; default 600",
     )
     bench.add_argument(
         "--out", type=Path, default=Path("out/benchmark"), help="folder of report and videos"
@@ -141,7 +144,9 @@ def add_parser(
         help="rskill.yaml files or folders of them",
     )
     bench.add_argument("--arbiter", help="the arbiter's endpoint")
-    bench.add_argument("--no-arbiter", action="store_true", help="run without arbiter and leases")
+    bench.add_argument(
+        "--no-arbiter", action="store_true", help="run without an arbiter and leases"
+    )
     bench.add_argument("--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT")
     add_license_flag(bench)
     add_trace_flag(bench)

@@ -20,7 +20,7 @@ def add_client_flags(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--wait", type=positive, default=WAIT_S, metavar="SECONDS",
-        help="for a runner that is starting; default %(default)g",
+        help="wait this long for a runner that is starting; default %(default)g",
     )  # fmt: skip
 
 

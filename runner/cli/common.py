@@ -101,20 +101,22 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         "--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock"
     )
     parser.add_argument("--arbiter", help="the arbiter's endpoint")
-    parser.add_argument("--no-arbiter", action="store_true", help="run without arbiter and leases")
+    parser.add_argument(
+        "--no-arbiter", action="store_true", help="run without an arbiter and leases"
+    )
     parser.add_argument(
         "--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT",
         help="address of a policy's sidecar; default ipc://RUNTIME/NAME.sock,"
-        " NAME being what follows the first - of the skill's name",
+        " where NAME is the part of the skill's name after the first -",
     )  # fmt: skip
     parser.add_argument(
         "--realtime", action=argparse.BooleanOptionalAction, default=True,
         help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value)"
-        " where the machine allows it",
+        " if the machine allows it",
     )  # fmt: skip
     add_license_flag(parser)
     add_trace_flag(parser)
-    parser.add_argument("--max-seconds", type=positive, help="stop by itself after so many seconds")
+    parser.add_argument("--max-seconds", type=positive, help="stop after this many seconds")
 
 
 def sidecars_given(flags: list[str]) -> dict[str, str]:

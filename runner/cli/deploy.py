@@ -83,7 +83,7 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner deploy`."""
-    deploy = commands.add_parser("deploy", help="a robot, as a deployment file describes it")
+    deploy = commands.add_parser("deploy", help="run the robot of a deployment file")
     deploy.add_argument(
         "--config",
         type=Path,

@@ -15,7 +15,9 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner episodes`."""
-    episodes = commands.add_parser("episodes", help="recorded episodes and the operator's marks")
+    episodes = commands.add_parser(
+        "episodes", help="list recorded episodes and the operator's marks"
+    )
     episodes.add_argument("--dataset", type=Path, required=True)
     episodes.add_argument(
         "--marked", choices=("success", "failure"),

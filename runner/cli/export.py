@@ -15,8 +15,8 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner export`."""
-    export = commands.add_parser("export", help="a recording as a file for the Rerun viewer")
-    export.add_argument("--dataset", type=Path, required=True, help="folder that was recorded into")
+    export = commands.add_parser("export", help="write a recording as a file for the Rerun viewer")
+    export.add_argument("--dataset", type=Path, required=True, help="folder of the recording")
     export.add_argument("--out", type=Path, required=True, help="a .rrd file")
     export.add_argument("--episode", type=int, help="only this one")
     return export

@@ -1,4 +1,4 @@
-"""`vram-runner frame --out FILE`: the newest picture of a running runner's camera."""
+"""`vram-runner frame --out FILE`: save the newest picture of a running runner's camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner frame`."""
-    frame = commands.add_parser("frame", help="the newest picture of a running runner's camera")
+    frame = commands.add_parser(
+        "frame", help="save the newest picture of a running runner's camera"
+    )
     frame.add_argument("camera", nargs="?", default="", help="default: the runner's first one")
     frame.add_argument("--out", type=Path, required=True, help="a .jpg or .png file")
     frame.add_argument("--max-age-ms", type=positive, default=500.0, help="default %(default)g")

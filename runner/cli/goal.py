@@ -18,7 +18,9 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner goal`."""
-    goal = commands.add_parser("goal", help="send a goal to a running runner, await its result")
+    goal = commands.add_parser(
+        "goal", help="send a goal to a running runner and wait for its result"
+    )
     goal.add_argument("skill", metavar="OWNER/SKILL")
     goal.add_argument("prompt", nargs="?", default="")
     goal.add_argument(
@@ -26,7 +28,7 @@ def add_parser(
     )
     goal.add_argument("--deadline", type=positive, default=0.0, metavar="SECONDS")
     goal.add_argument("--max-ticks", type=positive_int)
-    goal.add_argument("--id", help="name of the goal; default: one of its own")
+    goal.add_argument("--id", help="name of the goal; default: a new one")
     add_client_flags(goal)
     return goal
 

@@ -12,10 +12,10 @@ def add_parser(
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner mark`."""
     mark = commands.add_parser(
-        "mark", help="mark the recorded episode of the goal that runs, or of the last one"
+        "mark", help="mark the recorded episode of the running goal, or of the last one"
     )
     mark.add_argument("verdict", choices=("success", "failure", "discard"))
-    mark.add_argument("--goal", default="", help="only if it is this one")
+    mark.add_argument("--goal", default="", help="only if the goal is this one")
     add_client_flags(mark)
     return mark
 

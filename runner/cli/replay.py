@@ -23,11 +23,16 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner replay`."""
-    replay = commands.add_parser("replay", help="a recorded frame, its tick and its trace")
-    replay.add_argument("--dataset", type=Path, required=True, help="folder that was recorded into")
-    replay.add_argument("--frame", type=_index, required=True, help="from 0 on, over all episodes")
+    replay = commands.add_parser("replay", help="show a recorded frame, its tick and its trace")
+    replay.add_argument("--dataset", type=Path, required=True, help="folder of the recording")
     replay.add_argument(
-        "--episode", type=_index, help="count the frames from this episode's beginning"
+        "--frame",
+        type=_index,
+        required=True,
+        help="number of the frame over all episodes, from 0 on",
+    )
+    replay.add_argument(
+        "--episode", type=_index, help="count frames from the beginning of this episode"
     )
     replay.add_argument("--json", action="store_true", help="all of it, for programs")
     replay.add_argument(

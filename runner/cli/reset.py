@@ -1,4 +1,4 @@
-"""`vram-runner reset [--seed N]`: begin the scene of a running simulator again."""
+"""`vram-runner reset [--seed N]`: restart the scene of a running simulator."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner reset`."""
-    reset = commands.add_parser("reset", help="begin the scene of a running simulator again")
-    reset.add_argument("--seed", type=int, help="another scene; default: the present one")
+    reset = commands.add_parser("reset", help="restart the scene of a running simulator")
+    reset.add_argument("--seed", type=int, help="seed of another scene; default: the current one")
     add_client_flags(reset)
     return reset
 

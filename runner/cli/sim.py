@@ -64,13 +64,15 @@ def add_world_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--env-config",
         type=Path,
-        help="how a gymnasium environment is to be read (docs/reference/simulated-worlds.md)",
+        help="environment file of a gymnasium environment (docs/reference/simulated-worlds.md)",
     )
     parser.add_argument(
-        "--success", metavar="RULE", help="of a gymnasium environment: info:KEY or return:NUMBER"
+        "--success",
+        metavar="RULE",
+        help="success in a gymnasium environment: info:KEY or return:NUMBER",
     )
     parser.add_argument(
-        "--max-steps", type=positive_int, help="cut an episode off after so many steps"
+        "--max-steps", type=positive_int, help="end an episode after this many steps"
     )
 
 
@@ -78,19 +80,21 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner sim`."""
-    sim = commands.add_parser("sim", help="the simulated SO-101 on a mobile base, or another world")
+    sim = commands.add_parser("sim", help="simulate the SO-101 on a mobile base, or another world")
     add_world_flags(sim)
     sim.add_argument(
         "--policy",
         help="random, scripted:MODULE, scripted:FILE.py or, in so101, expert (grabs) plays"
-        " --episodes episodes; no goals are taken then",
+        " --episodes episodes, and no goals are accepted",
     )
-    sim.add_argument("--episodes", type=positive_int, help="of --policy; default 1")
-    sim.add_argument("--seed", type=int, default=0, help="decides everything about the episode")
+    sim.add_argument(
+        "--episodes", type=positive_int, help="number of episodes of --policy; default 1"
+    )
+    sim.add_argument("--seed", type=int, default=0, help="seed of the episode")
     sim.add_argument(
         "--record", type=Path, metavar="DIR",
         help="write every goal, or episode of --policy, as an episode of the LeRobotDataset"
-        " in this folder; a new one, or one of an earlier recording",
+        " in this folder, which is new or has an earlier recording",
     )  # fmt: skip
     sim.add_argument(
         "--record-format", choices=("full", "lerobot"), default="full",
@@ -102,16 +106,19 @@ def add_parser(
     sim.add_argument(
         "--timings",
         type=Path,
-        help="write when each tick began and how long it took, a JSON line each, at the end",
+        help="at the end, write when each tick began and how long it took, one JSON line each",
     )
     sim.add_argument(
         "--rate", type=not_negative, default=30.0, help="ticks per second; 0: as fast as possible"
     )
-    sim.add_argument("--deadline-policy", choices=("warn", "drop", "raise"), default="warn")
+    sim.add_argument(
+        "--deadline-policy", choices=("warn", "drop", "raise"), default="warn",
+        help="what to do with a late action: send it, drop it, or end the run; default warn",
+    )  # fmt: skip
     sim.add_argument(
         "--lockstep", action=argparse.BooleanOptionalAction, default=True,
-        help="the simulated world waits for the policy's chunks:"
-        " a slow machine only takes longer",
+        help="let the simulated world wait for the policy's chunks, so that a slow machine only"
+        " takes longer",
     )  # fmt: skip
     add_serving_flags(sim)
     return sim

@@ -1,4 +1,4 @@
-"""`vram-runner state`: what a running runner sees and does."""
+"""`vram-runner state`: show what a running runner sees and does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def add_parser(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner state`."""
-    state = commands.add_parser("state", help="what a running runner sees and does")
+    state = commands.add_parser("state", help="show what a running runner sees and does")
     state.add_argument("--json", action="store_true", help="all of it, for programs")
     add_client_flags(state)
     return state

@@ -60,7 +60,9 @@ class SensorReaderConfig(_Section):
     @model_validator(mode="after")
     def _topic_goes_with_publishing(self) -> Self:
         if self.publish_to_ros != (self.publish_topic is not None):
-            raise ValueError("publish_to_ros and publish_topic go together: give both or neither")
+            raise ValueError(
+                "publish_to_ros and publish_topic belong together: give both or neither"
+            )
         for name in ("publish_rate_hz", "publish_width"):
             if getattr(self, name) is not None and not self.publish_to_ros:
                 raise ValueError(f"{name} without publish_to_ros publishes nothing")
@@ -197,7 +199,9 @@ class RobotEnvironment(_Section):
         if twice := sorted({name for name in watched if watched.count(name) > 1}):
             raise ValueError(f"one detector a camera; given twice: {', '.join(twice)}")
         if (self.vla is None) != (self.task is None):
-            raise ValueError("task and vla go together: give both, or neither to serve goals only")
+            raise ValueError(
+                "task and vla belong together: give both, or neither to only serve goals"
+            )
         Body.model_validate({"embodiment_tags": self.known_tags, "capabilities": self.capabilities})
         return self
 

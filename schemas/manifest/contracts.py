@@ -163,7 +163,7 @@ class RosIntegration(Block):
         except ValueError as error:
             raise ValueError(f"must be the text of a JSON object: {error}") from error
         if not isinstance(goal, dict):
-            raise ValueError(f"must be the text of a JSON object, not of a {type(goal).__name__}")
+            raise ValueError(f"must be the text of a JSON object, not a {type(goal).__name__}")
         return text
 
 

@@ -188,7 +188,7 @@ class RSkillManifest(Block):
             return ""
         return (
             f"its license ({self.license}) does not allow commercial use; {LICENSE_FLAG} allows it "
-            "all the same"
+            "anyway"
         )
 
     @property

@@ -90,7 +90,7 @@ def check_endpoint(endpoint: str) -> str:
             f"an ipc:// endpoint needs an absolute path, not {path!r}; write {EXAMPLE}"
         )
     if "\0" in path:
-        raise ValueError(f"a socket path has no NUL, unlike {path!r}; write {EXAMPLE}")
+        raise ValueError(f"a socket path cannot contain NUL: {path!r}; write {EXAMPLE}")
     size = len(os.fsencode(path))
     if size > PATH_MAX_BYTES:
         raise ValueError(

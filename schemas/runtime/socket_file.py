@@ -59,7 +59,7 @@ class SocketFile:
         try:
             listener = self.bind()
         except ConfigError as error:
-            log.error("the socket's file was deleted and cannot be made again: %s", error)
+            log.error("the socket's file was deleted and cannot be created again: %s", error)
             return None
         log.warning("the socket's file %s was deleted; bound again", self._path)
         return listener

@@ -103,8 +103,7 @@ def check_uid(
     raise UntrustedServer(
         f"{where} is served by uid {uid}{f' ({user})' if user else ''}, not by a user that may "
         f"serve the {program}",
-        hint="nothing was asked of it and nothing it says is believed; if it may serve, set "
-        f"{USERS_VARIABLE}={uid}",
+        hint=f"nothing was sent to it; if it may serve, set {USERS_VARIABLE}={uid}",
         details={"endpoint": where, "uid": uid, "user": user, "program": program},
     )
 

@@ -82,7 +82,7 @@ class Because(StrEnum):
     ONE_LOAD = "one_load"  # one lease loads at a time
     KEPT = "kept"  # its bytes are charged, the GPU has to show them
     UNREADABLE = "unreadable"
-    MEASUREMENT = "measurement"  # the ledger has room, the GPU has to show it
+    MEASUREMENT = "measurement"  # the ledger has room, but the GPU has to show it
     ACCOUNTED = "accounted"  # all holders reattached or ran out of time
     INCOMPLETE = "incomplete"  # a gang, after a restart
     SHORT = "short"  # measured memory for a gang

@@ -60,7 +60,7 @@ def test_usage(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--task", " "], "the task says nothing"),
+        (["--task", " "], "the task is empty"),
         (["serve", "--result", "r.json"], "serve writes --history FILE"),
         (
             ["--task", "grab it", "--result", "/proc/none/result.json"],

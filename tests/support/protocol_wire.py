@@ -128,7 +128,7 @@ class Wire:
         self.protocol.tick(self.now)
 
     def greet(self) -> None:
-        """Hello until up, without leases to re-attach."""
+        """Hello until up, without leases to reattach."""
         self.connection.connected(self.now)
         hello = self.one("hello")
         self.reply(hello, **WELCOME)

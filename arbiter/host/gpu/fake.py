@@ -61,7 +61,7 @@ class FakeProbe:
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(
                 f"the simulated GPU in {folder} cannot be read: {error}",
-                hint="stop what uses it and delete the folder; the arbiter makes it anew",
+                hint="stop what uses it and delete the folder; the arbiter creates it again",
             ) from error
         processes = None
         if not state.config.faults.hide_processes:

@@ -32,7 +32,7 @@ from vram_arbiter.schemas.runtime.version import version
 DESCRIPTIONS = {
     "doctor": "Examine installation, driver, socket, permissions, clocks, cgroups, suspend, "
     "leftovers, ports, units, and what the arbiter says of itself and its GPUs. Each finding names "
-    "the command that mends it; nothing is changed. Exits 0 without a warning or error, 1 with "
+    "the command that fixes it; nothing is changed. Exits 0 without a warning or error, 1 with "
     "one, 3 if the arbiter cannot be reached."
 }
 
@@ -90,7 +90,7 @@ def doctor(*, as_json: bool, endpoint: str | None) -> int:
 
 
 def lines_of(report: Report, *, color: bool = False, width: int | None = None) -> list[str]:
-    """Return the report as lines: severity, code, what was found; below it what mends it.
+    """Return the report as lines: severity, code, what was found; below it what fixes it.
 
     `width`: columns to which findings are folded; commands stay in one line.
     """

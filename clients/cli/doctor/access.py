@@ -60,7 +60,7 @@ def permissions(m: Machine) -> Iterator[Finding]:
         if name in m.group_members(group):
             yield error(
                 "permissions.session",
-                f"{name} is a member of {group}, and this session began before that",
+                f"{name} is a member of {group}, but this session began before that",
                 f"newgrp {group}",
             )
         else:

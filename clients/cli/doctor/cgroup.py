@@ -55,7 +55,7 @@ def memory(m: Machine) -> Iterator[Finding]:
             )
         group = group.rpartition("/")[0]
     if clean:
-        yield ok("cgroup.limit", "no memory limit that the daemon would feel")
+        yield ok("cgroup.limit", "no memory limit affects the daemon")
 
 
 def out_of_memory(m: Machine) -> Iterator[Finding]:

@@ -33,7 +33,7 @@ def driver(m: Machine) -> Iterator[Finding]:
         yield error(
             "driver.mismatch",
             f"the loaded kernel module {_version(loaded)} is older or newer than NVIDIA's library "
-            f"({m.nvml.problem}): the driver was upgraded and the machine not restarted",
+            f"({m.nvml.problem}): the driver was upgraded, but the machine was not restarted",
             f"{m.sudo}reboot",
         )
     elif m.exists("/dev/nvmap") or m.exists("/etc/nv_tegra_release"):
@@ -54,7 +54,7 @@ def driver(m: Machine) -> Iterator[Finding]:
     else:
         yield note(
             "driver.none",
-            f"no NVIDIA GPU and no driver ({m.nvml.problem}); a GPU can be simulated",
+            f"no NVIDIA GPU and no driver ({m.nvml.problem}); use a simulated GPU",
             "vram-arbiter --gpu fake:8GiB",
         )
 
@@ -67,7 +67,7 @@ def devices(m: Machine) -> Iterator[Finding]:
     if missing:
         yield error(
             "devices.missing",
-            f"device nodes are missing: {', '.join(missing)}; the arbiter may not make them",
+            f"device nodes are missing: {', '.join(missing)}; the arbiter may not create them",
             f"{m.sudo}nvidia-modprobe -c 0 -u",
         )
     found = {node: there for node in NODES if (there := m.stat(node)) is not None}
@@ -115,7 +115,7 @@ def suspend(m: Machine) -> Iterator[Finding]:
     if off:
         yield warning(
             "suspend.units",
-            f"GPU memory is to be kept at a suspend, and {', '.join(off)} "
+            f"GPU memory should be kept in a suspend, but {', '.join(off)} "
             f"{'is' if len(off) == 1 else 'are'} not enabled: the machine may not suspend, or not "
             "resume",
             f"{m.sudo}systemctl enable {' '.join(off)}",

@@ -25,7 +25,7 @@ WRONG: Final = frozenset({Severity.WARNING, Severity.ERROR})
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding. `code` is stable: `CHECK.what`. `fix`: the command that mends it."""
+    """One finding. `code` is stable: `CHECK.what`. `fix`: the command that fixes it."""
 
     WHOLE: ClassVar = True
 

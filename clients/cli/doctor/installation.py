@@ -32,7 +32,7 @@ def origins(m: Machine) -> Iterator[Finding]:
         if os.path.realpath(copy) != os.path.realpath(installed.package):
             yield note(
                 "installation.shadowed",
-                f"another copy is on the path of this Python, and not used: {copy}",
+                f"another copy is on the path of this Python, but is not used: {copy}",
                 _remove(copy, installed.bin),
             )
     for name, place in installed.programs.items():

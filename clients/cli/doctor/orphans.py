@@ -37,7 +37,7 @@ def sockets(m: Machine) -> Iterator[Finding]:
                 clean = False
                 yield error(
                     "orphans.unlinked",
-                    f"a program holds {path} and its socket was removed: no client can reach it",
+                    f"a program holds {path} but its socket was removed: no client can reach it",
                     m.service("restart"),
                 )
             elif not held and not served:
@@ -60,11 +60,11 @@ def files(m: Machine) -> Iterator[Finding]:
     for name in aside:
         yield warning(
             "files.aside",
-            f"{folder}/{name} could not be used and was put aside; check the disk, then remove it",
+            f"{folder}/{name} could not be used and was set aside; check the disk, then remove it",
             f"{m.sudo}rm {folder}/{name}",
         )
     if not aside:
-        yield ok("files.sound", f"{folder}: nothing was put aside")
+        yield ok("files.sound", f"{folder}: nothing was set aside")
 
 
 def _state_folder(m: Machine) -> str:

@@ -23,7 +23,7 @@ def arbiters(m: Machine) -> Iterator[Finding]:
         spare = next((pid for pid in sorted(real, reverse=True) if pid != m.arbiter.pid), 0)
         yield warning(
             "ports.arbiters",
-            f"{len(real)} arbiters run and do not know each other: {named}",
+            f"{len(real)} arbiters run without knowing each other: {named}",
             f"{m.sudo}kill {spare}",
         )
     else:

@@ -98,7 +98,7 @@ def check_path(path: Path) -> None:
             raise ConfigError(f"the system's units cannot read {step}", hint=ELSEWHERE)
         if problem := writable_by_others(found):
             raise ConfigError(
-                f"{step} {problem}: that user could change what the units run",
+                f"{step} {problem}: this user could change what the units run",
                 hint=f"let it belong to root: chown root:root {step}; chmod go-w {step}",
             )
 

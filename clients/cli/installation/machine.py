@@ -24,7 +24,9 @@ def command(*argv: str) -> str:
             check=False,
         )  # fmt: skip
     except FileNotFoundError as error:
-        raise InstallFailed(f"{argv[0]} is not installed", hint="install it, then again") from error
+        raise InstallFailed(
+            f"{argv[0]} is not installed", hint="install it, then run the command again"
+        ) from error
     except subprocess.TimeoutExpired as error:
         raise InstallFailed(f"{' '.join(argv)}: no end after {COMMAND_S:g} s") from error
     if done.returncode:
@@ -44,7 +46,7 @@ class Services:
         if not _BOOTED.is_dir():
             raise ConfigError(
                 f"systemd does not run on this machine: {_BOOTED} is missing",
-                hint="in a container or a chroot write the files alone: --root /FOLDER",
+                hint="in a container or a chroot, write only the files: --root /FOLDER",
             )
         if not self.system and "XDG_RUNTIME_DIR" not in os.environ:
             raise ConfigError(

@@ -85,7 +85,7 @@ def _from_history(wanted: Range, endpoint: str | None) -> Story:
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(begin))
         raise EmptyTimeline(
             f"nothing happened since {since}, and no lease is held",
-            hint="ask for a longer time with --last or --since",
+            hint="choose a longer time with --last or --since",
         )
     reader = Reader(begin)
     for gpu in status.gpus:
@@ -187,7 +187,7 @@ def story_of(told: JsonMap, wanted: Range) -> Story:
     if begin >= end:
         raise EmptyTimeline(
             f"the event log ends at {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(end))}",
-            hint="ask for an earlier time with --since, or for --last",
+            hint="choose an earlier time with --since, or use --last",
         )
     reader = Reader(told["begin_wall_s"])
     for gpu in told["gpus"]:

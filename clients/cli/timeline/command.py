@@ -25,7 +25,7 @@ SUFFIXES = (".png", ".html", ".json")
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "-o", "--out", type=Path, required=True, metavar="FILE.{png,html,json}",
-        help="file to write; its ending says the form",
+        help="file to write; its suffix decides the format",
     )  # fmt: skip
     parser.add_argument(
         "--event-log", type=Path, metavar="LOG",
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if out.suffix == ".png":
         from vram_arbiter.schemas.runtime.extras import need
 
-        need("a timeline as .png (.html and .json need nothing)", "matplotlib", extra="runner")
+        need("a timeline as .png (.html and .json need no package)", "matplotlib", extra="runner")
     if args.event_log is not None:
         story = collect.from_log(args.event_log, Range(args.since_wall_s, args.last_s))
     else:

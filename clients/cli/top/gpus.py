@@ -81,7 +81,7 @@ def notices(status: StatusReply) -> list[str]:
     """Return what keeps the arbiter from granting at all, and problems of its own files."""
     found = []
     if status.phase == "recovering":
-        found.append("after a restart nothing is granted until every lease is accounted for")
+        found.append("restarted: nothing is granted until every lease is accounted for")
     if status.drained:
         found.append(f"drained by {status.drained}; nothing is granted until it is resumed")
     return [printable(line) for line in [*found, *status.problems]]

@@ -380,7 +380,7 @@ def test_a_gang_that_may_be_given_up_says_when_and_why() -> None:
     gives_up_at = driver.now + step["in_s"]
     assert step["action"] == "break"
     assert (
-        step["text"] == f"gives gang g up in {step['in_s']:.1f} s, if its memory is not free then"
+        step["text"] == f"gives up gang g in {step['in_s']:.1f} s, if its memory is not free then"
     )
     assert "lease_id" not in step or step["lease_id"] is None
     driver.advance(gives_up_at - 0.2 - driver.now)

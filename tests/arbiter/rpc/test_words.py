@@ -91,7 +91,7 @@ def test_every_wait_has_words() -> None:
         (
             r.Impractical.NOT_PINNED,
             False,
-            "its holder asked never to be evicted; that is its own to change",
+            "its holder asked never to be evicted, and only the holder can change that",
         ),
     ],
 )
@@ -106,7 +106,7 @@ def test_an_action_on_a_lease_that_is_over_names_its_end() -> None:
     """What the lease's own program would be told is no help to an operator."""
     over = words.error_view(r.TargetOver.of(r.Lost("L1-1", Why.PROCESS_DIED, 102)))
     assert (over.code, over.message) == ("lease_lost", "L1-1: process 102 died")
-    assert over.hint == "it is over; its story is in `vramctl history`"
+    assert over.hint == "it is over; see `vramctl history`"
 
 
 def test_an_operators_order_is_quoted_where_it_ended_a_lease() -> None:

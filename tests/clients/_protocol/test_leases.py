@@ -1,4 +1,4 @@
-"""Leases that the client's protocol holds: renewal, fencing, operations, re-attachment."""
+"""Leases that the client's protocol holds: renewal, fencing, operations, reattachment."""
 
 import pytest
 

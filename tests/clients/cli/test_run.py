@@ -129,7 +129,7 @@ def test_cuda_sees_the_granted_gpu(
         ([""], 127, "not found"),
         (["/"], 126, "is a directory"),
         ([__file__], 126, "permission denied"),
-        (["--pin", "--on-revoke", "term", "true"], 2, "exclude each other"),
+        (["--pin", "--on-revoke", "term", "true"], 2, "cannot be combined"),
         (["--gpu", "", "true"], 2, "--gpu: "),
         (["--name", "x\n", "true"], 2, "--name: "),
     ],

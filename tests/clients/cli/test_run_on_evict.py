@@ -216,7 +216,7 @@ def test_memory_that_a_server_does_not_free_is_not_granted(
         waiting = pool.submit(client.acquire, spec("b", 5), PATIENCE_S)
         told = run.said("vramctl status")
         assert "/free: answered 500: broken" in told
-        assert "the arbiter measures what the program keeps" in told
+        assert "the arbiter measures what the program retains" in told
 
         def explained() -> bool:
             (entry,) = client.why("b").leases
@@ -235,7 +235,7 @@ def test_a_restore_that_fails_gives_the_lease_back_and_keeps_the_program(
     urls = ("--url", "URL/free", "--restore-url", "URL/restore")
     with server(arbiter_daemon, "http", *urls, broken=["/restore"]) as (run, pid):
         client.acquire(spec("b", 5), PATIENCE_S).release()
-        told = run.said("goes on without one")
+        told = run.said("continues without one")
         assert "/restore: answered 500: broken" in told
         until(lambda: not client.status().leases)
         assert alive(pid)
@@ -251,11 +251,11 @@ def test_a_restore_that_fails_gives_the_lease_back_and_keeps_the_program(
         (["http", "--url", "http://192.0.2.1/free"], "--allow-remote"),
         (["http", "--url", "http://localhost/", "--body", "{"], "--body: expected JSON"),
         (["http", "--url", "http://localhost/", "--restore-body", "{}"], "needs --restore-url"),
-        (["vllm", "--method", "PUT"], "--method has no meaning for --on-evict vllm"),
-        (["stop", "--url", "http://localhost/"], "--url has no meaning for --on-evict stop"),
-        (["cuda-checkpoint", "--allow-remote"], "--allow-remote has no meaning"),
+        (["vllm", "--method", "PUT"], "--method has no effect with --on-evict vllm"),
+        (["stop", "--url", "http://localhost/"], "--url has no effect with --on-evict stop"),
+        (["cuda-checkpoint", "--allow-remote"], "--allow-remote has no effect"),
         (["stop", "--pin"], "leave out --on-evict stop"),
-        (["end", "--timeout", "5"], "--timeout has no meaning for --on-evict end"),
+        (["end", "--timeout", "5"], "--timeout has no effect with --on-evict end"),
         (["park"], "invalid choice"),
     ],
 )
@@ -285,5 +285,5 @@ def test_a_program_that_lives_on_is_bound_to_one_gpu() -> None:
     gpu = GpuView("GPU-1", 0, "x", "nvml", 8, 0, 0, 0, 0, 0.0, 0, None, ())
     check_gpus("any", [gpu])
     check_gpus("1", [gpu, gpu])
-    with pytest.raises(ConfigError, match=r"2 GPUs.*name it by --gpu"):
+    with pytest.raises(ConfigError, match=r"2 GPUs.*name one with --gpu"):
         check_gpus("any", [gpu, gpu])

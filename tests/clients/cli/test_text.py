@@ -111,7 +111,7 @@ def test_status_of_a_gpu_in_trouble() -> None:
         STATUS | {"phase": "recovering", "gpus": [gpu], "leases": [], "clients": 2}
     ) == [
         "arbiter recovering · epoch 3 · up 12 min · 2 clients",
-        "  after a restart nothing is granted until every lease is accounted for",
+        "  restarted: nothing is granted until every lease is accounted for",
         "",
         "GPU 0 Simulated GPU (GPU-1)",
         "  capacity 8 GiB: reserve 300 MiB + charged 5 GiB + stowaways 200 MiB",

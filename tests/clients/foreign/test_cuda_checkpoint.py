@@ -80,7 +80,7 @@ def test_all_cuda_processes_are_suspended_and_resumed() -> None:
 def test_a_process_that_cannot_be_suspended_leaves_none_suspended(step: str) -> None:
     driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
     driver.failing[step, 3] = State.RUNNING if step == "lock" else State.LOCKED
-    with pytest.raises(ActionFailed, match=f"{step} of pid 3 failed; the program runs on"):
+    with pytest.raises(ActionFailed, match=f"{step} of pid 3 failed; the program continues"):
         suspended(driver).free([2, 3])
     assert driver.states == {2: State.RUNNING, 3: State.RUNNING}
 

@@ -182,7 +182,7 @@ def test_a_user_that_was_named_is_believed(
 def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., object], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """libzmq reconnects by itself, to whatever listens then; the re-attachment holds every
+    """libzmq reconnects by itself, to whatever listens then; the reattachment holds every
     token."""
     with Client("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = client.acquire(spec("detector", 1))  # type: ignore[arg-type]

@@ -189,7 +189,7 @@ async def test_what_it_would_answer_wrongly_is_refused(short_folder: Path) -> No
             with pytest.raises(UnknownOp, match="no get_actions"):
                 await policy.call("get_actions")
             rtc = RealTimeChunking(left_over=((0.5,),), inference_delay=1, execution_horizon=1)
-            with pytest.raises(BadRequest, match="takes no left-over chunk"):
+            with pytest.raises(BadRequest, match="takes no remaining chunk"):
                 await policy.get_action({}, rtc=rtc)
 
 

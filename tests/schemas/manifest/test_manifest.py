@@ -194,7 +194,7 @@ def test_undeclared_joint_units_are_a_warning() -> None:
         ("ros_action", '"/navigate_to_pose"', '"navigate_to_pose"',
         "ros_integration.interface_name: 'navigate_to_pose' is not a full ROS name"),
         ("ros_service", '"{}"', '"[]"',
-        "ros_integration.default_goal_json: must be the text of a JSON object, not of a list"),
+        "ros_integration.default_goal_json: must be the text of a JSON object, not a list"),
         ("ros_service", '"{}"', '"{x}"',
         "ros_integration.default_goal_json: must be the text of a JSON object:"),
         ("reward", "progress_range: [0.0, 1.0]", "progress_range: [1.0, 0.0]",

@@ -165,8 +165,8 @@ PNG = bytes(8)
         ({}, "give 1 to 32 pictures"),
         ({"image": PNG, "images": [PNG] * PICTURES_MAX}, "give 1 to 32 pictures"),
         ({"images": [PNG] * (PICTURES_MAX + 1)}, "at most 32"),
-        ({"video": [PNG]}, "video and fps go together"),
-        ({"image": PNG, "fps": 2.0}, "video and fps go together"),
+        ({"video": [PNG]}, "video and fps belong together"),
+        ({"image": PNG, "fps": 2.0}, "video and fps belong together"),
         ({"video": [PNG], "fps": 0.0}, "greater than 0"),
     ],
 )

@@ -112,7 +112,7 @@ def test_a_holder_on_its_way_out() -> None:
     assert step["in_s"] == pytest.approx(d.REVOKE_DEADLINE_S, abs=0.1)
     assert (
         step["text"]
-        == "waits 30.0 s more for holder to release, after that w waits on, and the holder's "
+        == "waits 30.0 s more for holder to release, after that w continues to wait, and the holder's "
         "own rule applies"
     )
     driver.advance(d.REVOKE_DEADLINE_S + 0.1)
@@ -146,7 +146,10 @@ def test_a_load_under_way() -> None:
     driver.advance(0.01)
     driver.consumer("w").acquire(3 * GIB)
     step = only(driver)
-    assert (step["text"], step["in_s"]) == ("lets loader finish loading, one loads at a time", None)
+    assert (step["text"], step["in_s"]) == (
+        "lets loader finish loading, only one model loads at a time",
+        None,
+    )
 
     known = CoreDriver(settings={"learnt": {"loader": {"load_s": 4.0}}})
     known.consumer("loader").acquire(3 * GIB)
@@ -171,7 +174,7 @@ def test_a_gpu_that_cannot_be_read_and_one_that_shows_no_room() -> None:
     silent.device.silent = True
     silent.advance(3)
     silent.consumer("w").acquire(3 * GIB)
-    assert only(silent)["text"].endswith("the ledger has room, the GPU has to show it")
+    assert only(silent)["text"].endswith("the ledger has room, but the GPU has to show it")
 
 
 def test_pressure_plans_nothing_of_its_own() -> None:
@@ -251,7 +254,7 @@ def test_the_estimate_behind_others_counts_their_loads() -> None:
     driver.consumer("third").acquire(3 * GIB)
     assert driver.state(lease) == "revoking"
     assert eta(driver, "head") == pytest.approx(2.0 + 3.0)
-    assert eta(driver, "second") == pytest.approx(2.0 + 3.0 + 3.0), "one loads at a time"
+    assert eta(driver, "second") == pytest.approx(2.0 + 3.0 + 3.0), "only one model loads at a time"
     assert eta(driver, "third") is None, "head and second have to leave for it; it is unknown when"
 
 
