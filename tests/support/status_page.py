@@ -11,16 +11,22 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import until
 
 REPLY_S = 60.0
 """Every wait here is for something that comes; a busy machine may take its time over it."""
 LISTEN = ("--http", "127.0.0.1:0")
 
 
-def port_of(arbiter: ArbiterProcess) -> int:
-    """The port that the newest start of a daemon named in its log."""
-    found: list[str] = re.findall(r"status page: http://127\.0\.0\.1:(\d+)", arbiter.log)
-    return int(found[-1])
+def port_of(arbiter: ArbiterProcess, starts: int = 1) -> int:
+    """Return the port that a daemon named in its log at its last of so many starts. A thread writes
+    the log, so the line may come after READY."""
+
+    def named() -> list[str]:
+        found = re.findall(r"status page: http://127\.0\.0\.1:(\d+)", arbiter.log)
+        return found if len(found) >= starts else []
+
+    return int(until(named)[-1])
 
 
 @dataclass(frozen=True, slots=True)

@@ -244,7 +244,7 @@ def test_a_restart_and_a_stop_end_the_stream(make_arbiter: Any) -> None:
         assert serving_arbiter.stop() == 0
         assert [name for name, _ in page.events() if name == "snapshot"] == []
     serving_arbiter.start()
-    with EventStream(port_of(serving_arbiter)) as page:
+    with EventStream(port_of(serving_arbiter, starts=2)) as page:
         kinds = [event["kind"] for event in page.until("history")["events"]]
     assert kinds[-2:] == ["stopped", "started"] or {"stopped", "started"} <= set(kinds)
 
