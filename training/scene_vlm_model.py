@@ -1,4 +1,4 @@
-"""The demo's scene VLM: parameters, processor and network of a small Qwen3.5."""
+"""Network, tokenizer and processor of the small scene VLM: a Qwen3.5."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from vram_arbiter.sidecars.training import common, questions
+from training.common import Recipe
+from training.questions import corpus
+from training.tokens import byte_alphabet, learn_merges
 
 SPECIALS: Final = (
     "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>",
@@ -30,36 +32,36 @@ CHAT_TEMPLATE: Final = (
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class VlmRecipe:
-    """Parameters of a run beside its data."""
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class VlmRecipe(Recipe):
+    """Parameters of a run; `steps` and the time limit are those of the language stage.
+
+    `split_seed` stays when a run continues another with another seed.
+    """
 
     seed: int = 7
-    threads: int = 1
-    cameras: tuple[str, ...] = ("wrist",)
+    steps: int = 900
+    batch: int = 16
+    time_limit_s: float = 3600.0
+    vision_steps: int = 1200
+    both_steps: int = 150
+    camera: str = "wrist"
     # patches across and down; even, as 2 x 2 of them make one token
     grid: tuple[int, int] = (14, 10)
     patch_px: int = 16
     vision_width: int = 128
     vision_layers: int = 3
     width: int = 128
-    layer_types: tuple[str, ...] = (
-        "linear_attention",
-        "full_attention",
-        "full_attention",
-        "full_attention",
-    )
-    batch: int = 16
+    layer_types: tuple[str, ...] = ("linear_attention", *["full_attention"] * 3)
     questions_per_image: int = 3
-    vision_steps: int = 1200
-    language_steps: int = 900
-    steps: int = 150
-    language_budget_s: float = 3600.0
     learning_rate: float = 1.0e-3
     held_out: float = 0.12
-    split_seed: int = (
-        0  # not the seed of the run: a run that continues another keeps its held-out scenes
-    )
+    split_seed: int = 0
+
+    @property
+    def tokens(self) -> int:
+        """Image tokens of a picture."""
+        return self.grid[0] * self.grid[1] // 4
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -69,7 +71,7 @@ class VlmRecipe:
 
 SMOKE: Final = VlmRecipe(
     grid=(8, 6), vision_width=32, vision_layers=1, width=32, batch=6,
-    vision_steps=6, language_steps=6, steps=4, held_out=0.25,
+    vision_steps=6, steps=6, both_steps=4, held_out=0.25,
 )  # fmt: skip
 
 
@@ -87,9 +89,9 @@ def build_processor(folder: Path, recipe: VlmRecipe, names: Sequence[str]) -> An
 
     blank = Qwen2TokenizerFast(vocab={"<|endoftext|>": 0}, merges=[])
     split = blank.backend_tokenizer.pre_tokenizer
-    words = {piece for text in questions.corpus(names) for piece, _ in split.pre_tokenize_str(text)}
-    tokens, merges = common.learn_merges(words, suffix="")
-    vocab = dict.fromkeys([*common.byte_alphabet(), *tokens, *SPECIALS])
+    words = {piece for text in corpus(names) for piece, _ in split.pre_tokenize_str(text)}
+    tokens, merges = learn_merges(words, suffix="")
+    vocab = dict.fromkeys([*byte_alphabet(), *tokens, *SPECIALS])
     tokenizer = Qwen2TokenizerFast(
         vocab={token: index for index, token in enumerate(vocab)},
         merges=merges,
@@ -233,7 +235,5 @@ def take_over(model: Any, start: Path) -> None:
     earlier = type(model).from_pretrained(start, local_files_only=True)
     weights = earlier.state_dict()
     if earlier.config.text_config.layer_types != model.config.text_config.layer_types:
-        weights = {
-            name: value for name, value in weights.items() if name.startswith("model.visual.")
-        }
+        weights = {name: w for name, w in weights.items() if name.startswith("model.visual.")}
     model.load_state_dict(weights, strict=False)

@@ -1,4 +1,4 @@
-"""The demo's detector: parameters, tokenizer, processor and network of a small OwlViT."""
+"""Network, tokenizer and processor of the small detector: an OwlViT."""
 
 from __future__ import annotations
 
@@ -7,18 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from vram_arbiter.sidecars.training import common
+from training.common import Recipe
+from training.tokens import byte_alphabet, learn_merges
 
 PAD, START, END = "<|pad|>", "<|startoftext|>", "<|endoftext|>"
 MAX_TOKENS: Final = 16
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Recipe:
-    """Parameters of a run beside its data."""
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorRecipe(Recipe):
+    """Parameters of a run; `split_seed` stays when a run continues another with another seed."""
 
     seed: int = 7
-    threads: int = 1
+    steps: int = 3000
+    batch: int = 16
+    time_limit_s: float = 3600.0
     camera: str = "front"
     image_px: int = 400
     patch_px: int = 20
@@ -27,42 +30,31 @@ class Recipe:
     heads: int = 2
     text_width: int = 64
     text_layers: int = 2
-    batch: int = 16
     learning_rate: float = 1.5e-3
-    budget_s: float = 3600.0
-    max_steps: int = 3000
     held_out: float = 0.12
-    split_seed: int = (
-        7  # not the seed of the run: a run that continues another keeps its held-out scenes
-    )
+    split_seed: int = 7
     strange_queries: int = 10
     word_steps: int = 250
 
 
-SMOKE: Final = Recipe(
+SMOKE: Final = DetectorRecipe(
     image_px=128, patch_px=16, width=48, layers=2, text_width=32, text_layers=1, batch=8,
-    budget_s=8.0, max_steps=30, held_out=0.25, strange_queries=4, word_steps=40,
+    steps=30, held_out=0.25, strange_queries=4, word_steps=40,
 )  # fmt: skip
 
 
-def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
-    """Write a CLIP-format BPE tokenizer.
+def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
+    """Write processor and tokenizer, a BPE in CLIP's format. Returns the processor.
 
     Pad is id 0 (OWL masks queries that start with it), end the greatest id.
     """
-    from transformers import CLIPTokenizer
+    from transformers import CLIPTokenizer, OwlViTImageProcessor, OwlViTProcessor
 
-    alphabet = common.byte_alphabet()
-    tokens, merges = common.learn_merges(words, suffix="</w>")
-    vocab = [
-        PAD,
-        *alphabet,
-        *(letter + "</w>" for letter in alphabet),
-        *dict.fromkeys(tokens),
-        START,
-        END,
-    ]
-    tokenizer = CLIPTokenizer(
+    alphabet = byte_alphabet()
+    tokens, merges = learn_merges(words, suffix="</w>")
+    closed = [letter + "</w>" for letter in alphabet]
+    vocab = [PAD, *alphabet, *closed, *dict.fromkeys(tokens), START, END]
+    CLIPTokenizer(
         vocab={token: index for index, token in enumerate(vocab)},
         merges=merges,
         unk_token=END,
@@ -70,25 +62,17 @@ def build_tokenizer(folder: Path, words: Sequence[str]) -> None:
         eos_token=END,
         pad_token=PAD,
         model_max_length=MAX_TOKENS,
-    )
-    tokenizer.save_pretrained(folder)
-
-
-def build_processor(folder: Path, image_px: int, words: Sequence[str]) -> Any:
-    """Return the processor as `AutoProcessor` will read it back from `folder`."""
-    from transformers import CLIPTokenizer, OwlViTImageProcessor, OwlViTProcessor
-
-    build_tokenizer(folder, words)
+    ).save_pretrained(folder)
     size = {"height": image_px, "width": image_px}
-    image_processor = OwlViTImageProcessor(size=size, crop_size=size, do_center_crop=False)
     processor = OwlViTProcessor(
-        image_processor=image_processor, tokenizer=CLIPTokenizer.from_pretrained(folder)
+        image_processor=OwlViTImageProcessor(size=size, crop_size=size, do_center_crop=False),
+        tokenizer=CLIPTokenizer.from_pretrained(folder),
     )
     processor.save_pretrained(folder)
     return processor
 
 
-def build_model(recipe: Recipe, tokenizer: Any) -> Any:
+def build_model(recipe: DetectorRecipe, tokenizer: Any) -> Any:
     """Return a new OwlViT. Its position tables start as sines, so it need not learn adjacency."""
     import torch
     from transformers import OwlViTConfig, OwlViTForObjectDetection

@@ -12,7 +12,7 @@ SHAPE_WORDS: Final = {
     "ball": ("ball", "sphere", "round ball"),
     "cylinder": ("cylinder", "can", "tin"),
 }
-OTHER_COLOURS: Final = ("white", "black", "pink", "brown", "grey", "cyan", "silver", "golden")
+OTHER_COLORS: Final = ("white", "black", "pink", "brown", "grey", "cyan", "silver", "golden")
 OTHER_THINGS: Final = (
     "mug", "banana", "spoon", "bottle", "apple", "person", "chair", "screwdriver", "plate",
     "book", "phone", "dog", "scissors", "bowl", "pen", "shoe", "lamp", "key", "hammer", "tomato",
@@ -36,20 +36,21 @@ class Query:
     """
 
     text: str
-    colour: str | None
+    color: str | None
     shape: str | None
     known: bool = True
 
-    def matches(self, colour: str, shape: str) -> bool:
-        """Return whether an object of this color and shape answers the query."""
-        return self.known and self.colour in (None, colour) and self.shape in (None, shape)
+    def matches(self, name: str) -> bool:
+        """Return whether an object of this name, `COLOR SHAPE`, answers the query."""
+        color, shape = name.split(" ", 1)
+        return self.known and self.color in (None, color) and self.shape in (None, shape)
 
 
-def every_word(colours: Sequence[str], shapes: Sequence[str]) -> list[str]:
+def every_word(colors: Sequence[str], shapes: Sequence[str]) -> list[str]:
     """Return the words that a tokenizer should know as one piece, sorted."""
     words = {
-        *colours,
-        *OTHER_COLOURS,
+        *colors,
+        *OTHER_COLORS,
         *OTHER_THINGS,
         *THING_WORDS,
         *(s for s in shapes if s not in SHAPE_WORDS),
@@ -67,21 +68,21 @@ def every_word(colours: Sequence[str], shapes: Sequence[str]) -> list[str]:
 
 
 def sample_queries(
-    rng: random.Random, colours: Sequence[str], shapes: Sequence[str], strange: int
+    rng: random.Random, colors: Sequence[str], shapes: Sequence[str], strange: int
 ) -> list[Query]:
     """Return every (color, shape), every color, every shape in random words, and `strange` ones.
 
     Nothing can answer a strange query.
     """
     out: list[Query] = []
-    for colour in colours:
+    for color in colors:
         for shape in shapes:
-            out.append(Query(_say(rng, f"{colour} {_shape_word(rng, shape)}"), colour, shape))
-        out.append(Query(_say(rng, f"{colour} {rng.choice(THING_WORDS)}"), colour, None))
+            out.append(Query(_say(rng, f"{color} {_shape_word(rng, shape)}"), color, shape))
+        out.append(Query(_say(rng, f"{color} {rng.choice(THING_WORDS)}"), color, None))
     out += [Query(_say(rng, _shape_word(rng, shape)), None, shape) for shape in shapes]
     for _ in range(strange):
-        colour = rng.choice(OTHER_COLOURS) if rng.random() < 0.5 else rng.choice(colours)
-        if colour in OTHER_COLOURS and rng.random() < 0.6:
+        color = rng.choice(OTHER_COLORS) if rng.random() < 0.5 else rng.choice(colors)
+        if color in OTHER_COLORS and rng.random() < 0.6:
             noun = _shape_word(rng, rng.choice(shapes))
         elif rng.random() < 0.4:
             noun = "".join(
@@ -89,7 +90,7 @@ def sample_queries(
             )
         else:
             noun = rng.choice(OTHER_THINGS)
-        text = noun if noun in OTHER_THINGS and rng.random() < 0.3 else f"{colour} {noun}"
+        text = noun if noun in OTHER_THINGS and rng.random() < 0.3 else f"{color} {noun}"
         out.append(Query(_say(rng, text), None, None, known=False))
     return out
 

@@ -1,10 +1,10 @@
-"""Questions about a camera's picture, and the true answers: words only, no model, no images."""
+"""Questions about a camera's picture, and the true answers: words only, no images."""
 
 from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 GRASPED: Final = (
     "Has the robot gripper grasped the {}?",
@@ -51,6 +51,19 @@ SYNONYMS: Final = {
 NOTHING: Final = "nothing"
 
 
+def as_prompt(processor: Any, question: str) -> str:
+    """Return the chat of one picture and a question, ready for the answer."""
+    content = [{"type": "image"}, {"type": "text", "text": question}]
+    chat = [{"role": "user", "content": content}]
+    return str(processor.apply_chat_template(chat, add_generation_prompt=True, tokenize=False))
+
+
+def alike(held: str | None, names: Sequence[str]) -> list[str]:
+    """Return the other names that share color or shape with the held object."""
+    words = set((held or "").split(" "))
+    return [name for name in names if name != held and set(name.split(" ")) & words]
+
+
 def with_article(name: str) -> str:
     """Return the name with its article: `a red cube`, `an orange ball`."""
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
@@ -58,9 +71,9 @@ def with_article(name: str) -> str:
 
 def said(rng: random.Random, template: str, name: str) -> str:
     """Return the question about a name, the shape sometimes by a synonym."""
-    colour, shape = name.split(" ", 1)
+    color, shape = name.split(" ", 1)
     word = shape if rng.random() < 0.85 else rng.choice(SYNONYMS.get(shape, (shape,)))
-    text = template.format(f"{colour} {word}")
+    text = template.format(f"{color} {word}")
     return text.replace(" a orange", " an orange")
 
 
@@ -109,8 +122,8 @@ def corpus(names: Sequence[str]) -> list[str]:
     for name in names:
         for template in (*GRASPED, *PRESENT):
             texts.append(template.format(name))
-            colour, shape = name.split(" ", 1)
-            texts += [f"{colour} {word}" for word in SYNONYMS.get(shape, (shape,))]
+            color, shape = name.split(" ", 1)
+            texts += [f"{color} {word}" for word in SYNONYMS.get(shape, (shape,))]
         texts += [grasped(rng, name, held)[1] for held in (name, None)]
         texts += [present(rng, name, seen)[1] for seen in ([name], [])]
         texts += [listing(rng, [name])[1], listing(rng, [name, name])[1], f"an {name}"]
