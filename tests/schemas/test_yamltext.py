@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.support.deployment import load_robot
 from vram_arbiter.schemas.config.arbiter import load_config
-from vram_arbiter.schemas.config.robot import load_robot
 from vram_arbiter.schemas.config.scenario import load_scenario
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
