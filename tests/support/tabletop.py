@@ -1,4 +1,4 @@
-"""The simulated tabletop as tests use it: the scripted grab played to its end, and what it shows."""
+"""The simulated tabletop: its names, the scripted grab played to its end, and pictures of it."""
 
 import io
 

@@ -13,7 +13,7 @@ PAGES = [ROOT / "training/README.md", *sorted((CONFIGS / "models").rglob("README
 COMMAND = re.compile(r"python -m training ([^`\n]*)")
 
 
-def commands() -> list[str]:
+def commands_of_pages() -> list[str]:
     """Commands of README and model cards, in blocks and in sentences."""
     texts = [page.read_text(encoding="utf-8").replace("\\\n", " ") for page in PAGES]
     return [command for text in texts for command in COMMAND.findall(text)]
@@ -21,7 +21,7 @@ def commands() -> list[str]:
 
 def test_commands_of_the_pages_are_accepted() -> None:
     parser, whole = make_parser(), 0
-    for command in commands():
+    for command in commands_of_pages():
         words = shlex.split(command, comments=True)
         if "--out" in words:
             parser.parse_args(words)

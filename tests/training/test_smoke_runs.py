@@ -65,7 +65,7 @@ def progress(folder: Path) -> None:
     assert any(label["held"] for label in labels), "some grabs succeed"
 
 
-def observation() -> dict[str, Any]:
+def blank_observation() -> dict[str, Any]:
     pixels = {"front": (360, 480, 3), "wrist": (240, 320, 3)}
     images = {f"observation.images.{key}": np.zeros(pixels[key], np.uint8) for key in pixels}
     return images | {"observation.state": np.zeros(6, np.float32), "task": "grab the red cube"}
@@ -98,7 +98,7 @@ CASES = (
     Case(
         "policy", grabs, "action", "so101-grab",
         lambda: EndpointCall(
-            endpoint="get_action", data={"observation": observation(), "options": None}
+            endpoint="get_action", data={"observation": blank_observation(), "options": None}
         ),
     ),
     Case(

@@ -100,7 +100,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Weig
     return checkpoint
 
 
-def loaded(name: str, weights: Weights, dtype: str | None = None) -> PolicyAdapter:
+def load_policy(name: str, weights: Weights, dtype: str | None = None) -> PolicyAdapter:
     adapter = make_adapter(manifest_of(name, dtype), weights)
     assert isinstance(adapter, PolicyAdapter)
     adapter.prepare()
@@ -178,7 +178,7 @@ def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: st
     import torch
 
     weights = checkpoint(name)
-    adapter = loaded(name, weights)
+    adapter = load_policy(name, weights)
     queues = FAMILIES[family_of(name)].queues
     rows = ROWS[name]
     played = rows if queues else min(rows, CHUNK_ROWS_PLAYED)
@@ -209,7 +209,7 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
     import torch
 
     weights = checkpoint("lingbot_va")
-    adapter = loaded("lingbot_va", weights)
+    adapter = load_policy("lingbot_va", weights)
     assert len(adapter.networks) == 3
     shared = HostWeights(adapter.networks, "test")
     sizes = [sum(p.nbytes for p in network.parameters()) for network in adapter.networks]
@@ -293,7 +293,7 @@ def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weig
     import numpy as np
     import torch
 
-    adapter = loaded("vqbet", checkpoint("vqbet"))
+    adapter = load_policy("vqbet", checkpoint("vqbet"))
     first, second, third, fourth = observations(4)
 
     def after(*asked: dict[str, Any]) -> Any:
@@ -323,7 +323,7 @@ def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name:
     supported = FAMILIES[family_of(name)].precisions
     (observation,) = observations(1)
     for dtype in sorted({"bf16", "fp16"} & supported):
-        adapter = loaded(name, weights, dtype)
+        adapter = load_policy(name, weights, dtype)
         wanted = {"bf16": torch.bfloat16, "fp16": torch.float16}[dtype]
         kinds = {tensor.dtype for tensor in adapter.networks[0].parameters()}
         assert wanted in kinds
@@ -434,11 +434,11 @@ def test_what_cannot_act_is_refused(checkpoint: Callable[[str], Weights], tmp_pa
     save_file(load_file(file) | {flag: torch.tensor(False)}, file)
     weights = Weights(str(file.parent), local=True)
     with pytest.raises(ModelError, match="the quantizer of its actions is not trained"):
-        loaded("vqbet", weights)
+        load_policy("vqbet", weights)
     config = file.parent / "config.json"
     config.write_text(config.read_text().replace('"use_peft": false', '"use_peft": true'))
     with pytest.raises(ModelError, match="is a PEFT adapter"):
-        loaded("vqbet", weights)
+        load_policy("vqbet", weights)
 
 
 @pytest.mark.parametrize(
@@ -482,7 +482,7 @@ def test_a_guided_chunk_continues_the_one_before(
     import numpy as np
     import torch
 
-    adapter = loaded(name, checkpoint(name))
+    adapter = load_policy(name, checkpoint(name))
     observation = observations(1)[0]
     left_over = np.random.default_rng(2).normal(3.0, 2.0, (4, DIM)).astype(np.float32)
     policy = adapter._policy
@@ -517,7 +517,7 @@ def test_a_guided_chunk_continues_the_one_before(
 def test_a_policy_that_cannot_be_guided_refuses_a_left_over_chunk(
     checkpoint: Callable[[str], Weights], name: str
 ) -> None:
-    adapter = loaded(name, checkpoint(name))
+    adapter = load_policy(name, checkpoint(name))
     rtc = {"left_over": [[0.0] * DIM], "inference_delay": 1, "execution_horizon": 1}
     data = {"observation": observations(1)[0]}
     with pytest.raises(BadRequest, match="takes no left-over chunk"):
@@ -530,7 +530,7 @@ def test_tokens_that_are_no_actions_never_leave(
     checkpoint: Callable[[str], Weights], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: lerobot logs the failure and answers the middle of each joint's range."""
-    adapter = loaded("pi0_fast", checkpoint("pi0_fast"))
+    adapter = load_policy("pi0_fast", checkpoint("pi0_fast"))
     monkeypatch.setattr(policies.FastTokenizer, "decode", lambda self, tokens: None)
     with pytest.raises(ModelError, match="cannot be decoded into actions"):
         ask(adapter, observations(1)[0])
@@ -602,6 +602,6 @@ def test_a_pinned_revision_is_what_is_loaded(
         return folder
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
-    adapter = loaded("pi05", Weights("field/pi05", "0f1e2d"))
+    adapter = load_policy("pi05", Weights("field/pi05", "0f1e2d"))
     assert asked == [("field/pi05", "0f1e2d")]
     assert ask(adapter, observations(1)[0]).shape == (ROWS["pi05"], DIM)
