@@ -11,8 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from training import detector, policy, progress, record_grabs, record_progress, record_scenes
-from training import scene_vlm as vlm
+from training import (
+    detector,
+    policy,
+    progress,
+    record_grabs,
+    record_progress,
+    record_scenes,
+    scene_vlm,
+)
 from training.common import BadInput, Recipe, Trainer, write_card
 from vram_arbiter.schemas.plain import JsonObject
 
@@ -23,7 +30,7 @@ RECORDERS: Final = {
 }
 TRAINERS: Final = {
     "detector": detector.TRAINER,
-    "scene-vlm": vlm.TRAINER,
+    "scene-vlm": scene_vlm.TRAINER,
     "policy": policy.TRAINER,
     "progress": progress.TRAINER,
 }
@@ -78,6 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     try:
         if args.command == "record":
+            if args.count < 1:
+                raise BadInput(f"--count must be above 0, got {args.count}")
             more = {"policy": args.policy} if "policy" in args else {}
             figures = args.recorder(args.out, args.count, args.seed, **more)
         else:

@@ -170,7 +170,7 @@ def read_tries(
     infos = [_info_of(folder, kind) for folder in folders]
     joined = {}
     for name in columns:
-        parts = [np.load(folder / f"{name}.npy") for folder in folders]
+        parts = [np.load(_existing(folder / f"{name}.npy", kind)) for folder in folders]
         for folder, info, part in zip(folders, infos, parts, strict=True):
             if len(part) != sum(info["lengths"]):
                 raise BadInput(
@@ -183,7 +183,10 @@ def read_tries(
 
 def _info_of(folder: Path, kind: str) -> JsonObject:
     path = _existing(folder / INFO, kind)
-    info: JsonObject = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        info: JsonObject = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise BadInput(f"{path}: {error}") from error
     if info.get("kind") != kind:
         raise BadInput(f"{path} is of kind {info.get('kind')!r}, expected {kind!r}")
     return info

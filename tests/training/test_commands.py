@@ -37,6 +37,7 @@ def test_commands_of_the_pages_are_accepted() -> None:
         ("scene-vlm", "labels.jsonl is missing"),
         ("policy", "info.json is missing: record with `python -m training record grabs"),
         ("progress", "info.json is missing"),
+        ("detector --start-from x --batch 0", "--batch must be above 0, got 0"),
         ("progress --time-limit-s 0", "--time-limit-s must be above 0, got 0.0"),
     ],
 )
@@ -46,3 +47,5 @@ def test_what_cannot_be_trained_with_ends_with_status_2(
     folders = ["--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*arguments.split(), *folders]) == 2
     assert said in capsys.readouterr().err
+    assert main(["record", "progress", "--count", "0", "--out", str(tmp_path)]) == 2
+    assert "--count must be above 0, got 0" in capsys.readouterr().err
