@@ -75,7 +75,6 @@ COMMANDS: Mapping[str, Command] = {
     "hooks": Command("hooks", "run commands and webhooks for events"),
     "mcp": Command("mcp", "serve status, why and history to agents"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
-    "simulate": Command("offline", "simulate a scenario under one policy or more", passes_on=True),
     "demo": Command("demo", "run find, navigate, grab on a simulated arm inside 8 GiB"),
 }
 

@@ -110,7 +110,7 @@ class Gangs(Feature):
             self._deny(core, gang, no.GangTooLarge(gang.name, len(waiting), needed, budgets))
             return
         gang.phase = "waiting"
-        ageing_s = core.settings.ageing_s_per_point if core.policy.by_priority else 0.0
+        ageing_s = core.settings.ageing_s_per_point
         for lease in waiting:
             lease.request.rank = gang.first_at - gang.priority * ageing_s
             core.enqueue(lease)

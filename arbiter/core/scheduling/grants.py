@@ -241,7 +241,7 @@ def choose_later(core: Core, gpu: Gpu, head: Lease, *, planned: bool) -> Lease |
     `planned`: with the leases gone whose bytes are pending free, `head` fits.
     """
     ledger, queue = gpu.ledger, gpu.queue
-    if head.spec.exclusive or not core.policy.backfill:
+    if head.spec.exclusive:
         return None
     fold = _largest_fold_bytes(gpu)
     smallest, free = queue.smallest_need_bytes() - fold, ledger.budget_bytes - ledger.total_bytes()

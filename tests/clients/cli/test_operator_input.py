@@ -58,7 +58,6 @@ def typed(done: Finished) -> str:
         ("drain", "-r", " "), ("resume", "-r", "a\tb"), ("why", ""), ("why", "x\ny"),
         ("history", "-n", "0"), ("history", "--since", "yesterday"), ("replay",),
         ("replay", "x", "--policy", "best"),
-        ("simulate", "desktop", "--timeline", "-3"),
     ],
 )  # fmt: skip
 def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
@@ -231,9 +230,6 @@ def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) 
         assert says in (done.stdout if code == 0 else one_line(done))
     assert "no event log here" in one_line(
         vramctl("replay", str(tmp_path / "nothing"), environ=environ)
-    )
-    assert "one that is shipped: desktop" in one_line(
-        vramctl("simulate", "nothing", environ=environ)
     )
     assert json.loads(
         vramctl("replay", str(tmp_path / "nothing"), "--json", environ=environ).stdout

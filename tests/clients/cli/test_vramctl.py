@@ -105,7 +105,7 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
 EVERY_COMMAND = (
     "status", "why", "history", "watch", "top",
     "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
-    "hooks", "mcp", "replay", "simulate", "demo",
+    "hooks", "mcp", "replay", "demo",
 )  # fmt: skip
 
 
@@ -135,8 +135,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     ]
     lines += [
         ["vram_arbiter.schemas", "check", flag],
-        ["vram_arbiter.arbiter.lab", "replay", flag],
-        ["vram_arbiter.arbiter.lab", "simulate", flag],
+        ["vram_arbiter.arbiter.offline", "replay", flag],
     ]
     done = subprocess.run(
         [sys.executable, "-c", program, json.dumps(lines)],
@@ -144,9 +143,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     wanted = "vram-arbiter " if flag == "--version" else "sage: "
-    through_a_program = {
-        f"vram_arbiter.clients {command} {flag}" for command in ("replay", "simulate")
-    }
+    through_a_program = {f"vram_arbiter.clients replay {flag}"}
     wrong = {
         line: said for line, said in json.loads(done.stdout.splitlines()[-1]).items()
         if wanted not in said and line not in through_a_program

@@ -1,4 +1,4 @@
-"""Outcome of a run, logged or simulated: waits, switches, evictions and bytes, per consumer.
+"""Outcome of a simulated run: waits, switches, evictions and bytes per consumer, and their table.
 
 It counts and decides nothing.
 """
@@ -8,16 +8,22 @@ from dataclasses import asdict, dataclass, field
 from typing import Final
 
 from vram_arbiter.arbiter.core.effects import Effect, Note
-from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.notes import DeniedNote, GrantedNote, RevokeAskedNote, SwitchNote
 
-SHARES: Final = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+SHARES: Final = (0.5, 0.99, 1.0)
 """Waits that are shown: the one that this share of the jobs does not exceed."""
+STARVED_S = 60.0
+"""A job that waits longer than this counts as starved."""
+HEAD: Final = (
+    "policy", "consumer", "jobs", "unserved", "p50 wait", "p99", "max", f">{STARVED_S:.0f} s",
+    "switches", "loads", "evicted", "denied", "OOM", "moved", "peak",
+)  # fmt: skip
 
 
 @dataclass(slots=True)
 class Tally:
-    """Outcome of one consumer."""
+    """Outcome of one consumer. `waits_s`: from the arrival of a job until its model is there."""
 
     jobs: int = 0
     unserved: int = 0  # still waiting at the end; their wait so far is in waits_s
@@ -27,7 +33,6 @@ class Tally:
     loaded_bytes: int = 0
     ooms: int = 0
     waits_s: list[float] = field(default_factory=list)
-    """From the arrival of a job until its model is there; 0 if it was."""
 
     def wait_s(self, share: float) -> float:
         """Return the wait that this share of the jobs does not exceed."""
@@ -47,10 +52,11 @@ class Outcome:
     timeline: list[tuple[float, Note]] = field(default_factory=list)
 
     def of(self, consumer: str) -> Tally:
+        """Return the tally of a consumer."""
         return self.consumers.setdefault(consumer, Tally())
 
     def watch(self, at_s: float, effects: Sequence[Effect]) -> None:
-        """Count notes of the engine."""
+        """Count notes of the scheduler."""
         for effect in effects:
             if not isinstance(effect, Note):
                 continue
@@ -69,26 +75,27 @@ class Outcome:
 
     @property
     def total(self) -> Tally:
-        """Of all consumers."""
+        """Sum over all consumers."""
         columns = zip(*(asdict(tally).values() for tally in self.consumers.values()), strict=True)
         return Tally(*(sum(column[1:], column[0]) for column in columns))
 
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return the row of all, then those of the consumers, in the columns of HEAD."""
+        rows = []
+        for name, tally in [("", self.total), *sorted(self.consumers.items())]:
+            starved = sum(wait > STARVED_S for wait in tally.waits_s)
+            waits = [f"{tally.wait_s(share):.1f} s" for share in SHARES]
+            moved, peak = format_bytes(tally.loaded_bytes), format_bytes(self.peak_bytes)
+            counts = [tally.loads, tally.evicted, tally.denied, tally.ooms, moved]
+            last = ["", *counts, ""] if name else [self.switches, *counts, peak]
+            cells = [self.policy, name, tally.jobs, tally.unserved, *waits, starved, *last]
+            rows.append(tuple(map(str, cells)))
+        return rows
 
-def as_plain(outcome: Outcome) -> JsonObject:
-    """Return the outcome for `--json`, without the timeline."""
-    return {
-        "policy": outcome.policy,
-        "seconds": outcome.seconds,
-        "switches": outcome.switches,
-        "peak_bytes": outcome.peak_bytes,
-        "total": _plain_tally(outcome.total),
-        "consumers": {
-            name: _plain_tally(tally) for name, tally in sorted(outcome.consumers.items())
-        },
-    }
 
-
-def _plain_tally(tally: Tally) -> JsonObject:
-    counts = asdict(tally)
-    del counts["waits_s"]
-    return counts | {f"wait_{name}_s": tally.wait_s(share) for name, share in SHARES.items()}
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Return the rows of several runs in columns as wide as their longest cell."""
+    rows = [HEAD, *(row for outcome in outcomes for row in outcome.rows())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+    return "\n".join(lines)

@@ -1,8 +1,9 @@
-"""Ports of other programs' scheduling rules, against the same consumers and GPUs:
-`python -m tests.bench.other_rules [SCENARIO …]` prints the tables of docs/explanation/policies.md.
+"""The engine beside ports of other programs' scheduling rules, with the same consumers and GPU:
+`python -m tests.bench.policies.rules [SCENARIO …]` prints the figures of
+docs/explanation/policies.md.
 
-For comparison only. They get the same events and answer with the same effects as the engine, but
-decide as their originals do, by these sources:
+The ports get the same events and answer with the same effects as the engine, but decide as their
+originals do, by these sources:
 
 - `unmanaged`: no decision, every process loads at once, as without any of these programs.
 - `ollama_rules` (ollama, server/sched.go): first come first served. A model that fits into free
@@ -19,21 +20,24 @@ priorities, pins or load peaks.
 import argparse
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).parents[2])]
+    sys.path[:0] = [str(Path(__file__).parents[3] / "src"), str(Path(__file__).parents[3])]
 
-from tests.support.paths import ROOT
+from tests.bench.policies.actors import START_S
+from tests.bench.policies.outcome import Outcome, table
+from tests.bench.policies.scenarios import SCENARIOS, Scenario
+from tests.bench.policies.simulator import World
+from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     ClientConnected,
     Event,
     MemorySampled,
-    ProcessDied,
     ReadyReported,
     ReleaseReported,
     Tick,
@@ -42,15 +46,8 @@ from vram_arbiter.arbiter.core.events import (
     UseEnded,
 )
 from vram_arbiter.arbiter.core.model.refusals import Revoked, TooLarge
-from vram_arbiter.arbiter.core.settings import SCHEDULING
-from vram_arbiter.arbiter.lab import compare
-from vram_arbiter.arbiter.lab.outcome import Outcome
-from vram_arbiter.arbiter.lab.scenarios import settings_of, workload_of
-from vram_arbiter.arbiter.lab.simulator import simulate
-from vram_arbiter.arbiter.lab.workload import GpuPlan, Workload
-from vram_arbiter.schemas.config.scenario import Scenario, load_scenario
-from vram_arbiter.schemas.errors import CallerError
-from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, Token
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.schemas.ids import ClientId, LeaseId, Token
 from vram_arbiter.schemas.wire.notes import About, AnyNote, GrantedNote, RevokeAskedNote, SwitchNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush, RevokePush
 from vram_arbiter.schemas.wire.replies import AcquireReply, DoneReply
@@ -61,12 +58,6 @@ OLLAMA_MODELS = 3
 OLLAMA_POLL_S = 0.25
 OLLAMA_RECOVERED = 0.8
 OLLAMA_PATIENCE_S = 5.0
-
-
-class OneGpuOnly(CallerError):
-    """The ports know one GPU."""
-
-    code = "bad_request"
 
 
 @dataclass(slots=True)
@@ -87,17 +78,12 @@ class _Model:
 class Rules(ABC):
     """Bookkeeping that the ports share; `_serve` decides."""
 
-    def __init__(self, gpus: Sequence[GpuPlan]) -> None:
-        if len(gpus) != 1:
-            raise OneGpuOnly(
-                "the ports of other programs' rules know one GPU", hint="compare on one GPU"
-            )
-        self._gpu = gpus[0]
+    def __init__(self, gpu: GpuInfo) -> None:
+        self._gpu = gpu
         self._now = 0.0
         self._out: list[Effect] = []
         self._models: dict[LeaseId, _Model] = {}  # in the order of their loading
         self._queue: list[_Model] = []
-        self._clients: dict[ClientId, ProcessKey] = {}
         self._used_bytes = 0
         self._timer: float | None = None
         self._serial = 0
@@ -108,8 +94,8 @@ class Rules(ABC):
     def handle(self, event: Event, now: float) -> list[Effect]:
         self._now, self._out = now, []
         match event:
-            case ClientConnected(client, process):
-                self._clients[client] = process
+            case ClientConnected():
+                pass
             case AcquireRequested():
                 self._asked(event)
             case ReadyReported(client, request, lease):
@@ -136,11 +122,6 @@ class Rules(ABC):
                 self._models[lease].state = "leaving"
             case ReleaseReported(_, _, lease):
                 self._gone(lease)
-            case ProcessDied(process):
-                for model in [
-                    m for m in self._models.values() if self._clients[m.client] == process
-                ]:
-                    self._gone(model.id)
             case MemorySampled():
                 self._used_bytes = event.used_bytes
             case Tick() if self._timer is not None and self._timer <= now:
@@ -154,8 +135,8 @@ class Rules(ABC):
     def _asked(self, event: AcquireRequested) -> None:
         self._serial += 1
         model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
-        if event.spec.footprint.steady_bytes > self._gpu.total_bytes:
-            size, total = event.spec.footprint.steady_bytes, self._gpu.total_bytes
+        if event.spec.footprint.steady_bytes > self._gpu.capacity_bytes:
+            size, total = event.spec.footprint.steady_bytes, self._gpu.capacity_bytes
             refusal = TooLarge(event.spec.consumer, size, size, total, 0)
             self._out.append(Refuse(event.client, event.request, refusal))
             return
@@ -171,7 +152,7 @@ class Rules(ABC):
             state="queued" if model.state == "queued" else "loading",
             consumer=spec.consumer,
             model=spec.model,
-            gpu=self._gpu.info.id,
+            gpu=self._gpu.id,
             mode="shared",
             priority=spec.priority,
             evictable=spec.evictable,
@@ -182,7 +163,7 @@ class Rules(ABC):
         )
 
     def _note(self, body: AnyNote, model: _Model) -> None:
-        about = About(LeaseId(model.id), model.spec.consumer, self._gpu.info.id)
+        about = About(LeaseId(model.id), model.spec.consumer, self._gpu.id)
         self._out.append(Note(body, about))
 
     def _switch(self, model: _Model) -> SwitchNote:
@@ -241,8 +222,8 @@ class Unmanaged(Rules):
 class OllamaRules(Rules):
     """ollama: one pending request at a time."""
 
-    def __init__(self, gpus: Sequence[GpuPlan]) -> None:
-        super().__init__(gpus)
+    def __init__(self, gpu: GpuInfo) -> None:
+        super().__init__(gpu)
         self._leaving: _Model | None = None
         self._released_at: float | None = None  # it has gone; its memory is awaited
         self._used_before = 0
@@ -260,7 +241,7 @@ class OllamaRules(Rules):
         head = self._queue[0]
         if any(model.state == "loading" for model in self._models.values()):
             return  # loads are not mixed; the end of this one returns here
-        free = self._gpu.total_bytes - max(
+        free = self._gpu.capacity_bytes - max(
             self._used_bytes,
             sum(model.spec.footprint.steady_bytes for model in self._models.values()),
         )
@@ -268,7 +249,7 @@ class OllamaRules(Rules):
             len(self._models) < OLLAMA_MODELS and head.spec.footprint.steady_bytes <= free
         ):
             self._load(head)
-            self._out.append(Sample(self._gpu.info.id))
+            self._out.append(Sample(self._gpu.id))
             return
         idle = [model for model in self._models.values() if not model.uses and not model.owed]
         self._leaving = (idle or list(self._models.values()))[0]
@@ -289,7 +270,7 @@ class OllamaRules(Rules):
             return True
         if self._timer is None:
             self._timer = self._now + OLLAMA_POLL_S
-            self._out.append(Sample(self._gpu.info.id))
+            self._out.append(Sample(self._gpu.id))
         return False
 
 
@@ -307,34 +288,29 @@ class LlamaSwapRules(Rules):
             self._ask(present, self._queue[0])
 
 
-RULES: Mapping[str, Callable[[Sequence[GpuPlan]], Rules]] = {
+RULES: Mapping[str, Callable[[GpuInfo], Rules]] = {
     "unmanaged": Unmanaged,
     "ollama_rules": OllamaRules,
     "llama_swap_rules": LlamaSwapRules,
 }
 
 
-def under(workload: Workload, name: str) -> Outcome:
-    """Simulate a workload under another program's rules: its models are processes that end."""
-    return simulate(workload, RULES[name](workload.gpus), name, holders_exit=True)
-
-
-def outcomes_of(scenario: Scenario) -> list[Outcome]:
-    """Return a scenario under every policy of the engine, then under the rules of other
-    programs."""
-    settings = settings_of(scenario)
-    ours = [compare.under(workload_of(scenario), settings, name) for name in SCHEDULING]
-    return ours + [under(workload_of(scenario), name) for name in RULES]
+def run(scenario: Scenario, rules: str = "") -> Outcome:
+    """Simulate a scenario under the engine, or under another program's rules: there models are
+    processes that end."""
+    if rules:
+        return World(scenario, RULES[rules](scenario.gpu), rules, holders_exit=True).run()
+    engine = Arbiter(Settings(epoch=1, gpus=(scenario.gpu,)), START_S)
+    return World(scenario, engine, "vram-arbiter", holders_exit=False).run()
 
 
 def main() -> None:
-    shipped = sorted((ROOT / "configs" / "scenarios").glob("*.yaml"))
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("scenarios", metavar="SCENARIO", type=Path, nargs="*", default=shipped)
-    for path in parser.parse_args().scenarios:
-        scenario = load_scenario(path.read_text(), path.name)
-        print(f"{path.stem}: {scenario.about}")
-        print("\n".join([*compare.tables(outcomes_of(scenario)), ""]))
+    parser = argparse.ArgumentParser(description="The engine beside other programs' rules.")
+    parser.add_argument("scenarios", metavar="SCENARIO", nargs="*", default=[*SCENARIOS])
+    for name in parser.parse_args().scenarios:
+        scenario = SCENARIOS[name]
+        outcomes = [run(scenario, rules) for rules in ("", *RULES)]
+        print(f"{name}: {scenario.about}\n{table(outcomes)}\n")
 
 
 if __name__ == "__main__":

@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from tests.bench.policies.outcome import Tally
+from tests.bench.policies.scenarios import Job, Plan
 from vram_arbiter.arbiter.core.events import (
     AcquireRequested,
     ClientConnected,
     Event,
-    ProcessDied,
     ReadyReported,
     ReleaseReported,
     RevokeAcknowledged,
@@ -21,25 +22,35 @@ from vram_arbiter.arbiter.core.events import (
     UseBegan,
     UseEnded,
 )
-from vram_arbiter.arbiter.lab.gpu import START_S, SimulatedGpu
-from vram_arbiter.arbiter.lab.outcome import Tally
-from vram_arbiter.arbiter.lab.workload import Job, Plan
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.pushes import AnyPush, DeniedPush, GrantedPush, RevokePush
 from vram_arbiter.schemas.wire.views import LeaseView
 
+START_S = 1000.0
+"""The clock at the beginning."""
 OOM_RETRY_S = 1.0
 """Pause before a load that failed for lack of memory is retried."""
 FOREVER_S = 1e9
 """TTL of simulated leases: simulated consumers never forget to renew."""
 
 
+class Gpu(Protocol):
+    """The GPU as a process sees it."""
+
+    names: dict[ProcessKey, str]
+
+    def set(self, process: ProcessKey, count: int, now: float) -> bool: ...
+
+
 class Stage(Protocol):
-    """Surroundings of an actor."""
+    """Surroundings of an actor. `holders_exit`: models are processes that end when they are
+    unloaded, so nothing stays on the GPU."""
 
     now: float
-    gpus: dict[GpuId, SimulatedGpu]
     holders_exit: bool
+
+    @property
+    def gpu(self) -> Gpu: ...
 
     def at(self, when: float, call: Callable[[], None]) -> None: ...
 
@@ -62,45 +73,37 @@ class Actor:
 
     def __init__(self, stage: Stage, plan: Plan, number: int, tally: Tally) -> None:
         self.client = ClientId(f"s{number:04d}")
+        self.consumer = plan.consumer
         self.followers: Sequence[tuple[Actor, Sequence[Job]]] = ()
         self._stage = stage
         self._plan = plan
         self._process = ProcessKey(1000 + number, 1)
         self._tally = tally
-        self._state = "none"  # none, waiting, loading, held, leaving, gone
+        self._state = "none"  # none, waiting, loading, held, leaving
         self._asked: RequestId | None = None  # the acquire that is not answered yet
         self._lease = LeaseId("")
         self._token = Token(0, 0)
-        self._gpu = GpuId("")
-        # the plan with the model, times and bytes of the present lease
-        self._job = plan.jobs[0] if plan.jobs else None
+        self._job: Job | None = None  # the one with the times and bytes of the present lease
         self._held_at = 0.0
         self._revoked = False
         self._pending: deque[_Work] = deque()
-        self._settling: dict[UseId, _Work] = {}
         self._using: dict[UseId, _Work] = {}
         self._use_requests: dict[RequestId, UseId] = {}
-        self._numbers = 0
+        self._uses = 0
         self._round = 0  # number of the lease: plans of an earlier one are void
         self._given = 0  # jobs handed to followers
-        self._departs = False
 
     # -- work
     def begin(self) -> None:
-        stage, plan = self._stage, self._plan
-        for gpu in stage.gpus.values():
-            gpu.names[self._process] = plan.consumer
-        stage.post(ClientConnected(self.client, self._process, 1000, plan.consumer, self.client))
-        if plan.resident and plan.jobs:
-            self._acquire(plan.jobs[0])
-        for job in plan.jobs:
+        """Connect, and plan the arrivals."""
+        stage = self._stage
+        stage.gpu.names[self._process] = self.consumer
+        stage.post(ClientConnected(self.client, self._process, 1000, self.consumer, self.client))
+        for job in self._plan.jobs:
             stage.at(START_S + job.due_s, _later(self.arrive, job))
-        if plan.leaves_s is not None:
-            stage.at(START_S + plan.leaves_s, self._depart)
 
     def arrive(self, job: Job) -> None:
-        if self._state == "gone":
-            return
+        """A job is there."""
         self._tally.jobs += 1
         self._pending.append(_Work(job, self._stage.now))
         self._go()
@@ -117,29 +120,15 @@ class Actor:
     def _go(self) -> None:
         if self._state == "none" and self._pending:
             self._acquire(self._pending[0].job)
-        while self._state == "held" and not self._revoked and self._pending:
-            if (self._using or self._settling) and not self._pending[0].job.alongside:
-                return
-            self._start(self._pending.popleft())
+        if self._state == "held" and not self._revoked and self._pending and not self._using:
+            self._use(self._pending.popleft())
 
-    def _start(self, work: _Work) -> None:
-        fresh = work.arrived_at < self._held_at
+    def _use(self, work: _Work) -> None:
         if not work.served:
             work.served = True
             self._tally.waits_s.append(max(0.0, self._held_at - work.arrived_at))
-        self._numbers += 1
-        use = UseId(f"u{self._numbers}")
-        self._settling[use] = work
-        settle_s = work.job.settle_s if fresh else 0.0
-        self._stage.at(self._stage.now + settle_s, _later(self._begin_use, use, self._round))
-
-    def _begin_use(self, use: UseId, turn: int) -> None:
-        work = self._settling.pop(use, None)
-        if work is None or turn != self._round:
-            return
-        if work.job.use_s is None:
-            self._over(work)
-            return
+        self._uses += 1
+        use, turn = UseId(f"u{self._uses}"), self._round
         self._using[use] = work
         request = self._stage.next_request()
         self._use_requests[request] = use
@@ -151,60 +140,34 @@ class Actor:
         if work is None or turn != self._round:
             return
         self._say(UseEnded, use)
-        self._over(work)
-
-    def _over(self, work: _Work) -> None:
         self._pass_on()
-        if self._revoked and not self._using:
-            self._leave(self._plan.heed_s)
+        if self._revoked:
+            self._leave()
             return
         self._go()
-        if work.job.release_after_s is not None and self._idle():
-            turn, started = self._round, self._numbers
-            self._stage.at(
-                self._stage.now + work.job.release_after_s, lambda: self._let_go(turn, started)
-            )
-        elif self._departs:
-            self._depart()
+        if work.job.release_after_s is not None and not self._pending and not self._using:
+            uses, at = self._uses, self._stage.now + work.job.release_after_s
+            self._stage.at(at, lambda: self._release_if_idle(turn, uses))
 
     def _pass_on(self) -> None:
-        """End a job, done or failed: its followers get their next one."""
+        """A job is over, done or failed: each follower gets its next one."""
         for actor, jobs in self.followers:
             if self._given < len(jobs):
                 job = jobs[self._given]
                 self._stage.at(self._stage.now + job.due_s, _later(actor.arrive, job))
         self._given += 1
 
-    def _idle(self) -> bool:
-        return not (self._pending or self._settling or self._using)
-
-    def _let_go(self, turn: int, started: int) -> None:
-        if (
-            (turn, started) == (self._round, self._numbers)
-            and self._state == "held"
-            and self._idle()
-        ):
-            self._leave(0.0)
-        if self._departs:
-            self._depart()
-
-    def _depart(self) -> None:
-        """End the process as soon as it has nothing left to do."""
-        self._departs = True
-        if self._idle() and self._state in ("none", "held"):
-            self._state = "gone"
-            self._round += 1
-            for gpu in self._stage.gpus.values():
-                gpu.set(self._process, 0, self._stage.now)
-            self._stage.post(ProcessDied(self._process))
+    def _release_if_idle(self, turn: int, uses: int) -> None:
+        if (turn, uses) == (self._round, self._uses) and not self._pending:
+            self._leave()
 
     # -- the lease
     def _acquire(self, job: Job) -> None:
         self._state, self._job = "waiting", job
-        self._asked = self._stage.next_request()
+        self._asked = asked = self._stage.next_request()
         spec = replace(job.spec, ttl_s=FOREVER_S)
         self._stage.post(
-            AcquireRequested(self.client, self._asked, f"n{self._asked}", spec, job.wait_timeout_s)
+            AcquireRequested(self.client, asked, f"n{asked}", spec, job.wait_timeout_s)
         )
 
     def answered(self, request: RequestId, lease: LeaseView | None) -> None:
@@ -232,11 +195,11 @@ class Actor:
                 self._granted(lease)
             case DeniedPush(lease_id) if lease_id == self._lease:
                 self._give_up()
-            case RevokePush(lease_id) if lease_id == self._lease and self._state in (
-                "held",
-                "loading",
-            ):
-                self._asked_to_leave()
+            case RevokePush(lease_id) if lease_id == self._lease and not self._revoked:
+                self._revoked = True
+                self._say(RevokeAcknowledged, None)
+                if not self._using:
+                    self._leave()
             case _:
                 pass
 
@@ -251,24 +214,16 @@ class Actor:
 
     def _granted(self, lease: LeaseView) -> None:
         assert self._job is not None, "granted without a job"
-        self._state = "loading"
         assert lease.token is not None, f"{lease.lease_id} has no token"
-        assert lease.gpu is not None, f"{lease.lease_id} has no GPU"
-        self._lease = LeaseId(lease.lease_id)
-        self._token = lease.token
-        self._gpu = GpuId(lease.gpu)
+        self._state = "loading"
+        self._lease, self._token = LeaseId(lease.lease_id), lease.token
         self._round += 1
-        turn = self._round
-        if not self._stage.gpus[self._gpu].set(
-            self._process, self._job.spec.footprint.load_peak_bytes, self._stage.now
-        ):
+        turn, now, peak = self._round, self._stage.now, self._job.spec.footprint.load_peak_bytes
+        if self._stage.gpu.set(self._process, peak, now):
+            self._stage.at(now + self._job.load_s, lambda: self._loaded(turn))
+        else:
             self._tally.ooms += 1
-            self._stage.at(self._stage.now, lambda: self._out_of_memory(turn))
-            return
-        early = self._plan.resident and self._stage.now <= START_S + 1.0
-        self._stage.at(
-            self._stage.now + (0.0 if early else self._job.load_s), lambda: self._loaded(turn)
-        )
+            self._stage.at(now, lambda: self._out_of_memory(turn))
 
     def _out_of_memory(self, turn: int) -> None:
         """Fail the load, as a program that crashed and is restarted."""
@@ -281,40 +236,21 @@ class Actor:
         self._go()
 
     def _loaded(self, turn: int) -> None:
-        if turn != self._round or self._state != "loading" or self._job is None:
-            return
-        job = self._job
-        count = (
-            job.spec.footprint.steady_bytes if job.measured_bytes is None else job.measured_bytes
-        )
-        self._stage.gpus[self._gpu].set(self._process, count, self._stage.now)
-        self._state, self._held_at = "held", self._stage.now
-        self._say(ReadyReported, job.measured_bytes)
-        if self._revoked:
-            self._leave(self._plan.heed_s)
-        self._go()
-
-    def _asked_to_leave(self) -> None:
-        if self._revoked:
-            return
-        self._revoked = True
-        self._say(RevokeAcknowledged, None)
-        for use in reversed(list(self._settling)):
-            self._pending.appendleft(self._settling.pop(use))
-        if not self._using and self._state == "held":
-            self._leave(self._plan.heed_s)
-
-    def _leave(self, heed_s: float) -> None:
-        """Leave: unloading, then released."""
-        if self._state != "held":
-            return
-        self._state = "leaving"
-        turn = self._round
-        self._stage.at(self._stage.now + heed_s, lambda: self._unload(turn))
-
-    def _unload(self, turn: int) -> None:
         if turn != self._round or self._job is None:
             return
+        steady = self._job.spec.footprint.steady_bytes
+        self._stage.gpu.set(self._process, steady, self._stage.now)
+        self._state, self._held_at = "held", self._stage.now
+        self._say(ReadyReported, None)
+        if self._revoked:
+            self._leave()
+        self._go()
+
+    def _leave(self) -> None:
+        """Leave: unloading, then released."""
+        if self._state != "held" or self._job is None:
+            return
+        self._state, turn = "leaving", self._round
         self._say(UnloadStarted)
         self._stage.at(self._stage.now + self._job.unload_s, lambda: self._unloaded(turn))
 
@@ -322,17 +258,13 @@ class Actor:
         if turn != self._round or self._job is None:
             return
         kept = 0 if self._stage.holders_exit else self._job.spec.footprint.residue_bytes
-        self._stage.gpus[self._gpu].set(self._process, kept, self._stage.now)
+        self._stage.gpu.set(self._process, kept, self._stage.now)
         self._release()
-        self._state = "none"
-        self._go()
-        if self._departs:
-            self._depart()
+        self._again()
 
     def _release(self) -> None:
         self._round += 1
         self._revoked = False
-        self._settling.clear()
         self._say(ReleaseReported, False)
 
     def _say(self, event: Callable[..., Event], *rest: object) -> None:
