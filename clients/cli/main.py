@@ -54,7 +54,6 @@ COMMANDS: Mapping[str, Command] = {
     "status": Command("status", "show GPUs, leases and the queue", traced=False),
     "why": Command("why", "explain why a consumer is not running", traced=False),
     "history": Command("history", "list grants, evictions and verdicts with their reasons"),
-    "watch": Command("watch", "show status and events live"),
     "timeline": Command(
         "timeline.command", "draw GPU memory over time as .png, .html or a Perfetto trace"
     ),

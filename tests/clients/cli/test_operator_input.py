@@ -177,7 +177,7 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     status = json.loads(vramctl("status", "--json", environ=environ).stdout)
     assert status["drained"] == "", "what ended with 3 was not done afterwards"
     arbiter_daemon.kill()
-    others = (("history",), ("why", "x"), ("watch",), ("history", "-f"))
+    others = (("history",), ("why", "x"), ("history", "-f"))
     for action, dead in vramctl_at_once((*EVERY_ACTION, *others), environ=environ):
         assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (
             3,
