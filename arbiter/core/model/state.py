@@ -364,8 +364,13 @@ class Core:
                     del self.waiters_of[owner]
         self.timers.cancel(("wait", lease.id))
         for gpu_id in lease.request.gpus:
-            self.gpus[gpu_id].queue.discard(lease)
-            self.wake(self.gpus[gpu_id])
+            gpu = self.gpus[gpu_id]
+            gpu.queue.discard(lease)
+            if gpu.evictions:  # the room that they made is not this lease's any more
+                gpu.evictions = [
+                    one for one in gpu.evictions if not one.verdict or one.wanted_by != lease.id
+                ]
+            self.wake(gpu)
 
     def end(self, lease: Lease, error: Refusal | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
