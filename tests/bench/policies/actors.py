@@ -23,7 +23,13 @@ from vram_arbiter.arbiter.core.events import (
     UseEnded,
 )
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId, Token, UseId
-from vram_arbiter.schemas.wire.pushes import AnyPush, DeniedPush, GrantedPush, RevokePush
+from vram_arbiter.schemas.wire.pushes import (
+    AnyPush,
+    DeniedPush,
+    GrantedPush,
+    RevokePush,
+    RevokeWithdrawnPush,
+)
 from vram_arbiter.schemas.wire.views import LeaseView
 
 START_S = 1000.0
@@ -200,6 +206,9 @@ class Actor:
                 self._say(RevokeAcknowledged, None)
                 if not self._using:
                     self._leave()
+            case RevokeWithdrawnPush(lease_id) if lease_id == self._lease and self._state == "held":
+                self._revoked = False
+                self._go()
             case _:
                 pass
 
