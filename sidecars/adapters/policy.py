@@ -11,7 +11,12 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
 from vram_arbiter.sidecars.adapters import lingbot
 from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, ModelCall
-from vram_arbiter.sidecars.adapters.policy_checks import need_absolute, need_trained, need_weights
+from vram_arbiter.sidecars.adapters.policy_checks import (
+    need_absolute,
+    need_statistics,
+    need_trained,
+    need_weights,
+)
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
     family_of,
@@ -25,7 +30,7 @@ from vram_arbiter.sidecars.adapters.policy_observations import (
     Observations,
     misfits,
 )
-from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
+from vram_arbiter.sidecars.checkpoints import META, load_lerobot
 from vram_arbiter.sidecars.quantization import TORCH_NAMES, nf4_of, quantize_linear, torch_type
 from vram_arbiter.sidecars.weights import (
     ProcessorFiles,
@@ -158,8 +163,7 @@ class PolicyAdapter:
         policy = load_lerobot(
             self._policy_class, self._weights, self._config, nf4_of(self._manifest)
         )
-        if device != META:
-            need_trained(policy, self._weights.source)
+        need_trained(self._config.type, self._weights.source)
         self._guided = False
         self._policy = policy if self._has_own_dtype else _cast(policy, torch_type(self._dtype))
         self._quantize(device)
@@ -167,8 +171,11 @@ class PolicyAdapter:
             self._encoders = lingbot.load_encoders(policy)
         self._make_processors()
         need_absolute(self._after, self._weights.source)
-        need_statistics(self._before, self._config.input_features, self._weights.source)
-        need_statistics(self._after, self._config.output_features, self._weights.source)
+        for pipeline, features in (
+            (self._before, self._config.input_features),
+            (self._after, self._config.output_features),
+        ):
+            need_statistics(pipeline, features, self._weights.source, padded=self._family.pads)
         self._observations = Observations(
             self._config.input_features,
             self._manifest.image_preprocessing,

@@ -314,6 +314,77 @@ def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weig
         ask(adapter, stacked([first, second]) | {STATE: first[STATE]})
 
 
+def change(folder: Path, pattern: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    """Rewrite the tensors of the files of a checkpoint that match."""
+    from safetensors.torch import load_file, save_file
+
+    files = list(folder.glob(pattern))
+    assert files
+    for file in files:
+        save_file(change(load_file(file)), file, {"format": "pt"})
+
+
+STATISTICS: dict[str, tuple[str, Callable[[Any, Any], dict[str, Any]], str]] = {
+    "missing": ("act", lambda name, _: {name: None}, "no std"),
+    "too long": ("act", lambda name, x: {name: x.repeat(2)}, r"std has shape \(12,\), not \(6,\)"),
+    "broadcast": ("act", lambda name, x: {name: x[:1]}, r"std has shape \(1,\), not \(6,\)"),
+    "a number": ("act", lambda name, x: {name: x[0].clone()}, r"std has shape \(\), not"),
+    "zero": ("act", lambda name, x: {name: 0 * x}, "std is 0 or less"),
+    "negative": ("act", lambda name, x: {name: x.cumsum(0) - 3}, "std is 0 or less"),
+    "not finite": ("act", lambda name, x: {name: x / 0}, "std has NaN or infinity"),
+    "no max": ("diffusion", lambda name, _: {name: None}, "no max"),
+    "below min": ("diffusion", lambda name, x: {name: -x - 9}, "max is below min"),
+    "NaN": ("diffusion", lambda name, x: {name: x * float("nan")}, "max has NaN"),
+    "no quantile": ("pi05", lambda name, _: {name: None}, "no q99"),
+}
+WORDS = {"act": "std", "diffusion": "max", "pi05": "q99"}
+
+
+@pytest.mark.parametrize("case", STATISTICS)
+def test_statistics_that_cannot_convert_are_refused(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, case: str
+) -> None:
+    """Regression: load and `--check` accepted them; lerobot fails, or moves the robot, at the first
+    action."""
+    name, damage, told = STATISTICS[case]
+    for feature, step in ((STATE, "preprocessor"), ("action", "postprocessor")):
+        folder = tmp_path / step
+        shutil.copytree(checkpoint(name).source, folder)
+        key = f"{feature}.{WORDS[name]}"
+
+        def damaged(tensors: dict[str, Any], key: str = key) -> dict[str, Any]:
+            changed = tensors | damage(key, tensors[key])
+            return {one: tensor for one, tensor in changed.items() if tensor is not None}
+
+        change(folder, f"policy_{step}*.safetensors", damaged)
+        adapter = make_adapter(manifest_of(name), Weights(str(folder), local=True))
+        adapter.prepare()
+        for device in ("cpu", "meta"):
+            with pytest.raises(ModelError, match=f"convert {feature}: {told}"):
+                adapter.load(device)
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, number: float
+) -> None:
+    """Regression: such a checkpoint was `ok` and loaded, and failed at the first action."""
+    folder = tmp_path / "act"
+    shutil.copytree(checkpoint("act").source, folder)
+    key = "model.action_head.weight"
+
+    def damaged(tensors: dict[str, Any]) -> dict[str, Any]:
+        tensors[key][0, 3] = number
+        return tensors
+
+    change(folder, "model.safetensors", damaged)
+    adapter = make_adapter(manifest_of("act"), Weights(str(folder), local=True))
+    adapter.prepare()
+    for device in ("cpu", "meta"):
+        with pytest.raises(ModelError, match=rf"1 with NaN or infinity \({key}\)"):
+            adapter.load(device)
+
+
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "act ensembling"])
 def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name: str) -> None:
     """The manifest's number format is the one that the weights have after loading."""
@@ -363,6 +434,22 @@ def test_linear_layers_in_nf4(checkpoint: Callable[[str], Weights], name: str) -
     for device in ("meta", "cpu"):
         with pytest.raises(UnsupportedQuantization, match="no linear layer to quantize"):
             adapter.load(device)
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_a_quantized_layer_takes_the_numbers_of_autocast(tmp_path: Path, dtype: str) -> None:
+    """Regression: ACT makes its latent vector in float32, bitsandbytes answered in that, and the
+    next layer refused it at the first action."""
+    pytest.importorskip("bitsandbytes")
+    policies.save_act(tmp_path, latent_dim=8)
+    extra = f", min_params_to_quantize: 64, compute_dtype: {dtype}"
+    manifest = parse_manifest(manifest_text("act", "int4", extra=extra))
+    adapter = make_adapter(manifest, Weights(str(tmp_path), local=True))
+    assert isinstance(adapter, PolicyAdapter)
+    adapter.prepare()
+    adapter.load("cpu")
+    adapter.place("cpu")
+    assert ask(adapter, observations(1)[0]).shape == (5, DIM)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("act")])
@@ -426,16 +513,18 @@ def test_the_manifests_family_decides(
 def test_what_cannot_act_is_refused(checkpoint: Callable[[str], Weights], tmp_path: Path) -> None:
     """lerobot only warns of a VQ-BeT in its first stage of training, and its actions are noise."""
     import torch
-    from safetensors.torch import load_file, save_file
 
-    shutil.copytree(checkpoint("vqbet").source, tmp_path / "vqbet")
-    file = tmp_path / "vqbet" / "model.safetensors"
-    flag = "vqbet.action_head.vqvae_model.discretized"
-    save_file(load_file(file) | {flag: torch.tensor(False)}, file)
-    weights = Weights(str(file.parent), local=True)
-    with pytest.raises(ModelError, match="the quantizer of its actions is not trained"):
-        load_policy("vqbet", weights)
-    config = file.parent / "config.json"
+    folder = tmp_path / "vqbet"
+    shutil.copytree(checkpoint("vqbet").source, folder)
+    flag = {"vqbet.action_head.vqvae_model.discretized": torch.tensor(False)}
+    change(folder, "model.safetensors", lambda tensors: tensors | flag)
+    weights = Weights(str(folder), local=True)
+    adapter = make_adapter(manifest_of("vqbet"), weights)
+    adapter.prepare()
+    for device in ("cpu", "meta"):  # regression: `--check` was ok
+        with pytest.raises(ModelError, match="the quantizer of its actions is not trained"):
+            adapter.load(device)
+    config = folder / "config.json"
     config.write_text(config.read_text().replace('"use_peft": false', '"use_peft": true'))
     with pytest.raises(ModelError, match="is a PEFT adapter"):
         load_policy("vqbet", weights)

@@ -205,9 +205,10 @@ def test_any_reward_model_of_lerobots_is_asked_its_own_question(
 
 
 def test_a_number_that_is_none_is_no_opinion(mean_red: Any, tmp_path: Path, png: Any) -> None:
-    mean_red(tmp_path, math.nan)
+    mean_red(tmp_path, 1.0)
     adapter = RewardAdapter(reward_manifest(), Weights(str(tmp_path), local=True))
     adapter.prepare()
     adapter.load("cpu")
+    adapter.networks[0].gain.data.fill_(math.nan)
     with pytest.raises(ModelError, match="progress is not a number"):
         score(adapter, png(8, 8))
