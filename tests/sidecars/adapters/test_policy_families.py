@@ -55,7 +55,7 @@ def manifest_text(family: str, dtype: str = "fp32", more: str = "", extra: str =
     files = "{preprocessor_uri: local://x/a.json, postprocessor_uri: local://x/b.json}"
     processors = f"processors: {files}\n" if family in PROCESSOR_FAMILIES else ""
     return (
-        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 5\n"
+        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 1\n"
         "weights_uri: local://models/x\ndescription: a tiny model\nactions: [grasp]\n"
         f"latency_budget: {{per_chunk_ms: 100}}\nmodel_family: {family}\n"
         f"quantization: {{dtype: {dtype}, extra: {{trust_remote_code: true{extra}}}}}\n"
@@ -635,6 +635,41 @@ def test_a_camera_that_tdmpc_does_not_find_is_refused(
     adapter = make_adapter(manifest_of("tdmpc"), Weights(str(config.parent), local=True))
     with pytest.raises(ModelError, match=r"front; lerobot's tdmpc finds only observation\.image"):
         adapter.prepare()
+
+
+def test_the_only_camera_of_tdmpc_is_found(checkpoint: Callable[[str], Weights]) -> None:
+    """Regression: `--check` said that sensors_required does not name the camera that it names, and
+    the runner's name of it was not found."""
+    import numpy as np
+
+    weights = checkpoint("tdmpc")
+    text = (
+        manifest_text("tdmpc")
+        + f"sensors_required: [{{modality: rgb, vla_feature_key: {ONLY_CAMERA}}}]\n"
+    )
+    adapters = [
+        make_adapter(parse_manifest(text.replace("image}", f"{more}}}")), weights)
+        for more in ("image", "images.top")
+    ]
+    found = []
+    for adapter in adapters:
+        assert isinstance(adapter, PolicyAdapter)
+        adapter.prepare()
+        adapter.load("cpu")
+        adapter.place("cpu")
+        found.append(adapter.misfits())
+    told = "the checkpoint reads observation.image, sensors_required names observation.images.top"
+    assert found == [[], [told]]
+    (step,) = observations(1)
+    by_the_runner = {STATE: step[STATE], "observation.images.image": step[ONLY_CAMERA]}
+    answers = []
+    for observation in (step, by_the_runner):
+        adapters[0].run(EndpointCall(endpoint="reset"))
+        import torch
+
+        torch.manual_seed(SEED)
+        answers.append(ask(adapters[0], observation))
+    np.testing.assert_array_equal(*answers)
 
 
 def test_the_manifests_processors_are_used(
