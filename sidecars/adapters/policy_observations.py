@@ -116,12 +116,8 @@ def misfits(
     manifest: RSkillManifest,
     inputs: "Mapping[str, PolicyFeature]",
     outputs: "Mapping[str, PolicyFeature]",
-    chunk_size: int | None,
 ) -> list[str]:
-    """Return where a manifest contradicts its checkpoint, which the first goal would fail on.
-
-    `chunk_size` is the checkpoint's, None: it has none.
-    """
+    """Return where a manifest contradicts its checkpoint, which the first goal would fail on."""
     keys = [one.vla_feature_key for one in manifest.sensors_required if one.modality == "rgb"]
     named = {
         _input_of(key.rpartition(".")[2], manifest.image_preprocessing, inputs)
@@ -140,8 +136,6 @@ def misfits(
         stated = None if contract is None else contract.dim
         if stated is not None and feature is not None and (stated,) != tuple(feature.shape):
             found.append(f"{field} is {stated}, the checkpoint has {feature.shape[0]} numbers")
-    if chunk_size is not None and manifest.chunk_size > chunk_size:
-        found.append(f"chunk_size is {manifest.chunk_size}, the checkpoint answers {chunk_size}")
     return found
 
 

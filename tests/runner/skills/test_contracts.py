@@ -399,7 +399,8 @@ class Answers:
     async def load(self, **_: Any) -> dict[str, Any]:
         return {"lease_id": None, "token": None}
 
-    async def reset(self, *_: Any, **__: Any) -> None: ...
+    async def reset(self, *_: Any, **__: Any) -> dict[str, Any]:
+        return {"ok": True}
 
     async def get_action(self, observation: Any, **_: Any) -> dict[str, Any]:
         self.states.append(observation["observation.state"])

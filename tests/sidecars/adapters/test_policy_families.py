@@ -34,13 +34,12 @@ pytestmark = pytest.mark.heavy
 
 SAVERS = policies.SAVERS | backbone_policies.SAVERS
 NAMES = tuple(SAVERS)
-ROWS = {  # actions in one answer
-    "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
-    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5,
-    "evo1": 5, "vla_jepa": 5, "wall_x": 5, "gr00t": 3,
-    "molmoact2": 3, "lingbot_va": 4,
+ROWS = {  # actions in one answer, else 3: the checkpoint's n_action_steps
+    "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
+    "multi_task_dit": 4, "lingbot_va": 4,
 }  # fmt: skip
-CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
+WHOLE = ("act", "smolvla", "pi0", "pi05", "xvla", "eo1", "evo1", "vla_jepa", "wall_x")
+CHUNK_ROWS = 5  # of these, where the whole chunk is asked for
 SEED = 2  # most policies draw their actions
 NOT_SERVED = {
     "openvla": "", "fastwam": "hub repository whose name is fixed in its code",
@@ -65,11 +64,12 @@ def manifest_text(family: str, dtype: str = "fp32", more: str = "", extra: str =
     )
 
 
-def manifest_of(name: str, dtype: str | None = None) -> RSkillManifest:
+def manifest_of(name: str, dtype: str | None = None, **fields: Any) -> RSkillManifest:
     supported = FAMILIES[family_of(name)].precisions if family_of(name) in FAMILIES else {"fp32"}
-    return parse_manifest(
+    found = parse_manifest(
         manifest_text(family_of(name), dtype or ("fp32" if "fp32" in supported else "bf16"))
     )
+    return found.model_copy(update=fields)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -100,8 +100,10 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Weig
     return checkpoint
 
 
-def load_policy(name: str, weights: Weights, dtype: str | None = None) -> PolicyAdapter:
-    adapter = make_adapter(manifest_of(name, dtype), weights)
+def load_policy(
+    name: str, weights: Weights, dtype: str | None = None, **fields: Any
+) -> PolicyAdapter:
+    adapter = make_adapter(manifest_of(name, dtype, **fields), weights)
     assert isinstance(adapter, PolicyAdapter)
     adapter.prepare()
     adapter.load("cpu")
@@ -127,9 +129,37 @@ def observations(count: int) -> list[dict[str, Any]]:
     ]
 
 
-def ask(adapter: PolicyAdapter, observation: dict[str, Any]) -> Any:
-    call = EndpointCall(endpoint="get_action", data={"observation": observation})
+def ask(adapter: PolicyAdapter, observation: dict[str, Any], whole_chunk: bool = False) -> Any:
+    call = EndpointCall(
+        endpoint="get_action", data={"observation": observation}, whole_chunk=whole_chunk
+    )
     return adapter.run(call)["action"]
+
+
+def begin(adapter: PolicyAdapter) -> tuple[int, int]:
+    """Begin an episode; return its control steps of an observation, and actions of an answer."""
+    answer = adapter.run(EndpointCall(endpoint="reset"))
+    return answer["n_obs_steps"], answer["n_action_steps"]
+
+
+def history(steps: list[dict[str, Any]], at: int, length: int) -> dict[str, Any]:
+    """Return the observation of control step `at` as the runner sends it."""
+    return stacked([steps[max(0, place)] for place in range(at + 1 - length, at + 1)])
+
+
+def served(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
+    """Return the actions of one episode, played as they are answered."""
+    import numpy as np
+    import torch
+
+    length, _ = begin(adapter)
+    torch.manual_seed(SEED)
+    actions: list[Any] = []
+    while len(actions) < len(steps):
+        answer = ask(adapter, history(steps, len(actions), length))
+        assert answer.dtype == np.float32
+        actions += list(answer)
+    return np.stack(actions[: len(steps)])
 
 
 def stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
@@ -142,7 +172,7 @@ def stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
     return together | {"task": TASK}
 
 
-def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
+def lerobots_own(weights: Weights, steps: list[dict[str, Any]], **settings: Any) -> Any:
     """Return the actions of lerobot's loop, one a control step."""
     import numpy as np
     import torch
@@ -154,6 +184,8 @@ def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
     config.device = "cpu"
     if hasattr(config, "pretrained_backbone_weights"):
         config.pretrained_backbone_weights = None  # no network here
+    for field, value in settings.items():
+        setattr(config, field, value)
     policy = get_policy_class(config.type).from_pretrained(weights.source, config=config)
     policy.eval()
     before, after = make_pre_post_processors(config, pretrained_path=weights.source)
@@ -173,30 +205,90 @@ def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "lingbot_va"])
 def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: str) -> None:
     """Regression: policies with an observation history loaded, passed `--check`, and failed at the
-    first `get_action`."""
+    first `get_action`. Then chunks were played whole where lerobot plays 3 of 5."""
     import numpy as np
-    import torch
 
     weights = checkpoint(name)
     adapter = load_policy(name, weights)
-    queues = FAMILIES[family_of(name)].queues
-    rows = ROWS[name]
-    played = rows if queues else min(rows, CHUNK_ROWS_PLAYED)
-    steps = observations(2 * played + 1)
+    rows = ROWS.get(name, 3)
+    steps = observations(2 * rows + 1)
 
     expected = lerobots_own(weights, steps)
-    actions = []
     for goal in range(2):
-        torch.manual_seed(SEED)
-        actions = []
-        for start in range(0, len(steps), played):
-            first = max(0, start + 1 - adapter._config.n_obs_steps) if queues else start
-            answer = ask(adapter, stacked(steps[first : start + 1]))
-            assert answer.shape == (rows, DIM)
-            assert answer.dtype == np.float32
-            actions += list(answer[:played])
-        np.testing.assert_array_equal(np.stack(actions[: len(steps)]), expected, f"goal {goal}")
-        adapter.run(EndpointCall(endpoint="reset"))
+        np.testing.assert_array_equal(served(adapter, steps), expected, f"goal {goal}")
+    length, played = begin(adapter)
+    assert played == rows
+    assert (length > 1) is (name in ("diffusion", "vqbet", "multi_task_dit"))
+    assert ask(adapter, steps[0]).shape == (rows, DIM)
+    begin(adapter)
+    whole = ask(adapter, steps[0], whole_chunk=True)
+    assert whole.shape == (CHUNK_ROWS if name in WHOLE else rows, DIM)
+
+
+MOST = {  # most actions of a chunk that may be played, and its length
+    "act": (5, 5), "act ensembling": (1, 5), "diffusion": (7, 8), "vqbet": (4, 4), "tdmpc": (2, 5),
+    "gaussian_actor": (1, 1), "multi_task_dit": (7, 8), "smolvla": (5, 5), "pi0_fast": (3, 5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MOST)
+def test_a_manifest_may_say_how_many_actions_are_played(
+    checkpoint: Callable[[str], Weights], name: str
+) -> None:
+    """Regression: a diffusion policy answered what its checkpoint plays, whatever the manifest
+    said, and contradictions were `ok`."""
+    import numpy as np
+
+    weights = checkpoint(name)
+    most, chunk = MOST[name]
+    adapter = load_policy(name, weights, n_action_steps=most, chunk_size=chunk)
+    assert not [line for line in adapter.misfits() if "steps" in line or "chunk" in line]
+    length, played = begin(adapter)
+    assert played == most
+    if hasattr(adapter._config, "horizon") and name != "tdmpc":
+        steps = observations(2 * most + 1)
+        expected = lerobots_own(weights, steps, n_action_steps=most)
+        np.testing.assert_array_equal(served(adapter, steps), expected)
+    for fields, told in (
+        ({"n_action_steps": most + 1}, f"is {most + 1}, the checkpoint allows {most}"),
+        ({"chunk_size": chunk + 1}, f"is {chunk + 1}, the checkpoint answers {chunk}"),
+        ({"policy_extras": {"n_obs_steps": length + 1}}, f"the checkpoint sees {length} control"),
+    ):
+        wrong = make_adapter(manifest_of(name, **fields), weights)
+        assert isinstance(wrong, PolicyAdapter)
+        wrong.prepare()
+        wrong.load("meta")
+        assert [line for line in wrong.misfits() if told in line], "what `--check` says"
+        with pytest.raises(ModelError, match=told):
+            wrong.load("cpu")
+
+
+def test_a_history_takes_every_control_step_or_refuses(
+    checkpoint: Callable[[str], Weights],
+) -> None:
+    """Regression: observations a chunk apart entered the history as if one control step lay
+    between them, and the robot moved on the answer."""
+    import numpy as np
+
+    weights = checkpoint("diffusion")
+    steps = observations(4)
+    adapter = load_policy("diffusion", weights)
+    first = ask(adapter, steps[0])
+    for count in (1, 3):
+        with pytest.raises(BadRequest, match=f"has {count} control steps|takes up to 2"):
+            ask(adapter, stacked(steps[:count]))
+    with pytest.raises(BadRequest, match="of all inputs alike"):
+        ask(adapter, stacked(steps[:2]) | {STATE: steps[0][STATE]})
+    assert ask(adapter, stacked(steps[2:])).shape == first.shape, "all of it, whatever was before"
+    single = load_policy("diffusion", weights, n_action_steps=1)
+    expected = lerobots_own(weights, steps, n_action_steps=1)
+    np.testing.assert_array_equal(served(single, steps), expected)
+    begin(single)
+    import torch
+
+    torch.manual_seed(SEED)
+    alone = [ask(single, step)[0] for step in steps]
+    np.testing.assert_array_equal(np.stack(alone), expected, "each of them is a control step")
 
 
 def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]) -> None:
@@ -229,6 +321,8 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
         actions += [*ask(adapter, stacked(steps[1:5])), *ask(adapter, stacked(steps[5:13]))]
         np.testing.assert_array_equal(np.stack(actions), expected, f"goal {goal}")
         adapter.run(EndpointCall(endpoint="reset"))
+    np.testing.assert_array_equal(served(adapter, steps), expected, "as the runner asks")
+    assert begin(adapter) == (8, 8)
     policy = adapter._policy
     ask(adapter, steps[0])
     encode, policy._encode_frames = policy._encode_frames, None  # fails within an answer
@@ -288,30 +382,52 @@ def test_lingbot_needs_its_encoders(checkpoint: Callable[[str], Weights], tmp_pa
         prepared(wan_pretrained_path="wan")
 
 
-def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weights]) -> None:
-    """One observation a chunk: the oldest of three leaves with the fourth, as in lerobot."""
+@pytest.mark.parametrize("name", ["pi0", "pi05"])
+def test_relative_actions_are_relative_to_the_state_of_their_chunk(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
+) -> None:
+    """lerobot has both: its real-time engine and its server anchor a chunk at the state that it was
+    predicted from, as in training; `select_action` with a preprocessor at every step adds a newer
+    state to each row, which lerobot calls drift and refuses (`SyncInferenceEngine`)."""
     import numpy as np
     import torch
+    from lerobot.policies.rtc import reanchor_relative_rtc_prefix
+    from lerobot.processor import NormalizerProcessorStep, RelativeActionsProcessorStep
 
-    adapter = load_policy("vqbet", checkpoint("vqbet"))
-    first, second, third, fourth = observations(4)
+    folder = tmp_path / name
+    shutil.copytree(checkpoint(name).source, folder)
+    for file in folder.glob("policy_*processor.json"):
+        file.write_text(file.read_text().replace('"enabled": false', '"enabled": true'))
+    weights = Weights(str(folder), local=True)
+    adapter = load_policy(name, weights)
+    steps = observations(3)
 
-    def after(*asked: dict[str, Any]) -> Any:
-        adapter.run(EndpointCall(endpoint="reset"))
-        for observation in asked[:-1]:
-            ask(adapter, observation)
-        torch.manual_seed(SEED)
-        return ask(adapter, asked[-1])
+    anchored = served(adapter, steps)
+    drifting = lerobots_own(weights, steps)
+    np.testing.assert_array_equal(anchored[0], drifting[0])
+    moved = np.stack([step[STATE] - steps[0][STATE] for step in steps])
+    np.testing.assert_allclose(drifting - anchored, moved, atol=1e-5)
 
-    np.testing.assert_array_equal(
-        after(first, second, third, fourth), after(stacked([second, third, fourth]))
+    relative = next(s for s in adapter._before.steps if isinstance(s, RelativeActionsProcessorStep))
+    normal = next(s for s in adapter._before.steps if isinstance(s, NormalizerProcessorStep))
+    heard: list[Any] = []
+    predict = adapter._policy.predict_action_chunk
+
+    def hear(batch: Any, **guidance: Any) -> Any:
+        heard.append((predict(batch, **guidance), guidance))
+        return heard[-1][0]
+
+    adapter._policy.predict_action_chunk = hear
+    rtc = {"left_over": anchored.tolist(), "inference_delay": 1, "execution_horizon": 3}
+    call = {"endpoint": "get_action", "data": {"observation": steps[1]}, "rtc": rtc}
+    answer = adapter.run(EndpointCall.model_validate(call))["action"]
+    (chunk, guidance) = heard[0]
+    whole = adapter._after(chunk)[0, : len(answer)].numpy()  # as lerobot's engine does
+    np.testing.assert_array_equal(answer, whole)
+    expected = reanchor_relative_rtc_prefix(
+        torch.from_numpy(anchored), torch.from_numpy(steps[1][STATE]), relative, normal, "cpu"
     )
-    np.testing.assert_array_equal(after(first, second), after(stacked([first, first, second])))
-    assert not np.array_equal(after(first, second), after(second))
-    with pytest.raises(BadRequest, match="takes up to 3"):
-        ask(adapter, stacked([first, second, third, fourth]))
-    with pytest.raises(BadRequest, match="of all inputs alike"):
-        ask(adapter, stacked([first, second]) | {STATE: first[STATE]})
+    np.testing.assert_allclose(guidance["prev_chunk_left_over"][0], expected, atol=1e-6)
 
 
 def change(folder: Path, pattern: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
@@ -364,6 +480,34 @@ def test_statistics_that_cannot_convert_are_refused(
                 adapter.load(device)
 
 
+@pytest.mark.parametrize("name", ["act", "diffusion"])
+def test_an_action_that_never_moved_is_no_defect(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
+) -> None:
+    """A joint that stood still in all episodes has a standard deviation of 0, or equal bounds: it is
+    kept there. An observation of it would be divided by almost nothing."""
+    import numpy as np
+
+    folder = tmp_path / name
+    shutil.copytree(checkpoint(name).source, folder)
+
+    def still(tensors: dict[str, Any], feature: str = "action") -> dict[str, Any]:
+        for word, values in ((f"{feature}.std", 0.0), (f"{feature}.max", -1.0)):
+            tensors[word][2] = values
+        return tensors
+
+    change(folder, "policy_*.safetensors", still)
+    steps = observations(3)
+    weights = Weights(str(folder), local=True)
+    found = served(load_policy(name, weights), steps)
+    np.testing.assert_array_equal(found, lerobots_own(weights, steps))
+    assert np.ptp(found[:, 2]) < 1e-6
+    change(folder, "policy_pre*.safetensors", lambda tensors: still(tensors, STATE))
+    if name == "act":
+        with pytest.raises(ModelError, match=f"convert {STATE}: std is 0 or less"):
+            load_policy(name, weights)
+
+
 @pytest.mark.parametrize("number", [float("nan"), float("inf")])
 def test_weights_that_are_no_numbers_are_refused(
     checkpoint: Callable[[str], Weights], tmp_path: Path, number: float
@@ -402,7 +546,7 @@ def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name:
         if not adapter._has_own_dtype:  # rotary frequencies in 8 bits lose far positions
             buffers = dict(adapter.networks[0].named_buffers())
             assert all(buffers[key].dtype == torch.float32 for key in buffers if "inv_freq" in key)
-        assert ask(adapter, observation).shape == (ROWS[name], DIM)
+        assert ask(adapter, observation).shape == (ROWS.get(name, 3), DIM)
     for dtype in sorted({"fp32", "fp16", "int8", "fp8", "fp4_nvfp4"} - supported):
         with pytest.raises(UnsupportedQuantization, match=dtype):
             make_adapter(manifest_of(name, dtype), weights)
@@ -428,7 +572,7 @@ def test_linear_layers_in_nf4(checkpoint: Callable[[str], Weights], name: str) -
     layers = nf4_layers(adapter.networks[0])
     assert layers
     assert not any(last in layer for layer in layers)
-    assert ask(adapter, observations(1)[0]).shape == (ROWS[name], DIM)
+    assert ask(adapter, observations(1)[0]).shape == (ROWS.get(name, 3), DIM)
     adapter = make_adapter(manifest_of(name, "int4"), weights)  # 4,000,000 weights and more
     adapter.prepare()
     for device in ("meta", "cpu"):
@@ -449,7 +593,7 @@ def test_a_quantized_layer_takes_the_numbers_of_autocast(tmp_path: Path, dtype: 
     adapter.prepare()
     adapter.load("cpu")
     adapter.place("cpu")
-    assert ask(adapter, observations(1)[0]).shape == (5, DIM)
+    assert ask(adapter, observations(1)[0]).shape == (3, DIM)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("act")])
@@ -728,4 +872,4 @@ def test_a_pinned_revision_is_what_is_loaded(
     monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
     adapter = load_policy("pi05", Weights("field/pi05", "0f1e2d"))
     assert asked == [("field/pi05", "0f1e2d")]
-    assert ask(adapter, observations(1)[0]).shape == (ROWS["pi05"], DIM)
+    assert ask(adapter, observations(1)[0]).shape == (3, DIM)
