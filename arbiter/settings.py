@@ -12,7 +12,7 @@ from vram_arbiter.arbiter.host.journal import Opened
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig
 from vram_arbiter.schemas.errors import ConfigError, ProbeFailed
-from vram_arbiter.schemas.runtime.connection import Limits
+from vram_arbiter.schemas.runtime.connection import Bounds
 from vram_arbiter.schemas.units import format_bytes
 
 DESCRIPTOR_RESERVE = 192
@@ -88,12 +88,12 @@ def park_budget_bytes(configured: int | None, root: Path = Path("/")) -> int:
     return available // PARK_SHARE
 
 
-def router_limits(config: ArbiterConfig, open_files: int) -> Limits:
+def router_limits(config: ArbiterConfig, open_files: int) -> Bounds:
     """A connection may take three descriptors: its socket, and two pidfds if it is the only one of
     its process."""
     room = max(4, (open_files - DESCRIPTOR_RESERVE) // 3)
     return _filled(
-        Limits,
+        Bounds,
         config,
         connections_max=min(config.limits.connections_max, room),
         descriptor_reserve=DESCRIPTOR_RESERVE,

@@ -431,7 +431,10 @@ class Session:
                     wait.granted.fail(event.error)
             case r.RevokeAsked():
                 if lease := self._leases.get(event.record.lease_id):
-                    lease._revoke_asked(event.push, event.first)
+                    lease._revoke_asked(event.push)
+            case r.RevokeWithdrawn():
+                if lease := self._leases.get(event.record.lease_id):
+                    lease._revoke_withdrawn()
             case r.Gone():
                 if lease := self._leases.get(event.record.lease_id):
                     lease._lost(event.error, event.fenced)

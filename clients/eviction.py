@@ -112,6 +112,7 @@ class Departure:
         self._park = park
         self._park_now = False  # the holder itself wants to park
         self._unloaded = False
+        self._announcing = False  # an `unloading` is on its way, and not answered yet
         self._left: anyio.Event | None = None  # set when `_leave` returns; None: it was not started
 
     # -- reasons to leave --------------------------------------------------------------------------
@@ -121,6 +122,16 @@ class Departure:
         if self._left is None and not self.gone:
             self._left = anyio.Event()
             self._driver.spawn(self._leave, self._left, name=f"leave {self._record.lease_id}")
+
+    def stay_if_withdrawn(self) -> bool:
+        """Allow uses again if the revoke was withdrawn; not while the arbiter is told that the
+        unloading begins, nor where the holder itself leaves. Return whether the lease stays."""
+        leaves = self.own_will or self._park_now or self.unloading or self.gone
+        if not self._record.withdrawn or self._announcing or leaves:
+            return False
+        self._record.stays()
+        self.asked, self._left = False, None  # `_leave` ends
+        return True
 
     async def park(self) -> None:
         """Leave on the holder's wish, to come back. Returns when the lease is asleep or over."""
@@ -196,16 +207,17 @@ class Departure:
     # -- steps -------------------------------------------------------------------------------------
     async def _leave(self, left: anyio.Event) -> None:
         try:
-            await self._leave_at_safe_point()
+            await self._leave_at_safe_point(left)
         finally:
             left.set()
 
-    async def _leave_at_safe_point(self) -> None:
+    async def _leave_at_safe_point(self, left: anyio.Event) -> None:
         """1. Wait for the safe point: no use of the holder, not loading.
         2. Announce it, until no other process uses the lease. 3. Unload, or park. 4. Release.
-        A lease that may come back is asleep then; any other is over."""
+        A lease that may come back is asleep then; any other is over. If the revoke is withdrawn
+        before the unloading begins, the lease stays."""
         token = self._record.token
-        while not self.gone:
+        while not self.gone and self._left is left and not self.stay_if_withdrawn():
             if self.uses or not (self._record.held or self.own_will):  # 1
                 await self.progress.wait()
             elif not self._record.held or await self._announced():  # 2
@@ -241,6 +253,7 @@ class Departure:
         request = self._driver.protocol.holdings.unloading(
             self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S
         )
+        self._announcing = True
         try:
             await self._driver.reply(request)
         except BadState as error:
@@ -258,6 +271,8 @@ class Departure:
                 )
             await self.progress.wait(RETRY_UNLOADING_S)
             return False
+        finally:
+            self._announcing = False
         return True
 
     async def _unload_once(self) -> None:

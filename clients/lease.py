@@ -244,8 +244,8 @@ class AsyncLease:
             await self._departure.progress.wait()
 
     # -- the arbiter's part (called by the client) -------------------------------------------------
-    def _revoke_asked(self, push: RevokePush, first: bool) -> None:
-        if first and not self._departure.gone:
+    def _revoke_asked(self, push: RevokePush) -> None:
+        if not self._departure.gone:
             eta = self._handlers.safe_point_eta_s
             self._driver.protocol.holdings.revoke_ack(
                 self._record, eta() if eta else None, self._driver.now()
@@ -254,6 +254,11 @@ class AsyncLease:
                 if not self._departure.asked:
                     self._notify(self._handlers.on_revoke, "on_revoke", Eviction.of(push))
                 self._departure.start()
+        self._departure.progress.changed()
+
+    def _revoke_withdrawn(self) -> None:
+        """Note that the lease may stay: uses begin again, unless the unloading has begun."""
+        self._departure.stay_if_withdrawn()
         self._departure.progress.changed()
 
     def _returned(self) -> None:

@@ -34,9 +34,9 @@ from vram_arbiter.schemas.reasoner import (
     GetEpisode,
     GetTaskResult,
     ListTasks,
+    ReasonerState,
     ResultReply,
     Say,
-    StateReply,
     SubmitReply,
     SubmitTask,
     TasksReply,
@@ -112,7 +112,7 @@ class OperatorServer:
                 return dict(self._state())
         return {"pid": os.getpid()}
 
-    def _state(self) -> StateReply:
+    def _state(self) -> ReasonerState:
         motion = None if self._confirmations is None else self._confirmations.pending
         running = self._queue.running
         queued = sum(task.state == "queued" for task in self._queue.tasks())

@@ -49,9 +49,8 @@ class DeadlinePolicy(StrEnum):
     RAISE = "raise"
 
 
-@runtime_checkable
 class InferenceRunner(Protocol):
-    """A loop that turns observations into actions at a rate."""
+    """A loop that turns observations into actions at a rate, on hardware or in a simulator."""
 
     @property
     def rate_hz(self) -> float: ...

@@ -26,11 +26,6 @@ class ControlMode(StrEnum):
     DEX_HAND_JOINT = "dex_hand_joint"
     COMPOSITE_MODE = "composite_mode"
 
-    @property
-    def wire_number(self) -> int:
-        """The uint8 that stands for the mode in the field's action messages."""
-        return list(ControlMode).index(self)
-
 
 JOINT_MODES = frozenset(
     {ControlMode.JOINT_POSITION, ControlMode.JOINT_VELOCITY, ControlMode.JOINT_TORQUE}

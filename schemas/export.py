@@ -24,7 +24,6 @@ ROOTS: dict[str, str] = {
     "arbiter": "vram_arbiter.schemas.config.arbiter:ArbiterConfig",
     "hooks": "vram_arbiter.schemas.config.hooks:HooksConfig",
     "robot": "vram_arbiter.schemas.config.robot:RobotEnvironment",
-    "scenario": "vram_arbiter.schemas.config.scenario:Scenario",
 }
 """Documents with a single root: name → `module:class`."""
 

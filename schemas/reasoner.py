@@ -95,7 +95,7 @@ class Motion(TypedDict):
     text: str
 
 
-class StateReply(TypedDict):
+class ReasonerState(TypedDict):
     """`task` is the running one's text, or empty."""
 
     task: str

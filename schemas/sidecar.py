@@ -16,7 +16,15 @@ load, another request) are not looked at. Every request may carry "id" (echoed a
 have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
 unless it is the sidecar's current one) and "traceparent". Images are PNG or JPEG bytes of RGB,
 and a video is a list of them. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}` (numpy's
-.npy format, pickle never allowed). `get_action` may carry "rtc", what its chunk shall continue.
+.npy format, pickle never allowed).
+
+`get_action` answers the actions that are to be played before it is asked again, or with
+"whole_chunk" all that the policy predicted; it may carry "rtc", what its chunk shall continue. A
+policy with a history takes the last `n_obs_steps` control steps in one observation: each picture
+and vector with a leading dimension (or a list of pictures), oldest first, and before there were
+so many, the first of the episode repeated. The answer to `reset` says how many, and how many
+actions are played (`ResetResult`). One observation alone, as the field's clients send it, is
+accepted as the first one after a `reset`, and always where one action is played.
 
 `load` makes the model resident (acquiring the lease) and answers with the lease id and token, so
 that a caller can mark a use of its own on it at the arbiter: a goal that spans many `get_action`
@@ -174,7 +182,9 @@ class RealTimeChunking(BaseModel):
 class EndpointCall(_Call):
     endpoint: Literal["ping", "load", "reset", "get_action", "unload", "shutdown"]
     data: Message | None = None
-    rtc: RealTimeChunking | None = None  # of `get_action`; the field's clients have no such field
+    # of `get_action`; the field's clients have no such fields
+    rtc: RealTimeChunking | None = None
+    whole_chunk: bool = False
     api_token: str | None = None  # of the field's wire; not used on ipc
 
 
@@ -204,6 +214,14 @@ class LoadResult(TypedDict):
     lease_id: str | None  # None when the sidecar runs without an arbiter
     token: list[int] | None
     loaded: bool  # False: it was resident already
+
+
+class ResetResult(TypedDict):
+    """Begin of an episode. Servers of the field say nothing about it."""
+
+    ok: bool
+    n_obs_steps: NotRequired[int]  # control steps of an observation
+    n_action_steps: NotRequired[int]  # actions that are played before the next one
 
 
 class DetectionResult(TypedDict):

@@ -41,7 +41,7 @@ _TAGS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class Mistake:
     """One mistake in one file. `line` and `column` count from 1; 0 means the file, or the line, as
     a whole."""
 
@@ -148,15 +148,15 @@ def parse_yaml(content: str | bytes, name: str) -> YamlText:
         line = text.count("\n", 0, error.position) + 1
         column = error.position - text.rfind("\n", 0, error.position)
         what = f"not valid YAML: {error.reason}"
-        raise config_error(name, [Problem(line, "", what, column)]) from error
+        raise config_error(name, [Mistake(line, "", what, column)]) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         what = " ".join(part for part in (error.context, error.problem) if part)
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-        raise config_error(name, [Problem(line, "", f"not valid YAML: {what}", column)]) from error
+        raise config_error(name, [Mistake(line, "", f"not valid YAML: {what}", column)]) from error
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # such as "\UFFFFFFFF"
         line = 0 if loader is None else loader.line + 1
-        raise config_error(name, [Problem(line, "", f"not valid YAML: {error}")]) from error
+        raise config_error(name, [Mistake(line, "", f"not valid YAML: {error}")]) from error
     finally:
         if loader is not None:
             loader.dispose()
@@ -201,7 +201,7 @@ class _Survey:
     multiply."""
 
     def __init__(self) -> None:
-        self.problems: list[Problem] = []
+        self.problems: list[Mistake] = []
         self._known: dict[int, tuple[int, int]] = {}  # node → values in it, and levels
         self._open: set[int] = set()
 
@@ -264,7 +264,7 @@ class _Survey:
 
     def _say(self, node: yaml.Node, path: Path, problem: str) -> None:
         mark = node.start_mark
-        self.problems.append(Problem(mark.line + 1, dotted(path), problem, mark.column + 1))
+        self.problems.append(Mistake(mark.line + 1, dotted(path), problem, mark.column + 1))
 
 
 def _note_lines(node: yaml.Node, path: Path, lines: dict[Path, int]) -> None:
@@ -280,13 +280,13 @@ def _note_lines(node: yaml.Node, path: Path, lines: dict[Path, int]) -> None:
 
 def _text_of(content: str | bytes, name: str) -> str:
     if len(content) > TEXT_MAX_BYTES:
-        raise config_error(name, [Problem(0, "", f"larger than {TEXT_MAX_BYTES} bytes")])
+        raise config_error(name, [Mistake(0, "", f"larger than {TEXT_MAX_BYTES} bytes")])
     try:
         return content.decode("utf-8-sig") if isinstance(content, bytes) else content
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1  # type: ignore[arg-type]
         what = f"not UTF-8 text: {error.reason} at byte {error.start}"
-        raise config_error(name, [Problem(line, "", what)]) from error
+        raise config_error(name, [Mistake(line, "", what)]) from error
 
 
 def dotted(path: Path) -> str:
@@ -303,7 +303,7 @@ def did_you_mean(word: str, known: Collection[str]) -> str:
     return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(sorted(known))}"
 
 
-def config_error(name: str, problems: list[Problem]) -> ConfigError:
+def config_error(name: str, problems: list[Mistake]) -> ConfigError:
     """All mistakes of a file as one typed error: a line of text for each, and the fields for
     programs."""
     return ConfigError(
@@ -331,7 +331,7 @@ def validated[M: BaseModel](
 
 def problems_of(
     error: ValidationError, source: YamlText, known: Mapping[Path, Collection[str]]
-) -> list[Problem]:
+) -> list[Mistake]:
     """Pydantic's findings with the lines of the text. `known` lists the keys of each section, for
     suggestions."""
     problems = []
@@ -343,7 +343,7 @@ def problems_of(
             text = "unknown key" + did_you_mean(str(path[-1]), known.get(path[:-1], ()))
         else:
             text = _said(finding)
-        problems.append(Problem(source.line(path), dotted(path), text))
+        problems.append(Mistake(source.line(path), dotted(path), text))
     return sorted(problems, key=lambda problem: problem.line)
 
 

@@ -26,7 +26,6 @@ from vram_arbiter.sidecars.weights import (
 )
 
 if TYPE_CHECKING:
-    from lerobot.configs import PolicyFeature
     from torch import Tensor
 
 META = "meta"
@@ -41,6 +40,7 @@ class Differences:
     missing: set[str] = field(default_factory=set)
     foreign: set[str] = field(default_factory=set)
     misshapen: dict[str, str] = field(default_factory=dict)
+    broken: set[str] = field(default_factory=set)
 
     def refuse(self, source: str) -> None:
         """Raise ModelError if there are any, with counts and the first names."""
@@ -50,6 +50,7 @@ class Differences:
             "of another shape": [
                 f"{name} {shapes}" for name, shapes in sorted(self.misshapen.items())
             ],
+            "with NaN or infinity": sorted(self.broken),
         }
         parts = [f"{len(names)} {kind} ({_first(names)})" for kind, names in kinds.items() if names]
         if parts:
@@ -60,6 +61,7 @@ class Differences:
                     "missing": len(self.missing),
                     "foreign": len(self.foreign),
                     "misshapen": len(self.misshapen),
+                    "broken": len(self.broken),
                 },
             )
 
@@ -221,31 +223,6 @@ def _load_recorded(cls: Any, weights: Weights, config: Any, record: "_Record") -
     return model.eval()
 
 
-def need_statistics(pipeline: Any, features: "Mapping[str, PolicyFeature]", source: str) -> None:
-    """Raise ModelError if a processor lacks the statistics of one of `features`.
-
-    lerobot's processor then leaves the feature unchanged, in other units.
-    """
-    for step in pipeline.steps:
-        if not hasattr(step, "norm_map"):
-            continue
-        known = {name.rpartition(".")[0] for name in step.state_dict()}
-        modes = {kind.value: mode.value for kind, mode in step.norm_map.items()}
-        lacking = [
-            name
-            for name, feature in features.items()
-            if name in step.features
-            and modes.get(feature.type.value, "IDENTITY") != "IDENTITY"
-            and name not in known
-        ]
-        if lacking:
-            raise ModelError(
-                f"{source}: its {type(step).__name__} has no statistics of {_first(lacking)}",
-                hint="get the whole checkpoint: values would be in other units than the robot's",
-                details={"missing": len(lacking)},
-            )
-
-
 class _Record:
     """Record of what `load_state_dict` was given while one model was loaded."""
 
@@ -263,13 +240,21 @@ class _Record:
         """Note a failed load, which concerns the checkpoint and not only building without bytes."""
         return self.built and (not self._compared or self._found != Differences())
 
-    def compare(self, own: "Mapping[str, Tensor]", header: PackedHeader) -> None:
+    def compare(
+        self,
+        own: "Mapping[str, Tensor]",
+        header: PackedHeader,
+        state_dict: "Mapping[str, Tensor]",
+    ) -> None:
         """Compare a state dict before it is copied.
 
         Raises ModelError for defects that no further part of the checkpoint can repair.
         """
         self._compared = True
         self._found.misshapen |= header.misshapen
+        self._found.broken |= {
+            name for name, values in state_dict.items() if _is_broken(values, own.get(name))
+        }
         for name, tensor in header.tensors.items():
             if name not in own:
                 self._found.foreign.add(name)
@@ -277,11 +262,12 @@ class _Record:
                 self._found.misshapen[name] = f"{tuple(tensor.shape)}, not {tuple(own[name].shape)}"
             else:
                 self._loaded.add(name)
-        tied = {_identity(own[name]) for name in self._loaded}
+        here = self._loaded | (own.keys() & self._found.misshapen)
+        tied = {_identity(own[name]) for name in here}
         self._found.missing = {
             name for name, tensor in own.items() if _identity(tensor) not in tied
         } | header.missing
-        if self._found.foreign or self._found.misshapen:
+        if self._found.foreign or self._found.misshapen or self._found.broken:
             self.refuse_differences()
 
     def copied(self) -> None:
@@ -316,7 +302,7 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
         ) -> Any:
             nf4 = record.nf4
             header = PackedHeader(dict(state_dict)) if nf4 is None else packed_in(state_dict)
-            record.compare(self.state_dict(keep_vars=True), header)
+            record.compare(self.state_dict(keep_vars=True), header, state_dict)
             if nf4 is not None:
                 state_dict = install(self, state_dict, header, nf4)
             with _silence():
@@ -340,6 +326,18 @@ def _silence() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*is a no-op.*")
         yield
+
+
+def _is_broken(values: "Tensor", own: "Tensor | None") -> bool:
+    """Return whether a weight has NaN or infinity, or a buffer NaN: masks hold infinity."""
+    import torch
+
+    if not values.is_floating_point() or not values.numel() or values.device.type == META:
+        return False
+    low, high = torch.aminmax(values)  # one pass, and NaN stays NaN
+    if own is None or isinstance(own, torch.nn.Parameter):
+        return not bool(low.isfinite() & high.isfinite())
+    return bool(low.isnan())
 
 
 def _identity(tensor: Any) -> Any:

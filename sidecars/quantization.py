@@ -69,7 +69,9 @@ class Nf4:
                     f"{type(model).__name__} has no such module",
                     hint=f"its modules are {', '.join(dict(model.named_children()))}, and theirs",
                 )
-        kept = KEPT if self.skip_modules is None else self.skip_modules
+        kept = self.skip_modules
+        if kept is None:
+            kept = (*KEPT, *_vision_towers(model))
         uses = Counter(
             id(parameter) for _, parameter in model.named_parameters(remove_duplicate=False)
         )
@@ -105,6 +107,19 @@ class Nf4:
             bnb_4bit_compute_dtype=self.compute_type,
             llm_int8_skip_modules=all_but(chosen),
         )
+
+
+def _vision_towers(model: "Module") -> list[str]:
+    """Return the vision towers of a model of transformers, whose names differ by family."""
+    vision = getattr(getattr(model, "config", None), "vision_config", None)
+    found: list[str] = []
+    if vision is None or not type(model).__module__.startswith("transformers."):
+        return found
+    for name, module in model.named_modules():
+        sees = type(getattr(module, "config", None)) is type(vision)
+        if sees and not any(_within(name, outer) for outer in found):
+            found.append(name)
+    return found
 
 
 def all_but(chosen: Iterable[str]) -> list[str]:
@@ -268,11 +283,22 @@ def linear4bit(linear: Any, weight: Any, nf4: Nf4) -> Any:
         quant_storage=weight.quant_storage,
         device="meta",
     )
+    layer.register_forward_pre_hook(_autocast)
     weight.module, layer.weight, layer.quant_state = layer, weight, weight.quant_state
     layer.bias = linear.bias
     if linear.bias is not None:
         layer.bias.data = linear.bias.data.to(nf4.compute_type)
     return layer.train(linear.training)
+
+
+def _autocast(layer: Any, inputs: Any) -> Any:
+    """Cast a layer's input as torch's autocast does for linear layers; bitsandbytes leaves it."""
+    import torch
+
+    return tuple(
+        values.to(layer.compute_dtype) if torch.is_autocast_enabled(values.device.type) else values
+        for values in inputs
+    )
 
 
 def _store_as(layer: Any, dtype: "torch.dtype") -> None:

@@ -105,7 +105,7 @@ def _product_file(name: str) -> str | None:
 
 
 # -- the three programs
-def daemon(tracer: Tracer, arguments: list[str]) -> None:
+def run_daemon(tracer: Tracer, arguments: list[str]) -> None:
     """The daemon itself; the measuring process turns its tracer on and off by signals."""
     from vram_arbiter.arbiter.__main__ import main
 
@@ -325,7 +325,7 @@ def main(arguments: list[str]) -> int:
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["daemon", out, *rest]:
-            daemon(Tracer(Path(out)), rest)
+            run_daemon(Tracer(Path(out)), rest)
         case ["holder", out]:
             asyncio.run(holder(Tracer(Path(out))))
         case ["waiter", out]:

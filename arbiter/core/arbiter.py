@@ -158,8 +158,6 @@ class Arbiter:
     def _acquire(self, event: ev.AcquireRequested) -> None:
         """Queue a lease. A lease that is away comes back for it; a gang waits until it is whole."""
         core = self._core
-        if core.policy.alone:
-            event = replace(event, spec=replace(event.spec, mode="exclusive"))
         spec = event.spec
         if self._standby.away and self._standby.acquire(core, event):
             return

@@ -11,12 +11,15 @@
 |           | after the last step towards the exit                   | lease agreed to (`on_overstay`) |
 
 A holder unloads by itself, at its safe point: `unloading` is refused before that. A process that
-uses any lease is never signalled.
+uses any lease is never signalled. A revoke is for someone: when nothing wants the bytes any more
+and the holder has not begun to unload, it is withdrawn.
 
-Public: `ask` revokes a holder; `push_revoke` repeats that at once; `deny` ends a wait with an
-error; `on_ladder_due` and `on_overstay_due` serve the timers.
+Public: `ask` revokes a holder; `push_revoke` repeats that at once; `unwanted`, `take_back` and
+`settle` withdraw revokes; `deny` ends a wait with an error; `on_ladder_due` and `on_overstay_due`
+serve the timers.
 """
 
+from collections.abc import Iterable
 from typing import Literal
 
 from vram_arbiter.arbiter.core.effects import Signal
@@ -32,9 +35,10 @@ from vram_arbiter.schemas.wire.notes import (
     DeniedNote,
     RemindedNote,
     RevokeAskedNote,
+    RevokeWithdrawnNote,
     SignalledNote,
 )
-from vram_arbiter.schemas.wire.pushes import DeniedPush, RevokePush
+from vram_arbiter.schemas.wire.pushes import DeniedPush, RevokePush, RevokeWithdrawnPush
 
 
 def ask(
@@ -81,6 +85,48 @@ def ask(
     core.note(asked, holder)
 
 
+# -- withdrawn
+def unwanted(core: Core, gpu: Gpu) -> list[Eviction]:
+    """Return the evictions of holders that do not unload yet, and whose bytes nothing wants any
+    more: the waiter waits no longer, the pressure is over. An operator's order stands."""
+    return [
+        one
+        for one in gpu.evictions
+        if one.why.order is None
+        and (one.wanted_by not in core.waiting if one.wanted_by else not gpu.pressed)
+        and one.lease in gpu.residents.by_state[LeaseState.REVOKING]
+    ]
+
+
+def take_back(core: Core, gpu: Gpu, evictions: Iterable[Eviction]) -> None:
+    """Let scheduling decide anew on holders that were revoked; `settle` has to follow it."""
+    for eviction in evictions:
+        holder = gpu.residents[eviction.lease]
+        gpu.evictions.remove(eviction)
+        holder.departure.eviction = None
+        for timer in ("revoke", "overstay"):
+            core.timers.cancel((timer, holder.id))
+        core.move(holder, LeaseState.HELD, Why.WITHDRAWN)
+
+
+def settle(core: Core, gpu: Gpu, evictions: Iterable[Eviction]) -> None:
+    """Tell the holders that were not revoked again that they may stay; for the others the
+    acknowledgement counts that they gave."""
+    for eviction in evictions:
+        holder = gpu.residents[eviction.lease]
+        if (anew := holder.departure.eviction) is not None:
+            anew.acked_at = eviction.acked_at
+            continue
+        holder.departure.revoked_before = True
+        assert holder.token is not None, f"{holder.id} was revoked without a token"
+        core.push(holder, RevokeWithdrawnPush(holder.id, holder.token))
+        why, ms = eviction.why, (core.now - eviction.asked_at) * 1e3
+        core.note(RevokeWithdrawnNote(why.wanted_by, why.cause, len(holder.uses), ms), holder)
+        if holder.spec.standby or holder.spec.park_bytes:
+            core.record_lease(holder)
+
+
+# -- the ladder
 def push_revoke(core: Core, holder: Lease, *, extra: bool = False) -> None:
     """Push `revoke` now, if the holder is being revoked, and plan the next step.
 

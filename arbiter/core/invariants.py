@@ -12,9 +12,11 @@ grow with the number of leases. The tests' drivers also check everything
      measurement or reserved; a lease on standby is neither; parked weights fit the host RAM budget
   5. tokens only grow
   6. every waiter is in a queue, a bounded one has a timer, and its GPU has a next reading planned
-  7. of a gang that is not complete, all waiting members are charged, or none
+  7. a holder is revoked for someone: a waiter, pressure or an operator
+  8. of a gang that is not complete, all waiting members are charged, or none
 """
 
+from vram_arbiter.arbiter.core.eviction import unwanted
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -40,6 +42,8 @@ def check(core: Core) -> None:
         _check_gpu(gpu)
         if (head := gpu.queue.head) is not None:
             _check_head(core, gpu, head)
+        if gpu.evictions and not gpu.blocked and (vain := unwanted(core, gpu)):
+            raise InvariantViolation(7, f"{vain[0].lease} is revoked, and nothing wants its bytes")
     for token, _ in core.turn.granted:
         if token <= core.last_token:
             raise InvariantViolation(5, f"token {token} after {core.last_token}")
@@ -48,7 +52,7 @@ def check(core: Core) -> None:
     waiting = len(core.waiting) - len(core.unqueued)
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
-    for feature in core.features:  # 4, 7
+    for feature in core.features:  # 4, 8
         if feature.live:
             feature.check(core)
 

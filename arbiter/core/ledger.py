@@ -33,6 +33,7 @@ class Account:
     retained_bytes: int = 0  # outside its leases
     retained_floor_bytes: int = 0  # declared; more was measured and may shrink down to this
     measured_bytes: int = 0  # evidence newer than the last change; 0: none
+    shown_in: MemorySampled | None = None  # newest reading that listed bytes of the process
     # sums over the charges: all, what fitted when it was granted, what is reserved
     leased_bytes: int = 0
     leased_approved_bytes: int = 0
@@ -272,6 +273,7 @@ class GpuLedger:
                 self.stowaways[use.process] = use
             elif use.used_bytes is not None:
                 shown[account] = use.used_bytes
+                account.shown_in = reading if use.used_bytes else account.shown_in
         explained_bytes = sum([use.held_bytes for use in self.stowaways.values()])
         self.stowaway_bytes = explained_bytes + self.unattributed_bytes
         complete = None not in [use.used_bytes for use in reading.processes or ()]

@@ -1,8 +1,6 @@
-"""What the engine is told at its construction: GPUs, scheduling policy and constants."""
+"""What the engine is told at its construction: GPUs and constants."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId
@@ -20,43 +18,6 @@ class GpuInfo:
     source: str = ""  # what reads it: nvml, unified, fake
     noise_bytes: int = 0  # by how much its readings move when nothing happens
     total_bytes: int = 0  # what its readings call all of it; 0: not known before the first one
-
-
-DEFAULT = "default"
-
-
-@dataclass(frozen=True, slots=True)
-class Scheduling:
-    """One policy. The defaults are the policy `default`."""
-
-    summary: str
-    by_priority: bool = True
-    """Waiters by priority with ageing; False: strictly as they came."""
-    backfill: bool = True
-    """A small waiter may pass the head if that cannot delay it."""
-    least_recent: bool = False
-    """Victims by least recent use alone, until enough is covered; False: the cheapest set that
-    covers the need.
-    """
-    alone: bool = False
-    """Every lease is exclusive: one model at a time per GPU."""
-
-
-SCHEDULING: Mapping[str, Scheduling] = MappingProxyType(
-    {
-        DEFAULT: Scheduling(
-            "priority with ageing, conservative backfill, cheapest covering victims"
-        ),
-        "fifo": Scheduling(
-            "strictly as they came, without backfill", by_priority=False, backfill=False
-        ),
-        "no_backfill": Scheduling("default, but without backfill", backfill=False),
-        "lru": Scheduling(
-            "default, but the least recently used leave, whatever they hold", least_recent=True
-        ),
-        "one_model": Scheduling("default, but one model at a time per GPU", alone=True),
-    }
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +54,6 @@ class Settings:
     each time."""
     host_ram_budget_bytes: int = 0
     """Host RAM for the weights of parked leases; 0: no parking."""
-    policy: str = DEFAULT
-    """A name of `SCHEDULING`; KeyError at the engine's construction for another one."""
     learnt: dict[str, dict[str, float]] = field(default_factory=dict)
     """Durations learned by earlier runs, per consumer: {"drain_s", "unload_s", "verify_s",
     "load_s"}."""

@@ -22,10 +22,9 @@ def replay_lines(found: Replayed) -> list[str]:
     what = f"{found.events} events, identical"
     if found.raised:
         what += f" up to the defect that ended the daemon: {found.raised}"
-    policy = found.header.settings.policy
     return [
         *lines,
-        f"{what} ({_files(len(found.files))}, {seconds:.1f} s from {since}, policy {policy})",
+        f"{what} ({_files(len(found.files))}, {seconds:.1f} s from {since})",
     ]
 
 

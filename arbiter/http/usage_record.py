@@ -31,7 +31,7 @@ type Part = tuple[str | int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class Division:
     """How the bytes of one GPU were divided from an instant on."""
 
     number: int
@@ -53,7 +53,7 @@ class UsageRecord:
         self._usage = usage
         self._started_at = started_at
         self._clock = clock
-        self._samples: dict[int, deque[Sample]] = {}  # by GPU, oldest first
+        self._samples: dict[int, deque[Division]] = {}  # by GPU, oldest first
         self._parts = 0
         self._taken_at = float("-inf")
         self._timer: asyncio.TimerHandle | None = None
@@ -110,7 +110,7 @@ class UsageRecord:
             if samples and (samples[-1].parts, samples[-1].used_bytes) == (parts, one.used_bytes):
                 continue
             self.number += 1
-            samples.append(Sample(self.number, at_s, one.index, one.used_bytes, parts))
+            samples.append(Division(self.number, at_s, one.index, one.used_bytes, parts))
             self._parts += 1 + len(parts)
             while len(samples) > 1 and samples[1].at_s <= at_s - KEPT_S:
                 self._forget(samples)
@@ -120,7 +120,7 @@ class UsageRecord:
                 return
             self._forget(longest)
 
-    def _forget(self, samples: deque[Sample]) -> None:
+    def _forget(self, samples: deque[Division]) -> None:
         """Drop the oldest sample of a GPU; its newest one always stays, since it still holds."""
         self._parts -= 1 + len(samples.popleft().parts)
 

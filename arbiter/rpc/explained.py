@@ -133,10 +133,9 @@ def _leaving(one: Blocker) -> str:
     charge, ago = gib(one.bytes), f"revoked {one.seconds or 0.0:.1f} s ago"
     match one.condition:
         case Condition.REVOKED if one.uses:
-            uses = f"{one.uses} use{'' if one.uses == 1 else 's'}"
             return (
-                f"waits for {one.consumer} to finish {uses} ({ago}), then it unloads and {charge} "
-                "are verified"
+                f"waits for {one.consumer} to finish {_in_flight(one)} ({ago}), then it unloads "
+                f"and {charge} are verified"
             )
         case Condition.REVOKED:
             return f"waits for {one.consumer} to unload ({ago}), then {charge} are verified"
@@ -193,9 +192,14 @@ def _loading(one: Blocker) -> str:
     return told if one.quiet_s is None else f"{told}, nothing new for {one.quiet_s:.0f} s"
 
 
+def _in_flight(one: Blocker) -> str:
+    label = f' "{one.label}"' if one.label else ""
+    return f"1 use{label}" if one.uses == 1 else f"{one.uses} uses"
+
+
 def _uses(one: Blocker) -> str:
     paused = f", {one.paused} paused" if one.paused else ""
-    running = f"{one.uses} use{'' if one.uses == 1 else 's'} running" if one.uses else "idle"
+    running = f"{_in_flight(one)} running" if one.uses else "idle"
     return running + paused
 
 

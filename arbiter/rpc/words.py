@@ -387,6 +387,10 @@ def _reason(body: notes.AnyNote, about: notes.About | None) -> str:
             return {"loading": "all fit", "complete": "all are held"}.get(phase, "")
         case notes.RevokeAskedNote(wanted_by, _, _, why, gang, order):
             return cause(RevokeCause(why, wanted_by, gang, order))
+        case notes.RevokeWithdrawnNote(cause="waiter", wanted_by=wanted_by):
+            return f"{wanted_by} needs the room no longer"
+        case notes.RevokeWithdrawnNote():
+            return "the GPU is within its budget again"
         case notes.SignalledNote(asked_s=asked_s, on_overstay=on_overstay):
             return f"asked {asked_s:.1f} s ago, idle, and its lease says on_overstay={on_overstay}"
         case notes.ExpiredNote(Why.NOT_RENEWED, ttl_s):

@@ -21,6 +21,8 @@ from vram_arbiter.clients._protocol.records import (
     Resized,
     Returned,
     RevokeAsked,
+    RevokeWithdrawn,
+    TokenPair,
     error_of,
 )
 from vram_arbiter.schemas import defaults as d
@@ -183,7 +185,8 @@ class Holdings:
             self._connection.asked_at
         )  # as for the first grant
         record.held = record.released = False
-        record.measured_bytes = record.revoke = None
+        record.measured_bytes = None
+        record.stays()
         self.held[record.lease_id] = record
         self._connection.events.append(Returned(record))
 
@@ -201,8 +204,14 @@ class Holdings:
     def revoked(self, push: RevokePush) -> None:
         record = self.held.get(push.lease_id)
         if record is not None and record.token == push.token:
-            first, record.revoke = record.revoke is None, push
-            self._connection.events.append(RevokeAsked(record, push, first))
+            record.revoke, record.withdrawn = push, False
+            self._connection.events.append(RevokeAsked(record, push))
+
+    def revoke_withdrawn(self, lease_id: str, token: TokenPair) -> None:
+        record = self.held.get(lease_id)
+        if record is not None and record.token == token and record.revoke is not None:
+            record.withdrawn = True
+            self._connection.events.append(RevokeWithdrawn(record))
 
     def lost(self, push: LostPush) -> None:
         record = self._record(push.lease_id)
@@ -223,7 +232,8 @@ class Holdings:
                     self.returned(entry.lease)  # if its grant was lost on the way
             elif entry.kept:
                 record.confirmed_at = record.renewed_at = self._connection.asked_at
-                record.revoke = None  # the arbiter repeats a revoke that still holds
+                if entry.lease is not None and entry.lease.state == "held":  # not revoked any more
+                    self.revoke_withdrawn(record.lease_id, record.token)
             else:
                 self._gone(record, error_of(entry.error))
 

@@ -26,6 +26,7 @@ from vram_arbiter.schemas.wire.pushes import (
     PreparePush,
     ResizedPush,
     RevokePush,
+    RevokeWithdrawnPush,
 )
 from vram_arbiter.schemas.wire.replies import AnyReply, ReattachReply
 
@@ -100,6 +101,8 @@ class ClientProtocol:
                 self.holdings.resized(push.lease_id)
             case RevokePush():
                 self.holdings.revoked(push)
+            case RevokeWithdrawnPush():
+                self.holdings.revoke_withdrawn(push.lease_id, push.token)
             case LostPush():
                 self.holdings.lost(push)
             case EventPush():

@@ -95,7 +95,13 @@ class RevokeAsked:
 
     record: "LeaseRecord"
     push: RevokePush
-    first: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RevokeWithdrawn:
+    """The holder may stay, if it has not begun to unload."""
+
+    record: "LeaseRecord"
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +158,7 @@ Event = (
     | Granted
     | Denied
     | RevokeAsked
+    | RevokeWithdrawn
     | Gone
     | Returned
     | Resized
@@ -178,6 +185,7 @@ class LeaseRecord:
     measured_bytes: int | None = None
     uses: set[str] = field(default_factory=set)
     revoke: RevokePush | None = None
+    withdrawn: bool = False  # `revoke` is over; the lease stays if it has not begun to unload
     released: bool = False
     asleep: str = ""  # `standby` or `parked`: evicted, and may come back under the same id
     wanted: bool = False  # asleep, and reacquired
@@ -187,6 +195,10 @@ class LeaseRecord:
     resizing: Message | None = None  # the footprint that its owner waits for
     resizing_until: float | None = None  # None: no limit
     resize_id: int | None = None  # the newest request that asked for it
+
+    def stays(self) -> None:
+        """Forget the revoke that was withdrawn."""
+        self.revoke, self.withdrawn = None, False
 
     def ref(self) -> Message:
         """`schemas.wire.LeaseRef`."""

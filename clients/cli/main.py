@@ -54,7 +54,6 @@ COMMANDS: Mapping[str, Command] = {
     "status": Command("status", "show GPUs, leases and the queue", traced=False),
     "why": Command("why", "explain why a consumer is not running", traced=False),
     "history": Command("history", "list grants, evictions and verdicts with their reasons"),
-    "watch": Command("watch", "show status and events live"),
     "timeline": Command(
         "timeline.command", "draw GPU memory over time as .png, .html or a Perfetto trace"
     ),
@@ -75,9 +74,6 @@ COMMANDS: Mapping[str, Command] = {
     "hooks": Command("hooks", "run commands and webhooks for events"),
     "mcp": Command("mcp", "serve status, why and history to agents"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
-    "simulate": Command(
-        "offline", "simulate a scenario under one or more policies", passes_on=True
-    ),
     "demo": Command("demo", "run find, navigate and grab on a simulated arm in 8 GiB"),
 }
 

@@ -37,6 +37,8 @@ PATIENCE_S: Final = 1.0
 FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
 BUSY_POLL_S: Final = 0.5
 SUSPENDED_GRACE_S: Final = 5.0
+UNTIL_ENDED: Final = "until it ends"
+"""Label of the use of a program that does not come back: a waiter reads in `why` what it is for."""
 NO_LEASE: Final = "its lease is over"
 
 
@@ -211,9 +213,12 @@ class Supervisor:
         that."""
         try:
             await lease.ready()
-            if self._spec.on_revoke != "term":
-                async with lease.use(self._spec.consumer):
+            state = lease.state
+            while self._spec.on_revoke != "term" and state == "held":
+                async with lease.use("" if self._spec.comes_back else UNTIL_ENDED):
                     await self._leave.wait()
+                self._leave.clear()
+                state = await lease.wait_change("revoking")  # held again: it was withdrawn
         except VramError as error:
             log.warning("%s: %s", lease.lease_id, error)
 
@@ -318,8 +323,8 @@ class Supervisor:
             pause_s = LOOK_S
 
     def _decide(self, status: StatusReply | None) -> None:
-        """Leave where a revoke is for a higher priority. A request that came after the revoke is
-        seen in `status`."""
+        """Leave where a revoke is for a higher priority, or for an equal one where the program
+        comes back. A request that came after the revoke is seen in `status`."""
         lease, spec = self.lease, self._spec
         eviction = lease.evicted
         if eviction is None or self._ending or self._leave.is_set() or spec.on_revoke != "priority":
@@ -332,7 +337,8 @@ class Supervisor:
         asked_by = spec.priority + 1 if eviction.priority is None else eviction.priority
         waiting.append((eviction.by, asked_by))
         consumer, priority = max(waiting, key=lambda one: one[1])
-        if priority > spec.priority:
+        # equals take turns where both come back; a program that would be ended for good stays
+        if priority > spec.priority or (spec.comes_back and priority == spec.priority):
             self._reason = (
                 eviction.reason if consumer == eviction.by else f"{consumer} needs the room"
             )

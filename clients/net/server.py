@@ -19,7 +19,7 @@ from typing import Self
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
 from vram_arbiter.schemas.errors import LimitExceeded, MessageTooLarge, VramError
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.runtime.connection import Connection, Limits
+from vram_arbiter.schemas.runtime.connection import Bounds, Connection
 from vram_arbiter.schemas.runtime.endpoints import socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, pack, unpack_map
@@ -120,7 +120,7 @@ class RouterServer:
     A handler runs in a task of its own, so that a slow one delays no other request; its work up to
     the first wait is done at once.
     Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at
-    most 1 MiB. `work_share` as in `schemas.runtime.connection.Limits`.
+    most 1 MiB. `work_share` as in `schemas.runtime.connection.Bounds`.
     Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has
     it.
     """
@@ -141,7 +141,7 @@ class RouterServer:
         )
         several_bytes = max(64 * MIB, 8 * message_max_bytes)
         self._waiting_max_bytes = several_bytes
-        limits = Limits(
+        limits = Bounds(
             message_max_bytes=message_max_bytes,
             # these wires have no hello: the first request may be a picture
             stranger_message_max_bytes=message_max_bytes,

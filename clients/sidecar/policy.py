@@ -35,7 +35,8 @@ class PolicyClient(SidecarClient):
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
     ) -> Message:
-        """Forget the episode so far. Raises Evicted, NotResident, SidecarUnavailable."""
+        """Forget the episode so far; the answer may say what the next one takes (`ResetResult`).
+        Raises Evicted, NotResident, SidecarUnavailable."""
         fields = {"data": npy.pack(dict(data or {}))}
         result = await self.call("reset", fields, token=token, timeout_s=timeout_s)
         return result if isinstance(result, dict) else {}
@@ -46,10 +47,12 @@ class PolicyClient(SidecarClient):
         *,
         options: JsonMap | None = None,
         rtc: RealTimeChunking | None = None,
+        whole_chunk: bool = False,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
     ) -> Message:
-        """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`.
+        """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`: those that
+        are played before it is asked again, or the `whole_chunk`.
 
         `rtc` says what they shall continue; a policy that cannot be guided refuses it (BadRequest).
         Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory,
@@ -60,6 +63,8 @@ class PolicyClient(SidecarClient):
             "options": npy.pack(dict(options)) if options else None,
         }
         fields: Message = {"data": data} | ({"rtc": rtc.model_dump()} if rtc is not None else {})
+        if whole_chunk:
+            fields["whole_chunk"] = True
         result = npy.unpack(await self.call("get_action", fields, token=token, timeout_s=timeout_s))
         if isinstance(result, list) and result:  # the field's servers answer [actions, info]
             result = result[0]

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from importlib import import_module
 
 from vram_arbiter.arbiter.__main__ import parser as arbiter_parser
-from vram_arbiter.arbiter.lab.__main__ import parser as lab_parser
+from vram_arbiter.arbiter.offline.__main__ import parser as event_log_parser
 from vram_arbiter.clients.cli.installation.completion import whole_parser
 from vram_arbiter.reasoner.options import parser as reasoner_parser
 from vram_arbiter.runner.__main__ import parser as runner_parser
@@ -15,10 +15,10 @@ EVERYWHERE = ("-h", "--version")  # options of every command, which its table le
 
 
 def vramctl() -> argparse.ArgumentParser:
-    """Return one parser of all commands, with those that the lab parses."""
+    """Return one parser of all commands, with those that the arbiter's own program parses."""
     made = whole_parser()
     (commands,) = (one for one in made._actions if isinstance(one, argparse._SubParsersAction))
-    offline = subcommands(lab_parser())
+    offline = subcommands(event_log_parser())
     commands.choices.update({name: offline[name] for name in commands.choices if name in offline})
     return made
 

@@ -25,8 +25,8 @@ from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
 from vram_arbiter.schemas.errors import ConfigError, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest
+from vram_arbiter.schemas.yamltext import Mistake, YamlText, config_error, parse_yaml, read_text
 from vram_arbiter.schemas.yamltext import Path as FieldPath
-from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, parse_yaml, read_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class DeploymentFile:
         sensors[0].backend_params.device: …`
         """
         problems = [
-            Problem(self.source.line(_path(field)), field, _on_one_line(text))
+            Mistake(self.source.line(_path(field)), field, _on_one_line(text))
             for field, text in found
         ]
         return config_error(self.source.name, sorted(problems, key=lambda problem: problem.line))

@@ -14,21 +14,15 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from vram_arbiter.runner.control.mailbox import Mailbox
-from vram_arbiter.runner.protocols import Goal, GoalData, SkillEnded
+from vram_arbiter.runner.protocols import Goal, GoalData, InferenceRunner, SkillEnded
 from vram_arbiter.schemas.errors import InternalError, VramError
 from vram_arbiter.schemas.world import RunResult
 
 log = logging.getLogger(__name__)
 
 
-class Controlled(Protocol):
+class Controlled(InferenceRunner, Protocol):
     """A runner that can be driven from outside between its ticks."""
-
-    def activate(self) -> None: ...
-
-    def run(self, max_ticks: int | None = None) -> RunResult: ...
-
-    def deactivate(self) -> None: ...
 
     def request_stop(self) -> None: ...
 

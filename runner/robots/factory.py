@@ -37,7 +37,7 @@ from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.units import POSITION, JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.yamltext import Problem, config_error, did_you_mean, dotted
+from vram_arbiter.schemas.yamltext import Mistake, config_error, did_you_mean, dotted
 
 LEROBOT = "lerobot:"
 MUJOCO = "so101_mujoco"
@@ -254,12 +254,12 @@ def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
             f"{config.adapter} has no motor bus to switch off; use hold",
         )
     known = so101(simulated=False) if config.adapter == LEROBOT + "so101_follower" else None
-    problems: list[Problem] = []
+    problems: list[Mistake] = []
     joints, scales = [], {}
     for name in names:
         joint = _joint(name, params.joints.get(name, JointParams()), robot, known)
         if isinstance(joint, str):
-            problems.append(Problem(0, dotted(("hal", "params", "joints", name)), joint))
+            problems.append(Mistake(0, dotted(("hal", "params", "joints", name)), joint))
             continue
         joints.append(joint[0])
         scales[name] = joint[1]

@@ -15,7 +15,7 @@ from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import Path, Problem, config_error, did_you_mean, dotted
+from vram_arbiter.schemas.yamltext import Mistake, Path, config_error, did_you_mean, dotted
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -121,7 +121,7 @@ class LerobotParams(ModelParams):
 
 def wrong(source: str, path: Path, problem: str) -> ConfigError:
     """Return one mistake below `hal`."""
-    return config_error(source, [Problem(0, dotted(("hal", *path)), problem)])
+    return config_error(source, [Mistake(0, dotted(("hal", *path)), problem)])
 
 
 def read_params[T: Params](kind: type[T], config: HalConfig, source: str) -> T:
@@ -138,14 +138,14 @@ def read_params[T: Params](kind: type[T], config: HalConfig, source: str) -> T:
                 if len(path) == 5 and path[2] == "joints":
                     fields = list(JointParams.model_fields)
                 text = f"unknown key{did_you_mean(str(path[-1]), fields)}"
-            problems.append(Problem(0, dotted(path), text))
+            problems.append(Mistake(0, dotted(path), text))
         raise config_error(source, problems) from error
 
 
 def check_joints(given: JsonMap, names: tuple[str, ...], path: Path, source: str) -> None:
     """Raise ConfigError for each key of `given`, at `path`, that is no joint."""
     problems = [
-        Problem(
+        Mistake(
             0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"
         )
         for name in given

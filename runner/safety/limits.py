@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
-from vram_arbiter.schemas.yamltext import Problem, config_error
+from vram_arbiter.schemas.yamltext import Mistake, config_error
 
 Vector3 = tuple[float, float, float]
 EVERYWHERE: tuple[Vector3, Vector3] = (
@@ -193,12 +193,12 @@ def _refuse_what_is_wrong(
     for key in POSITIVE:
         value = getattr(envelope, key)
         if value is not None and not value > 0:  # NaN too
-            problems.append(Problem(0, f"{name}.{key}", f"must be above 0, not {value}"))
+            problems.append(Mistake(0, f"{name}.{key}", f"must be above 0, not {value}"))
     low, high = _intersection(limits.box, envelope)
     for axis, least, most in zip("xyz", low, high, strict=True):
         if least > most:
             problems.append(
-                Problem(
+                Mistake(
                     0,
                     f"{name}.workspace_box_min_xyz",
                     f"the workspace is empty: {axis} {least} > {most}",
@@ -211,12 +211,12 @@ def _refuse_what_is_wrong(
             wrong = [item["msg"] for item in error.errors() if item["type"] == "value_error"]
             text = wrong[0] if wrong else "give min_xyz and max_xyz, or center_xyz and radius_m"
             problems.append(
-                Problem(0, f"{name}.no_go_zones[{index}]", text.removeprefix("Value error, "))
+                Mistake(0, f"{name}.no_go_zones[{index}]", text.removeprefix("Value error, "))
             )
     if kinematics is None:
         asked = [key for key in NEEDS_KINEMATICS if key in envelope.model_fields_set]
         problems += [
-            Problem(
+            Mistake(
                 0,
                 f"{name}.{key}",
                 "this cannot be enforced: there are no kinematics of this robot"
@@ -229,7 +229,7 @@ def _refuse_what_is_wrong(
         raise error_of(problems)
 
 
-def error_of(problems: list[Problem]) -> ConfigError:
+def error_of(problems: list[Mistake]) -> ConfigError:
     return config_error("safety", problems)
 
 

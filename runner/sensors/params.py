@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.plain import JsonObject
-from vram_arbiter.schemas.yamltext import Problem, YamlText, config_error, problems_of
+from vram_arbiter.schemas.yamltext import Mistake, YamlText, config_error, problems_of
 
 
 class BackendParams(BaseModel):
@@ -45,7 +45,7 @@ def refuse(config: SensorReaderConfig, field: str, problem: str) -> ConfigError:
 
 def refuse_field(config: SensorReaderConfig, field: str, problem: str) -> ConfigError:
     """Return an error about one field of the camera itself."""
-    return _named(config, [Problem(0, field, problem)])
+    return _named(config, [Mistake(0, field, problem)])
 
 
 def require_module(config: SensorReaderConfig, module: str, distribution: str, extra: str) -> None:
@@ -59,13 +59,13 @@ def _error(config: SensorReaderConfig, found: list[tuple[str, str]]) -> ConfigEr
     return _named(
         config,
         [
-            Problem(0, f"backend_params.{field}" if field else "backend_params", text)
+            Mistake(0, f"backend_params.{field}" if field else "backend_params", text)
             for field, text in found
         ],
     )
 
 
-def _named(config: SensorReaderConfig, problems: list[Problem]) -> ConfigError:
+def _named(config: SensorReaderConfig, problems: list[Mistake]) -> ConfigError:
     error = config_error(f"sensor {config.sensor_id}", problems)
     details: JsonObject = {**error.details, "sensor_id": config.sensor_id}
     return ConfigError(error.message, details=details)

@@ -60,7 +60,7 @@ def mean(values: Sequence[float]) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class SeedOutcome:
     """Outcome of one seed. `success` None: the world does not judge, or `error` tells why not.
 
     An error of the contestant while it plays (`model_error`) is a failure where the world judges;
@@ -115,7 +115,7 @@ class Cell:
     contestant: str
     task: str | None
     revision: str = ""
-    episodes: list[Played] = field(default_factory=list)
+    episodes: list[SeedOutcome] = field(default_factory=list)
     complete: bool = False
     why: str = ""
 
@@ -135,7 +135,7 @@ class Cell:
     def success_rate(self) -> float | None:
         return self.successes / self.judged if self.judged else None
 
-    def add(self, played: Played) -> None:
+    def add(self, played: SeedOutcome) -> None:
         """Add an outcome.
 
         In a world that judges, a contestant's own error is a failure, also before the world's first
@@ -303,7 +303,7 @@ class Benchmark:
 
     async def _episode_of(
         self, worker: ThreadPoolExecutor, contestant: Contestant, seed: int
-    ) -> Played | None:
+    ) -> SeedOutcome | None:
         """None: stopped in its middle."""
         began_s = time.monotonic()
         path = self._video_of(contestant.name, seed)
@@ -337,7 +337,7 @@ class Benchmark:
         except Cancelled:
             return None
         except VramError as error:
-            played = Played(seed, None, error=error.code, message=str(error))
+            played = SeedOutcome(seed, None, error=error.code, message=str(error))
         finally:
             self.runner.robot.video.recorder = None
             if recorder is not None:
@@ -358,7 +358,7 @@ class Benchmark:
 
     def _episode(
         self, contestant: Contestant, goal: Goal, seed: int, recorder: VideoRecorder | None
-    ) -> Played | None:
+    ) -> SeedOutcome | None:
         """Ticks until the episode is over."""
         runner, robot, ended = self.runner, self.runner.robot, list[SkillEnded]()
         robot.video.recorder = recorder
@@ -384,7 +384,7 @@ class Benchmark:
         if robot.failure is not None:  # in the tick in which the contestant was done
             raise robot.failure
         episode = robot.episodes[-1]
-        return Played(
+        return SeedOutcome(
             seed,
             False if error is not None and episode.success is not None else episode.success,
             steps=episode.steps,
@@ -424,7 +424,7 @@ def file_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9.-]+", "-", text).strip("-.")
 
 
-def _verdict(played: Played) -> str:
+def _verdict(played: SeedOutcome) -> str:
     word = {True: "success", False: "failure", None: "error" if played.error else "not judged"}[
         played.success
     ]

@@ -158,11 +158,6 @@ class ObjectSpec:
         return self.height_m / 2.0
 
 
-def vocabulary() -> list[str]:
-    """Return all object names a scene can hold, in a fixed order."""
-    return [f"{colour} {shape}" for colour in COLOURS for shape in SHAPES]
-
-
 def wrap_angle(angle_rad: float) -> float:
     """Return the same angle in (-pi, pi]."""
     return math.atan2(math.sin(angle_rad), math.cos(angle_rad))

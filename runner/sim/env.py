@@ -322,13 +322,6 @@ class SimEnv:
         """
         return self.ground_truth().held
 
-    def is_held_above_table(self, name: str) -> bool:
-        """Return whether this object is held. Raises KeyError for a name that is not in the
-        scene.
-        """
-        truth = self.ground_truth()
-        return truth.objects[name].name == truth.held
-
     def _truth(self, name: str, rest_z_m: float) -> ObjectTruth:
         body = self._data.body(name)
         position = tuple(float(v) for v in body.xpos)

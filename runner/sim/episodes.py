@@ -7,7 +7,6 @@ A run that is stopped before that has an unfinished episode, which does not coun
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vram_arbiter.schemas.world import TickResult
@@ -24,8 +23,6 @@ class Episode:
     success: bool | None
     truncated: bool
     total_reward: float | None = None
-    first_tick: int = 0
-    last_tick: int = 0
 
 
 class EpisodeView:
@@ -38,10 +35,9 @@ class EpisodeView:
     def __init__(self) -> None:
         self.finished: deque[Episode] = deque(maxlen=EPISODES_KEPT)
         self.count = 0
-        self._begin(0)
+        self._begin()
 
-    def _begin(self, tick_idx: int) -> None:
-        self._first_tick = tick_idx
+    def _begin(self) -> None:
         self.steps = 0
         self.total_reward: float | None = None
 
@@ -52,7 +48,7 @@ class EpisodeView:
         ends = bool(tick.terminated or tick.truncated)
         if tick.step_idx is None and not ends:
             if tick.terminated is None:  # a reset tick: what was open before it never finished
-                self._begin(tick.tick_idx)
+                self._begin()
             return
         self.steps += tick.step_idx is not None
         if tick.reward is not None:
@@ -65,17 +61,7 @@ class EpisodeView:
                     success=tick.success,
                     truncated=bool(tick.truncated),
                     total_reward=self.total_reward,
-                    first_tick=self._first_tick,
-                    last_tick=tick.tick_idx,
                 )
             )
             self.count += 1
-            self._begin(tick.tick_idx + 1)
-
-
-def episodes_of(ticks: Iterable[TickResult]) -> list[Episode]:
-    """Return the finished episodes of a recorded run."""
-    view = EpisodeView()
-    for tick in ticks:
-        view.add(tick)
-    return list(view.finished)
+            self._begin()

@@ -8,10 +8,8 @@ from __future__ import annotations
 import enum
 import math
 
-from vram_arbiter.runner.sim.config import ARM_JOINTS, CONTROL_DT_S, REST_POSE
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.kinematics import ArmKinematics
-from vram_arbiter.runner.skills.motion import bounded
 
 OPEN_RAD = 0.80
 CLOSED_RAD = -0.10
@@ -71,11 +69,6 @@ class GrabExpert:
     def done(self) -> bool:
         """Whether the lift is finished."""
         return self.phase is Phase.DONE
-
-    @property
-    def lifting(self) -> bool:
-        """Whether the object should be between the fingers by now."""
-        return self.phase in (Phase.LIFT, Phase.DONE)
 
     def _believed(self) -> tuple[float, float, float]:
         x, y, z = self._env.ground_truth().objects[self._name].position_base
@@ -158,39 +151,3 @@ class GrabExpert:
         ahead = [a + share * (b - a) for a, b in zip(here, goal, strict=True)]
         joints, _ = self._kinematics.solve(ahead, list(self._env.joint_state().values()))
         return [*joints[:5], grip]
-
-
-class RestController:
-    """Brings the arm back to the rest pose at a bounded joint speed, optionally opening it
-    first.
-    """
-
-    def __init__(self, start: dict[str, float], *, speed_rad_s: float = 1.6) -> None:
-        self._target = [start[n] for n in ARM_JOINTS]
-        self._stride = speed_rad_s * CONTROL_DT_S
-
-    def act(self) -> list[float]:
-        """Return the next joint target; the same pose again once at rest."""
-        self._target = [
-            bounded(here, there, self._stride)
-            for here, there in zip(self._target, REST_POSE, strict=True)
-        ]
-        return list(self._target)
-
-    @property
-    def done(self) -> bool:
-        """Whether the target has arrived at the rest pose."""
-        return all(abs(a - b) < 1e-6 for a, b in zip(self._target, REST_POSE, strict=True))
-
-
-def run_expert(
-    env: SimEnv, expert: GrabExpert, *, max_steps: int = 150, settle_steps: int = 6
-) -> bool:
-    """Let the expert finish; whether anything is held at the end."""
-    for _ in range(max_steps):
-        env.step(expert.act())
-        if expert.done:
-            break
-    for _ in range(settle_steps):
-        env.step(expert.act())
-    return env.held_object() is not None

@@ -36,12 +36,6 @@ class ArmKinematics:
         self._range = np.array([self._model.joint(n).range for n in ARM_JOINTS])
         self._mount = np.array(config.mount_in_base_m)
 
-    def grasp_point(self, joints: Sequence[float]) -> tuple[float, float, float]:
-        """Forward kinematics: where the grasp point is in the base frame, in meters."""
-        self._pose(joints)
-        x, y, z = self._data.site_xpos[self._site] + self._mount
-        return float(x), float(y), float(z)
-
     def solve(
         self,
         point_base_m: Sequence[float],

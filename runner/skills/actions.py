@@ -112,7 +112,7 @@ class ActionPlan:
 
 # -- one step
 @dataclass(slots=True)
-class Stepped:
+class RowStep:
     """What one row asks of the robot. `problem`: how it falls short; `withheld`: nothing moves."""
 
     targets: dict[str, float]  # rad by joint
@@ -147,11 +147,11 @@ class Stepper:
         # those that are told where to be and take their time to come there
         self._slow = {j.name for j in robot.joints if j.gripper or leading} & self._longest.keys()
 
-    def step(self, row: Row, start: Mapping[str, float]) -> Stepped:
+    def step(self, row: Row, start: Mapping[str, float]) -> RowStep:
         """Return what to do from the joint targets `start` (rad). Raises ModelError for a step
         that no unit explains.
         """
-        done = Stepped({})
+        done = RowStep({})
         for command in self._plan.commands:
             values = [row[index] for index in command.at]
             match command.kind:
@@ -179,7 +179,7 @@ class Stepper:
 
     def _add(
         self,
-        done: Stepped,
+        done: RowStep,
         names: tuple[str, ...],
         steps: Sequence[float],
         start: Mapping[str, float],
@@ -194,7 +194,7 @@ class Stepper:
             done.targets[name] = target
 
     def _move_tool(
-        self, done: Stepped, command: Command, values: Sequence[float], start: Mapping[str, float]
+        self, done: RowStep, command: Command, values: Sequence[float], start: Mapping[str, float]
     ) -> None:
         import numpy as np
 
@@ -237,7 +237,7 @@ class Stepper:
         done.targets.update(self._in_time(done, found.joints, start))
 
     def _in_time(
-        self, done: Stepped, joints: Mapping[str, float], start: Mapping[str, float]
+        self, done: RowStep, joints: Mapping[str, float], start: Mapping[str, float]
     ) -> dict[str, float]:
         """Return the way to `joints` as far as the slowest of them comes in one period."""
         share = 1.0

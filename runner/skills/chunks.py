@@ -75,6 +75,7 @@ class ChunkPlayer:
         self._asked_at = 0  # rows played before the observation of the chunk under way
         self._steps_since = 0  # control steps since then
         self._late = False  # the chunk that is awaited was due and not there
+        self._stands = False  # no row was played in the last control step
         self._begun = -1  # the newest chunk of which a row was played
         self.chunks = 0
         self.played = 0
@@ -82,9 +83,12 @@ class ChunkPlayer:
     def wants_observation(self, ahead: int = 0) -> bool:
         """Return whether the next `next_row` will ask for a chunk and so needs an observation.
 
-        With `ahead`, whether it or one of so many after it will, as far as the rows tell.
+        With `ahead`, whether it or one of so many after it will, as far as the rows tell: also
+        while a chunk is under way, once for every step in which a row plays.
         """
-        return self._under_way is None and len(self._rows) <= self._prefetch_at + ahead
+        if self._under_way is not None and (self._stands or not ahead):
+            return False
+        return len(self._rows) <= self._prefetch_at + ahead
 
     @property
     def delay(self) -> int:
@@ -119,7 +123,8 @@ class ChunkPlayer:
                 self._under_way = None
                 self._collect(future)
             self._steps_since += 1
-        if not self._rows:
+        self._stands = not self._rows
+        if self._stands:
             self._late = True
             return None
         self.played += 1

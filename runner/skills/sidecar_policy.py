@@ -173,7 +173,7 @@ class SidecarPolicy(SkillBase):
         self._running = False
         self._player: ChunkPlayer | None = None
         self._recent: deque[Row] = deque(maxlen=STILL_WINDOW)
-        self._seen: deque[Message] = deque(maxlen=wiring.rollout.n_obs_steps)
+        self._seen: deque[Message] = deque(maxlen=1)  # the policy's history
         self._latency_s = 0.0  # of the newest chunk that was answered
         self._target: dict[str, float] = {}
 
@@ -187,16 +187,17 @@ class SidecarPolicy(SkillBase):
                 f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`"
             )
         await self._occupy(goal)
-        await self._client.reset({TASK_KEY: self._task}, token=self._token)
+        begun = await self._client.reset({TASK_KEY: self._task}, token=self._token)
+        rollout = self._wiring.rollout
         self._ramp, self._running, self._commanded = None, False, None
         self._recent.clear()
-        self._seen.clear()
+        self._seen = deque(maxlen=_count(begun, "n_obs_steps") or rollout.n_obs_steps or 1)
         # of this goal: a late request without a token would load the model anew
         token = self._token
         self._player = ChunkPlayer(
             lambda observation: self._request(observation, token),
-            prefetch_at=self._wiring.rollout.prefetch_at,
-            keep=self._wiring.steps_per_chunk,
+            prefetch_at=rollout.prefetch_at,
+            keep=self._wiring.steps_per_chunk or _count(begun, "n_action_steps"),
             wait_s=self._wait_s,
             latency_steps=self._latency_steps,
         )
@@ -274,7 +275,12 @@ class SidecarPolicy(SkillBase):
             asked_s = time.monotonic()
             try:
                 async with asyncio.timeout(limit_s):
-                    answer = await self._client.get_action(observation, rtc=rtc, token=token)
+                    answer = await self._client.get_action(
+                        observation,
+                        rtc=rtc,
+                        whole_chunk=self._wiring.rollout.prefetch_at > 0,
+                        token=token,
+                    )
             except TimeoutError:
                 raise SidecarUnavailable(
                     f"{self.key} hangs: no chunk within {limit_s:g} s, {self._budget()}",
@@ -305,8 +311,13 @@ class SidecarPolicy(SkillBase):
         return (
             self._running
             and self._player is not None
-            and self._player.wants_observation(self._wiring.rollout.n_obs_steps - 1)
+            and self._player.wants_observation(self._ahead)
         )
+
+    @property
+    def _ahead(self) -> int:
+        """Control steps before a request of which the policy sees the observations, too."""
+        return (self._seen.maxlen or 1) - 1
 
     def _step(self, world: WorldState) -> StepOutcome:
         player = self._player
@@ -328,8 +339,8 @@ class SidecarPolicy(SkillBase):
             return Hold("at the start pose")
         if player.played >= self._steps or self._stands_still(player):
             return Done({"steps": player.played, "chunks": player.chunks})
-        if player.wants_observation(self._wiring.rollout.n_obs_steps - 1):
-            self._seen.append(self._observation(world, measured))
+        if player.wants_observation(self._ahead):
+            self._see(self._observation(world, measured))
         played = player.next_row(self._history() if player.wants_observation() else None)
         if played is None:
             return Hold("the policy thinks", standing=player.played > 0)
@@ -439,16 +450,17 @@ class SidecarPolicy(SkillBase):
             observation[key] = _picture(frame, self._wiring.rollout.views.get(camera))
         return observation
 
-    def _history(self) -> Message:
-        """Return the observations since the last chunk as one, and forget them.
+    def _see(self, observation: Message) -> None:
+        """Add a control step to the history; the first one of a goal fills it, as in lerobot."""
+        self._seen.extend([observation] * (1 if self._seen else self._ahead + 1))
 
-        With several, arrays have a leading dimension: control steps, oldest first. The sidecar
-        keeps what came with the chunks before.
+    def _history(self) -> Message:
+        """Return the last observations as one: with several, arrays have a leading dimension, of
+        control steps with the oldest first.
         """
         import numpy as np
 
         steps = list(self._seen)
-        self._seen.clear()
         if len(steps) == 1:
             return steps[0]
         return {
@@ -494,6 +506,12 @@ class SidecarPolicy(SkillBase):
         except (TypeError, ValueError) as error:
             raise ModelError(f"the policy's actions are no numbers: {error}") from error
         return self._wiring.actions.rows(actions)
+
+
+def _count(begun: JsonMap, name: str) -> int | None:
+    """Return what a sidecar says of an episode; None: a server of the field, which does not."""
+    found = begun.get(name)
+    return found if isinstance(found, int) and found > 0 else None
 
 
 def _joint_action(targets: Mapping[str, float], twist: Twist | None, world: WorldState) -> Action:

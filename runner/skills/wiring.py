@@ -56,7 +56,9 @@ class Rollout(BaseModel):
     views: dict[str, View] = Field(default_factory=dict)
     prefetch_at: int = Field(default=0, ge=0, le=1000)
     rtc: RealTime | None = None  # for policies that lerobot guides by the chunk before
-    n_obs_steps: int = Field(default=1, ge=1, le=16)  # consecutive observations that a chunk needs
+    n_obs_steps: int | None = Field(
+        default=None, ge=1, le=16
+    )  # consecutive observations that a chunk needs; None: as many as the sidecar says, else 1
     targets_lead: bool = (
         False  # its targets are set points far ahead of the arm: a robot goes there step by step
     )

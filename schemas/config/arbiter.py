@@ -78,8 +78,6 @@ class SchedulingConfig(_Section):
     )
     """Of two consumers that thrash, the resident one stays for the cost of a switch, at most this
     long. 0: never."""
-    policy: Literal["default", "fifo", "no_backfill", "lru", "one_model"] = "default"
-    """Order of the queue and choice of victims (docs/explanation/policies.md)."""
 
 
 class RevokeConfig(_Section):

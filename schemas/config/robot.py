@@ -1,7 +1,7 @@
 """A deployment: which robot, which cameras, which skill, at which rate. The YAML file that
 `vram-runner deploy` reads.
 
-Pure: `load_robot(text, name)` takes the text of a file. Field names are those of the field's
+Pure: `robot_of` takes a file that was read. Field names are those of the field's
 `RobotEnvironment` files, so that they load unchanged. Nothing is guessed: what an adapter or a
 reader needs beyond these fields stands in `transport`, `params` and `backend_params` and is checked
 by that adapter, before anything moves.
@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, m
 from vram_arbiter.schemas.body import Body, Capability
 from vram_arbiter.schemas.manifest.contracts import Quantization, SafetyEnvelope
 from vram_arbiter.schemas.manifest.vocabulary import DetectorMode, EmbodimentTag
-from vram_arbiter.schemas.yamltext import Path, YamlText, parse_yaml, validated
+from vram_arbiter.schemas.yamltext import Path, YamlText, validated
 
 RATE_HZ_MAX = 1000.0
 MAX_AGE_MS = 100.0
@@ -224,15 +224,6 @@ def known_keys() -> Mapping[Path, Collection[str]]:
         **{("sensors", index): list(SensorReaderConfig.model_fields) for index in range(64)},
         **{("detectors", index): list(DetectorConfig.model_fields) for index in range(64)},
     }
-
-
-def load_robot(text: str, name: str) -> RobotEnvironment:
-    """Read the text of a deployment file; `name` is how errors call it.
-
-    Raises ConfigError with every mistake and its line: `robot.yaml:7: sensors[0].bakend: unknown
-    key; did you mean backend?`
-    """
-    return robot_of(parse_yaml(text, name))
 
 
 def robot_of(source: YamlText) -> RobotEnvironment:

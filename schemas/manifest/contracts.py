@@ -30,14 +30,14 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector3 = tuple[Finite, Finite, Finite]
 
 
-class Block(BaseModel):
+class ManifestBlock(BaseModel):
     """Base of every block: immutable, and an unknown field is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 # -- what the skill needs of the robot
-class SensorRequirement(Block):
+class SensorRequirement(ManifestBlock):
     """One sensor, by the policy's feature key, or `count` sensors of a modality. Sizes in
     pixels."""
 
@@ -48,7 +48,7 @@ class SensorRequirement(Block):
     count: Annotated[int, Field(ge=1)] = 1
 
 
-class ControlModeSemantics(Block):
+class ControlModeSemantics(ManifestBlock):
     """How the numbers of one actuator are meant."""
 
     mode: Literal["absolute", "delta"]
@@ -57,7 +57,7 @@ class ControlModeSemantics(Block):
     reference_frame: str | None = None
 
 
-class ActuatorRequirement(Block):
+class ActuatorRequirement(ManifestBlock):
     """One actuator that the skill commands. Grippers state their convention, cartesian ones their
     frame, others neither."""
 
@@ -84,14 +84,14 @@ class ActuatorRequirement(Block):
         return self
 
 
-class EmbodimentExtra(Block):
+class EmbodimentExtra(ManifestBlock):
     """Sensors and actuators of a robot that no list knows (`embodiment_tags: [custom]`)."""
 
     sensors: Annotated[tuple[SensorRequirement, ...], Field(min_length=1)]
     actuators: Annotated[tuple[ActuatorRequirement, ...], Field(min_length=1)]
 
 
-class SafetyEnvelope(Block):
+class SafetyEnvelope(ManifestBlock):
     """Limits that the skill accepts below the robot's own. Metres, seconds, newtons, radians."""
 
     workspace_box_min_xyz: Vector3 | None = None
@@ -117,7 +117,7 @@ class SafetyEnvelope(Block):
 
 
 # -- what it runs on
-class Quantization(Block):
+class Quantization(ManifestBlock):
     """Number format of the weights and what makes it.
 
     `extra` of the field: `scheme`, `quantizer`, `compute_dtype`, `min_params_to_quantize`,
@@ -131,7 +131,7 @@ class Quantization(Block):
     extra: dict[str, JsonValue] = {}
 
 
-class LatencyBudget(Block):
+class LatencyBudget(ManifestBlock):
     """Time limits: of one chunk, of warming up, of loading (ms), and of one whole goal (s)."""
 
     per_chunk_ms: Positive
@@ -141,7 +141,7 @@ class LatencyBudget(Block):
 
 
 # -- the kinds' own blocks
-class RosIntegration(Block):
+class RosIntegration(ManifestBlock):
     """The ROS 2 action or service that a `ros_action` or `ros_service` skill wraps."""
 
     package: Annotated[str, Field(min_length=1, max_length=200)]
@@ -167,7 +167,7 @@ class RosIntegration(Block):
         return text
 
 
-class DetectorContract(Block):
+class DetectorContract(ManifestBlock):
     """Vocabulary and input of a detector. `input_size` is width × height, `max_side` the longest
     edge, in pixels."""
 
@@ -179,7 +179,7 @@ class DetectorContract(Block):
     max_side: PositiveInt | None = None
 
 
-class SegmenterContract(Block):
+class SegmenterContract(ManifestBlock):
     """Limits of a promptable segmenter."""
 
     engine: Literal["sam2_hf"]
@@ -188,7 +188,7 @@ class SegmenterContract(Block):
     min_mask_area_px: Annotated[int, Field(ge=1)] = 64
 
 
-class RewardContract(Block):
+class RewardContract(ManifestBlock):
     """How a progress monitor looks and what its numbers mean."""
 
     progress_range: tuple[float, float] = (0.0, 1.0)
@@ -226,7 +226,7 @@ class RewardContract(Block):
         return self
 
 
-class PlaybookContract(Block):
+class PlaybookContract(ManifestBlock):
     """When a written procedure applies, where its text is, and when it is done."""
 
     trigger: Annotated[str, Field(min_length=1, max_length=500)]

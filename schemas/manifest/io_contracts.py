@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
-from vram_arbiter.schemas.manifest.contracts import Block, Finite, PositiveInt
+from vram_arbiter.schemas.manifest.contracts import Finite, ManifestBlock, PositiveInt
 from vram_arbiter.schemas.manifest.problems import Problem, raise_if
 from vram_arbiter.schemas.manifest.vocabulary import (
     JOINT_SPACE_LAYOUTS,
@@ -27,7 +27,7 @@ FileUri = Annotated[
 ]
 
 
-class Processors(Block):
+class Processors(ManifestBlock):
     """The two files that turn observations into a policy's input and its output into actions."""
 
     preprocessor_uri: Annotated[
@@ -48,7 +48,7 @@ class Processors(Block):
         return self
 
 
-class ImagePreprocessing(Block):
+class ImagePreprocessing(ManifestBlock):
     """What was done to the pictures in training. `aliases` maps the robot's camera names to the
     policy's."""
 
@@ -69,7 +69,7 @@ class ImagePreprocessing(Block):
         return self
 
 
-class StateBindings(Block):
+class StateBindings(ManifestBlock):
     """Where the parts of a task-space state vector come from on this robot."""
 
     eef_frame: str | None = None
@@ -79,7 +79,7 @@ class StateBindings(Block):
     quaternion_convention: Literal["xyzw", "wxyz"] = "xyzw"
 
 
-class StatePart(Block):
+class StatePart(ManifestBlock):
     """One stretch of a state vector. Joints left out are all of the robot's, grippers included.
 
     `ee` is an end effector or a frame of the robot; its pose is expressed in `frame`. `rotation`
@@ -110,7 +110,7 @@ class StatePart(Block):
         return self
 
 
-class StateContract(Block):
+class StateContract(ManifestBlock):
     """The proprioception that the checkpoint was trained on: a named layout with bindings for
     task-space layouts, or its `parts` in order; and its width."""
 
@@ -180,7 +180,7 @@ _OF_A_COMMAND = (
 )
 
 
-class ActionSlot(Block):
+class ActionSlot(ManifestBlock):
     """A slice of the action vector, both ends inclusive, and where it goes. `discard` drops it;
     `terminate` ends the goal once its one value is above 0.5. The policy's numbers are clipped to
     `input_bounds` before they are scaled, as robosuite's controllers do."""
@@ -272,7 +272,7 @@ _DELTA_WIDTH = {
 }
 
 
-class ActionContract(Block):
+class ActionContract(ManifestBlock):
     """The action vector of the checkpoint. With `slots`, each of its `dim` values lies in exactly
     one slot."""
 

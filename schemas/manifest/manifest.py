@@ -11,11 +11,11 @@ from pydantic import Field, JsonValue, StringConstraints, model_validator
 
 from vram_arbiter.schemas.manifest.contracts import (
     ActuatorRequirement,
-    Block,
     DetectorContract,
     EmbodimentExtra,
     Finite,
     LatencyBudget,
+    ManifestBlock,
     NonEmpty,
     PlaybookContract,
     Positive,
@@ -71,7 +71,7 @@ LICENSE_HELP: Final = "also run models whose license does not allow commercial u
 _TEMPLATE_WORDS = ("TEMPLATE_ORG", "TEMPLATE_ID")
 
 
-class RSkillManifest(Block):
+class RSkillManifest(ManifestBlock):
     """The package description of one robot skill.
 
     `min_vram_gb` is what its authors declare per number format, in the field's loose GB: good for a

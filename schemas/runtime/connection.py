@@ -35,7 +35,7 @@ OUT_MESSAGES_MAX = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class Bounds:
     """Bounds of a server; sizes in bytes, times in seconds."""
 
     message_max_bytes: int = MESSAGE_MAX_BYTES

@@ -1,7 +1,7 @@
 """A ZeroMQ ROUTER on asyncio for unix sockets, for every server of the product.
 
-Peers are untrusted: they may send anything, at any speed, and never read. The bounds of `Limits`
-hold in bytes as well as in counts, per connection, process and user. The kernel names a peer once,
+Peers are untrusted: they may send anything, at any speed, and never read. `Bounds` hold
+in bytes as well as in counts, per connection, process and user. The kernel names a peer once,
 at accept (`peercred`). Work is done in turns over users, processes and connections, so that a flood
 delays others by a few messages. libzmq is not involved: it aborts or buffers without bound on such
 input before a program sees a byte. Must not know what a message means.
@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from vram_arbiter.schemas.ids import ProcessKey
-from vram_arbiter.schemas.runtime.connection import Connection, Handler, Limits, User
+from vram_arbiter.schemas.runtime.connection import Bounds, Connection, Handler, User
 from vram_arbiter.schemas.runtime.peercred import Peer, PeerGone, identify
 from vram_arbiter.schemas.runtime.socket_file import SocketFile
 from vram_arbiter.schemas.runtime.turns import Turns
@@ -58,11 +58,11 @@ class Router:
     """
 
     def __init__(
-        self, path: Path, handler: Handler, limits: Limits | None = None, group: int | None = None
+        self, path: Path, handler: Handler, limits: Bounds | None = None, group: int | None = None
     ) -> None:
         self._file = SocketFile(path, group)
         self.handler = handler
-        self.limits = limits or Limits()
+        self.limits = limits or Bounds()
         self._direct_share = min(DIRECT_SHARE, self.limits.work_share)
         self._listener: socket.socket | None = None
         self.loop: asyncio.AbstractEventLoop  # from `start` on

@@ -42,6 +42,7 @@ class Why(StrEnum):
     RETURNED = "returned"  # from standby, by itself
     READY = "ready"
     REVOKED = "revoked"
+    WITHDRAWN = "withdrawn"  # the revoke: nothing wants the bytes any more
     SAFE_POINT = "safe_point"
     LET_GO = "let_go"  # the holder released
     LET_GO_BEFORE = "let_go_before"  # its holder said so after a restart

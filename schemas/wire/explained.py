@@ -47,6 +47,7 @@ class Blocker:
     state: str
     uses: int
     condition: Condition
+    label: str = ""  # of its oldest use
     paused: int = 0  # uses that pause
     seconds: float | None = None
     pid: int | None = None

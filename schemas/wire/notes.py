@@ -171,6 +171,18 @@ class RevokeAskedNote:
 
 
 @dataclass(frozen=True, slots=True)
+class RevokeWithdrawnNote:
+    """A revoke ends without an eviction: nothing wants the bytes any more."""
+
+    TAG: ClassVar = ("kind", "revoke_withdrawn")
+
+    wanted_by: str  # consumer of the waiter that is gone
+    cause: Cause
+    uses: int
+    ms: float  # since the revoke
+
+
+@dataclass(frozen=True, slots=True)
 class RevokeAckedNote:
     TAG: ClassVar = ("kind", "revoke_acked")
 
@@ -444,6 +456,7 @@ type AnyNote = (
     | UseYieldedNote
     | UseEndedNote
     | RevokeAskedNote
+    | RevokeWithdrawnNote
     | RevokeAckedNote
     | RemindedNote
     | DeadlinePassedNote

@@ -35,6 +35,16 @@ class RevokePush:
 
 
 @dataclass(frozen=True, slots=True)
+class RevokeWithdrawnPush:
+    """The holder may stay: nothing wants its bytes any more. One that unloads already goes on."""
+
+    TAG: ClassVar = ("push", "revoke_withdrawn")
+
+    lease_id: str
+    token: Token
+
+
+@dataclass(frozen=True, slots=True)
 class GrantedPush:
     """A request that waited is granted."""
 
@@ -96,7 +106,14 @@ class PreparePush:
 
 
 type AnyPush = (
-    RevokePush | GrantedPush | DeniedPush | ResizedPush | LostPush | EventPush | PreparePush
+    RevokePush
+    | RevokeWithdrawnPush
+    | GrantedPush
+    | DeniedPush
+    | ResizedPush
+    | LostPush
+    | EventPush
+    | PreparePush
 )
 
 PUSHES: Final[Mapping[str, type[Any]]] = MappingProxyType(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 STEPS_MAX: Final = 16
-"""Control steps in one observation: the most that a manifest's `n_obs_steps` may say."""
+"""Control steps in one observation: their pictures have to fit into one message."""
 _PARTS: Final = ("vae", "text_encoder", "tokenizer")
 _WORD_FILES: Final = ("tokenizer.json", "spiece.model")
 _VAE_FILE: Final = "diffusion_pytorch_model.safetensors"
@@ -119,19 +119,21 @@ def act(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
     """Return the actions (B, T, D) that `select_action` plays until it would predict again.
 
     They stay in the policy's queue: the next call replays the episode's control steps through
-    `select_action`, one an action, and the last of them predicts. After a failure the episode
-    begins anew. Raises BadRequest for another number of steps.
+    `select_action`, one an action, and the last of them predicts. `steps` may be as many as the
+    longest answer has actions: then the last ones are those. After a failure the episode begins
+    anew. Raises BadRequest for another number of steps.
     """
     import torch
 
     queue = policy._action_queue
     needed = len(queue) + 1 if policy._started else 1
+    if len(steps) == policy.config.chunk_size:
+        steps = steps[-needed:]
     if len(steps) != needed:
         raise BadRequest(
             f"the observation has {len(steps)} control steps, but this policy's cache needs "
             f"{needed}: one after each action of its last answer",
-            hint=f"play whole answers, with policy_extras n_obs_steps: {STEPS_MAX} and without "
-            "prefetch_at, or reset",
+            hint="play whole answers, or reset",
             details={"needed": needed},
         )
     try:

@@ -11,7 +11,12 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
 from vram_arbiter.sidecars.adapters import lingbot
 from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, ModelCall
-from vram_arbiter.sidecars.adapters.policy_checks import need_absolute, need_trained, need_weights
+from vram_arbiter.sidecars.adapters.policy_checks import (
+    need_absolute,
+    need_statistics,
+    need_trained,
+    need_weights,
+)
 from vram_arbiter.sidecars.adapters.policy_families import (
     computing_type,
     family_of,
@@ -25,7 +30,8 @@ from vram_arbiter.sidecars.adapters.policy_observations import (
     Observations,
     misfits,
 )
-from vram_arbiter.sidecars.checkpoints import META, load_lerobot, need_statistics
+from vram_arbiter.sidecars.adapters.policy_pace import Pace, pace_of, settle
+from vram_arbiter.sidecars.checkpoints import META, load_lerobot
 from vram_arbiter.sidecars.quantization import TORCH_NAMES, nf4_of, quantize_linear, torch_type
 from vram_arbiter.sidecars.weights import (
     ProcessorFiles,
@@ -74,20 +80,23 @@ class PolicyAdapter:
     `observation.images.CAMERA` uint8 (H, W, 3) RGB or PNG/JPEG bytes, `task` text. Camera names go
     through the manifest's `image_preprocessing.aliases`. Answer: `action` float32 (T, D).
 
-    Policies without memory (ACT, SmolVLA, pi0 …) answer their whole chunk, as lerobot's inference
-    server does; the caller plays as much of it as the manifest's `n_action_steps` says. Policies
-    with `Family.queues` answer what lerobot's `select_action` plays before it predicts again: T is
-    the checkpoint's `n_action_steps` (TDMPC: `n_action_repeats`). A gaussian actor and an ACT with
-    temporal ensembling give one action an observation, so T is 1 and they have to be asked at
-    every control step.
+    T is what is played before the next observation, the checkpoint's own `n_action_steps` unless
+    the manifest says otherwise (`policy_pace`). A call with `whole_chunk` is answered with all
+    actions that were predicted. Policies with `Family.queues` answer what lerobot's
+    `select_action` plays before it predicts again, others cut their chunk. A gaussian actor and an
+    ACT with temporal ensembling give one action an observation: T is 1.
 
-    The history of such a policy is lerobot's own queue: it begins empty at `reset`, the first
-    observation fills it by repetition, and each further one pushes out the oldest. It was trained
-    on consecutive control steps, but a caller that sends one observation a chunk leaves T steps
-    between two entries. An observation may therefore have a leading dimension, the last 1 to
-    `n_obs_steps` control steps with the oldest first; the actions are then those of a robot that
-    calls `select_action` at every step. lerobot's inference server cannot be followed here: it
-    gives one observation to `predict_action_chunk`, on which these policies fail.
+    The history of a policy with one is lerobot's own queue, which takes an observation at every
+    control step. So a call brings all of it: the last `n_obs_steps` control steps in a leading
+    dimension, oldest first. A lone observation is taken where lerobot's loop has no other: the
+    first of an episode fills the history by repetition, and where T is 1 each call is a control
+    step. Any other call is refused: observations that lie T steps apart look T times as fast.
+    lerobot's inference server cannot be followed here: it gives one observation to
+    `predict_action_chunk`, on which these policies fail.
+
+    Relative actions are relative to the state that their whole chunk was predicted from, as
+    lerobot trains them. Its synchronous loop adds the state of the step at which each is played,
+    which it calls a defect and refuses (`rollout/inference/sync.py`).
 
     LingBot-VA's cache takes the observation after every action that it answered, so each call
     after the first has to bring just these (`lingbot.act`).
@@ -108,6 +117,8 @@ class PolicyAdapter:
         self._before: Any = None
         self._after: Any = None
         self._observations: Observations | None = None
+        self._pace: Pace | None = None
+        self._begun = False  # an observation was seen since the last reset
         self._device = "cpu"
         self._guided = False  # lerobot's real-time chunking was enabled
 
@@ -141,10 +152,13 @@ class PolicyAdapter:
             lingbot.settle(self._config, self._weights.source)
 
     def misfits(self) -> list[str]:
-        """Return where the manifest contradicts the checkpoint's configuration. After `prepare`."""
+        """Return where the manifest contradicts the checkpoint. After `load`."""
         config = self._config
-        chunk_size = getattr(config, "chunk_size", None)
-        return misfits(self._manifest, config.input_features, config.output_features, chunk_size)
+        assert self._pace is not None
+        return [
+            *misfits(self._manifest, config.input_features, config.output_features),
+            *self._pace.contradictions(self._manifest),
+        ]
 
     @property
     def _has_own_dtype(self) -> bool:
@@ -158,28 +172,30 @@ class PolicyAdapter:
         policy = load_lerobot(
             self._policy_class, self._weights, self._config, nf4_of(self._manifest)
         )
-        if device != META:
-            need_trained(policy, self._weights.source)
-        self._guided = False
+        need_trained(self._config.type, self._weights.source)
+        pace = pace_of(policy, history=self._family.queues, replays=self._family.replays)
+        if device != META and (wrong := pace.contradictions(self._manifest)):
+            raise ModelError(
+                f"{self._manifest.name}: {'; '.join(wrong)}", hint="correct the manifest"
+            )
+        self._pace = settle(policy, pace, self._manifest)
+        self._guided = self._begun = False
         self._policy = policy if self._has_own_dtype else _cast(policy, torch_type(self._dtype))
         self._quantize(device)
         if self._family.replays:
             self._encoders = lingbot.load_encoders(policy)
         self._make_processors()
         need_absolute(self._after, self._weights.source)
-        need_statistics(self._before, self._config.input_features, self._weights.source)
-        need_statistics(self._after, self._config.output_features, self._weights.source)
+        for pipeline, features in (
+            (self._before, self._config.input_features),
+            (self._after, self._config.output_features),
+        ):
+            need_statistics(pipeline, features, self._weights.source, padded=self._family.pads)
         self._observations = Observations(
             self._config.input_features,
             self._manifest.image_preprocessing,
-            self._steps_max,
+            self._pace.observations,
         )
-
-    @property
-    def _steps_max(self) -> int:
-        if self._family.replays:
-            return lingbot.STEPS_MAX
-        return int(self._config.n_obs_steps) if self._family.queues else 1
 
     def _quantize(self, device: str) -> None:
         """Quantize linear layers to NF4 where the manifest says int4; on `meta`, choose them."""
@@ -236,9 +252,12 @@ class PolicyAdapter:
 
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, EndpointCall)
+        assert self._pace is not None
+        seen, played = self._pace.observations, self._pace.actions
         if call.endpoint == "reset":
             self._policy.reset()
-            return {"ok": True}
+            self._begun = False
+            return {"ok": True, "n_obs_steps": seen, "n_action_steps": played}
         observation = (call.data or {}).get("observation")
         if not isinstance(observation, Mapping):
             raise BadRequest(
@@ -246,7 +265,8 @@ class PolicyAdapter:
                 hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
             )
         assert self._observations is not None
-        return {"action": self._act(self._observations.read(observation), call.rtc)}
+        actions = self._act(self._observations.read(observation), call.rtc)
+        return {"action": actions if call.whole_chunk else actions[:played]}
 
     def _act(self, steps: list[Batch], rtc: RealTimeChunking | None) -> "NDArray[Any]":
         import torch
@@ -325,7 +345,25 @@ class PolicyAdapter:
                     hint="the sidecar's log has the tokens; nothing was sent to the robot",
                 )
             return chunk
-        return (lingbot.act if self._family.replays else _select)(self._policy, steps)
+        if self._family.replays:
+            return lingbot.act(self._policy, steps)
+        self._need_history(len(steps))
+        return _select(self._policy, steps)
+
+    def _need_history(self, given: int) -> None:
+        """Raise BadRequest for observations that are not the control steps which lerobot's loop
+        would have seen."""
+        assert self._pace is not None
+        needed, alone = self._pace.observations, not self._begun or self._pace.actions == 1
+        if given != needed and not (given == 1 and alone):
+            raise BadRequest(
+                f"the observation has {given} control steps, but this policy's history needs "
+                f"{needed}: one after each action, oldest first",
+                hint="send the last ones together, before that the first one repeated; one alone "
+                "begins an episode, after reset",
+                details={"needed": needed},
+            )
+        self._begun = True
 
     @property
     def _selects(self) -> bool:

@@ -50,6 +50,7 @@ class Family:
     the only name of an image that its code finds. `remote_code`: what of it is Python files of a
     hub repository. `dtype_field` is the field of its configuration that names the number format, if
     it has one, and `casts` marks code that casts unasked; layers of either may stay float32.
+    `pads` marks processors that widen vectors before they normalize them.
     `replays` marks a policy that computes with encoders of a folder of their own, and that needs
     the observation after each of its actions.
     """
@@ -62,6 +63,7 @@ class Family:
     remote_code: str | None = None
     dtype_field: str | None = None
     casts: bool = False
+    pads: bool = False
     replays: bool = False
 
 
@@ -83,7 +85,7 @@ FAMILIES: Final[Mapping[ModelFamily, Family]] = {
         dtype_field="dtype",
     ),
     ModelFamily.EO1: Family(("eo1",), precisions=_OWN_FLOATS, dtype_field="dtype"),
-    ModelFamily.EVO1: Family(("evo1",)),
+    ModelFamily.EVO1: Family(("evo1",), pads=True),
     ModelFamily.XVLA: Family(("xvla",), precisions=_OWN_FLOATS, dtype_field="dtype"),
     ModelFamily.VLA_JEPA: Family(
         ("vla_jepa",), ("diffusers",), precisions=_BF16, dtype_field="torch_dtype"

@@ -76,10 +76,11 @@ class Observations:
 
     def _feature_name(self, name: str) -> str:
         """Return the checkpoint's name of an input: the manifest maps the robot's camera names."""
-        if self._rules is None or not name.startswith(IMAGE_PREFIX):
+        if not name.startswith(IMAGE_PREFIX):
             return name
         camera = name.removeprefix(IMAGE_PREFIX)
-        return self._rules.input_template.format(cam=self._rules.aliases.get(camera, camera))
+        aliases = self._rules.aliases if self._rules is not None else {}
+        return _input_of(aliases.get(camera, camera), self._rules, self._features)
 
     def _image(self, name: str, value: Any) -> Any:
         """Convert uint8 HWC to float (3, H, W) in 0..1, turned and resized as in training."""
@@ -115,18 +116,16 @@ def misfits(
     manifest: RSkillManifest,
     inputs: "Mapping[str, PolicyFeature]",
     outputs: "Mapping[str, PolicyFeature]",
-    chunk_size: int | None,
 ) -> list[str]:
-    """Return where a manifest contradicts its checkpoint, which the first goal would fail on.
-
-    `chunk_size` is the checkpoint's, None: it has none.
-    """
-    rules = manifest.image_preprocessing
-    template = rules.input_template if rules is not None else IMAGE_PREFIX + "{cam}"
+    """Return where a manifest contradicts its checkpoint, which the first goal would fail on."""
     keys = [one.vla_feature_key for one in manifest.sensors_required if one.modality == "rgb"]
-    named = {template.format(cam=key.rpartition(".")[2]) for key in keys if key}
+    named = {
+        _input_of(key.rpartition(".")[2], manifest.image_preprocessing, inputs)
+        for key in keys
+        if key
+    }
     found = [
-        f"the checkpoint reads {name}, which sensors_required does not name"
+        f"the checkpoint reads {name}, sensors_required names {', '.join(sorted(named)) or 'none'}"
         for name, feature in inputs.items()
         if feature.type.value == "VISUAL" and not _is_padded(name) and name not in named
     ]
@@ -137,9 +136,17 @@ def misfits(
         stated = None if contract is None else contract.dim
         if stated is not None and feature is not None and (stated,) != tuple(feature.shape):
             found.append(f"{field} is {stated}, the checkpoint has {feature.shape[0]} numbers")
-    if chunk_size is not None and manifest.chunk_size > chunk_size:
-        found.append(f"chunk_size is {manifest.chunk_size}, the checkpoint answers {chunk_size}")
     return found
+
+
+def _input_of(
+    camera: str, rules: ImagePreprocessing | None, inputs: "Mapping[str, PolicyFeature]"
+) -> str:
+    """Return the checkpoint's input of a policy's camera. Checkpoints of one camera may have it
+    beside the state, as `observation.image`."""
+    name = (IMAGE_PREFIX + "{cam}" if rules is None else rules.input_template).format(cam=camera)
+    lone = f"observation.{camera}"
+    return lone if name not in inputs and lone in inputs else name
 
 
 def _is_padded(name: str) -> bool:

@@ -20,7 +20,7 @@ from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.settings import core_changes
 from vram_arbiter.schemas.config.arbiter import LIVE_KEYS, ArbiterConfig, load_config
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime.connection import Limits
+from vram_arbiter.schemas.runtime.connection import Bounds
 
 GIB = 1 << 30
 FIRST = "limits: {leases_per_client_max: 2}\nlog: {level: info}\n"
@@ -192,7 +192,7 @@ def test_each_live_key_reaches_a_part() -> None:
         "history.max_events", "history.days", "log.level",
     }  # fmt: skip
     assert set(reached.values()) <= names | {""}
-    elsewhere = {field.name for cls in (SessionSettings, Limits) for field in fields(cls)}
+    elsewhere = {field.name for cls in (SessionSettings, Bounds) for field in fields(cls)}
     assert not elsewhere & set(reached.values()), "a copy would keep the former value"
 
 

@@ -9,12 +9,12 @@ from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.settings import park_budget_bytes
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig
 from vram_arbiter.schemas.defaults import KIB
-from vram_arbiter.schemas.runtime.connection import Limits
+from vram_arbiter.schemas.runtime.connection import Bounds
 
 
 def test_each_constant_of_the_configuration_reaches_a_part() -> None:
     """They are matched by name: a key of another name would have no effect."""
-    names = {field.name for cls in (Settings, SessionSettings, Limits) for field in fields(cls)}
+    names = {field.name for cls in (Settings, SessionSettings, Bounds) for field in fields(cls)}
     config = dict(ArbiterConfig())
     unused = [
         f"{section}.{key}"

@@ -225,6 +225,34 @@ async def test_revoked_at_the_safe_point_and_not_before(
         assert lease.error is None
 
 
+async def test_a_holder_stays_when_nothing_wants_its_room_any_more(
+    arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    """The holder unloaded at the end of its use for a waiter that had given up."""
+    story: list[str] = []
+    async with (
+        AsyncClient("holder", endpoint=arbiter_daemon.endpoint) as holder,
+        AsyncClient("waiter", endpoint=arbiter_daemon.endpoint) as waiter,
+    ):
+        lease = await holder.acquire(spec("a", 5), unload=lambda: story.append("unload"))
+        await lease.ready()
+        for name in ("first", "second"):
+            async with lease.use(name):
+                with pytest.raises(WaitTimeout):
+                    await waiter.acquire(spec("b", 5, independent=True), wait_timeout_s=0.5)
+                with anyio.fail_after(WAIT_S):
+                    while (state := lease.state) != "held":
+                        await lease.wait_change(state)
+                assert lease.evicted is None
+                async with lease.use("another"):
+                    assert (await states(waiter))["a"] == "held"
+        assert story == []
+        kinds = [event["kind"] for event in (await waiter.history(0, 500)).events]
+        assert kinds.count("revoke_withdrawn") == 2
+        other = await waiter.acquire(spec("b", 5), WAIT_S)
+        assert (story, lease.state, other.state) == (["unload"], "gone", "loading")
+
+
 async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
     arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:

@@ -20,6 +20,8 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WouldDeadlock,
 )
+from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.wire.pushes import RevokePush
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
@@ -201,6 +203,9 @@ async def test_weights_are_parked_where_the_budget_has_room(
         assert (model.did[-1], detector.state) == ("unload", "gone")
 
 
+AGAIN = RevokePush("L1", Token(1, 1), "", 1.0, 0, park=False)
+
+
 async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, beside: Start
 ) -> None:
@@ -212,9 +217,7 @@ async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
         detector = await parkable(client, spec, model)
         parking = beside(detector.park())
         while not parking.done:
-            detector._revoke_asked(
-                {}, False
-            )  # as the arbiter says it again and again while somebody waits
+            detector._revoke_asked(AGAIN)  # as the arbiter repeats it
             await anyio.sleep(0)
         await parking
         assert (detector.state, model.did) == ("gone", ["park", "unload"])

@@ -93,7 +93,7 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
         Path("other.yaml").write_text(manifest.replace("images.wrist", "images.palm"))
         other = sidecar(check.replace("act-grab/rskill.yaml", "other.yaml"))
         assert other.wait(WAIT_S) == 2, "its first goal would fail"
-        misfit = "the checkpoint reads observation.images.wrist, which sensors_required does not"
+        misfit = "the checkpoint reads observation.images.wrist, sensors_required names "
         assert misfit in Path("sidecar.log").read_text()
         serving = sidecar(serve)
         try:

@@ -32,9 +32,8 @@ def install_into(
     packages = prefix / "lib" / version / "site-packages"
     packages.mkdir(parents=True)
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
-    left_out = shutil.ignore_patterns(*(name.strip("/") for name in wheel["exclude"]))
     for name in wheel["packages"]:  # its links are followed, as by the wheel's builder
-        shutil.copytree(TREE / name, packages / Path(name).name, ignore=left_out)
+        shutil.copytree(TREE / name, packages / Path(name).name)
     (packages / "dependencies.pth").write_text(f"{dependencies}\n")
 
     (prefix / "pyvenv.cfg").write_text(

@@ -4,7 +4,6 @@ Everything runs in a fresh interpreter in an empty folder: inside pytest the tre
 path and the answer would always be the wished one.
 """
 
-import ast
 import json
 import os
 import subprocess
@@ -125,34 +124,3 @@ importlib.import_module("vram_arbiter.{package}.__main__")
 print(json.dumps([heavy for heavy in {HEAVY!r} if heavy in sys.modules]))
 """
     assert json.loads(in_a_fresh_interpreter(code, tmp_path)) == []
-
-
-def training_modules_imported(source: str) -> list[str]:
-    """Modules of a `training` folder that this source imports, at the top or in a function."""
-    names = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            names += [f"{node.module}.{alias.name}" for alias in node.names]
-    return [name for name in names if "training" in name.split(".")]
-
-
-def test_no_shipped_module_imports_training_code() -> None:
-    """The wheel leaves `training/` folders out: an import of one works in a clone only."""
-    assert training_modules_imported("def f():\n    from a.training.b import c") == [
-        "a.training.b.c"
-    ]
-    shipped = [
-        path
-        for package in PACKAGES
-        for path in (TREE / package).rglob("*.py")
-        if "training" not in path.relative_to(TREE).parts
-    ]
-    assert len(shipped) > 100
-    found = {
-        str(path.relative_to(TREE)): names
-        for path in shipped
-        if (names := training_modules_imported(path.read_text(encoding="utf-8")))
-    }
-    assert found == {}

@@ -23,10 +23,9 @@ import yaml
 
 from docs.hooks.programs import parsers, subcommands
 from tests.packaging.test_pages import PAGES, TREE
+from tests.support.deployment import load_robot
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.config.hooks import load_hooks
-from vram_arbiter.schemas.config.robot import load_robot
-from vram_arbiter.schemas.config.scenario import load_scenario
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.manifest.load import parse_manifest
 
@@ -238,7 +237,6 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     ),
     frozenset({"kwargs", "actions"}): lambda text: environment(**yaml.safe_load(text)),
     frozenset({"hooks"}): lambda text: load_hooks(text, "page"),
-    frozenset({"gpu", "consumers"}): lambda text: load_scenario(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
     frozenset({"http"}): lambda text: load_config(text, "page"),
     frozenset({"telemetry"}): lambda text: load_config(text, "page"),

@@ -6,11 +6,16 @@ from pathlib import Path
 import pytest
 
 TREE = Path(__file__).parents[2]
-FOLDERS = "arbiter|clients|schemas|sidecars|runner|reasoner|configs|examples|docs|tests|src"
+FOLDERS = (
+    "arbiter|clients|schemas|sidecars|runner|reasoner|configs|examples|docs|tests|training|src"
+)
 PATH = re.compile(rf"`((?:{FOLDERS})/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::(\w+))?`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#([\w-]+))?\)")
+PLACES = ("docs", "training", "configs/models")
 CODE = {".conf", ".example", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"}
-PAGES = sorted([*TREE.glob("*.md"), *(TREE / "docs").rglob("*.md")])
+PAGES = sorted(
+    [*TREE.glob("*.md"), *(page for top in PLACES for page in (TREE / top).rglob("*.md"))]
+)
 
 
 def anchors(page: Path) -> set[str]:

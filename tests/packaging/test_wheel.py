@@ -40,7 +40,7 @@ def test_everything_has_one_import_name(names: list[str]) -> None:
     [
         "vram_arbiter/__init__.py",
         "vram_arbiter/py.typed",
-        "vram_arbiter/arbiter/lab/__main__.py",
+        "vram_arbiter/arbiter/offline/__main__.py",
         "vram_arbiter/configs/arbiter.yaml",
         "vram_arbiter/schemas/json/arbiter.json",
     ],

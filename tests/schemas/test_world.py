@@ -155,11 +155,6 @@ def test_wrong_action_is_refused(fields: dict[str, Any], message: str) -> None:
         )
 
 
-def test_wire_numbers_of_control_modes() -> None:
-    assert [mode.wire_number for mode in ControlMode] == list(range(13))
-    assert ControlMode.COMPOSITE_MODE.wire_number == 12
-
-
 def test_camera_puts_a_pixel_on_the_plane() -> None:
     looking_down = CameraModel(
         K=((100, 0, 50), (0, 100, 50), (0, 0, 1)),

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.support.deployment import load_robot
 from vram_arbiter.schemas.config.arbiter import load_config
-from vram_arbiter.schemas.config.robot import load_robot
-from vram_arbiter.schemas.config.scenario import load_scenario
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 from vram_arbiter.schemas.yamltext import (
@@ -130,7 +129,7 @@ WORDS = st.sampled_from(
 
 @given(st.lists(WORDS | st.text(max_size=4), max_size=30).map("".join))
 def test_no_text_raises_anything_but_a_typed_error(text: str) -> None:
-    for load in (parse_yaml, load_config, load_robot, load_scenario, parse_manifest):
+    for load in (parse_yaml, load_config, load_robot, parse_manifest):
         try:
             load(text, "x.yaml")
         except (ConfigError, ManifestError) as error:

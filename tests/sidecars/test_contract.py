@@ -42,7 +42,7 @@ def red() -> bytes:
     return encoded(size=(96, 96), color=(200, 30, 30))
 
 
-def observation(cameras: tuple[str, ...]) -> Message:
+def get_action(cameras: tuple[str, ...]) -> Message:
     import numpy as np
 
     pixels = {f"observation.images.{one}": np.zeros((96, 96, 3), np.uint8) for one in cameras}
@@ -76,7 +76,7 @@ KINDS = (
         slow=True,
     ),
     Kind(
-        "policy", "rskills/so101-grab", lambda: observation(("front", "wrist")),
+        "policy", "rskills/so101-grab", lambda: get_action(("front", "wrist")),
         lambda: {"endpoint": "get_action", "data": {"observation": {"observation.state": [1.0]}}},
     ),
     Kind(
@@ -86,7 +86,7 @@ KINDS = (
         slow=True,
     ),
     Kind(
-        "passthrough", "diagnostics/gpu-passthrough", lambda: observation(("front",)),
+        "passthrough", "diagnostics/gpu-passthrough", lambda: get_action(("front",)),
         lambda: {"endpoint": "get_action", "data": {"observation": {}}}, parks=False,
     ),
 )  # fmt: skip

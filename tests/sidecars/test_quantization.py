@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.sidecars.adapters import tiny_vision
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.schemas.errors import CODES, ConfigError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -286,6 +287,16 @@ class TestTransformers:
         }
         with pytest.raises(ConfigError, match="no such module"):
             self.load(folder, "meta", skip_modules=["vision_tower"])
+
+    @pytest.mark.parametrize("save", [tiny_vision.save_smolvlm, tiny_vision.save_llava_onevision])
+    def test_a_vision_tower_of_any_name_stays(self, tmp_path: Path, save: Any) -> None:
+        """Regression: SmolVLM's is called `vision_model`, which the default did not name."""
+        save(tmp_path)
+        quantized = nf4_layers(self.load(tmp_path))
+        assert any("language_model" in name or "text_model" in name for name in quantized)
+        assert not any("vision" in name for name in quantized)
+        everything = nf4_layers(self.load(tmp_path, skip_modules=[]))
+        assert any("vision" in name for name in everything)
 
     def test_the_manifests_compute_dtype_is_that_of_the_whole_model(self, folder: Path) -> None:
         import torch

@@ -13,11 +13,11 @@ PROBE_FAILURE = "the driver hangs"
 """What a failed reading of the driver reports."""
 
 
-def busy_driver(seed: int, steps: int = 120, policy: str = "default") -> CoreDriver:
+def busy_driver(seed: int, steps: int = 120) -> CoreDriver:
     """Four consumers that load, use, release, cancel, report and die, on a GPU that lags and
     sometimes cannot be read."""
     random = Random(seed)
-    driver = CoreDriver(settings={"policy": policy})
+    driver = CoreDriver()
     driver.device.lag_s = 0.03
     driver.device.overhead_bytes = 200 * MIB
     people = {name: driver.consumer(name) for name in ("detector", "vlm", "grab", "chat")}

@@ -78,7 +78,6 @@ PROGRAMS: Mapping[str, Program] = {
             "vram_arbiter.clients.cli.operators",
             "vram_arbiter.clients.cli.run",
             "vram_arbiter.clients.cli.status",
-            "vram_arbiter.clients.cli.watch",
             "vram_arbiter.clients.cli.why",
         ),
     ),

@@ -48,7 +48,7 @@ def test_threads_that_wait_for_the_same_program_all_hear_of_its_end(
     arbiter_daemon: ArbiterProcess,
 ) -> None:
     """A recorder waits for its writer on two threads."""
-    process = start("vramctl", ["watch"], arbiter_daemon.environ)
+    process = start("vramctl", ["history", "-f"], arbiter_daemon.environ)
     codes: list[int] = []
     waiting = [threading.Thread(target=lambda: codes.append(process.wait(WAIT_S))) for _ in "ab"]
     for one in waiting:

@@ -110,7 +110,7 @@ class Gangs(Feature):
             self._deny(core, gang, no.GangTooLarge(gang.name, len(waiting), needed, budgets))
             return
         gang.phase = "waiting"
-        ageing_s = core.settings.ageing_s_per_point if core.policy.by_priority else 0.0
+        ageing_s = core.settings.ageing_s_per_point
         for lease in waiting:
             lease.request.rank = gang.first_at - gang.priority * ageing_s
             core.enqueue(lease)
@@ -306,14 +306,14 @@ class Gangs(Feature):
 
     # -- reports and invariants --------------------------------------------------------------------
     def check(self, core: Core) -> None:
-        """Check invariant 7: all waiting members of a gang are charged, or none."""
+        """Check invariant 8: all waiting members of a gang are charged, or none."""
         for gang in self._named(self.settled | self.touched):
             for lease in gang.waiting():
                 charged = lease.gpu is not None and lease.id in core.gpus[lease.gpu].ledger.charges
                 if charged != (gang.phase == "loading"):
                     told = "charged" if charged else "not charged"
                     raise InvariantViolation(
-                        7, f"gang {gang.name} is {gang.phase}, and {lease.id} is {told}"
+                        8, f"gang {gang.name} is {gang.phase}, and {lease.id} is {told}"
                     )
 
     def view(self, shown: LeaseView, lease: Lease) -> LeaseView:

@@ -67,9 +67,14 @@ class Residents(dict[LeaseId, Lease]):
     def moved(self, lease: Lease, before: LeaseState) -> None:
         """A lease of this GPU came to another state."""
         self.by_state[before].pop(lease.id, None)
-        self.by_state[lease.state][lease.id] = lease
+        now_there = self.by_state[lease.state]
+        now_there[lease.id] = lease
         if lease.state is LeaseState.HELD:
             self.recent[lease.id] = lease
+            if before is LeaseState.REVOKING:  # back among those that became ready since
+                in_order = sorted(now_there.values(), key=lambda one: one.ready_at)
+                now_there.clear()
+                now_there.update((one.id, one) for one in in_order)
 
     def seen(self, taken_at: float) -> None:
         """Forget recent leases that a reading that began at `taken_at` has seen."""
@@ -234,7 +239,7 @@ class Gpu:
     queue: WaitQueue
     residents: Residents = field(default_factory=Residents)
     verifications: dict[str, Verification] = field(default_factory=dict)
-    evictions: list[Eviction] = field(default_factory=list)  # not yet counted to a grant
+    evictions: list[Eviction] = field(default_factory=list)  # under way, or for a waiter
     pending_free: PendingFree = field(default_factory=PendingFree)
     # when the newest verdicts fell, and how many bytes left by each
     left: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LEFT_KEPT))

@@ -56,7 +56,7 @@ TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
         # denied from loading: the grant could not be journalled, so it was never sent
         _S.LOADING: frozenset({_S.HELD, _S.VERIFYING, _S.DENIED, *_GONE}),
         _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
-        _S.REVOKING: frozenset({_S.UNLOADING, _S.VERIFYING, *_GONE}),
+        _S.REVOKING: frozenset({_S.HELD, _S.UNLOADING, _S.VERIFYING, *_GONE}),
         _S.UNLOADING: frozenset({_S.VERIFYING, *_GONE}),
         _S.VERIFYING: frozenset({_S.RELEASED, _S.PARKED, _S.STANDBY}),
         _S.PARKED: frozenset({_S.LOADING, _S.QUEUED, _S.CANCELLED, _S.LOST}),
@@ -156,7 +156,7 @@ class Departure:
     """How a lease leaves its GPU. Empty while it stays."""
 
     eviction: Eviction | None = None  # None: it was not revoked
-    revoked_before: bool = False  # by a daemon that ended since; the holder may act on it
+    revoked_before: bool = False  # withdrawn, or by an earlier daemon; the holder may act on it
     baseline: MemorySampled | None = None  # the GPU when the unloading began
     hangs: bool = False  # the unloading has taken a whole deadline, its bytes are not counted on
     exiting: bool = False  # its process ends, so it keeps nothing

@@ -32,7 +32,7 @@ from vram_arbiter.arbiter.core.model.lease import (
     Use,
 )
 from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
-from vram_arbiter.arbiter.core.settings import SCHEDULING, Settings
+from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause
 from vram_arbiter.schemas.wire.errors import Refusal
@@ -156,15 +156,15 @@ class Core:
 
     def __init__(self, settings: Settings, now: float, features: tuple[Feature, ...]) -> None:
         self.settings = settings
-        self.policy = SCHEDULING[settings.policy]
         self.features = features
         self.started_at = now
         self.now = now
         self.turn = Turn()
-        ageing_s = settings.ageing_s_per_point if self.policy.by_priority else 0.0
         self.gpus: dict[GpuId, Gpu] = {
             info.id: Gpu(
-                info, GpuLedger(info, settings.verify_tolerance_bytes), WaitQueue(ageing_s)
+                info,
+                GpuLedger(info, settings.verify_tolerance_bytes),
+                WaitQueue(settings.ageing_s_per_point),
             )
             for info in sorted(settings.gpus, key=lambda info: info.index)
         }
@@ -364,8 +364,13 @@ class Core:
                     del self.waiters_of[owner]
         self.timers.cancel(("wait", lease.id))
         for gpu_id in lease.request.gpus:
-            self.gpus[gpu_id].queue.discard(lease)
-            self.wake(self.gpus[gpu_id])
+            gpu = self.gpus[gpu_id]
+            gpu.queue.discard(lease)
+            if gpu.evictions:  # the room that they made is not this lease's any more
+                gpu.evictions = [
+                    one for one in gpu.evictions if not one.verdict or one.wanted_by != lease.id
+                ]
+            self.wake(gpu)
 
     def end(self, lease: Lease, error: Refusal | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""

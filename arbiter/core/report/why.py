@@ -250,6 +250,7 @@ def holder(core: Core, gpu: Gpu, lease: Lease, waiter: Lease | None = None) -> B
         bytes=gpu.ledger.charge_bytes(lease.id),
         state=lease.state,
         uses=len(lease.uses),
+        label=next((use.label for use in lease.uses.values()), ""),
         condition=condition,
         paused=len(lease.uses.paused),
         seconds=seconds,

@@ -217,10 +217,7 @@ def cancel(core: Core, event: ev.CancelRequested) -> None:
 
 
 def cancel_waiter(core: Core, lease: Lease, why: Why, by: str = "") -> None:
-    """End a wait that its own client ends.
-
-    A revoke that was sent for it stands: the holder may be unloading by now.
-    """
+    """End a wait that its own client ends."""
     core.move(lease, LeaseState.CANCELLED, why)
     core.dequeue(lease)
     core.note(CancelledNote(why, by), lease)

@@ -136,7 +136,7 @@ class _Reduction:
                 self.served.add(waiter.id)
             elif head is None:
                 head = waiter
-                if self.core.policy.backfill and not head.spec.exclusive:
+                if not head.spec.exclusive:
                     after = ledger.total_if(everything, admission.joining(head))
                     spare = ledger.budget_bytes - after  # as `grants` backfills
 

@@ -1,6 +1,8 @@
 """Grants: one pass over the GPUs that changed.
 
 Per GPU, in this order (the numbers stand in `_serve`):
+  0. revokes that nothing wants any more are taken back; those that are not decided again by what
+     follows are withdrawn
   1. under pressure: revoke idle holders, grant nothing
   2. a group of requests loads on the GPU: its feature grants the next one (`Feature.serve`)
   3. blocked (recovering, drained, reading unknown, a load under way): grant and revoke nothing
@@ -14,7 +16,7 @@ Per GPU, in this order (the numbers stand in `_serve`):
      beside it on the day that they are gone, and may be revoked itself
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import Literal
 
@@ -53,6 +55,27 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed or gpu.ledger.pressure_bytes():
         note_pressure(core, gpu)
     gpu.blocked = admission.blocked(core, gpu)
+    unwanted = eviction.unwanted(core, gpu) if gpu.evictions else []
+    if not unwanted or _awaited(core, gpu, unwanted):
+        _decide(core, gpu)
+        return
+    eviction.take_back(core, gpu, unwanted)  # 0
+    _decide(core, gpu)
+    eviction.settle(core, gpu, unwanted)
+
+
+def _awaited(core: Core, gpu: Gpu, unwanted: Sequence[Eviction]) -> bool:
+    """Return whether nothing can be decided now, and the request to serve needs the room of
+    holders that were revoked for another."""
+    if not gpu.blocked or gpu.pressed:
+        return False
+    head, leaving = admission.front(core, gpu), admission.leaving(gpu)
+    for one in unwanted:
+        leaving.pop(one.lease, None)
+    return head is not None and not admission.fits(gpu, head, leaving)
+
+
+def _decide(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.serving:  # 1
         _relieve(core, gpu)
         return
@@ -218,18 +241,12 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
 
 
 def _take_evictions(core: Core, gpu: Gpu, lease: Lease) -> list[Eviction]:
-    """Take the evictions that were for a lease, or for a waiter that has gone since, off the GPU's
-    list. Return those that came to a verdict: they made its room.
-    """
-    kept: list[Eviction] = []
-    made_room: list[Eviction] = []
-    for one in gpu.evictions:
-        if one.wanted_by != lease.id and (not one.verdict or one.wanted_by in core.waiting):
-            kept.append(one)
-        elif one.verdict:
-            made_room.append(one)
-            core.costs.switched(one.consumer, lease.spec.consumer, core.now)
-    gpu.evictions = kept
+    """Take the evictions that were asked for a lease and came to a verdict off the GPU's list:
+    they made its room."""
+    made_room = [one for one in gpu.evictions if one.wanted_by == lease.id and one.verdict]
+    for one in made_room:
+        gpu.evictions.remove(one)
+        core.costs.switched(one.consumer, lease.spec.consumer, core.now)
     return made_room
 
 
@@ -241,7 +258,7 @@ def choose_later(core: Core, gpu: Gpu, head: Lease, *, planned: bool) -> Lease |
     `planned`: with the leases gone whose bytes are pending free, `head` fits.
     """
     ledger, queue = gpu.ledger, gpu.queue
-    if head.spec.exclusive or not core.policy.backfill:
+    if head.spec.exclusive:
         return None
     fold = _largest_fold_bytes(gpu)
     smallest, free = queue.smallest_need_bytes() - fold, ledger.budget_bytes - ledger.total_bytes()

@@ -119,8 +119,7 @@ def _cheapest(
         return None
     if len(rest) == 1:
         return must + rest
-    by_age = core.policy.least_recent
-    return must + _search(core, gpu, base, rest, covers, by_age=by_age)
+    return must + _search(core, gpu, base, rest, covers)
 
 
 def _search(
@@ -129,8 +128,6 @@ def _search(
     going: Mapping[LeaseId, int],
     candidates: Sequence[Lease],
     covers: _Covers,
-    *,
-    by_age: bool = False,
 ) -> list[Lease]:
     """Return the cheapest set that covers (ADR 17); all candidates together do, none of them does
     not.
@@ -140,8 +137,8 @@ def _search(
         one.id: total - gpu.ledger.total_if({**going, one.id: one.residue_bytes})
         for one in candidates
     }
-    if by_age or len(candidates) > EXACT_SEARCH_MAX:
-        return _greedy(candidates, covers, freed, by_age=by_age)
+    if len(candidates) > EXACT_SEARCH_MAX:
+        return _greedy(candidates, covers, freed)
     return _exact(core, candidates, covers, freed)
 
 
@@ -180,22 +177,20 @@ def _exact(
 
 
 def _greedy(
-    candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int], *, by_age: bool
+    candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
 ) -> list[Lease]:
     """Take cheap classes first, the largest of a class first, until they cover; then give back what
-    is not needed. `by_age`: take the least recently used first, and give nothing back.
+    is not needed.
     """
 
     def cost(one: Lease) -> tuple[float, ...]:
         age = (one.uses.last_at, one.request.arrival)
-        if by_age:
-            return (bool(one.uses), not freed[one.id], *age)
         return (bool(one.uses), one.spec.priority, not _can_park(one), -freed[one.id], *age)
 
     order = sorted(candidates, key=cost)
     size = 1 + bisect_left(range(1, len(order)), True, key=lambda n: covers(order[:n]))
     plan = order[:size]
-    for lease in () if by_age else reversed(order[:size]):
+    for lease in reversed(order[:size]):
         without = [other for other in plan if other is not lease]
         if covers(without):
             plan = without

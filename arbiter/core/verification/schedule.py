@@ -11,6 +11,7 @@ The bytes stay charged until then. A failed reading means unknown: it frees noth
 from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
+from vram_arbiter.arbiter.core.ledger import bytes_of
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Verdict, Verification
 from vram_arbiter.arbiter.core.model.state import Core
@@ -37,7 +38,7 @@ def begin_for_lease(
         grace_s: Seconds without a verdict: a lost holder may still be loading.
         fenced_at: When the holder has fenced itself, in monotonic seconds.
     """
-    baseline = lease.departure.baseline or gpu.sample or gpu.before_sleep
+    baseline = lease.departure.baseline or _last_shown(core, gpu, lease.process, alive=alive)
     learning.on_leaving(core, lease)
     vanishes = lease.departure.exiting or not alive
     verification = Verification(
@@ -57,6 +58,19 @@ def begin_for_lease(
         exclusive=lease.spec.exclusive,
     )
     _start_clock(core, gpu, verification)
+
+
+def _last_shown(core: Core, gpu: Gpu, process: ProcessKey, *, alive: bool) -> MemorySampled | None:
+    """Return the newest reading in which the bytes of a process were still there.
+
+    The death of a process may be heard after a reading that shows its bytes as those of a child
+    that outlives it.
+    """
+    shown_in = gpu.ledger.accounts[process].shown_in
+    recent = shown_in and core.now - shown_in.taken_at <= core.settings.verify_timeout_s
+    if recent and not alive:
+        return shown_in
+    return gpu.sample or gpu.before_sleep
 
 
 def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
@@ -258,13 +272,16 @@ def _announce(
     if verification.verdict is judgement.verdict and not judgement.resolved:
         return
     verification.verdict = judgement.verdict
+    residue_bytes = judgement.residue_bytes
+    if reading is not None and (shown := bytes_of(reading, verification.process)) is not None:
+        residue_bytes = min(residue_bytes, shown)  # what it may retain, it need not hold
     verified = VerifiedNote(
         verdict=judgement.verdict,
         resolved=judgement.resolved,
         ms=(core.now - verification.confirmed_at) * 1e3,
         before_bytes=None if verification.baseline is None else verification.baseline.used_bytes,
         after_bytes=None if reading is None else reading.used_bytes,
-        residue_bytes=judgement.residue_bytes,
+        residue_bytes=residue_bytes,
         culprits=judgement.culprits,
     )
     about = About(verification.lease, verification.consumer, gpu.info.id)
@@ -294,12 +311,13 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     core.record_residue(gpu, process, retained_bytes)
     core.forget(f"lease:{lease_id}")
     # 2. its eviction, and the waiter that it was for
-    for eviction in gpu.evictions:
-        if eviction.lease == lease_id:
-            eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
-            waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by else None
-            for gpu_id in () if waiter is None else waiter.request.gpus:
-                core.wake(core.gpus[gpu_id])  # the waiter may fit on another GPU
+    for eviction in [one for one in gpu.evictions if one.lease == lease_id]:
+        eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
+        waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by else None
+        if waiter is None:
+            gpu.evictions.remove(eviction)
+        for gpu_id in () if waiter is None else waiter.request.gpus:
+            core.wake(core.gpus[gpu_id])  # the waiter may fit on another GPU
     # 3. the lease
     lease = core.leases.get(lease_id)
     if lease is not None and lease.state is LeaseState.VERIFYING:

@@ -56,6 +56,7 @@ from vram_arbiter.schemas.wire.notes import (
     ResizedNote,
     RevokeAckedNote,
     RevokeAskedNote,
+    RevokeWithdrawnNote,
     SignalledNote,
     UnloadingNote,
     VerifiedNote,
@@ -179,6 +180,10 @@ class LeaseTelemetry:
             case RevokeAskedNote():
                 leaving = self._leaving.get(lease_id)
                 span = None if leaving is None else leaving.evict
+            case RevokeWithdrawnNote():
+                leaving = self._leaving.get(lease_id)
+                span = None if leaving is None else leaving.evict
+                self._end_leaving(lease_id, at_ns, names.EVENT_REVOKE_WITHDRAWN)
             case ReleasedNote():
                 span = self._let_go(about, "", at_ns)
             case LostNote() | ExpiredNote():

@@ -58,7 +58,9 @@ export function evictionsOf(events) {
     all = [];
   for (const event of events) {
     const one = open.get(event.lease_id);
-    if (event.kind === "revoke_asked") {
+    if (event.kind === "revoke_asked" && one) {
+      one.reason = event.reason ?? one.reason; // another waiter takes it over
+    } else if (event.kind === "revoke_asked") {
       const made = {
         lease: event.lease_id,
         consumer: event.consumer ?? "",
@@ -83,6 +85,11 @@ export function evictionsOf(events) {
       last.end = event.at_wall_s;
       if (last.name === "verify") last.ms = event.ms;
       one.running = "";
+      open.delete(event.lease_id);
+    } else if (one && event.kind === "revoke_withdrawn") {
+      one.verdict = "withdrawn";
+      one.running = "";
+      one.phases[one.phases.length - 1].end = event.at_wall_s;
       open.delete(event.lease_id);
     } else if (one && (event.kind === "lost" || event.kind === "expired")) {
       one.reason = event.reason ?? one.reason;

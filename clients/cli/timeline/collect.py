@@ -14,7 +14,7 @@ from pathlib import Path
 
 from vram_arbiter.clients.cli import history
 from vram_arbiter.clients.cli.history import NEVER
-from vram_arbiter.clients.cli.offline import LABORATORY
+from vram_arbiter.clients.cli.offline import EVENT_LOG
 from vram_arbiter.clients.cli.status import all_pages
 from vram_arbiter.clients.cli.timeline.reader import Reader
 from vram_arbiter.clients.cli.timeline.story import Story, within
@@ -159,7 +159,7 @@ def from_log(log: Path, wanted: Range) -> Story:
 def read_log(log: Path) -> JsonMap:
     """Have the arbiter's program read a log. Raises BadEventLog."""
     done = subprocess.run(
-        [sys.executable, "-m", LABORATORY, "story", "--json", str(log)],
+        [sys.executable, "-m", EVENT_LOG, "story", "--json", str(log)],
         stdout=subprocess.PIPE,
         text=True,
         check=False,

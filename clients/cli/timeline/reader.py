@@ -26,6 +26,7 @@ _NEXT = {
     "granted": "loading",
     "ready": "held",
     "revoke_asked": "revoking",
+    "revoke_withdrawn": "held",
     "unloading": "unloading",
     "released": "verifying",
     "standby": "standby",
@@ -37,6 +38,7 @@ _BEFORE = {
     "resized": "held",
     "revoke_asked": "held",
     "revoke_acked": "revoking",
+    "revoke_withdrawn": "revoking",
     "use_began": "held",
     "use_ended": "held",
     "use_yielded": "held",
@@ -256,7 +258,10 @@ class Reader:
         leaving = self._leaving.get(lease_id)
         if leaving is None:
             return
-        if kind == "revoke_acked" and leaving.acked_s is None:
+        if kind == "revoke_withdrawn":
+            leaving.verdict, leaving.withdrawn_s = "withdrawn", at_s
+            del self._leaving[lease_id]
+        elif kind == "revoke_acked" and leaving.acked_s is None:
             leaving.acked_s = at_s
         elif kind == "unloading":
             leaving.unloading_s = at_s

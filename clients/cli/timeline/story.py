@@ -44,6 +44,7 @@ class EvictionStory:
     unloading_s: float | None = None
     released_s: float | None = None
     verified_s: float | None = None
+    withdrawn_s: float | None = None  # nothing wanted the room any more
     verdict: str = ""
 
     def phases(self, until_s: float) -> tuple[Span, ...]:
@@ -53,9 +54,11 @@ class EvictionStory:
         for at, (name, end) in enumerate(zip(PHASES, ends, strict=True)):
             if end is None and any(later is not None for later in ends[at + 1 :]):
                 continue  # not seen: its time counts for the next phase
-            spans.append(Span(begin, until_s if end is None else end, name, going=end is None))
             if end is None:
+                going = self.withdrawn_s is None
+                spans.append(Span(begin, self.withdrawn_s or until_s, name, going=going))
                 break
+            spans.append(Span(begin, end, name))
             begin = end
         return tuple(spans)
 

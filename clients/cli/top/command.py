@@ -30,12 +30,12 @@ def check_terminal() -> None:
     if not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
         raise ConfigError(
             "vramctl top needs a terminal as its input, output and error output",
-            hint="use `vramctl status` once, or `vramctl watch` for lines of events",
+            hint="use `vramctl status` once, or `vramctl history -f` for lines of events",
         )
     if os.environ.get("TERM", "dumb") == "dumb":
         raise ConfigError(
             "vramctl top needs a terminal that can move its cursor, TERM says none",
-            hint="set TERM, or use `vramctl status` or `vramctl watch`",
+            hint="set TERM, or use `vramctl status` or `vramctl history -f`",
         )
 
 

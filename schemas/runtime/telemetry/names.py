@@ -43,6 +43,7 @@ EVENT_ESTOP = "vram.event.estop_requested"
 EVENT_STALE = "vram.event.staleness_latched"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 EVENT_REVOKE_ACKED = "vram.event.revoke_acked"  # within lease.evict
+EVENT_REVOKE_WITHDRAWN = "vram.event.revoke_withdrawn"
 EVENT_REMINDED = "vram.event.reminded"
 EVENT_DEADLINE_PASSED = "vram.event.deadline_passed"
 EVENT_SIGNALLED = "vram.event.signalled"

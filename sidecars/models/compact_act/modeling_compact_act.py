@@ -111,7 +111,7 @@ class CompactActPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def reset(self) -> None:
         """Forget the queued actions; call between goals."""
-        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        self._action_queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
 
     def view(self, key: str, image: Tensor) -> Tensor:
         """Return the crop of a (B, 3, H, W) image for the policy, averaged to its size."""
@@ -144,10 +144,10 @@ class CompactActPolicy(PreTrainedPolicy):  # type: ignore[misc]
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Return the next action; a new chunk is predicted after `n_action_steps` of the last."""
-        if not self._queue:
+        if not self._action_queue:
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
-            self._queue.extend(chunk.transpose(0, 1))
-        return self._queue.popleft()
+            self._action_queue.extend(chunk.transpose(0, 1))
+        return self._action_queue.popleft()
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss over the unpadded chunk, plus the auxiliary one if labeled."""

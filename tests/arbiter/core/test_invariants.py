@@ -149,7 +149,7 @@ def half_a_gang(b: Broken) -> None:
         (6, waiter_in_no_queue, "are in queues"),
         (6, queue_without_waiter, "is the head"),
         (6, bound_without_timer, "no timer"),
-        (7, half_a_gang, "is gathering"),
+        (8, half_a_gang, "is gathering"),
         (6, no_next_reading, "is planned"),
     ],
 )

@@ -90,8 +90,8 @@ def test_find_navigate_grab_and_find_again() -> None:
     assert driver.state(policy) == "revoking"
     text = driver.why("detector")["leases"][0]["text"]
     assert (
-        "waits for policy to finish 1 use (revoked 3.0 s ago), then it unloads and 4.00 GiB are "
-        "verified" in text
+        'waits for policy to finish 1 use "grab" (revoked 3.0 s ago), then it unloads and 4.00 GiB '
+        "are verified" in text
     )
 
     robot.runner.use_end(policy, "goal-1", robot.policy.token(policy))

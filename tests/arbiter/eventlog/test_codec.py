@@ -62,9 +62,7 @@ def test_what_a_run_posts_survives_a_log(busy: CoreDriver) -> None:
 
 
 def test_settings_survive_a_log() -> None:
-    settings = Settings(
-        3, (GpuInfo(GpuId("g"), 0, "gpu", 8),), policy="lru", learnt={"a": {"load_s": 0.1}}
-    )
+    settings = Settings(3, (GpuInfo(GpuId("g"), 0, "gpu", 8),), learnt={"a": {"load_s": 0.1}})
     assert from_map(Settings, json.loads(to_json(settings)), strict=True) == settings
 
 

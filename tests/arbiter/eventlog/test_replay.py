@@ -12,7 +12,7 @@ from tests.support.scenes import held
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import text
 from vram_arbiter.arbiter.eventlog.logfile import LogError
-from vram_arbiter.arbiter.lab.__main__ import main
+from vram_arbiter.arbiter.offline.__main__ import main
 
 
 @pytest.fixture

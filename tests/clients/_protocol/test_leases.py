@@ -113,16 +113,31 @@ def test_a_refused_use_does_not_count(link: Wire) -> None:
     assert link.holdings.held
 
 
-def test_revoke_is_told_first_once_and_then_as_news(link: Wire) -> None:
+def test_each_revoke_is_told(link: Wire) -> None:
     link.hold()
     link.push("revoke", lease_id="L1-1", token=[1, 2], uses=1)
     link.push("revoke", lease_id="L1-1", token=[1, 2], uses=0)
     first, second = link.told()
     assert isinstance(first, r.RevokeAsked)
     assert isinstance(second, r.RevokeAsked)
-    assert (first.first, second.first, second.push.uses) == (True, False, 0)
+    assert (first.push.uses, second.push.uses) == (1, 0)
     link.push("revoke", lease_id="L1-1", token=[1, 7], uses=0)
     assert link.told() == []
+
+
+def test_a_withdrawn_revoke_is_told_once(link: Wire) -> None:
+    record = link.hold()
+    link.push("revoke_withdrawn", lease_id="L1-1", token=[1, 2])
+    assert link.told() == [], "it was not revoked"
+    link.push("revoke", lease_id="L1-1", token=[1, 2], uses=1)
+    link.push("revoke_withdrawn", lease_id="L1-1", token=[1, 7])
+    link.push("revoke_withdrawn", lease_id="L1-1", token=[1, 2])
+    _, told = link.told()
+    assert isinstance(told, r.RevokeWithdrawn)
+    assert told.record is record
+    assert record.withdrawn
+    link.push("revoke", lease_id="L1-1", token=[1, 2], uses=1)
+    assert not record.withdrawn, "and revoked anew"
 
 
 def test_a_released_lease_is_neither_renewed_nor_reattached(link: Wire) -> None:

@@ -19,15 +19,10 @@ from rich.console import Console
 from rich.text import Text
 
 from vram_arbiter.arbiter import log as telemetry
-from vram_arbiter.arbiter.core.effects import Note
-from vram_arbiter.arbiter.lab import compare as lab_text
-from vram_arbiter.arbiter.lab.outcome import Outcome
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
-from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
-from vram_arbiter.schemas.wire.notes import About, QueuedNote
 
 GIB = 1 << 30
 HOSTILE = (
@@ -136,10 +131,6 @@ EVENT = {
 }
 
 
-def about(name: str) -> About:
-    return About(LeaseId("L1"), name, None)
-
-
 SAID: dict[str, Callable[[str], list[str]]] = {
     "status": lambda name: text.status_lines(
         {
@@ -170,10 +161,6 @@ SAID: dict[str, Callable[[str], list[str]]] = {
     "event, new field": lambda name: [text.event_line({**EVENT, name: name})],
     "error": lambda name: [text.error_line({"message": name, "hint": name})],
     "table": lambda name: text.table(["LEASE", "CONSUMER"], [["L1", name], [name, "x"]]),
-    "table of the laboratory": lambda name: lab_text.table(["consumer", "waits"], [[name, 1]]),
-    "timeline": lambda name: lab_text.timeline_lines(
-        Outcome(name, 1.0, timeline=[(1.0, Note(QueuedNote(1, None, name), about(name)))]), 5
-    ),
 }
 
 

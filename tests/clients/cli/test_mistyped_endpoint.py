@@ -14,7 +14,7 @@ COMMANDS = (
     ["vram_arbiter.clients", "status", "--endpoint", "EP"],
     ["vram_arbiter.clients", "evict", "x", "-r", "y", "--endpoint", "EP"],
     ["vram_arbiter.clients", "run", "--vram", "1GiB", "--endpoint", "EP", "true"],
-    ["vram_arbiter.clients", "watch", "--endpoint", "EP"],
+    ["vram_arbiter.clients", "history", "-f", "--endpoint", "EP"],
     ["vram_arbiter.arbiter", "--gpu", "fake:8GiB", "--endpoint", "EP"],
     ["vram_arbiter.runner", "estop", "--endpoint", "EP"],
 )

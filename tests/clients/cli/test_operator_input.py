@@ -58,7 +58,6 @@ def typed(done: Finished) -> str:
         ("drain", "-r", " "), ("resume", "-r", "a\tb"), ("why", ""), ("why", "x\ny"),
         ("history", "-n", "0"), ("history", "--since", "yesterday"), ("replay",),
         ("replay", "x", "--policy", "best"),
-        ("simulate", "desktop", "--timeline", "-3"),
     ],
 )  # fmt: skip
 def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
@@ -178,7 +177,7 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     status = json.loads(vramctl("status", "--json", environ=environ).stdout)
     assert status["drained"] == "", "what ended with 3 was not done afterwards"
     arbiter_daemon.kill()
-    others = (("history",), ("why", "x"), ("watch",), ("history", "-f"))
+    others = (("history",), ("why", "x"), ("history", "-f"))
     for action, dead in vramctl_at_once((*EVERY_ACTION, *others), environ=environ):
         assert (dead.returncode, "it was killed, its socket is left over" in one_line(dead)) == (
             3,
@@ -231,9 +230,6 @@ def test_an_empty_and_a_cut_log(arbiter_daemon: ArbiterProcess, tmp_path: Path) 
         assert says in (done.stdout if code == 0 else one_line(done))
     assert "no event log here" in one_line(
         vramctl("replay", str(tmp_path / "nothing"), environ=environ)
-    )
-    assert "one that is shipped: desktop" in one_line(
-        vramctl("simulate", "nothing", environ=environ)
     )
     assert json.loads(
         vramctl("replay", str(tmp_path / "nothing"), "--json", environ=environ).stdout

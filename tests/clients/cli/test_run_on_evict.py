@@ -17,6 +17,7 @@ import pytest
 from tests.support.leases import view_of
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.waiting import until
 from vram_arbiter.clients.cli.run import check_gpus
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import ConfigError
@@ -95,14 +96,6 @@ def server(
     urls = [option.replace("URL", f"http://{HOST}:{port}") for option in options]
     with running(arbiter, "--on-evict", action, *urls, "--", *command) as run:
         yield run, int(run.line())
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > deadline:
-            raise TimeoutError
-        time.sleep(0.02)
 
 
 def alive(pid: int) -> bool:

@@ -288,7 +288,7 @@ def test_without_a_terminal_it_names_what_works(tmp_path: Path) -> None:
     done = vramctl("top", environ={**os.environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)})
     assert done.returncode == 2
     assert "needs a terminal" in done.stderr
-    assert "`vramctl status` once, or `vramctl watch`" in done.stderr
+    assert "`vramctl status` once, or `vramctl history -f`" in done.stderr
 
 
 # -- lines alone

@@ -1,17 +1,9 @@
 """`vramctl` as a program: output, exit codes, and what its quick path imports."""
 
-import contextlib
 import json
 import os
-import pty
-import queue
-import select
-import signal
 import subprocess
 import sys
-import termios
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,7 +47,7 @@ def test_the_path_of_status_imports_nothing_heavy(nowhere: dict[str, str]) -> No
 @pytest.mark.e2e
 def test_3_without_an_arbiter(nowhere: dict[str, str]) -> None:
     run = ["run", "--vram", "1GiB", "true"]
-    commands = (["status"], ["why", "x"], ["history"], ["watch"], run)
+    commands = (["status"], ["why", "x"], ["history"], ["history", "-f"], run)
     for command, done in vramctl_at_once(commands, environ=nowhere):
         assert done.returncode == 3, command
         assert "VRAM_ARBITER_ENDPOINT" in done.stderr, command
@@ -93,7 +85,6 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
         "status",
         "why",
         "history",
-        "watch",
         "run",
         "doctor",
         "demo",
@@ -103,9 +94,9 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
 
 
 EVERY_COMMAND = (
-    "status", "why", "history", "watch", "top",
+    "status", "why", "history", "top",
     "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
-    "hooks", "mcp", "replay", "simulate", "demo",
+    "hooks", "mcp", "replay", "demo",
 )  # fmt: skip
 
 
@@ -135,8 +126,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     ]
     lines += [
         ["vram_arbiter.schemas", "check", flag],
-        ["vram_arbiter.arbiter.lab", "replay", flag],
-        ["vram_arbiter.arbiter.lab", "simulate", flag],
+        ["vram_arbiter.arbiter.offline", "replay", flag],
     ]
     done = subprocess.run(
         [sys.executable, "-c", program, json.dumps(lines)],
@@ -144,9 +134,7 @@ def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) ->
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     wanted = "vram-arbiter " if flag == "--version" else "sage: "
-    through_a_program = {
-        f"vram_arbiter.clients {command} {flag}" for command in ("replay", "simulate")
-    }
+    through_a_program = {f"vram_arbiter.clients replay {flag}"}
     wrong = {
         line: said for line, said in json.loads(done.stdout.splitlines()[-1]).items()
         if wanted not in said and line not in through_a_program
@@ -288,74 +276,3 @@ def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
     done = vramctl("doctor", environ=arbiter_daemon.environ)
     assert done.returncode == 0, done.stdout
     assert "its probe answers (a simulated GPU)" in done.stdout, "what reads the GPU is said"
-
-
-@pytest.mark.e2e
-def test_watch_prints_plain_lines_where_there_is_no_terminal(
-    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "vram_arbiter.clients", "watch"],
-        env=arbiter_daemon.environ,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        lines: queue.Queue[str] = queue.Queue()
-        output = process.stdout
-        assert output is not None
-        threading.Thread(target=lambda: lines.put(output.readline()), daemon=True).start()
-        deadline = time.monotonic() + PATIENCE_S
-        line = ""
-        while (
-            not line and time.monotonic() < deadline
-        ):  # the subscription may begin after some of these
-            with client.lease(spec("a", 1)) as lease:
-                lease.ready()
-            with contextlib.suppress(queue.Empty):
-                line = lines.get(timeout=0.05)
-        assert "  a L" in line
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE_S) in (0, 130)
-    finally:
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.e2e
-def test_watch_draws_the_status_on_a_terminal(
-    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
-    lease = client.acquire(spec("detector", 5))
-    lease.ready()
-    master, terminal = pty.openpty()
-    termios.tcsetwinsize(terminal, (40, 140))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "vram_arbiter.clients", "watch"],
-        env={**arbiter_daemon.environ, "TERM": "xterm"},
-        stdin=terminal,
-        stdout=terminal,
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(terminal)
-    shown = b""
-    try:
-        deadline = time.monotonic() + PATIENCE_S
-        while b"held, idle" not in shown and time.monotonic() < deadline:
-            if select.select([master], [], [], 1.0)[0]:
-                shown += os.read(master, 65_536)
-        assert b"arbiter serving" in shown
-        assert b"held, idle" in shown
-        process.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:  # it restores the screen, and must not block on us
-            if select.select([master], [], [], 1.0)[0]:
-                try:
-                    os.read(master, 65_536)
-                except OSError:  # the other side is closed: it has ended
-                    break
-        assert process.wait(PATIENCE_S) in (0, 130)
-    finally:
-        process.kill()
-        process.wait()
-        os.close(master)

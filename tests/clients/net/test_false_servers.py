@@ -153,7 +153,7 @@ def test_vramctl_says_who_serves_there(short_folder: Path) -> None:
     """Regression: clients believed any process that served the path."""
     environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{short_folder}/s"}
     with false_server(short_folder, "s") as heard:
-        for command in (["status"], ["status", "--json"], ["resume"], ["watch"]):
+        for command in (["status"], ["status", "--json"], ["resume"], ["history", "-f"]):
             done = subprocess.run(
                 [sys.executable, "-m", "vram_arbiter.clients", *command],
                 env=environ,

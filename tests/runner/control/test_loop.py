@@ -4,7 +4,6 @@ resynchronization, figures.
 
 import json
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from vram_arbiter.runner.protocols import (
     DeadlinePolicy,
     Goal,
     Hold,
-    InferenceRunner,
     Picture,
     SafetyGate,
     SkillEnded,
@@ -121,10 +119,6 @@ def scripted(
     skill = Thinker(clock, decide_s)
     loop.begin_skill(skill, Goal("g", "a/thinker"), lambda ended: None)
     return loop, skill
-
-
-def test_the_loop_is_an_inference_runner(clock: Any) -> None:
-    assert isinstance(scripted(clock, [])[0], InferenceRunner)
 
 
 def test_ticks_stand_on_the_grid_of_the_rate(clock: Any) -> None:
@@ -229,10 +223,6 @@ def test_ticks_carry_the_callers_trace(clock: Any) -> None:
     assert result.trace_context is not None
     assert result.trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
     assert scripted(clock, [])[0].tick().trace_context is None
-
-
-def test_make_runner_is_a_real_runner(make_runner: Callable[..., Any]) -> None:
-    assert isinstance(make_runner(), InferenceRunner)
 
 
 class Oversleeper:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.deployment import load_robot
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.safety.gate import RobotGate
-from vram_arbiter.schemas.config.robot import load_robot
 
 FOLDER = Path(__file__).parents[3] / "configs" / "robots"
 FILES = sorted(path.name for path in FOLDER.glob("*.yaml"))

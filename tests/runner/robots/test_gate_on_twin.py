@@ -11,7 +11,6 @@ from vram_arbiter.runner.protocols import Hal, RobotDescription
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.so101_kinematics import So101Kinematics, kinematics_for
 from vram_arbiter.runner.safety.gate import RobotGate
-from vram_arbiter.runner.sim.config import SceneConfig
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
@@ -65,22 +64,18 @@ def drive(
 
 
 def test_kinematics_agree_with_the_simulators() -> None:
-    from vram_arbiter.runner.sim.kinematics import ArmKinematics
+    from vram_arbiter.runner.sim.env import SimEnv
 
-    scene = SceneConfig()
     pose = {
-        "shoulder_pan": 0.3,
-        "shoulder_lift": -0.4,
-        "elbow_flex": 0.5,
-        "wrist_flex": 0.7,
+        "shoulder_pan": 0.3, "shoulder_lift": -0.4, "elbow_flex": 0.5, "wrist_flex": 0.7,
         "wrist_roll": 0.2,
-    }
-    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
-    theirs = ArmKinematics(scene).grasp_point([*(pose[name] for name in names), 0.0])
+    }  # fmt: skip
+    with SimEnv() as env:
+        env.reset(1)
+        env.place(env.base_pose(), [*pose.values(), 0.0])
+        theirs, mount = env.gripper_position(), env.config.mount_in_base_m
     ours = So101Kinematics().points(pose)["tool"]
-    assert ours == pytest.approx(
-        [a - b for a, b in zip(theirs, scene.mount_in_base_m, strict=True)], abs=1e-6
-    )
+    assert ours == pytest.approx([a - b for a, b in zip(theirs, mount, strict=True)], abs=1e-6)
 
 
 def test_only_robots_that_are_known_have_kinematics() -> None:

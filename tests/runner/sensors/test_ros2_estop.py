@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from tests.support.dds import NETWORK
+from tests.support.deployment import load_robot
 from tests.support.waiting import until
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic, said
-from vram_arbiter.schemas.config.robot import RobotEnvironment, load_robot
+from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.errors import ConfigError
 
 pytestmark = pytest.mark.heavy

@@ -13,6 +13,7 @@ import pytest
 
 from tests.runner.manual_clock import ManualClock
 from tests.runner.small_robots import FedCamera
+from tests.support.deployment import load_robot
 from tests.support.paths import ROOT
 from vram_arbiter.runner.protocols import Goal, MobileBase, RobotDescription, SkillEnded
 from vram_arbiter.runner.robots.base import HalBase
@@ -28,7 +29,6 @@ from vram_arbiter.runner.skills.motion import joint_positions
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers, turn
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.wiring import Wiring, wire_up
-from vram_arbiter.schemas.config.robot import load_robot
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ModelError, StateStale
 from vram_arbiter.schemas.manifest import (
@@ -399,7 +399,8 @@ class Answers:
     async def load(self, **_: Any) -> dict[str, Any]:
         return {"lease_id": None, "token": None}
 
-    async def reset(self, *_: Any, **__: Any) -> None: ...
+    async def reset(self, *_: Any, **__: Any) -> dict[str, Any]:
+        return {"ok": True}
 
     async def get_action(self, observation: Any, **_: Any) -> dict[str, Any]:
         self.states.append(observation["observation.state"])

@@ -78,6 +78,8 @@ class Sidecar:
         self.tokens: list[Any] = []
         self.observations: list[Any] = []
         self.guidance: list[Any] = []  # "rtc" of each request for actions
+        self.whole: list[bool] = []  # whether each asked for the whole chunk
+        self.begun: Message = {}  # what it says of an episode
         self.serial = 1
         self.action: Any = None
         self.error: VramError | None = None
@@ -133,6 +135,7 @@ class Sidecar:
         elif endpoint == "get_action":
             self.observations.append(npy.unpack(message["data"]["observation"]))
             self.guidance.append(message.get("rtc"))
+            self.whole.append(message.get("whole_chunk", False))
             number = len(self.observations) - 1
             action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
@@ -151,7 +154,7 @@ class Sidecar:
             if self.wanted:
                 reply["wanted"] = True
         else:
-            reply = {"ok": True}
+            reply = {"ok": True} | (self.begun if endpoint == "reset" else {})
         if "id" in message:
             reply["re"] = message["id"]
         await self.server.send(peer, reply)
@@ -196,6 +199,7 @@ class Bench:
             manifest, wiring, self.client, arbiter, period_s=1 / 30, **options
         )
         self.position = dict(REST)
+        self.played: list[tuple[float, ...]] = []
 
     def world(self, frames: bool = True, **changes: Any) -> WorldState:
         frame = SensorFrame(
@@ -222,6 +226,7 @@ class Bench:
         outcome = await asyncio.to_thread(self.skill.step, self.world(frames, **changes))
         if isinstance(outcome, Act):
             self.position.update(zip(JOINTS, outcome.action.rows[0], strict=True))
+            self.played.append(outcome.action.rows[0])
         return outcome
 
     async def play(self) -> tuple[list[tuple[float, ...]], Done]:
@@ -309,21 +314,65 @@ def test_a_goal_is_one_use_and_its_chunks_play_in_order(
     scenario(run_async, policy_bench(Arbiter()), play)
 
 
-def test_a_policy_with_a_history_sees_consecutive_steps(tmp_path: Path, run_async: Run) -> None:
-    """Regression: it got one observation a chunk, and was trained on one a control step."""
-    manifest = parse_manifest(MANIFEST.replace("steps: 7,", "steps: 7, n_obs_steps: 2,"))
+@pytest.mark.parametrize("told", ["by the manifest", "by the sidecar"])
+def test_a_policy_with_a_history_sees_consecutive_steps(
+    tmp_path: Path, run_async: Run, told: str
+) -> None:
+    """Regression: it got one observation a chunk, and was trained on one a control step. Then only
+    a manifest could change that, and few do."""
+    text = MANIFEST if told == "by the sidecar" else MANIFEST.replace("7,", "7, n_obs_steps: 2,")
 
     async def play(b: Bench) -> None:
+        b.sidecar.begun = {"n_obs_steps": 2} if told == "by the sidecar" else {}
+        for _ in range(2):
+            b.position = dict(REST)
+            b.sidecar.observations.clear()
+            await b.skill.start(GOAL)
+            await b.play()
+            states = [seen["observation.state"] for seen in b.sidecar.observations]
+            assert states[0].ravel().tolist() == pytest.approx([0.0, 0.5, 0.0, 0.5]), "as lerobot"
+            assert states[1].ravel().tolist() == pytest.approx([0.0, 0.01, 0.0, 0.02])
+            assert states[2].ravel().tolist() == pytest.approx([0.01, 0.01, 0.01, 0.02])
+            assert b.sidecar.observations[1]["observation.images.front"].shape == (2, 2, 4, 3)
+            assert b.sidecar.observations[1]["task"] == GOAL.prompt
+            await b.skill.finish()
+
+    scenario(run_async, Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", None), play)
+
+
+def test_a_history_has_no_gap_while_the_next_chunk_is_on_its_way(
+    tmp_path: Path, run_async: Run
+) -> None:
+    """With `prefetch_at` rows play meanwhile; each is a control step that lerobot would have seen."""
+    text = MANIFEST.replace("steps: 7,", "steps: 7, prefetch_at: 2,")
+
+    async def play(b: Bench) -> None:
+        b.sidecar.begun = {"n_obs_steps": 3, "n_action_steps": 2}
         await b.skill.start(GOAL)
         await b.play()
-        states = [seen["observation.state"] for seen in b.sidecar.observations]
-        assert states[0].tolist() == pytest.approx([0.0, 0.5]), "there is no step before the first"
-        assert states[1].shape == states[2].shape == (2, 2)
-        assert states[1].ravel().tolist() == pytest.approx([0.0, 0.01, 0.0, 0.02])
-        assert states[2].ravel().tolist() == pytest.approx([0.01, 0.01, 0.01, 0.02])
-        assert b.sidecar.observations[1]["observation.images.front"].shape == (2, 2, 4, 3)
-        assert b.sidecar.observations[1]["task"] == GOAL.prompt
+        histories = [seen["observation.state"][:, 0] for seen in b.sidecar.observations]
+        assert len(histories) > 3
+        stood = [round(100 * value) for value in (0.0, 0.0, *(row[0] for row in b.played))]
+        for history in histories:
+            found = [round(100 * float(value)) for value in history]
+            assert any(found == stood[at : at + 3] for at in range(len(stood) - 2)), found
+        assert all(b.sidecar.whole), "rows behind the two are needed for those that are skipped"
 
+    scenario(run_async, Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", None), play)
+
+
+def test_as_many_actions_are_played_as_the_checkpoint_says(tmp_path: Path, run_async: Run) -> None:
+    """Regression: the whole chunk was played where lerobot plays a part of it."""
+
+    async def play(b: Bench) -> None:
+        b.sidecar.begun = {"n_action_steps": 2}
+        await b.skill.start(GOAL)
+        rows, _ = await b.play()
+        told = [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (3, 0)]
+        assert rows == [pytest.approx((n / 100, i / 100)) for n, i in told]
+        assert not any(b.sidecar.whole)
+
+    manifest = parse_manifest(MANIFEST)
     scenario(run_async, Bench(manifest, f"ipc://{tmp_path}/grab.sock", None), play)
 
 

@@ -10,9 +10,9 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.support.deployment import load_robot
 from tests.support.paths import ROOT
 from vram_arbiter.schemas.config.arbiter import load_config
-from vram_arbiter.schemas.config.robot import load_robot
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 

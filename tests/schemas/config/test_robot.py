@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vram_arbiter.schemas.config.robot import RobotEnvironment, SensorBackend, load_robot
+from tests.support.deployment import load_robot
+from vram_arbiter.schemas.config.robot import RobotEnvironment, SensorBackend
 from vram_arbiter.schemas.errors import ConfigError
 
 SMALL = """\

@@ -18,7 +18,7 @@ import pytest
 import zmq
 
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime.connection import OUT_MESSAGES_MAX, Connection, Limits
+from vram_arbiter.schemas.runtime.connection import OUT_MESSAGES_MAX, Bounds, Connection
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import FRAMES_MAX, GREETING, READY, Oversize, encode
 
@@ -28,7 +28,7 @@ GREETING_AND_READY = (
     + (b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00")
 )
 WAIT_S = 60.0
-LIMITS = Limits(
+LIMITS = Bounds(
     message_max_bytes=1 << 20, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
 )
 
@@ -74,7 +74,7 @@ def path() -> Iterator[Path]:
 
 @asynccontextmanager
 async def serving_router(
-    path: Path, handler: Echo, limits: Limits = LIMITS
+    path: Path, handler: Echo, limits: Bounds = LIMITS
 ) -> AsyncIterator[Router]:
     router = Router(path, handler, limits)
     router.bind()
@@ -314,7 +314,7 @@ def test_silent_connections_are_cut(path: Path) -> None:
 
     async def scenario() -> None:
         handler = Echo(admits=False)
-        limits = Limits(handshake_s=0.0, hello_s=0.01, process_share=1.0, user_share=1.0)
+        limits = Bounds(handshake_s=0.0, hello_s=0.01, process_share=1.0, user_share=1.0)
         async with serving_router(path, handler, limits) as router:
             bare = [await Raw.connect(path, b"") for _ in range(50)]
             shaken = await Raw.connect(path)
@@ -331,7 +331,7 @@ def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
 
     async def scenario() -> None:
         handler = Echo()
-        limits = Limits(
+        limits = Bounds(
             connections_max=8, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
         )
         async with serving_router(path, handler, limits) as router:
@@ -357,7 +357,7 @@ assert peer.recv() == b"x"
 def test_a_process_has_a_share_of_the_connections(path: Path) -> None:
     async def scenario() -> None:
         handler = Echo()
-        limits = Limits(
+        limits = Bounds(
             connections_max=8, process_share=0.5, user_share=1.0, handshake_s=30, hello_s=30
         )
         async with serving_router(path, handler, limits):

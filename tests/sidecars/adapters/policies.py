@@ -81,11 +81,9 @@ def save_act(folder: Path, **options: Any) -> None:
 
     small = {
         "dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1,
-        "n_vae_encoder_layers": 1, "chunk_size": 5, "n_action_steps": 3,
+        "n_vae_encoder_layers": 1, "chunk_size": 5, "n_action_steps": 3, "latent_dim": 4,
     }  # fmt: skip
-    config = ACTConfig(
-        **features(FRONT), pretrained_backbone_weights=None, latent_dim=4, **(small | options)
-    )
+    config = ACTConfig(**features(FRONT), pretrained_backbone_weights=None, **(small | options))
     save(folder, config, FRONT)
     text = json.loads((folder / "config.json").read_text())
     text["pretrained_backbone_weights"] = "ResNet18_Weights.IMAGENET1K_V1"  # as on the hub

@@ -96,7 +96,8 @@ def test_what_is_missing_or_misshapen_is_named(adapter, observation):
 
 def test_reset_and_reload(adapter, observation):
     expected = act(adapter, observation)
-    assert adapter.run(EndpointCall(endpoint="reset")) == {"ok": True}
+    begun = adapter.run(EndpointCall(endpoint="reset"))
+    assert begun == {"ok": True, "n_obs_steps": 1, "n_action_steps": 5}
     adapter.load("cpu")
     assert (act(adapter, observation) == expected).all()
 

@@ -34,13 +34,12 @@ pytestmark = pytest.mark.heavy
 
 SAVERS = policies.SAVERS | backbone_policies.SAVERS
 NAMES = tuple(SAVERS)
-ROWS = {  # actions in one answer
-    "act": 5, "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
-    "multi_task_dit": 4, "smolvla": 5, "pi0": 5, "pi05": 5, "pi0_fast": 3, "xvla": 5, "eo1": 5,
-    "evo1": 5, "vla_jepa": 5, "wall_x": 5, "gr00t": 3,
-    "molmoact2": 3, "lingbot_va": 4,
+ROWS = {  # actions in one answer, else 3: the checkpoint's n_action_steps
+    "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
+    "multi_task_dit": 4, "lingbot_va": 4,
 }  # fmt: skip
-CHUNK_ROWS_PLAYED = 3  # of policies without memory: the checkpoints' n_action_steps
+WHOLE = ("act", "smolvla", "pi0", "pi05", "xvla", "eo1", "evo1", "vla_jepa", "wall_x")
+CHUNK_ROWS = 5  # of these, where the whole chunk is asked for
 SEED = 2  # most policies draw their actions
 NOT_SERVED = {
     "openvla": "", "fastwam": "hub repository whose name is fixed in its code",
@@ -55,7 +54,7 @@ def manifest_text(family: str, dtype: str = "fp32", more: str = "", extra: str =
     files = "{preprocessor_uri: local://x/a.json, postprocessor_uri: local://x/b.json}"
     processors = f"processors: {files}\n" if family in PROCESSOR_FAMILIES else ""
     return (
-        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 5\n"
+        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 1\n"
         "weights_uri: local://models/x\ndescription: a tiny model\nactions: [grasp]\n"
         f"latency_budget: {{per_chunk_ms: 100}}\nmodel_family: {family}\n"
         f"quantization: {{dtype: {dtype}, extra: {{trust_remote_code: true{extra}}}}}\n"
@@ -65,11 +64,12 @@ def manifest_text(family: str, dtype: str = "fp32", more: str = "", extra: str =
     )
 
 
-def manifest_of(name: str, dtype: str | None = None) -> RSkillManifest:
+def manifest_of(name: str, dtype: str | None = None, **fields: Any) -> RSkillManifest:
     supported = FAMILIES[family_of(name)].precisions if family_of(name) in FAMILIES else {"fp32"}
-    return parse_manifest(
+    found = parse_manifest(
         manifest_text(family_of(name), dtype or ("fp32" if "fp32" in supported else "bf16"))
     )
+    return found.model_copy(update=fields)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -100,8 +100,10 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Weig
     return checkpoint
 
 
-def loaded(name: str, weights: Weights, dtype: str | None = None) -> PolicyAdapter:
-    adapter = make_adapter(manifest_of(name, dtype), weights)
+def load_policy(
+    name: str, weights: Weights, dtype: str | None = None, **fields: Any
+) -> PolicyAdapter:
+    adapter = make_adapter(manifest_of(name, dtype, **fields), weights)
     assert isinstance(adapter, PolicyAdapter)
     adapter.prepare()
     adapter.load("cpu")
@@ -127,9 +129,37 @@ def observations(count: int) -> list[dict[str, Any]]:
     ]
 
 
-def ask(adapter: PolicyAdapter, observation: dict[str, Any]) -> Any:
-    call = EndpointCall(endpoint="get_action", data={"observation": observation})
+def ask(adapter: PolicyAdapter, observation: dict[str, Any], whole_chunk: bool = False) -> Any:
+    call = EndpointCall(
+        endpoint="get_action", data={"observation": observation}, whole_chunk=whole_chunk
+    )
     return adapter.run(call)["action"]
+
+
+def begin(adapter: PolicyAdapter) -> tuple[int, int]:
+    """Begin an episode; return its control steps of an observation, and actions of an answer."""
+    answer = adapter.run(EndpointCall(endpoint="reset"))
+    return answer["n_obs_steps"], answer["n_action_steps"]
+
+
+def history(steps: list[dict[str, Any]], at: int, length: int) -> dict[str, Any]:
+    """Return the observation of control step `at` as the runner sends it."""
+    return stacked([steps[max(0, place)] for place in range(at + 1 - length, at + 1)])
+
+
+def served(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
+    """Return the actions of one episode, played as they are answered."""
+    import numpy as np
+    import torch
+
+    length, _ = begin(adapter)
+    torch.manual_seed(SEED)
+    actions: list[Any] = []
+    while len(actions) < len(steps):
+        answer = ask(adapter, history(steps, len(actions), length))
+        assert answer.dtype == np.float32
+        actions += list(answer)
+    return np.stack(actions[: len(steps)])
 
 
 def stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
@@ -142,7 +172,7 @@ def stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
     return together | {"task": TASK}
 
 
-def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
+def lerobots_own(weights: Weights, steps: list[dict[str, Any]], **settings: Any) -> Any:
     """Return the actions of lerobot's loop, one a control step."""
     import numpy as np
     import torch
@@ -154,6 +184,8 @@ def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
     config.device = "cpu"
     if hasattr(config, "pretrained_backbone_weights"):
         config.pretrained_backbone_weights = None  # no network here
+    for field, value in settings.items():
+        setattr(config, field, value)
     policy = get_policy_class(config.type).from_pretrained(weights.source, config=config)
     policy.eval()
     before, after = make_pre_post_processors(config, pretrained_path=weights.source)
@@ -173,30 +205,90 @@ def lerobots_own(weights: Weights, steps: list[dict[str, Any]]) -> Any:
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "lingbot_va"])
 def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: str) -> None:
     """Regression: policies with an observation history loaded, passed `--check`, and failed at the
-    first `get_action`."""
+    first `get_action`. Then chunks were played whole where lerobot plays 3 of 5."""
     import numpy as np
-    import torch
 
     weights = checkpoint(name)
-    adapter = loaded(name, weights)
-    queues = FAMILIES[family_of(name)].queues
-    rows = ROWS[name]
-    played = rows if queues else min(rows, CHUNK_ROWS_PLAYED)
-    steps = observations(2 * played + 1)
+    adapter = load_policy(name, weights)
+    rows = ROWS.get(name, 3)
+    steps = observations(2 * rows + 1)
 
     expected = lerobots_own(weights, steps)
-    actions = []
     for goal in range(2):
-        torch.manual_seed(SEED)
-        actions = []
-        for start in range(0, len(steps), played):
-            first = max(0, start + 1 - adapter._config.n_obs_steps) if queues else start
-            answer = ask(adapter, stacked(steps[first : start + 1]))
-            assert answer.shape == (rows, DIM)
-            assert answer.dtype == np.float32
-            actions += list(answer[:played])
-        np.testing.assert_array_equal(np.stack(actions[: len(steps)]), expected, f"goal {goal}")
-        adapter.run(EndpointCall(endpoint="reset"))
+        np.testing.assert_array_equal(served(adapter, steps), expected, f"goal {goal}")
+    length, played = begin(adapter)
+    assert played == rows
+    assert (length > 1) is (name in ("diffusion", "vqbet", "multi_task_dit"))
+    assert ask(adapter, steps[0]).shape == (rows, DIM)
+    begin(adapter)
+    whole = ask(adapter, steps[0], whole_chunk=True)
+    assert whole.shape == (CHUNK_ROWS if name in WHOLE else rows, DIM)
+
+
+MOST = {  # most actions of a chunk that may be played, and its length
+    "act": (5, 5), "act ensembling": (1, 5), "diffusion": (7, 8), "vqbet": (4, 4), "tdmpc": (2, 5),
+    "gaussian_actor": (1, 1), "multi_task_dit": (7, 8), "smolvla": (5, 5), "pi0_fast": (3, 5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MOST)
+def test_a_manifest_may_say_how_many_actions_are_played(
+    checkpoint: Callable[[str], Weights], name: str
+) -> None:
+    """Regression: a diffusion policy answered what its checkpoint plays, whatever the manifest
+    said, and contradictions were `ok`."""
+    import numpy as np
+
+    weights = checkpoint(name)
+    most, chunk = MOST[name]
+    adapter = load_policy(name, weights, n_action_steps=most, chunk_size=chunk)
+    assert not [line for line in adapter.misfits() if "steps" in line or "chunk" in line]
+    length, played = begin(adapter)
+    assert played == most
+    if hasattr(adapter._config, "horizon") and name != "tdmpc":
+        steps = observations(2 * most + 1)
+        expected = lerobots_own(weights, steps, n_action_steps=most)
+        np.testing.assert_array_equal(served(adapter, steps), expected)
+    for fields, told in (
+        ({"n_action_steps": most + 1}, f"is {most + 1}, the checkpoint allows {most}"),
+        ({"chunk_size": chunk + 1}, f"is {chunk + 1}, the checkpoint answers {chunk}"),
+        ({"policy_extras": {"n_obs_steps": length + 1}}, f"the checkpoint sees {length} control"),
+    ):
+        wrong = make_adapter(manifest_of(name, **fields), weights)
+        assert isinstance(wrong, PolicyAdapter)
+        wrong.prepare()
+        wrong.load("meta")
+        assert [line for line in wrong.misfits() if told in line], "what `--check` says"
+        with pytest.raises(ModelError, match=told):
+            wrong.load("cpu")
+
+
+def test_a_history_takes_every_control_step_or_refuses(
+    checkpoint: Callable[[str], Weights],
+) -> None:
+    """Regression: observations a chunk apart entered the history as if one control step lay
+    between them, and the robot moved on the answer."""
+    import numpy as np
+
+    weights = checkpoint("diffusion")
+    steps = observations(4)
+    adapter = load_policy("diffusion", weights)
+    first = ask(adapter, steps[0])
+    for count in (1, 3):
+        with pytest.raises(BadRequest, match=f"has {count} control steps|takes up to 2"):
+            ask(adapter, stacked(steps[:count]))
+    with pytest.raises(BadRequest, match="of all inputs alike"):
+        ask(adapter, stacked(steps[:2]) | {STATE: steps[0][STATE]})
+    assert ask(adapter, stacked(steps[2:])).shape == first.shape, "all of it, whatever was before"
+    single = load_policy("diffusion", weights, n_action_steps=1)
+    expected = lerobots_own(weights, steps, n_action_steps=1)
+    np.testing.assert_array_equal(served(single, steps), expected)
+    begin(single)
+    import torch
+
+    torch.manual_seed(SEED)
+    alone = [ask(single, step)[0] for step in steps]
+    np.testing.assert_array_equal(np.stack(alone), expected, "each of them is a control step")
 
 
 def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]) -> None:
@@ -209,7 +301,7 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
     import torch
 
     weights = checkpoint("lingbot_va")
-    adapter = loaded("lingbot_va", weights)
+    adapter = load_policy("lingbot_va", weights)
     assert len(adapter.networks) == 3
     shared = HostWeights(adapter.networks, "test")
     sizes = [sum(p.nbytes for p in network.parameters()) for network in adapter.networks]
@@ -229,6 +321,8 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
         actions += [*ask(adapter, stacked(steps[1:5])), *ask(adapter, stacked(steps[5:13]))]
         np.testing.assert_array_equal(np.stack(actions), expected, f"goal {goal}")
         adapter.run(EndpointCall(endpoint="reset"))
+    np.testing.assert_array_equal(served(adapter, steps), expected, "as the runner asks")
+    assert begin(adapter) == (8, 8)
     policy = adapter._policy
     ask(adapter, steps[0])
     encode, policy._encode_frames = policy._encode_frames, None  # fails within an answer
@@ -288,30 +382,151 @@ def test_lingbot_needs_its_encoders(checkpoint: Callable[[str], Weights], tmp_pa
         prepared(wan_pretrained_path="wan")
 
 
-def test_a_history_fills_once_and_then_moves_on(checkpoint: Callable[[str], Weights]) -> None:
-    """One observation a chunk: the oldest of three leaves with the fourth, as in lerobot."""
+@pytest.mark.parametrize("name", ["pi0", "pi05"])
+def test_relative_actions_are_relative_to_the_state_of_their_chunk(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
+) -> None:
+    """lerobot has both: its real-time engine and its server anchor a chunk at the state that it was
+    predicted from, as in training; `select_action` with a preprocessor at every step adds a newer
+    state to each row, which lerobot calls drift and refuses (`SyncInferenceEngine`)."""
     import numpy as np
     import torch
+    from lerobot.policies.rtc import reanchor_relative_rtc_prefix
+    from lerobot.processor import NormalizerProcessorStep, RelativeActionsProcessorStep
 
-    adapter = loaded("vqbet", checkpoint("vqbet"))
-    first, second, third, fourth = observations(4)
+    folder = tmp_path / name
+    shutil.copytree(checkpoint(name).source, folder)
+    for file in folder.glob("policy_*processor.json"):
+        file.write_text(file.read_text().replace('"enabled": false', '"enabled": true'))
+    weights = Weights(str(folder), local=True)
+    adapter = load_policy(name, weights)
+    steps = observations(3)
 
-    def after(*asked: dict[str, Any]) -> Any:
-        adapter.run(EndpointCall(endpoint="reset"))
-        for observation in asked[:-1]:
-            ask(adapter, observation)
-        torch.manual_seed(SEED)
-        return ask(adapter, asked[-1])
+    anchored = served(adapter, steps)
+    drifting = lerobots_own(weights, steps)
+    np.testing.assert_array_equal(anchored[0], drifting[0])
+    moved = np.stack([step[STATE] - steps[0][STATE] for step in steps])
+    np.testing.assert_allclose(drifting - anchored, moved, atol=1e-5)
 
-    np.testing.assert_array_equal(
-        after(first, second, third, fourth), after(stacked([second, third, fourth]))
+    relative = next(s for s in adapter._before.steps if isinstance(s, RelativeActionsProcessorStep))
+    normal = next(s for s in adapter._before.steps if isinstance(s, NormalizerProcessorStep))
+    heard: list[Any] = []
+    predict = adapter._policy.predict_action_chunk
+
+    def hear(batch: Any, **guidance: Any) -> Any:
+        heard.append((predict(batch, **guidance), guidance))
+        return heard[-1][0]
+
+    adapter._policy.predict_action_chunk = hear
+    rtc = {"left_over": anchored.tolist(), "inference_delay": 1, "execution_horizon": 3}
+    call = {"endpoint": "get_action", "data": {"observation": steps[1]}, "rtc": rtc}
+    answer = adapter.run(EndpointCall.model_validate(call))["action"]
+    (chunk, guidance) = heard[0]
+    whole = adapter._after(chunk)[0, : len(answer)].numpy()  # as lerobot's engine does
+    np.testing.assert_array_equal(answer, whole)
+    expected = reanchor_relative_rtc_prefix(
+        torch.from_numpy(anchored), torch.from_numpy(steps[1][STATE]), relative, normal, "cpu"
     )
-    np.testing.assert_array_equal(after(first, second), after(stacked([first, first, second])))
-    assert not np.array_equal(after(first, second), after(second))
-    with pytest.raises(BadRequest, match="takes up to 3"):
-        ask(adapter, stacked([first, second, third, fourth]))
-    with pytest.raises(BadRequest, match="of all inputs alike"):
-        ask(adapter, stacked([first, second]) | {STATE: first[STATE]})
+    np.testing.assert_allclose(guidance["prev_chunk_left_over"][0], expected, atol=1e-6)
+
+
+def change(folder: Path, pattern: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    """Rewrite the tensors of the files of a checkpoint that match."""
+    from safetensors.torch import load_file, save_file
+
+    files = list(folder.glob(pattern))
+    assert files
+    for file in files:
+        save_file(change(load_file(file)), file, {"format": "pt"})
+
+
+STATISTICS: dict[str, tuple[str, Callable[[Any, Any], dict[str, Any]], str]] = {
+    "missing": ("act", lambda name, _: {name: None}, "no std"),
+    "too long": ("act", lambda name, x: {name: x.repeat(2)}, r"std has shape \(12,\), not \(6,\)"),
+    "broadcast": ("act", lambda name, x: {name: x[:1]}, r"std has shape \(1,\), not \(6,\)"),
+    "a number": ("act", lambda name, x: {name: x[0].clone()}, r"std has shape \(\), not"),
+    "zero": ("act", lambda name, x: {name: 0 * x}, "std is 0 or less"),
+    "negative": ("act", lambda name, x: {name: x.cumsum(0) - 3}, "std is 0 or less"),
+    "not finite": ("act", lambda name, x: {name: x / 0}, "std has NaN or infinity"),
+    "no max": ("diffusion", lambda name, _: {name: None}, "no max"),
+    "below min": ("diffusion", lambda name, x: {name: -x - 9}, "max is below min"),
+    "NaN": ("diffusion", lambda name, x: {name: x * float("nan")}, "max has NaN"),
+    "no quantile": ("pi05", lambda name, _: {name: None}, "no q99"),
+}
+WORDS = {"act": "std", "diffusion": "max", "pi05": "q99"}
+
+
+@pytest.mark.parametrize("case", STATISTICS)
+def test_statistics_that_cannot_convert_are_refused(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, case: str
+) -> None:
+    """Regression: load and `--check` accepted them; lerobot fails, or moves the robot, at the first
+    action."""
+    name, damage, told = STATISTICS[case]
+    for feature, step in ((STATE, "preprocessor"), ("action", "postprocessor")):
+        folder = tmp_path / step
+        shutil.copytree(checkpoint(name).source, folder)
+        key = f"{feature}.{WORDS[name]}"
+
+        def damaged(tensors: dict[str, Any], key: str = key) -> dict[str, Any]:
+            changed = tensors | damage(key, tensors[key])
+            return {one: tensor for one, tensor in changed.items() if tensor is not None}
+
+        change(folder, f"policy_{step}*.safetensors", damaged)
+        adapter = make_adapter(manifest_of(name), Weights(str(folder), local=True))
+        adapter.prepare()
+        for device in ("cpu", "meta"):
+            with pytest.raises(ModelError, match=f"convert {feature}: {told}"):
+                adapter.load(device)
+
+
+@pytest.mark.parametrize("name", ["act", "diffusion"])
+def test_an_action_that_never_moved_is_no_defect(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
+) -> None:
+    """A joint that stood still in all episodes has a standard deviation of 0, or equal bounds: it is
+    kept there. An observation of it would be divided by almost nothing."""
+    import numpy as np
+
+    folder = tmp_path / name
+    shutil.copytree(checkpoint(name).source, folder)
+
+    def still(tensors: dict[str, Any], feature: str = "action") -> dict[str, Any]:
+        for word, values in ((f"{feature}.std", 0.0), (f"{feature}.max", -1.0)):
+            tensors[word][2] = values
+        return tensors
+
+    change(folder, "policy_*.safetensors", still)
+    steps = observations(3)
+    weights = Weights(str(folder), local=True)
+    found = served(load_policy(name, weights), steps)
+    np.testing.assert_array_equal(found, lerobots_own(weights, steps))
+    assert np.ptp(found[:, 2]) < 1e-6
+    change(folder, "policy_pre*.safetensors", lambda tensors: still(tensors, STATE))
+    if name == "act":
+        with pytest.raises(ModelError, match=f"convert {STATE}: std is 0 or less"):
+            load_policy(name, weights)
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(
+    checkpoint: Callable[[str], Weights], tmp_path: Path, number: float
+) -> None:
+    """Regression: such a checkpoint was `ok` and loaded, and failed at the first action."""
+    folder = tmp_path / "act"
+    shutil.copytree(checkpoint("act").source, folder)
+    key = "model.action_head.weight"
+
+    def damaged(tensors: dict[str, Any]) -> dict[str, Any]:
+        tensors[key][0, 3] = number
+        return tensors
+
+    change(folder, "model.safetensors", damaged)
+    adapter = make_adapter(manifest_of("act"), Weights(str(folder), local=True))
+    adapter.prepare()
+    for device in ("cpu", "meta"):
+        with pytest.raises(ModelError, match=rf"1 with NaN or infinity \({key}\)"):
+            adapter.load(device)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "act ensembling"])
@@ -323,7 +538,7 @@ def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name:
     supported = FAMILIES[family_of(name)].precisions
     (observation,) = observations(1)
     for dtype in sorted({"bf16", "fp16"} & supported):
-        adapter = loaded(name, weights, dtype)
+        adapter = load_policy(name, weights, dtype)
         wanted = {"bf16": torch.bfloat16, "fp16": torch.float16}[dtype]
         kinds = {tensor.dtype for tensor in adapter.networks[0].parameters()}
         assert wanted in kinds
@@ -331,7 +546,7 @@ def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name:
         if not adapter._has_own_dtype:  # rotary frequencies in 8 bits lose far positions
             buffers = dict(adapter.networks[0].named_buffers())
             assert all(buffers[key].dtype == torch.float32 for key in buffers if "inv_freq" in key)
-        assert ask(adapter, observation).shape == (ROWS[name], DIM)
+        assert ask(adapter, observation).shape == (ROWS.get(name, 3), DIM)
     for dtype in sorted({"fp32", "fp16", "int8", "fp8", "fp4_nvfp4"} - supported):
         with pytest.raises(UnsupportedQuantization, match=dtype):
             make_adapter(manifest_of(name, dtype), weights)
@@ -357,12 +572,28 @@ def test_linear_layers_in_nf4(checkpoint: Callable[[str], Weights], name: str) -
     layers = nf4_layers(adapter.networks[0])
     assert layers
     assert not any(last in layer for layer in layers)
-    assert ask(adapter, observations(1)[0]).shape == (ROWS[name], DIM)
+    assert ask(adapter, observations(1)[0]).shape == (ROWS.get(name, 3), DIM)
     adapter = make_adapter(manifest_of(name, "int4"), weights)  # 4,000,000 weights and more
     adapter.prepare()
     for device in ("meta", "cpu"):
         with pytest.raises(UnsupportedQuantization, match="no linear layer to quantize"):
             adapter.load(device)
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_a_quantized_layer_takes_the_numbers_of_autocast(tmp_path: Path, dtype: str) -> None:
+    """Regression: ACT makes its latent vector in float32, bitsandbytes answered in that, and the
+    next layer refused it at the first action."""
+    pytest.importorskip("bitsandbytes")
+    policies.save_act(tmp_path, latent_dim=8)
+    extra = f", min_params_to_quantize: 64, compute_dtype: {dtype}"
+    manifest = parse_manifest(manifest_text("act", "int4", extra=extra))
+    adapter = make_adapter(manifest, Weights(str(tmp_path), local=True))
+    assert isinstance(adapter, PolicyAdapter)
+    adapter.prepare()
+    adapter.load("cpu")
+    adapter.place("cpu")
+    assert ask(adapter, observations(1)[0]).shape == (3, DIM)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("act")])
@@ -426,19 +657,21 @@ def test_the_manifests_family_decides(
 def test_what_cannot_act_is_refused(checkpoint: Callable[[str], Weights], tmp_path: Path) -> None:
     """lerobot only warns of a VQ-BeT in its first stage of training, and its actions are noise."""
     import torch
-    from safetensors.torch import load_file, save_file
 
-    shutil.copytree(checkpoint("vqbet").source, tmp_path / "vqbet")
-    file = tmp_path / "vqbet" / "model.safetensors"
-    flag = "vqbet.action_head.vqvae_model.discretized"
-    save_file(load_file(file) | {flag: torch.tensor(False)}, file)
-    weights = Weights(str(file.parent), local=True)
-    with pytest.raises(ModelError, match="the quantizer of its actions is not trained"):
-        loaded("vqbet", weights)
-    config = file.parent / "config.json"
+    folder = tmp_path / "vqbet"
+    shutil.copytree(checkpoint("vqbet").source, folder)
+    flag = {"vqbet.action_head.vqvae_model.discretized": torch.tensor(False)}
+    change(folder, "model.safetensors", lambda tensors: tensors | flag)
+    weights = Weights(str(folder), local=True)
+    adapter = make_adapter(manifest_of("vqbet"), weights)
+    adapter.prepare()
+    for device in ("cpu", "meta"):  # regression: `--check` was ok
+        with pytest.raises(ModelError, match="the quantizer of its actions is not trained"):
+            adapter.load(device)
+    config = folder / "config.json"
     config.write_text(config.read_text().replace('"use_peft": false', '"use_peft": true'))
     with pytest.raises(ModelError, match="is a PEFT adapter"):
-        loaded("vqbet", weights)
+        load_policy("vqbet", weights)
 
 
 @pytest.mark.parametrize(
@@ -482,7 +715,7 @@ def test_a_guided_chunk_continues_the_one_before(
     import numpy as np
     import torch
 
-    adapter = loaded(name, checkpoint(name))
+    adapter = load_policy(name, checkpoint(name))
     observation = observations(1)[0]
     left_over = np.random.default_rng(2).normal(3.0, 2.0, (4, DIM)).astype(np.float32)
     policy = adapter._policy
@@ -517,7 +750,7 @@ def test_a_guided_chunk_continues_the_one_before(
 def test_a_policy_that_cannot_be_guided_refuses_a_left_over_chunk(
     checkpoint: Callable[[str], Weights], name: str
 ) -> None:
-    adapter = loaded(name, checkpoint(name))
+    adapter = load_policy(name, checkpoint(name))
     rtc = {"left_over": [[0.0] * DIM], "inference_delay": 1, "execution_horizon": 1}
     data = {"observation": observations(1)[0]}
     with pytest.raises(BadRequest, match="takes no left-over chunk"):
@@ -530,7 +763,7 @@ def test_tokens_that_are_no_actions_never_leave(
     checkpoint: Callable[[str], Weights], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: lerobot logs the failure and answers the middle of each joint's range."""
-    adapter = loaded("pi0_fast", checkpoint("pi0_fast"))
+    adapter = load_policy("pi0_fast", checkpoint("pi0_fast"))
     monkeypatch.setattr(policies.FastTokenizer, "decode", lambda self, tokens: None)
     with pytest.raises(ModelError, match="cannot be decoded into actions"):
         ask(adapter, observations(1)[0])
@@ -546,6 +779,41 @@ def test_a_camera_that_tdmpc_does_not_find_is_refused(
     adapter = make_adapter(manifest_of("tdmpc"), Weights(str(config.parent), local=True))
     with pytest.raises(ModelError, match=r"front; lerobot's tdmpc finds only observation\.image"):
         adapter.prepare()
+
+
+def test_the_only_camera_of_tdmpc_is_found(checkpoint: Callable[[str], Weights]) -> None:
+    """Regression: `--check` said that sensors_required does not name the camera that it names, and
+    the runner's name of it was not found."""
+    import numpy as np
+
+    weights = checkpoint("tdmpc")
+    text = (
+        manifest_text("tdmpc")
+        + f"sensors_required: [{{modality: rgb, vla_feature_key: {ONLY_CAMERA}}}]\n"
+    )
+    adapters = [
+        make_adapter(parse_manifest(text.replace("image}", f"{more}}}")), weights)
+        for more in ("image", "images.top")
+    ]
+    found = []
+    for adapter in adapters:
+        assert isinstance(adapter, PolicyAdapter)
+        adapter.prepare()
+        adapter.load("cpu")
+        adapter.place("cpu")
+        found.append(adapter.misfits())
+    told = "the checkpoint reads observation.image, sensors_required names observation.images.top"
+    assert found == [[], [told]]
+    (step,) = observations(1)
+    by_the_runner = {STATE: step[STATE], "observation.images.image": step[ONLY_CAMERA]}
+    answers = []
+    for observation in (step, by_the_runner):
+        adapters[0].run(EndpointCall(endpoint="reset"))
+        import torch
+
+        torch.manual_seed(SEED)
+        answers.append(ask(adapters[0], observation))
+    np.testing.assert_array_equal(*answers)
 
 
 def test_the_manifests_processors_are_used(
@@ -602,6 +870,6 @@ def test_a_pinned_revision_is_what_is_loaded(
         return folder
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
-    adapter = loaded("pi05", Weights("field/pi05", "0f1e2d"))
+    adapter = load_policy("pi05", Weights("field/pi05", "0f1e2d"))
     assert asked == [("field/pi05", "0f1e2d")]
-    assert ask(adapter, observations(1)[0]).shape == (ROWS["pi05"], DIM)
+    assert ask(adapter, observations(1)[0]).shape == (3, DIM)

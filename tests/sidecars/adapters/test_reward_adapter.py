@@ -53,17 +53,18 @@ def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(
     """A scene that the training never saw; the pictures are what the runner would serve."""
     import random
 
+    from tests.support.tabletop import photo, run_expert
     from vram_arbiter.runner.sim.env import SimEnv
-    from vram_arbiter.runner.sim.expert import GrabExpert, run_expert
+    from vram_arbiter.runner.sim.expert import GrabExpert
     from vram_arbiter.runner.sim.kinematics import ArmKinematics
     from vram_arbiter.runner.sim.tasks import stand_before
 
     with SimEnv() as env:
         env.reset(4711, names=("red cube", "blue ball", "green cylinder"))
         stand_before(env, "red cube", random.Random(0), error_m=0.0)
-        before = as_png(env.render("wrist"))
+        before = photo(env, "wrist")
         assert run_expert(env, GrabExpert(env, ArmKinematics(env.config), "red cube"))
-        after = as_png(env.render("wrist"))
+        after = photo(env, "wrist")
     right = score(shipped_adapter, before, after)
     assert right["success"][0] < 0.5 < right["success"][1]
     assert right["progress"][1] > right["progress"][0] + 0.3
@@ -204,9 +205,10 @@ def test_any_reward_model_of_lerobots_is_asked_its_own_question(
 
 
 def test_a_number_that_is_none_is_no_opinion(mean_red: Any, tmp_path: Path, png: Any) -> None:
-    mean_red(tmp_path, math.nan)
+    mean_red(tmp_path, 1.0)
     adapter = RewardAdapter(reward_manifest(), Weights(str(tmp_path), local=True))
     adapter.prepare()
     adapter.load("cpu")
+    adapter.networks[0].gain.data.fill_(math.nan)
     with pytest.raises(ModelError, match="progress is not a number"):
         score(adapter, png(8, 8))

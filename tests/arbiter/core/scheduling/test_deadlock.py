@@ -3,8 +3,6 @@ left alone."""
 
 from typing import Any
 
-import pytest
-
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Effect, Push, Refuse
 from vram_arbiter.arbiter.core.scheduling import deadlock
@@ -213,14 +211,6 @@ def test_a_debt_is_on_its_way_back(driver: CoreDriver) -> None:
     wanted = job.acquire(5 * GIB)
     assert driver.state(wanted) == "queued"
     driver.until(lambda: driver.state(wanted) == "loading", limit_s=15.0)
-
-
-@pytest.mark.parametrize("policy", ["no_backfill", "fifo"])
-def test_without_backfill_whoever_stands_behind_a_stuck_head_is_stuck(policy: str) -> None:
-    driver = CoreDriver(8 * GIB, settings={"policy": policy})
-    job, _ = using(driver, "job", 2)
-    driver.consumer("big").acquire(6 * GIB)
-    assert refusal(job.try_acquire(1 * GIB)).code == "would_deadlock"
 
 
 def test_uses_that_come_back_after_a_restart_are_looked_at_too(driver: CoreDriver) -> None:

@@ -120,15 +120,6 @@ def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway() -> None:
     assert (driver.state(head), driver.state(small)) == ("queued", "queued")
 
 
-def test_with_no_backfill_nobody_passes() -> None:
-    driver = CoreDriver(8 * GIB, settings={"policy": "no_backfill"})
-    stowaway(driver, 4)
-    driver.consumer("head").acquire(5 * GIB)
-    small = driver.consumer("small").acquire(1 * GIB)
-    driver.advance(2.0)
-    assert driver.state(small) == "queued"
-
-
 # -- the bound on the head's wait
 def test_of_a_stowaway_that_gives_back_a_part_the_head_gets_it_all() -> None:
     """It fits beside what is left of the stowaway, not beside who passed it: that one is asked."""

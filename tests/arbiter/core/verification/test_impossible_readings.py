@@ -100,8 +100,7 @@ def test_a_little_more_than_everything_is_the_drivers_rounding() -> None:
 
 
 def test_a_reading_is_compared_with_what_is_leased_out_where_the_whole_is_not_known() -> None:
-    """The scenarios of `simulate`, and logs, name a capacity only; a larger whole is plausible
-    there."""
+    """Logs may name a capacity only; a larger whole is plausible there."""
     driver = CoreDriver(8 * GIB)
     (info,) = driver.settings.gpus
     driver.settings = replace(driver.settings, gpus=(replace(info, total_bytes=0),))

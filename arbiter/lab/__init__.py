@@ -1,1 +1,0 @@
-"""Laboratory: simulation and comparison of scheduling policies, offline."""

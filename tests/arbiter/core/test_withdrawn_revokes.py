@@ -1,0 +1,255 @@
+"""A holder is revoked for someone: a revoke that nothing wants any more is withdrawn, and a grant
+names only the evictions that were asked for it."""
+
+from collections.abc import Callable
+
+import pytest
+
+from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.arbiter.core.model.lease import LeaseState
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import LeaseId
+
+GIB = d.GIB
+
+
+def held(driver: CoreDriver, name: str, gib: float, **spec: object) -> tuple[Consumer, LeaseId]:
+    """A loaded holder."""
+    person = driver.consumer(name)
+    lease = person.acquire(int(gib * GIB), **spec)  # type: ignore[arg-type]
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    driver.advance(0.01)
+    return person, lease
+
+
+def revoked_in_use(
+    driver: CoreDriver, **spec: object
+) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
+    """A holder in use that was revoked, and the waiter that it was revoked for."""
+    holder, lease = held(driver, "train", 5, **spec)
+    holder.use_begin(lease)
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    holder.ack(lease)
+    return holder, lease, waiter, wanted
+
+
+def evict(driver: CoreDriver, lease: LeaseId) -> None:
+    """An operator's order."""
+    ops = driver.consumer("ops")
+    driver.post(OperatorAsked(ops.client, driver.next_request(), "evict", lease, "ops", "test"))
+
+
+LEAVES: dict[str, Callable[[CoreDriver, Consumer, LeaseId], object]] = {
+    "cancel": lambda driver, waiter, wanted: waiter.cancel(wanted),
+    "process died": lambda driver, waiter, wanted: waiter.die(),
+    "client left": lambda driver, waiter, wanted: waiter.leave("hung up"),
+}
+
+
+@pytest.mark.parametrize("how", LEAVES)
+def test_a_revoke_is_withdrawn_with_its_waiter(how: str) -> None:
+    """A holder in use stayed `revoking` for a waiter that was ended, unloaded at the end of its
+    use, and the GPU stood empty with no waiter."""
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver)
+    LEAVES[how](driver, waiter, wanted)
+    assert driver.state(lease) == "held"
+    assert [push["lease_id"] for push in driver.pushes("revoke_withdrawn")] == [lease]
+    (note,) = driver.notes("revoke_withdrawn")
+    assert (note["lease_id"], note["wanted_by"]) == (lease, "waiter")
+    holder.use_end(lease)
+    holder.use_begin(lease)
+    driver.advance(60.0)
+    assert driver.state(lease) == "held"
+    assert not driver.notes("deadline_passed")
+    assert not driver.notes("reminded")
+
+
+def test_a_revoke_is_withdrawn_where_the_wait_times_out() -> None:
+    driver = CoreDriver()
+    holder, lease = held(driver, "train", 5)
+    holder.use_begin(lease)
+    driver.consumer("hasty").acquire(5 * GIB, wait_timeout_s=3.0)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    driver.until(lambda: bool(driver.notes("denied")))
+    assert driver.state(lease) == "held"
+
+
+def test_a_revoke_is_withdrawn_where_other_room_came_first() -> None:
+    """Of two GPUs the other one was emptied by its holder: the grant there needs no eviction."""
+    driver = CoreDriver(gpus=2)
+    one, first = held(driver, "one", 5, gpu="0")
+    two, second = held(driver, "two", 5, gpu="1")
+    one.use_begin(first)
+    two.use_begin(second)
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(5 * GIB)
+    driver.until(lambda: "revoking" in (driver.state(first), driver.state(second)))
+    revoked = first if driver.state(first) == "revoking" else second
+    other, leaving = (two, second) if revoked == first else (one, first)
+    other.use_end(leaving)
+    other.unload(leaving)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    assert driver.state(revoked) == "held"
+    (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == wanted]
+    assert not granted["evicted"]
+
+
+def test_an_unload_that_has_begun_completes() -> None:
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver)
+    holder.use_end(lease)
+    holder.unloading(lease)
+    waiter.cancel(wanted)
+    assert driver.state(lease) == "unloading"
+    assert not driver.pushes("revoke_withdrawn")
+    holder.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_another_waiter_takes_the_eviction_over() -> None:
+    """No withdrawal and no second acknowledgement: the holder is asked on, for the next in the
+    queue, and its eviction is that one's."""
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver)
+    later = driver.consumer("later")
+    next_one = later.acquire(5 * GIB)
+    waiter.cancel(wanted)
+    assert driver.state(lease) == "revoking"
+    assert not driver.pushes("revoke_withdrawn")
+    assert driver.pushes("revoke", lease)[-1]["wanted_by"] == "later"
+    pushes = len(driver.pushes("revoke", lease))
+    driver.advance(5.0)
+    assert len(driver.pushes("revoke", lease)) == pushes, "it is acknowledged already"
+    holder.use_end(lease)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(next_one) == "loading")
+    (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == next_one]
+    assert granted["evicted"] == ["train"]
+
+
+def test_only_what_another_waiter_needs_stays_revoked() -> None:
+    driver = CoreDriver()
+    one, first = held(driver, "one", 3)
+    two, second = held(driver, "two", 4)
+    one.use_begin(first)
+    two.use_begin(second)
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(7 * GIB)
+    driver.until(lambda: {driver.state(first), driver.state(second)} == {"revoking"})
+    small = driver.consumer("small")
+    driver.advance(0.1)
+    little = small.acquire(3 * GIB)
+    waiter.cancel(wanted)
+    states = {driver.state(first), driver.state(second)}
+    assert states == {"revoking", "held"}
+    assert len(driver.pushes("revoke_withdrawn")) == 1
+    holder, lease = (one, first) if driver.state(first) == "revoking" else (two, second)
+    holder.use_end(lease)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(little) == "loading")
+
+
+def test_an_operators_order_stands() -> None:
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver)
+    evict(driver, lease)
+    waiter.cancel(wanted)
+    driver.advance(1.0)
+    assert driver.state(lease) == "revoking"
+    holder.use_end(lease)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
+def test_a_revoke_for_pressure_ends_with_the_pressure() -> None:
+    driver = CoreDriver()
+    _, lease = held(driver, "train", 5)
+    stranger = driver.consumer("stranger")
+    stranger.leave()
+    driver.device.set(stranger.process, 4 * GIB, driver.now)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    driver.device.set(stranger.process, 0, driver.now)
+    driver.until(lambda: driver.state(lease) == "held")
+    (note,) = driver.notes("revoke_withdrawn")
+    assert note["cause"] == "pressure"
+
+
+def test_a_release_that_crosses_the_withdrawal_is_that_of_an_eviction() -> None:
+    """The holder acted on the revoke before it heard of the withdrawal: a lease on standby comes
+    back, and its weights stay in host RAM."""
+    driver = CoreDriver(settings={"host_ram_budget_bytes": 8 * GIB})
+    holder, lease, waiter, wanted = revoked_in_use(driver, standby=True, park_bytes=4 * GIB)
+    holder.use_end(lease)
+    waiter.cancel(wanted)
+    assert driver.state(lease) == "held"
+    assert driver.status()["host_ram"]["parked_bytes"] == 0, "booked for nothing"
+    holder.unload(lease, parked=True)
+    driver.until(lambda: driver.state(lease) == "loading")
+    (parked,) = driver.notes("parked")
+    assert parked["comes_back"]
+
+
+def test_a_withdrawn_holder_keeps_its_place_among_residents() -> None:
+    """Residents are listed by when they became ready; a verdict looks at the newest of them."""
+    driver = CoreDriver(16 * GIB)
+    holder, lease = held(driver, "old", 5)
+    held(driver, "new", 1)
+    holder.use_begin(lease)
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(14 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    waiter.cancel(wanted)
+    residents = driver.arbiter.inspect().gpus[driver.device.gpu].residents
+    ready = [one.ready_at for one in residents.by_state[LeaseState.HELD].values()]
+    assert ready == sorted(ready)
+
+
+def test_a_grant_names_only_evictions_that_were_asked_for_it() -> None:
+    """134 s after an eviction for a waiter that had gone, a grant on the empty GPU said «fits after
+    train left» and a switch of 762 s."""
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver)
+    holder.use_end(lease)
+    holder.unloading(lease)
+    waiter.cancel(wanted)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    driver.advance(134.0)
+    _, latecomer = held(driver, "late", 5)
+    (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == latecomer]
+    assert not granted["evicted"]
+    (switch,) = [note for note in driver.notes("switch") if note["lease_id"] == latecomer]
+    assert (switch["switched"], switch["drain_ms"]) == (False, 0.0)
+    assert not driver.arbiter.inspect().gpus[driver.device.gpu].evictions
+
+
+def test_a_waiter_that_leaves_before_its_grant_leaves_no_eviction_behind() -> None:
+    """The next lease on the GPU would have been told that it made room."""
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver)
+    driver.device.failing = "the driver hangs"
+    driver.consumer("third").acquire(GIB, priority=90)  # a head that keeps the waiter waiting
+    holder.use_end(lease)
+    holder.unload(lease)
+    driver.device.failing = ""
+    gpu = driver.arbiter.inspect().gpus[driver.device.gpu]
+    driver.until(lambda: any(one.verdict for one in gpu.evictions) or not gpu.evictions)
+    if driver.state(wanted) == "queued":
+        waiter.cancel(wanted)
+    assert not gpu.evictions
+
+
+def test_an_operators_eviction_makes_no_switch() -> None:
+    driver = CoreDriver()
+    holder, lease = held(driver, "train", 5)
+    evict(driver, lease)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    _, later = held(driver, "later", 5)
+    (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == later]
+    assert not granted["evicted"]

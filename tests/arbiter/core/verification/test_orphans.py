@@ -1,0 +1,61 @@
+"""A child outlives the process that held the lease, and keeps its bytes as a stowaway."""
+
+import pytest
+
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.arbiter.core.events import ProcessDied
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.ids import ProcessKey
+
+GIB = d.GIB
+CHILD = ProcessKey(4000, 1)
+
+
+@pytest.mark.parametrize("read_first", [False, True], ids=["death, reading", "reading, death"])
+def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool) -> None:
+    """Under load a reading that shows the orphan came before the death of its parent, and the
+    verdict said `verified` with the 4 GiB still there. They were the orphan's on the ledger, so
+    nothing was granted on them; only the note was wrong."""
+    driver = CoreDriver()
+    driver.device.names[CHILD] = "job"
+    parent = driver.consumer("job")
+    lease = parent.acquire(4 * GIB)
+    parent.load(lease)
+    driver.advance(2.0)
+    driver.device.set(parent.process, 0, driver.now)
+    driver.device.set(CHILD, 4 * GIB, driver.now)
+    if read_first:
+        driver.until(lambda: driver.gpu()["stowaway_bytes"] == 4 * GIB)
+        driver.advance(0.5)
+    driver.post(ProcessDied(parent.process))
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(5 * GIB)
+    driver.until(lambda: bool(driver.notes("verified")))
+    (verdict,) = driver.notes("verified")
+    assert (verdict["verdict"], verdict["culprits"]) == (
+        "contested",
+        [{"pid": CHILD.pid, "name": "job", "bytes": 4 * GIB}],
+    )
+    driver.advance(5.0)
+    assert driver.gpu()["charged_bytes"] == 0
+    assert driver.gpu()["stowaway_bytes"] == 4 * GIB, "charged once"
+    assert driver.state(wanted) == "queued", "nothing is granted on bytes that are not free"
+    driver.device.set(CHILD, 0, driver.now)
+    driver.until(lambda: driver.state(wanted) == "loading")
+
+
+def test_bytes_that_were_given_back_long_ago_are_not_looked_for() -> None:
+    """A holder that freed its memory and dies later owes nothing: a program that took the room
+    since is a stowaway, and no culprit."""
+    driver = CoreDriver()
+    holder = driver.consumer("holder")
+    lease = holder.acquire(4 * GIB)
+    holder.load(lease)
+    driver.advance(2.0)
+    driver.device.set(holder.process, 0, driver.now)
+    driver.advance(30.0)
+    driver.device.set(CHILD, 4 * GIB, driver.now)
+    driver.advance(2.0)
+    driver.post(ProcessDied(holder.process))
+    driver.until(lambda: bool(driver.notes("verified")), limit_s=1.0)
+    assert driver.notes("verified")[0]["verdict"] == "verified"

@@ -1,0 +1,86 @@
+"""The shipped detector and scene VLM on scenes that their training never saw, through the adapters
+that serve them."""
+
+import random
+
+import pytest
+
+from tests.support.paths import CONFIGS
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.sidecar import DetectOp, QueryOp
+from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.weights import resolve
+
+pytest.importorskip("mujoco")
+from tests.support.tabletop import NAMES, photo, run_expert
+from vram_arbiter.runner.sim.env import SimEnv
+from vram_arbiter.runner.sim.expert import GrabExpert
+from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.sim.tasks import stand_before
+
+pytestmark = pytest.mark.heavy
+
+UNSEEN = range(900, 906)
+
+
+def adapter_of(skill: str):
+    manifest = load_manifest(CONFIGS / "rskills" / skill / "rskill.yaml")
+    adapter = make_adapter(manifest, resolve(str(manifest.weights_uri), CONFIGS))
+    adapter.prepare()
+    adapter.load("cpu")
+    return adapter
+
+
+def test_the_detector_finds_the_target_and_turns_down_the_absent():
+    adapter = adapter_of("so101-detector")
+
+    def found(image: bytes, query: str) -> list[dict]:
+        return adapter.run(DetectOp(op="detect", image=image, query=query))["detections"]
+
+    alarms = 0
+    with SimEnv() as env:
+        for seed in UNSEEN:
+            env.reset(seed)
+            image, truth = photo(env, "front"), env.seen_objects("front")[env.target].box
+            best = max(found(image, f"the {env.target}"), key=lambda one: one["score"])["box"]
+            for axis in (0, 1):
+                off = (best[axis] + best[axis + 2] - truth[axis] - truth[axis + 2]) / 2
+                assert abs(off) < 8, f"seed {seed}: {env.target}"
+            there = {thing.name for thing in env.layout.objects}
+            absent = [name for name in NAMES if name not in there]
+            alarms += sum(bool(found(image, name)) for name in absent[::5])
+    assert alarms <= 5  # of 18; the model card tells how often
+
+
+def test_the_scene_vlm_tells_held_from_empty_and_from_another():
+    adapter, wrong = adapter_of("so101-scene-vlm"), []
+
+    def expect(word: str, name: str, env: SimEnv) -> None:
+        question = f"Has the robot gripper grasped the {name}?"
+        op = QueryOp(op="query", image=photo(env, "wrist"), question=question, max_new_tokens=32)
+        if not (answer := adapter.run(op)["answer"]).startswith(word):
+            wrong.append(f"{name}: {answer}")
+
+    with SimEnv() as env:
+        kinematics = ArmKinematics(env.config)
+        for seed in UNSEEN:
+            env.reset(seed)
+            target, other = env.layout.objects[0].name, env.layout.objects[1].name
+            stand_before(env, target, random.Random(seed))
+            expect("No", target, env)
+            assert run_expert(env, GrabExpert(env, kinematics, target)), "choose another seed"
+            expect("Yes", target, env)
+            expect("No", other, env)
+    # 18 questions; the card gives 98 % over all, 95 % while another one of the same color is held
+    assert len(wrong) <= 2, wrong
+
+
+def test_the_shipped_models_are_small():
+    """They are in the wheel and in the repository."""
+    sizes = {
+        folder.name: sum(file.stat().st_size for file in folder.iterdir())
+        for folder in (CONFIGS / "models").iterdir()
+        if folder.is_dir()
+    }
+    assert len(sizes) == 4
+    assert max(sizes.values()) < 8_000_000

@@ -1,0 +1,1 @@
+"""How the shipped models were made: scripts for a clone, which no program imports."""
