@@ -142,9 +142,8 @@ def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
 
     headers = [header(data) for data in images]
     if sum(one.width * one.height for one in headers) > PIXELS_MAX:
-        sizes = ", ".join(sorted({f"{one.width} x {one.height}" for one in headers}))
         raise BadRequest(
-            f"{len(images)} pictures of {sizes} have more than {PIXELS_MAX} pixels",
+            f"{len(images)} pictures of {sizes(headers)} have more than {PIXELS_MAX} pixels",
             hint="send fewer, or smaller ones",
         )
     decoded = []
@@ -162,9 +161,15 @@ def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
 def of_one_size(pictures: "Sequence[Image.Image]") -> "Sequence[Image.Image]":
     """Return the pictures. Raises BadRequest unless all have the size of the first."""
     if len({picture.size for picture in pictures}) > 1:
-        sizes = ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in pictures}))
-        raise BadRequest(f"pictures of different sizes: {sizes}", hint="send one camera's pictures")
+        raise BadRequest(
+            f"pictures of different sizes: {sizes(pictures)}", hint="send one camera's pictures"
+        )
     return pictures
+
+
+def sizes(pictures: "Sequence[Header | Image.Image]") -> str:
+    """Return the different sizes of pictures in words, such as `640 x 480, 80 x 60`."""
+    return ", ".join(sorted({f"{picture.width} x {picture.height}" for picture in pictures}))
 
 
 def within(picture: "Image.Image", max_side: int) -> "Image.Image":

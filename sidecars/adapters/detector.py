@@ -14,9 +14,9 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
-from vram_arbiter.sidecars.adapters.inputs import to_model
+from vram_arbiter.sidecars.adapters.inputs import processed, to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
-from vram_arbiter.sidecars.images import decode, within
+from vram_arbiter.sidecars.images import decode, sizes, within
 from vram_arbiter.sidecars.weights import (
     Weights,
     from_pretrained,
@@ -27,6 +27,7 @@ from vram_arbiter.sidecars.weights import (
 ZERO_SHOT_LOADER = "transformers.AutoModelForZeroShotObjectDetection"
 _ANSWERS = {"logits", "pred_boxes", "decoder_class_logits", "decoder_coord_logits"}
 _SEPARATOR = re.compile(r"\s*(?:</c>|,|\s\.(?:\s|$))\s*")  # the field joins its labels by </c>
+_ENDS_IN_A_DOT = re.compile(r"[^\s.]\.\s*$")  # as Grounding DINO's own texts do
 
 type _Found = tuple[list[float], list[str], list[list[float]]]
 """Scores, texts and boxes (x0, y0, x1, y1 in pixels), as long as each other."""
@@ -93,14 +94,17 @@ class DetectorAdapter(OneNetwork):
         import torch
 
         self._refuse_long(labels)
+        self._refuse_size(picture)
         model = self._model
+        # Grounding DINO scores tokens, the others score texts. Its processor would join the texts
+        # just so, but not those with a dot.
+        grounds = hasattr(model.config, "max_text_len")
+        text = ". ".join(labels).lower() + "." if grounds else labels
         inputs = to_model(
-            self._processor(images=picture, text=[labels], truncation=True, return_tensors="pt"),
+            processed(self._processor, [picture], images=picture, text=[text], truncation=True),
             model,
         )
-        # Grounding DINO scores tokens, the others score texts.
-        tokens = inputs["input_ids"][0].tolist() if hasattr(model.config, "max_text_len") else None
-        spans = None if tokens is None else self._spans(tokens, labels)
+        spans = self._spans(inputs["input_ids"][0].tolist(), labels) if grounds else None
         # It also makes float32 of its own between layers of 16 bits; autocast joins them.
         mixed = spans is not None and model.dtype in (torch.float16, torch.bfloat16)
         with (
@@ -138,6 +142,18 @@ class DetectorAdapter(OneNetwork):
                     hint="describe the object in fewer words",
                 )
 
+    def _refuse_size(self, picture: Any) -> None:
+        """Raise BadRequest for a picture that the processor passes on and the model cannot read."""
+        reader = self._processor.image_processor
+        size = dict(reader.size)
+        needed = size.get("width", picture.width), size.get("height", picture.height)
+        if not reader.do_resize and picture.size != needed:
+            raise BadRequest(
+                f"a picture of {sizes([picture])}; this model reads {needed[0]} x {needed[1]}, and "
+                "its processor resizes none",
+                hint="send a picture of that size, and a max_side no lower",
+            )
+
     def _classified(
         self, outputs: Any, labels: list[str], threshold: float, size: tuple[int, int]
     ) -> _Found:
@@ -152,6 +168,11 @@ class DetectorAdapter(OneNetwork):
         spans, at = [], 0
         for label in labels:
             own = self._processor.tokenizer(label.lower(), add_special_tokens=False)["input_ids"]
+            if not own:
+                raise BadRequest(
+                    f"{label[:40]!r} has no characters that this model reads",
+                    hint="describe the object in words",
+                )
             while at < len(tokens) and tokens[at : at + len(own)] != own:
                 at += 1
             spans.append(slice(at, at + len(own)))
@@ -201,19 +222,24 @@ def _is_repository(name: str) -> bool:
 
 
 def split_query(query: str | Sequence[str]) -> list[str]:
-    """Return the texts of `red cube</c>blue ball`, `red cube . blue ball` or `red cube, blue ball`,
-    or of a list of such, without doubles.
+    """Return the texts of `red cube</c>blue ball`, `red cube . blue ball`, `red cube, blue ball` or
+    `red cube. blue ball.`, or of a list of such, without doubles.
 
     Raises: BadRequest for none or too many.
     """
     queries = [query] if isinstance(query, str) else query
-    parts = [part for one in queries for part in _SEPARATOR.split(one)]
+    parts = [
+        part
+        for one in queries
+        for text in (one.split(". ") if _ENDS_IN_A_DOT.search(one) else [one])
+        for part in _SEPARATOR.split(text)
+    ]
     labels = [part.strip().rstrip(".").strip() for part in parts]
     labels = list(dict.fromkeys(label for label in labels if label))
     if not labels or len(labels) > QUERIES_MAX:
         raise BadRequest(
             f"expected a query of 1 to {QUERIES_MAX} objects, got {len(labels)}",
-            hint="separate them by </c>, ' . ' or commas",
+            hint="separate them by </c>, ' . ' or commas, or end each with a dot",
         )
     return labels
 

@@ -1,7 +1,29 @@
 """Inputs of a transformers model: on its device, pictures in its precision."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from vram_arbiter.schemas.errors import BadRequest
+from vram_arbiter.sidecars.images import sizes
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+def processed(processor: Any, pictures: "Sequence[Image]", **given: Any) -> Mapping[str, Any]:
+    """Call a processor with what is `given` for a caller's pictures.
+
+    Raises BadRequest for whatever its arithmetic raises, such as for a picture 200 times as wide
+    as high, of which resizing leaves nothing.
+    """
+    try:
+        inputs: Mapping[str, Any] = processor(return_tensors="pt", **given)
+    except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
+        raise BadRequest(
+            f"{type(processor).__name__} cannot read pictures of {sizes(pictures)}: {error}",
+            hint="send pictures of an ordinary shape",
+        ) from error
+    return inputs
 
 
 def to_model(inputs: Mapping[str, Any], model: Any) -> Any:

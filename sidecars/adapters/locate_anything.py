@@ -17,7 +17,7 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
 from vram_arbiter.sidecars.adapters.detector import split_query
-from vram_arbiter.sidecars.adapters.inputs import to_model
+from vram_arbiter.sidecars.adapters.inputs import processed, to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.weights import CONFIG_FILE, Weights, from_pretrained, model_options
@@ -107,7 +107,7 @@ class LocateAnythingAdapter(OneNetwork):
             messages, tokenize=False, add_generation_prompt=True
         )
         images, videos = self._processor.process_vision_info(messages)
-        inputs = self._processor(text=[prompt], images=images, videos=videos, return_tensors="pt")
+        inputs = processed(self._processor, [picture], text=[prompt], images=images, videos=videos)
         with torch.inference_mode():
             answer = self._model.generate(
                 **to_model(inputs, self._model),

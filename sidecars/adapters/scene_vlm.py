@@ -11,7 +11,7 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QueryOp
 from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
-from vram_arbiter.sidecars.adapters.inputs import to_model
+from vram_arbiter.sidecars.adapters.inputs import processed, to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
 from vram_arbiter.sidecars.images import decode_all, of_one_size, within
 from vram_arbiter.sidecars.weights import (
@@ -25,6 +25,7 @@ from vram_arbiter.sidecars.weights import (
 ANSWER_MAX_S: Final = 120.0
 # limit of a question with its pictures: the bytes of the cache grow with it, beside the footprint
 PROMPT_MAX_TOKENS: Final = 16_384
+OPENING, CLOSING = "<think>", "</think>"  # around a thought
 
 
 class SceneVlmAdapter(OneNetwork):
@@ -78,9 +79,8 @@ class SceneVlmAdapter(OneNetwork):
         inputs, thinks = self._inputs(
             pictures[:count], of_one_size(pictures[count:]), call.fps, call.question
         )
-        text = self._generate(inputs, call.max_new_tokens)
-        # a template may have opened the thought at the end of the prompt
-        return {"ok": True, "answer": after_thinking(f"<think>{text}" if thinks else text)}
+        ids = self._generate(inputs, call.max_new_tokens)
+        return {"ok": True, "answer": self._answer(ids, thinks)}
 
     def _inputs(
         self, images: Sequence[Any], video: Sequence[Any], fps: float | None, question: str
@@ -94,14 +94,8 @@ class SceneVlmAdapter(OneNetwork):
         given: dict[str, Any] = {"images": [list(images)]} if images else {}  # of one prompt
         if video:
             given |= _video(video, fps)
-        try:
-            inputs = processor(text=[prompt], return_tensors="pt", **given)
-        except ValueError as error:  # such as a picture 200 times as wide as high
-            raise BadRequest(
-                f"{type(processor).__name__} cannot read these pictures: {error}",
-                hint="send pictures of an ordinary shape",
-            ) from error
-        return to_model(inputs, self._model), prompt.rstrip().endswith("<think>")
+        inputs = processed(processor, [*images, *video], text=[prompt], **given)
+        return to_model(inputs, self._model), prompt.rstrip().endswith(OPENING)
 
     def _prompt(self, content: Sequence[Message]) -> str:
         """Return the user's turn and the begin of the answer, as the checkpoint's template says."""
@@ -141,7 +135,20 @@ class SceneVlmAdapter(OneNetwork):
                 hint="send all of them as `images`",
             )
 
-    def _generate(self, inputs: Any, max_new_tokens: int) -> str:
+    def _answer(self, ids: list[int], thinks: bool) -> str:
+        """Decode the answer without its thoughts; `thinks`: the prompt ends in the middle of one.
+
+        A tokenizer that marks thoughts by special tokens drops those from the text, so ids are cut.
+        """
+        tokens = self._processor.tokenizer.added_tokens_encoder
+        opening, closing = tokens.get(OPENING), tokens.get(CLOSING)
+        if closing in ids:
+            ids, thinks = ids[len(ids) - ids[::-1].index(closing) :], False
+        text = str(self._processor.decode(ids, skip_special_tokens=True))
+        return after_thinking(OPENING + text if thinks or opening in ids else text)
+
+    def _generate(self, inputs: Any, max_new_tokens: int) -> list[int]:
+        """Return the ids of the answer's tokens. Raises LimitExceeded for too long a prompt."""
         import torch
 
         asked = inputs["input_ids"].shape[1]
@@ -159,7 +166,8 @@ class SceneVlmAdapter(OneNetwork):
             output = self._model.generate(
                 **inputs, max_new_tokens=max_new_tokens, do_sample=False, max_time=ANSWER_MAX_S
             )
-        return str(self._processor.decode(output[0, asked:], skip_special_tokens=True))
+        ids: list[int] = output[0, asked:].tolist()
+        return ids
 
 
 def _video(frames: Sequence[Any], fps: float | None) -> dict[str, Any]:
@@ -190,8 +198,8 @@ def after_thinking(text: str) -> str:
     Raises: LimitExceeded if the tokens ended in the middle of a thought. There is no answer then,
     and an empty one would be taken for one.
     """
-    answer = text.rpartition("</think>")[2]
-    if "<think>" in answer:
+    answer = text.rpartition(CLOSING)[2]
+    if OPENING in answer:
         raise LimitExceeded(
             "the model has used all tokens for thinking",
             hint="raise max_new_tokens, or use a checkpoint that does not think",

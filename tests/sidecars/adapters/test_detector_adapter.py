@@ -22,7 +22,9 @@ BLOCK = "actions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0, max
     [
         ("red cube", ["red cube"]),
         ("red cube . blue ball", ["red cube", "blue ball"]),
-        ("red cube. blue ball.", ["red cube. blue ball"]),
+        ("red cube. blue ball.", ["red cube", "blue ball"]),
+        ("1.5 l bottle. blue ball. ", ["1.5 l bottle", "blue ball"]),
+        (["red cube. blue ball.", "a no. 5 bolt"], ["red cube", "blue ball", "a no. 5 bolt"]),
         ("red cube, blue ball,red cube", ["red cube", "blue ball"]),
         ("a no. 5 bolt .", ["a no. 5 bolt"]),
         ("red cube</c>blue ball</c> mug </c>", ["red cube", "blue ball", "mug"]),

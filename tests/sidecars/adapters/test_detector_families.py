@@ -32,6 +32,56 @@ def loaded(saved, manifest):
     return loaded
 
 
+@pytest.mark.parametrize(
+    ("query", "labels"),
+    [
+        ("1.5 l bottle", {"1.5 l bottle"}),
+        (["1.5 l bottle", "Ball"], {"1.5 l bottle", "Ball"}),
+        ("red cube. blue ball.", {"red cube", "blue ball"}),
+    ],
+)
+def test_grounding_dino_takes_texts_with_a_dot(query, labels, loaded, png):
+    """Its processor joins texts by dots, and hands a list with a dot in it to the tokenizer as it
+    is: a TypeError, told as the model's failure."""
+    reply = loaded("grounding_dino").run(
+        DetectOp(op="detect", image=png(WIDTH, HEIGHT), query=query)
+    )
+    assert {one["label"] for one in reply["detections"]} <= labels
+    assert reply["detections"]
+
+
+def test_grounding_dino_reads_the_text_that_its_processor_would_write(loaded, png):
+    """Joining the texts here must not change what the model reads."""
+    adapter = loaded("grounding_dino")
+    ours = adapter._processor(text=["red cube. ball."])["input_ids"]
+    assert ours == adapter._processor(text=[["Red cube", "ball"]])["input_ids"]
+
+
+def test_a_text_without_a_letter_is_refused(loaded, png):
+    """Characters that the tokenizer drops left no token to score: an IndexError."""
+    call = DetectOp(op="detect", image=png(WIDTH, HEIGHT), query="\u200b")
+    with pytest.raises(BadRequest, match="has no characters that this model reads"):
+        loaded("grounding_dino").run(call)
+
+
+@pytest.mark.parametrize(("size", "shrunk"), [((2000, 3), "1024 x 2"), ((3, 2000), "2 x 1024")])
+def test_a_picture_of_which_resizing_leaves_nothing_is_refused(size, shrunk, loaded, png):
+    """Resizing by the longer side leaves no pixel of the shorter one: the processor's ValueError
+    was told as the model's failure."""
+    call = DetectOp(op="detect", image=png(*size), query=LABELS)
+    with pytest.raises(BadRequest, match=f"Processor cannot read pictures of {shrunk}: "):
+        loaded("grounding_dino").run(call)
+
+
+@pytest.mark.parametrize("family", ["owlvit", "owlv2", "omdet_turbo"])
+def test_a_picture_that_no_processor_resizes_is_not_passed_on(family, loaded, png):
+    """A checkpoint whose processor does not resize handed any size to a model of one size."""
+    adapter = loaded(family)
+    adapter._processor.image_processor.do_resize = False
+    with pytest.raises(BadRequest, match="a picture of 80 x 60; this model reads 64 x 64"):
+        adapter.run(DetectOp(op="detect", image=png(WIDTH, HEIGHT), query=LABELS))
+
+
 def detect(adapter, picture):
     reply = adapter.run(DetectOp(op="detect", image=picture, query=LABELS))
     for one in reply["detections"]:

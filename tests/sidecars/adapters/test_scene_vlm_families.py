@@ -85,6 +85,27 @@ def test_each_family_answers_about_several_pictures(family, loaded, manifest, pn
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("special", [True, False])
+def test_thoughts_are_no_part_of_the_answer(special, loaded):
+    """Regression: decoding drops special tokens. Where a tokenizer counts `<think>` and `</think>`
+    among them, thought and answer were one text: `is it a cubeyes`."""
+    adapter = loaded("qwen3_5")
+    tokenizer = adapter._processor.tokenizer
+    tokenizer.add_tokens(["<think>", "</think>"], special_tokens=special)
+
+    def answer(text, thinks=False):
+        return adapter._answer(tokenizer(text)["input_ids"], thinks)
+
+    assert answer("<think>is it a cube</think>\n\nyes<|im_end|>") == "yes"
+    assert answer("is it</think>no<think>a cube</think>yes<|im_end|>", thinks=True) == "yes"
+    assert answer("yes<|im_end|>") == "yes"
+    assert answer("is it a cube</think>", thinks=True) == ""
+    for text, thinks in (("<think>is it", False), ("is it", True), ("a</think>b<think>", True)):
+        with pytest.raises(LimitExceeded, match="all tokens for thinking"):
+            answer(text, thinks)
+
+
+@pytest.mark.heavy
 @pytest.mark.parametrize("family", FAMILIES)
 def test_each_family_looks_at_all_frames_of_a_video(family, loaded, manifest, png):
     import torch
@@ -129,7 +150,7 @@ def test_what_the_model_cannot_read_is_refused(loaded, manifest, png, monkeypatc
         adapter.run(asked(video=[png(64, 48), png(48, 64)], fps=1.0))
     with pytest.raises(BadRequest, match="stands for a picture"):
         adapter.run(asked(image=png()).model_copy(update={"question": "<|image_pad|>?"}))
-    with pytest.raises(BadRequest, match="cannot read these pictures"):
+    with pytest.raises(BadRequest, match="cannot read pictures of 900 x 4: "):
         adapter.run(asked(image=png(900, 4)))
     with pytest.raises(BadRequest, match="more than"):
         adapter.run(asked(images=[png(4000, 2100), png(4000, 2100)]))
