@@ -33,7 +33,16 @@ calls is one use.
 
 from typing import Annotated, Literal, NotRequired, Self, TypedDict
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    FiniteFloat,
+    Tag,
+    TypeAdapter,
+    model_validator,
+)
 
 from vram_arbiter.schemas.limits import Seconds
 from vram_arbiter.schemas.plain import Message
@@ -86,11 +95,16 @@ class _Look(_Call):
 
 class DetectOp(_Look):
     """Find `query` in an image. Several are separated by `</c>`, ` . ` or commas, as the field
-    writes them, or come as a list."""
+    writes them, end in a dot each, or come as a list."""
 
     op: Literal["detect"]
     image: ImageBytes
-    query: Question | Annotated[list[Question], Field(min_length=1, max_length=QUERIES_MAX)]
+    query: Annotated[
+        Annotated[Question, Tag("text")]
+        | Annotated[list[Question], Field(min_length=1, max_length=QUERIES_MAX), Tag("list")],
+        # else an error of one is told as an error of the other
+        Discriminator(lambda query: "text" if isinstance(query, str) else "list"),
+    ]
     max_side: Annotated[int, Field(ge=32, le=4096)] = 1024
     # how LocateAnything decodes; other detectors have one way
     mode: Literal["fast", "slow", "hybrid"] = "hybrid"

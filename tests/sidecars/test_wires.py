@@ -105,7 +105,14 @@ def test_both_families_reach_the_host():
         ({"op": "get_action"}, "bad_request", "get_action"),
         ({"op": "detect"}, "bad_request", "image"),
         ({"op": "detect", "image": "text", "query": "x", "colour": 1}, "bad_request", "colour"),
-        ({"op": "detect", "image": PNG, "query": ""}, "bad_request", "query"),
+        ({"op": "detect", "image": PNG, "query": ""}, "bad_request", "query.text: String should"),
+        ({"op": "detect", "image": PNG, "query": []}, "bad_request", "query.list: List should"),
+        (
+            {"op": "detect", "image": PNG, "query": ["cup"] * 200},
+            "bad_request",
+            "query.list: List should have at most 64 items after validation, not 200",
+        ),
+        ({"op": "detect", "image": PNG, "query": ["cup", 1]}, "bad_request", "query.list.1: Input"),
         (
             {"op": "detect", "image": PNG, "query": "x", "max_side": 10**9},
             "bad_request",
