@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, Final
 
 from vram_arbiter.clients.configs import CONFIGS_VARIABLE
@@ -221,9 +222,27 @@ def read_config(cls: Any, weights: Weights) -> Any:
 
 def _unfit(cls: Any, weights: Weights, error: Exception) -> ModelError:
     return ModelError(
-        f"{cls.__name__} cannot load {weights.source}: {type(error).__name__}: {error}",
+        f"{cls.__name__} cannot load {weights.source}: {reason(error)}",
         hint="check that it is complete and of the manifest's kind",
     )
+
+
+def reason(error: BaseException) -> str:
+    """Return a library's failure in words.
+
+    Checkpoints name other repositories of the hub (tokenizers, backbones). The libraries say that
+    one is not in the cache, but not which: it is an argument of theirs.
+    """
+    link: BaseException | None = error
+    while link is not None and type(link).__name__ != "LocalEntryNotFoundError":
+        link = link.__cause__ or link.__context__
+    frames = [] if link is None else walk_tb(link.__traceback__)
+    for asked in (frame.f_locals for frame, _ in frames):
+        if name := asked.get("repo_id"):
+            revision = asked.get("revision") or "main"
+            at = "" if revision == "main" else f" --revision {revision}"
+            return f"{name} is not in the hub's cache: `hf download {name}{at}` fetches it"
+    return f"{type(error).__name__}: {error}"
 
 
 def model_options(manifest: RSkillManifest, weights: Weights, device: str) -> Message:

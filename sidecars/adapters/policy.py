@@ -39,6 +39,7 @@ from vram_arbiter.sidecars.weights import (
     fetched,
     model_type,
     read_config,
+    reason,
 )
 
 if TYPE_CHECKING:
@@ -246,7 +247,7 @@ class PolicyAdapter:
                 getattr(step, _LAZY, None)  # no residency reads files, and none the hub
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelError(
-                f"{files.source}: its processors cannot be read: {type(error).__name__}: {error}",
+                f"{files.source}: its processors cannot be read: {reason(error)}",
                 hint="check that the checkpoint is complete",
             ) from error
 

@@ -16,7 +16,7 @@ from vram_arbiter.sidecars.adapters.base import LEROBOT, ModelCall
 from vram_arbiter.sidecars.checkpoints import META, load_lerobot
 from vram_arbiter.sidecars.images import decode_all, of_one_size
 from vram_arbiter.sidecars.quantization import check_weights, nf4_of, quantize_linear
-from vram_arbiter.sidecars.weights import Weights, read_config
+from vram_arbiter.sidecars.weights import Weights, read_config, reason
 
 # own reward types, by lerobot's naming convention
 _OWN_MODELS = ("vram_arbiter.sidecars.models.compact_progress",)
@@ -87,7 +87,7 @@ class RewardAdapter:
         except (ValueError, ImportError, OSError) as error:
             raise ModelError(
                 f"{self._weights.source}: no processors for {self._config.type}: "
-                f"{error.__cause__ or error}",
+                f"{reason(error.__cause__ or error)}",
                 hint="install the packages that this reward model needs",
             ) from error
 

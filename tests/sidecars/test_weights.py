@@ -67,6 +67,29 @@ def test_hub_and_folder_take_the_same_call(tmp_path):
         from_pretrained(Model, Weights("broken"))
 
 
+@pytest.mark.heavy
+def test_a_part_that_is_not_in_the_cache_is_named(monkeypatch):
+    """Regression: a checkpoint names its tokenizer by a repository of the hub. Where that was never
+    fetched, the libraries said that they could not connect, and not to what."""
+    hub = pytest.importorskip("huggingface_hub")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+
+    class Policy:
+        @classmethod
+        def from_pretrained(cls, source, **options):
+            try:
+                hub.hf_hub_download("test/no-such-tokenizer", "tokenizer.json", **options)
+            except OSError as error:
+                raise ValueError("a step cannot be made") from error
+
+    with pytest.raises(ModelError) as refused:
+        from_pretrained(Policy, Weights(str(Path("/x")), local=True), revision="v2")
+    assert refused.value.message == (
+        "Policy cannot load /x: test/no-such-tokenizer is not in the hub's cache: "
+        "`hf download test/no-such-tokenizer --revision v2` fetches it"
+    )
+
+
 def asking(dtype: str) -> Any:
     manifest = load_manifest(configs_folder({}) / "rskills" / "so101-grab" / "rskill.yaml")
     asked = Quantization.model_validate({"dtype": dtype})
