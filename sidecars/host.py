@@ -110,7 +110,7 @@ class SidecarHost:
                 await asyncio.wait([stopped, background[0]], return_when=asyncio.FIRST_COMPLETED)
             finally:
                 stopped.cancel()
-                await residency.leave()
+                await residency.leave(self._refused)
                 for task in background:
                     task.cancel()
                 outcomes = await asyncio.gather(*background, return_exceptions=True)

@@ -57,7 +57,7 @@ class Residency:
         self._gpu = GpuCopy(settings, models, self._host, self._died)
         self._recall = Recall(settings.name, self._host, self._gpu)
         self._uses = Uses(client)
-        self._ending = False
+        self._ending: VramError | None = None  # what later requests are told
         self._obtaining: asyncio.Task[AsyncLease | None] | None = None
         self._unloads = 0  # number of unload requests: earlier waits for the model end
         self.lease: AsyncLease | None = None
@@ -187,9 +187,14 @@ class Residency:
         both."""
         return self._turn.locked() or self._recall.under_way
 
-    async def leave(self) -> None:
-        """End of the program: after the op in progress, free everything."""
-        self._ending = True
+    async def leave(self, cause: VramError | None = None) -> None:
+        """End of the program: after the op in progress, free everything.
+
+        Requests that wait, or come yet, get the `cause`.
+        """
+        self._ending = cause or SidecarUnavailable(
+            f"{self._settings.name} is ending", hint="start it again"
+        )
         lease = self.lease
         if self._prepared is not None and not self._prepared.done():
             self._prepared.cancel()
@@ -236,7 +241,7 @@ class Residency:
             return True
         self._refuse_if_ending()
         if unloads != self._unloads:
-            raise unwanted(self._settings.name)
+            raise self._unwanted()
         self._gpu.to("waiting")
         self._obtaining = asyncio.create_task(self._obtain(deadline), name="obtain")
         try:
@@ -246,7 +251,7 @@ class Residency:
             if unloads != self._unloads:  # an unload came in the moment of the grant
                 if lease is not None:
                     await lease.release()
-                raise unwanted(self._settings.name)
+                raise self._unwanted()
             await self._load(lease)
         except BaseException as error:
             self._gpu.not_loaded()
@@ -257,7 +262,7 @@ class Residency:
                 and unloads != self._unloads
                 and not _being_cancelled()
             ):
-                raise unwanted(self._settings.name) from None
+                raise self._unwanted() from None
             raise
         finally:
             self._obtaining = None
@@ -265,8 +270,11 @@ class Residency:
         return True
 
     def _refuse_if_ending(self) -> None:
-        if self._ending:
-            raise SidecarUnavailable(f"{self._settings.name} is ending", hint="start it again")
+        if self._ending is not None:
+            raise self._ending
+
+    def _unwanted(self) -> VramError:
+        return self._ending or unwanted(self._settings.name)
 
     async def _restore(self, lease: AsyncLease) -> None:
         """Load after a grant, by itself or because it was called back.

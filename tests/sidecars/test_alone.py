@@ -93,6 +93,27 @@ def test_on_a_simulated_gpu_it_waits_for_the_arbiter_that_makes_the_gpu(box, arb
     assert lease["gpu"] == uuid, "the lease is of the GPU that holds the bytes"
 
 
+@pytest.mark.parametrize(("kind", "flags"), [("lone_box", ["--no-arbiter"]), ("box", [])])
+def test_without_its_simulated_gpu_it_tells_those_that_wait(kind, flags, request):
+    """Regression: requests that came while it prepared were told that the sidecar "is ending", or
+    that it "was told to unload". The cause stood in the log alone."""
+    box = request.getfixturevalue(kind)
+    sidecar = box.spawn("detector", *flags)
+    (sidecar.folder / "slow_prepare").touch()
+    assert sidecar.ask("ping")["ok"]
+    waiting = [sidecar.send_detect(), sidecar.client.send("load")]
+    until(lambda: sidecar.ask("ping").get("wanted"))
+    shutil.rmtree(box.gpu_folder)
+    (sidecar.folder / "slow_prepare").unlink()
+    for request_id in waiting:
+        reply = sidecar.client.reply(request_id)
+        assert (reply["code"], reply["hint"]) == (
+            "no_gpu",
+            "start the arbiter with --gpu fake:8GiB",
+        )
+    assert sidecar.process.wait(PATIENCE_S) == 1
+
+
 def test_its_end_in_the_middle_of_a_load_is_in_order(lone_box):
     """Regression: the load that was undone and the unload both left the state `unloading`, and the
     program hung behind the assertion until it was killed."""
