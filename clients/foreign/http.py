@@ -107,10 +107,10 @@ def answer(request: Request, deadline: Deadline) -> Reply:
     return Reply(reply.status, {key.lower(): value for key, value in reply.getheaders()}, body)
 
 
-def call(request: Request, deadline: Deadline) -> bytes:
-    """Return the body of a success. Raises ActionFailed for any other status than 2xx."""
+def call(request: Request, deadline: Deadline, *, besides: int = 200) -> bytes:
+    """Return the body of a success: 2xx, or the status `besides`. Raises ActionFailed for another."""
     reply = answer(request, deadline)
-    if not 200 <= reply.status < 300:
+    if not 200 <= reply.status < 300 and reply.status != besides:
         told = printable(reply.body.decode(errors="replace"))[:SHOWN_MAX_CHARS]
         raise ActionFailed(
             f"{request}: answered {reply.status}" + (f": {told}" if told else ""),

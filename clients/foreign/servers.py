@@ -124,24 +124,30 @@ class Ollama(Server):
 
 class LlamaCpp(Server):
     """llama.cpp's `llama-server` as a router (started without a model): `/models/unload` for each
-    model that is not unloaded (https://github.com/ggml-org/llama.cpp/blob/master/tools/server,
-    "Using multiple models"). Each model is a process of its own, which ends.
+    model that has a process (https://github.com/ggml-org/llama.cpp/blob/master/tools/server,
+    "Using multiple models"), which ends. One that failed to load is `unloaded`, with a flag.
 
-    Unloading aborts requests in progress, which `/slots` shows unless it is switched off.
+    Unloading aborts requests in progress, which `/slots` shows unless it is switched off, kills a
+    load with the request that it is for, and cancels a download, which holds no GPU memory.
     """
 
     name = "llama.cpp"
     default_url = "http://127.0.0.1:8080"
     keeps_context = False
-    AWAY: ClassVar = ("unloaded", "failed")
+    AWAY: ClassVar = ("unloaded", "downloading", "downloaded")
+    NOT_RUNNING: ClassVar = 400
 
     def requests(self, deadline: Deadline) -> int | None:
-        busy = 0
-        for model in self._models(deadline, lambda status: status == "loaded"):
-            request = self._get(f"/slots?model={quote(model, safe='')}")
+        models = self._models(deadline)
+        busy = sum(status == "loading" for status in models.values())  # each for a request
+        for model in [model for model, status in models.items() if status == "loaded"]:
+            # without `autoload` it would load a model that left meanwhile
+            request = self._get(f"/slots?model={quote(model, safe='')}&autoload=false")
             reply = answer(request, deadline)
+            if reply.status == self.NOT_RUNNING:
+                continue
             if reply.status != 200:
-                return None  # --no-slots
+                return busy or None  # --no-slots
             try:
                 slots = json.loads(reply.body)
             except ValueError as error:
@@ -154,13 +160,16 @@ class LlamaCpp(Server):
     def free(self, pids: Sequence[int]) -> None:
         deadline = Deadline(self.timeout_s)
         for model in self._loaded(deadline):
-            call(self._post("/models/unload", {"model": model}), deadline)
+            unload = self._post("/models/unload", {"model": model})
+            call(unload, deadline, besides=self.NOT_RUNNING)  # it ended meanwhile
         self._until_none(self._loaded, deadline, "POST /models/unload: still loaded:")
 
     def _loaded(self, deadline: Deadline) -> Sequence[str]:
-        return self._models(deadline, lambda status: status not in self.AWAY)
+        models = self._models(deadline)
+        return [model for model, status in models.items() if status not in self.AWAY]
 
-    def _models(self, deadline: Deadline, wanted: Callable[[object], bool]) -> Sequence[str]:
+    def _models(self, deadline: Deadline) -> Mapping[str, object]:
+        """Return the state of each model. Raises ActionFailed."""
         request = self._get("/models")
         models = _entries(call_json(request, deadline), "data", request)
         if not all(isinstance(model.get("status"), dict) for model in models):
@@ -168,7 +177,7 @@ class LlamaCpp(Server):
                 f"{request}: models without a status",
                 hint="start llama-server without a model: only its router can unload",
             )
-        return [str(model.get("id")) for model in models if wanted(model["status"].get("value"))]
+        return {str(model.get("id")): model["status"].get("value") for model in models}
 
 
 class ComfyUi(Server):

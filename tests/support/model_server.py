@@ -1,5 +1,7 @@
 """Stand-in for a model server: answers as vLLM, Ollama, llama.cpp's router and ComfyUI do.
 
+The router's answers are those of a real `llama-server`, by which it was compared.
+
 `python -m tests.support.model_server FOLDER BYTES HOST PORT [BROKEN…]` holds bytes on the simulated
 GPU in FOLDER until it is told to free them, prints its pid, and serves until SIGTERM.
 """
@@ -10,18 +12,27 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import FrameType
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
+
+
+@dataclass
+class Refusal:
+    """An answer with status 400."""
+
+    message: str
 
 
 class ModelServer:
     """A server with two models loaded.
 
     `heard`: what was called, in order. `busy`: answers of the next looks at its work, then 0.
-    `broken`: paths that answer with this status.
+    `broken`: paths that answer with this status. `states`: llama.cpp's models that are not loaded;
+    `lost`: those whose load or download an unload has ended.
     """
 
     def __init__(
@@ -34,6 +45,8 @@ class ModelServer:
         self.heard: list[tuple[str, Any]] = []
         self.busy: list[int] = []
         self.broken: dict[str, int] = {}
+        self.states = {"c": "unloaded"}
+        self.lost: list[str] = []
         self.lingering = 0  # looks at the list of models that still show those being unloaded
         self._leaving: list[str] = []
         self._free, self._load = free, load
@@ -63,12 +76,15 @@ class ModelServer:
         self._server.server_close()
 
     def serve(self, request: BaseHTTPRequestHandler) -> None:
-        path = urlsplit(request.path).path
+        parts = urlsplit(request.path)
         sent = request.rfile.read(int(request.headers.get("Content-Length", 0)))
         body = json.loads(sent) if sent else None
         self.heard.append((f"{request.command} {request.path}", body))
-        status = self.broken.get(path, 200)
-        answer = self.answer(path, body) if status == 200 else "broken <&>\x1b"
+        status, answer = self.broken.get(parts.path, 200), "broken <&>\x1b"
+        if status == 200:
+            answer = self.answer(parts.path, body or dict(parse_qsl(parts.query)))
+        if isinstance(answer, Refusal):
+            status, answer = 400, {"error": {"code": 400, "message": answer.message}}
         data = (answer if isinstance(answer, str) else json.dumps(answer)).encode()
         request.send_response(status)
         request.send_header("Content-Length", str(len(data)))
@@ -85,17 +101,27 @@ class ModelServer:
                 self.unload(body["model"])
                 return {"done": True, "done_reason": "unload"}
             case "/models/unload":
-                self.unload(body["model"])
-                return {"success": True}
+                return self.unload_routed(body["model"])
             case "/api/ps":
                 return {"models": [{"model": name, "size_vram": 1} for name in self.listed()]}
             case "/models":
-                shown = dict.fromkeys("abc", "unloaded")
+                shown = dict.fromkeys("ab", "unloaded") | self.states
                 shown |= dict.fromkeys(self.listed(), "loaded")
-                return {"data": [{"id": n, "status": {"value": v}} for n, v in shown.items()]}
+                failed = {"failed": True, "exit_code": 1}  # beside `unloaded`
+                return {
+                    "data": [
+                        {"id": name, "status": {"value": value, **(failed if name == "c" else {})}}
+                        for name, value in shown.items()
+                    ]
+                }
             case "/metrics":
                 count = self.busy.pop(0) if self.busy else 0
                 return f'# HELP x\nvllm:num_requests_running{{m="a b"}} {count}.0\nother 7\n'
+            case "/slots" if body["model"] not in self.loaded:
+                if body.get("autoload") == "false":
+                    return Refusal("model is not loaded")
+                self.loaded.append(body["model"])
+                return [{"id": 0, "is_processing": False}]
             case "/slots":
                 return [{"id": 0, "is_processing": bool(self.busy and self.busy.pop(0))}]
             case "/queue":
@@ -109,6 +135,20 @@ class ModelServer:
             self._leaving.append(name)
         if not self.loaded:
             self._free()
+
+    def unload_routed(self, name: str) -> "Refusal | dict[str, bool]":
+        """Unload as the router does: it ends whatever the model is about."""
+        state = self.states.get(name)
+        if name in self.loaded:
+            self.unload(name)
+        elif state in ("loading", "downloading"):
+            self.lost.append(name)
+            self.states[name] = "unloaded"
+        elif state == "sleeping":
+            self.states[name] = "unloaded"
+        else:
+            return Refusal("model is not running")
+        return {"success": True}
 
     def listed(self) -> list[str]:
         """Models that a list shows: those being unloaded too, for a while."""

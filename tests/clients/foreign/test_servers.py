@@ -65,6 +65,57 @@ def test_requests_in_progress_are_counted_where_the_server_tells(
     assert SERVERS["llama.cpp"](model_server.url, LIMIT_S).busy() is None
 
 
+def test_a_download_of_llama_cpp_is_left_alone(model_server: ModelServer) -> None:
+    """Regression: it counted as loaded, and making room canceled the user's download. A model that
+    sleeps has a process with a context, which ends."""
+    model_server.states = {"c": "unloaded", "d": "downloading", "e": "sleeping", "f": "downloaded"}
+    SERVERS["llama.cpp"](model_server.url, LIMIT_S).free([])
+    assert model_server.loaded == model_server.lost == []
+    assert model_server.states == {**model_server.states, "d": "downloading", "e": "unloaded"}
+
+
+def test_a_load_of_llama_cpp_is_work(model_server: ModelServer) -> None:
+    """Regression: a model that loads counted as idle, and unloading kills its load, with the
+    request that it is for. It is work also where the server shows no slots."""
+    model_server.states = {"c": "unloaded", "d": "loading"}
+    server = SERVERS["llama.cpp"](model_server.url, LIMIT_S)
+    assert server.busy() == 1
+    model_server.busy = [1, 0]
+    assert server.busy() == 2
+    model_server.broken = {"/slots": 501}
+    assert server.busy() == 1
+
+
+def test_a_look_at_llama_cpp_loads_nothing(model_server: ModelServer) -> None:
+    """Regression: `/slots` of a model that left between two looks loaded it again."""
+
+    def leaves_meanwhile(path: str, body: object) -> object:
+        if path == "/slots":
+            model_server.loaded = []
+        return ModelServer.answer(model_server, path, body)
+
+    model_server.answer = leaves_meanwhile  # type: ignore[method-assign]
+    assert SERVERS["llama.cpp"](model_server.url, LIMIT_S).busy() == 0
+    assert model_server.loaded == []
+
+
+def test_a_model_of_llama_cpp_that_ends_meanwhile_keeps_no_other(model_server: ModelServer) -> None:
+    """Regression: the router answers 400 for a model that is not running any more, and the models
+    behind it kept their memory."""
+
+    def ends_meanwhile(path: str, body: object) -> object:
+        if path == "/models/unload" and "a" in model_server.loaded:
+            model_server.unload("a")
+        return ModelServer.answer(model_server, path, body)
+
+    model_server.answer = ends_meanwhile  # type: ignore[method-assign]
+    SERVERS["llama.cpp"](model_server.url, LIMIT_S).free([])
+    assert model_server.loaded == []
+    model_server.loaded, model_server.broken = ["a"], {"/models/unload": 500}
+    with pytest.raises(ActionFailed, match="answered 500"):
+        SERVERS["llama.cpp"](model_server.url, LIMIT_S).free([])
+
+
 def test_what_a_failing_server_says_is_told(model_server: ModelServer) -> None:
     vllm = SERVERS["vllm"](model_server.url, LIMIT_S)
     model_server.broken = {"/sleep": 500}
