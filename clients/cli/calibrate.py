@@ -102,8 +102,8 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     add(
         "--name",
         type=arguments.name,
-        metavar="OWNER/NAME",
-        help="key of COMMAND's entry (default: local/PROGRAM)",
+        metavar="[OWNER/]NAME",
+        help="key of COMMAND's entry (default: PROGRAM); without an owner it is local/NAME",
     )
     add(
         "--rate",
@@ -181,9 +181,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _target(args: argparse.Namespace, configs: Path) -> Target:
     if args.program:
-        key = args.name or "local/" + re.sub(r"\s", "-", printable(Path(args.program[0]).name))
+        key = args.name or re.sub(r"\s", "-", printable(Path(args.program[0]).name))
+        key = key if "/" in key else f"local/{key}"
         if not KEY.fullmatch(key):
-            args.parser.error(f"--name: expected OWNER/NAME, got {key!r}")
+            args.parser.error(f"--name: expected NAME or OWNER/NAME without spaces, got {key!r}")
         return Target(key, None)
     if args.name or args.seconds:
         args.parser.error("--name and --seconds belong to `-- COMMAND`")

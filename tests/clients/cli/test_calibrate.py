@@ -533,8 +533,10 @@ def test_the_command_beside_a_running_arbiter(
             pass
         granted = client.history(kinds=["granted"]).events[0]
     assert granted["consumer"] == "vramctl calibrate acme/thing"
-    assert calibrate("--", sys.executable, "-c", HOLDING) == 0
-    assert "steady          900 MiB" in capsys.readouterr().out
+    assert calibrate("--name", "thing", "--", sys.executable, "-c", HOLDING) == 0
+    printed = capsys.readouterr().out
+    assert "steady          900 MiB" in printed
+    assert "\nlocal/thing:\n" in printed, "the how-tos name it so, and were refused"
 
 
 HOLDING = """
@@ -589,7 +591,8 @@ with Client("robot", endpoint=sys.argv[1]) as client, client.lease(vram="1GiB", 
         ([], 2, "expected either MANIFEST or `-- COMMAND`"),
         (["so101-detector", "--", "true"], 2, "expected either MANIFEST or `-- COMMAND`"),
         (["so101-detector", "--seconds", "3"], 2, "belong to `-- COMMAND`"),
-        (["--name", "no-owner", "--", "true"], 2, "expected OWNER/NAME"),
+        (["--name", "a/b/c", "--", "true"], 2, "expected NAME or OWNER/NAME without spaces"),
+        (["--name", "a b", "--", "true"], 2, "expected NAME or OWNER/NAME without spaces"),
         (["--rate", "10", "--", "true"], 2, "expected a number, 20 to 1000"),
         (["no-such-skill"], 2, "cannot be read"),
         (["so101-navigate", "--no-arbiter"], 2, "which no sidecar serves"),

@@ -270,6 +270,7 @@ def test_what_cuda_checkpoint_needs_is_checked_before_the_program_starts(
         environ=arbiter_daemon.environ,
     )  # fmt: skip
     assert (done.returncode, "cuda-checkpoint needs" in done.stderr) == (1, True), done.stderr
+    assert done.stderr.count("\n") == 1, "and nothing of a peak"
     assert not (tmp_path / "began").exists()
 
 
