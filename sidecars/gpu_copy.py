@@ -158,7 +158,6 @@ class GpuCopy:
         )
         _log.error("%s", error)
         self._died(error)
-        self._host.drop()
         await _released(lease)
 
     # -- leaving the GPU

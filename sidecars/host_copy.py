@@ -21,18 +21,18 @@ _log = logging.getLogger("sidecars")
 class HostCopy:
     """Weights in host RAM, and the tasks that read and drop them.
 
-    `steady_bytes` is their size before they were first read. `client` None: without an arbiter they
-    are never read ahead and always stay.
+    `expected_bytes` is their size before they were first read. `client` None: without an arbiter
+    they are never read ahead and always stay.
     """
 
-    def __init__(self, models: Models, client: AsyncClient | None, steady_bytes: int) -> None:
-        self._models, self._client, self._steady_bytes = models, client, steady_bytes
+    def __init__(self, models: Models, client: AsyncClient | None, expected_bytes: int) -> None:
+        self._models, self._client, self._expected_bytes = models, client, expected_bytes
         self._reading: asyncio.Task[int] | None = None  # under way, or there
         self._foreseen: asyncio.Task[None] | None = None  # reads ahead of a request
         self._expiry: asyncio.TimerHandle | None = None  # drops them where no request comes
         self._asking: asyncio.Task[None] | None = None  # whether they may stay
         self._dropping: set[asyncio.Task[None]] = set()
-        self.size_bytes: int | None = None  # when they were there the last time
+        self.size_bytes: int | None = None  # when they were there the last time; None: read first
 
     def fetch(self) -> asyncio.Task[int]:
         """Begin to read them, if they are not there."""
@@ -44,7 +44,7 @@ class HostCopy:
     async def fetched(self, reading: asyncio.Task[int]) -> int:
         """Wait for what `fetch` began, and return their bytes. It outlives a caller that is
         canceled. Raises ModelError or ConfigError."""
-        self.size_bytes = await asyncio.shield(reading)
+        self.size_bytes = self._expected_bytes = await asyncio.shield(reading)
         return self.size_bytes
 
     def drop(self) -> None:
@@ -58,7 +58,8 @@ class HostCopy:
     ) -> None:
         """Read them once `prepared` is over, where the budget has room beside what is parked.
 
-        They are dropped after `FORESEEN_S` where they are not `wanted` then.
+        They are dropped after `FORESEEN_S` where they are not `wanted` then, and at once where they
+        are there and the budget has no room.
         """
         if self._client is None or (self._foreseen is not None and not self._foreseen.done()):
             return
@@ -93,12 +94,16 @@ class HostCopy:
             await prepared()
             ram = (await client.status()).host_ram
             room = ram.budget_bytes - ram.parked_bytes
-            if (size := self.size_bytes or self._steady_bytes) > room:
+            if (size := self.size_bytes or self._expected_bytes) > room:
                 _log.info("%d bytes of weights, room for %d: they are not read ahead", size, room)
+                if not wanted():
+                    self.drop()
                 return
             await self.fetched(self.fetch())
         except VramError as error:
             _log.info("the weights are not read ahead: %s", error)
+            if not wanted():
+                self.drop()
             return
         loop = asyncio.get_running_loop()
         self._expiry = loop.call_later(FORESEEN_S, self._expire, wanted)

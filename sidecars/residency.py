@@ -83,6 +83,9 @@ class Residency:
         if self._client is None or self._ending or self.state != "unloaded":
             return  # else they are in host RAM already, or on their way
         _log.info("%s says that the model is wanted soon", by)
+        self._read_ahead()
+
+    def _read_ahead(self) -> None:
         self._host.read_ahead(self.prepared, lambda: self.state != "unloaded" or self.wanted)
 
     async def prepared(self) -> None:
@@ -343,7 +346,15 @@ class Residency:
         _log.warning("lease %s is lost: %s", lease.lease_id, error)
 
     def _died(self, error: VramError) -> None:
+        """Keep the weights for the next request, which need not read them again.
+
+        Where their keeper died as well, it is started again and reads them: that takes as long as
+        at the start, so the lease is not asked for before.
+        """
         self.last_error = error
+        if self._ending is None:
+            self._host.size_bytes = None
+            self._read_ahead()
 
     # -- uses
     def _check(self, token: Token) -> None:

@@ -7,11 +7,13 @@ the keeper for each residency. Must not know leases, wires or torch.
 
 import asyncio
 import contextlib
+import logging
 import multiprocessing
 import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from multiprocessing.context import ForkServerContext, ForkServerProcess
@@ -33,6 +35,9 @@ ENVIRONMENT: Final = {
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
 }
+
+
+_log = logging.getLogger("sidecars")
 
 
 class Models(Protocol):
@@ -187,6 +192,8 @@ class ModelProcesses:
         """Return the keeper, another one where it has died."""
         keeper = self._keeper
         if keeper is None or keeper.ended.is_set():
+            _log.info("starting the model's processes: its libraries are imported")
+            began = time.monotonic()
             keeper = await self._start()
             try:
                 await keeper.prepare()
@@ -194,6 +201,7 @@ class ModelProcesses:
                 await keeper.end()
                 raise
             self._keeper = keeper
+            _log.info("prepared after %.2f s", time.monotonic() - began)
         return keeper
 
     async def _start(self) -> _Keeper:

@@ -329,6 +329,35 @@ def test_a_model_that_dies_while_it_works_is_an_error_and_its_lease_ends(box, ar
     assert sidecar.detect()["ok"]
 
 
+def test_the_request_after_a_killed_model_reads_no_weights(box):
+    """Regression: the weights were dropped with the model's process, so the next request read them
+    again, and imported everything where their keeper had died too: 35 s under load, with a lease
+    that kept other models from loading, and no line in the log."""
+    sidecar = box.start("detector")
+    assert sidecar.detect()["ok"]
+    (sidecar.folder / "fail_read").touch()
+    os.kill(sidecar.model_pid(), signal.SIGKILL)
+    until(lambda: sidecar.state() == "unloaded")
+    assert sidecar.detect()["ok"], "nothing was read"
+    assert sidecar.log.count("prepared after") == 1
+
+
+def test_after_a_killed_keeper_the_model_is_read_before_a_lease_is_asked_for(box, arbiter):
+    """A lease that loads keeps other models from loading; imports and reading take the longest."""
+    sidecar = box.start("detector")
+    assert sidecar.detect()["ok"]
+    (sidecar.folder / "slow_prepare").touch()
+    (keeper,) = children(server_of_imports(sidecar.process.pid))
+    os.kill(keeper, signal.SIGKILL)
+    until(lambda: leases(arbiter) == {})
+    until(lambda: sidecar.log.count("its libraries are imported") == 2)
+    waiting = sidecar.send_detect()
+    until(lambda: sidecar.ask("ping").get("wanted"))
+    assert leases(arbiter) == {}
+    (sidecar.folder / "slow_prepare").unlink()
+    assert sidecar.client.reply(waiting, PATIENCE_S)["ok"]
+
+
 def test_a_model_that_dies_while_it_loads_is_an_error(box, arbiter):
     (box.runtime / "detector-model").mkdir()
     switch = box.runtime / "detector-model" / "slow_load"

@@ -215,6 +215,28 @@ async def test_a_model_that_is_wanted_soon_is_read_ahead_and_nothing_else(
             await residency.leave()
 
 
+async def test_weights_of_a_model_that_died_stay_for_the_next_request(arbiter_daemon):
+    """Regression: they were dropped, and the next request read all of them again. Where the budget
+    of host RAM has no room for them they do go."""
+    models = Models(weights_bytes=GB)
+    async with (
+        AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client,
+        asyncio.timeout(WAIT_S),
+    ):
+        residency = Residency(settings(arbiter_daemon), models, client)
+        await residency.load()
+        models.started[0].ended.set()
+        while residency.state != "unloaded":
+            await asyncio.sleep(0.01)
+        await residency.load()
+        assert (models.reads, residency.state) == (1, "resident")
+        residency._host._expected_bytes = (await client.status()).host_ram.budget_bytes + 1
+        models.started[1].ended.set()
+        while models.in_host_ram:
+            await asyncio.sleep(0.01)
+        await residency.leave()
+
+
 async def test_weights_stay_in_host_ram_while_the_arbiter_has_room_for_them(arbiter_daemon):
     """A parked model comes back without reading its weights again, and an unload frees them."""
     models = Models(weights_bytes=GB)
