@@ -30,6 +30,7 @@ HOW_TO = Path(__file__).parents[2] / "docs/how-to"
 SYSTEM = "/etc/systemd/system"
 ENDPOINT = "ipc:///run/vram-arbiter/arbiter.sock"
 ARBITER = "vram-arbiter.service"
+LOADER = "/etc/ld.so.conf.d/opt-python.conf"
 
 
 def steps(heading: str, page: str = "systemd.md") -> list[str]:
@@ -45,7 +46,6 @@ def booted() -> Iterator[Machine]:
     made = Machine()
     try:
         made.run("mkdir", "-m", "1777", "/run/logs")
-        made.run("groupadd", "--system", "--force", "render")  # a group of devices is not removed
         output = "append:/run/logs/%n.log"
         text = f"[Service]\nStandardOutput={output}\nStandardError={output}\n"
         made.write(f"{SYSTEM}/vram-.service.d/log.conf", text)
@@ -70,6 +70,13 @@ def machine(booted: Machine, before: set[str]) -> Machine:
     assert "-m venv" in install[0]  # these two are done: the environment is mounted
     assert "pip install" in install[1]
     command = ["env", "USER=daemon", "bash", "-c", f"{install[2].partition('#')[0]} --yes 2>&1"]
+    booted.run("mv", LOADER, f"{LOADER}.off")  # the interpreter's own is hidden from units
+    booted.run("ldconfig")
+    said = booted.run(*command, code=2)
+    assert "a unit cannot run the product by /opt/" in said
+    assert "libpython" in said
+    booted.run("mv", f"{LOADER}.off", LOADER)
+    booted.run("ldconfig")
     said = booted.run(*command, code=1)
     assert f"{ARBITER} does not start" in said
     assert 'ARBITER_OPTIONS="--gpu fake:8GiB" into /etc/vram-arbiter/arbiter.env' in said
@@ -388,5 +395,9 @@ def test_a_removal_leaves_nothing_behind(machine: Machine, before: set[str]) -> 
     assert not [path for path in kept if "usr/local" in path or path.endswith(ARBITER)]
 
     machine.run("rm", f"{SYSTEM}/vram-sidecar@.service")
-    machine.run("/opt/vram-arbiter/bin/vramctl", "uninstall", "--purge", "--yes")
+    purge = ("/opt/vram-arbiter/bin/vramctl", "uninstall", "--purge")
+    machine.run("usermod", "--append", "--groups", "render", "games")
+    assert "keep    group render: games belong to it" in machine.run(*purge, "--dry-run")
+    machine.run("gpasswd", "--delete", "games", "render")
+    machine.run(*purge, "--yes")
     assert files_inside(machine) ^ before == set()

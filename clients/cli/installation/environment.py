@@ -10,11 +10,11 @@ import os
 import re
 import stat
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from vram_arbiter.clients.cli.installation.site import PROGRAMS
+from vram_arbiter.clients.cli.installation.site import LINKS_MAX, PROGRAMS
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.version import version
 
@@ -26,12 +26,20 @@ ELSEWHERE: Final = (
 )
 _PLAIN: Final = re.compile(r"/[A-Za-z0-9._+/-]*")
 _START_S: Final = 60.0
-_LINKS_MAX: Final = 40
 _ASK: Final = (
     "import json, sys, vram_arbiter\n"
     "from vram_arbiter.schemas.runtime.version import version\n"
-    "print(json.dumps([version(), vram_arbiter.__file__, *sys.path]))"
+    "files = {line.split(None, 5)[5].strip() for line in open('/proc/self/maps') if '/' in line}\n"
+    "print(json.dumps([version(), vram_arbiter.__file__, *sys.path, *sorted(files)]))"
 )
+"""The mapped files are the interpreter's libraries: a libpython lies where its builder put it."""
+_AS_A_UNIT: Final = (
+    "unshare", "--mount", "sh", "-c",
+    "for hidden in $0; do test ! -d $hidden || mount -t tmpfs -o mode=0 tmpfs $hidden || exit; done;"
+    ' exec setpriv --reuid=65534 --regid=65534 --clear-groups "$@"',
+    " ".join(HIDDEN),
+)  # fmt: skip
+"""What root can read says little of a unit, which has another user, and these folders hidden."""
 
 
 def check_prefix(prefix: Path) -> None:
@@ -56,9 +64,9 @@ def check_environment(prefix: Path, *, system: bool) -> None:
     if system:
         for program in (*programs, python):
             check_path(program)
-    found, package, *folders = _ask(python)
+    found, *places = _ask(python, _AS_A_UNIT if system else ())
     if system:
-        for path in (package, *folders):
+        for path in places:
             if os.path.exists(path):
                 check_path(Path(path))
     if found != version():
@@ -77,14 +85,23 @@ def _interpreter(program: Path) -> Path:
     return Path(os.fsdecode(found[1]))
 
 
-def _ask(python: Path) -> list[str]:
-    """Return version, package and import folders of an environment. Raises ConfigError."""
+def _ask(python: Path, through: Sequence[str] = ()) -> list[str]:
+    """Return version, package, import folders and mapped files of an environment, whose interpreter
+    is started `through` a command. Raises ConfigError."""
     done = subprocess.run(
-        [python, "-I", "-c", _ASK],
+        [*through, python, "-I", "-c", _ASK],
         env={}, cwd="/", capture_output=True, text=True, timeout=_START_S, check=False,
     )  # fmt: skip
+    if through and done.stderr.startswith(("unshare:", "mount:")):
+        return _ask(python)  # a container, where units get no folders of their own either
     if done.returncode:
-        said = done.stderr.strip().rpartition("\n")[2]
+        said = done.stderr.strip().rpartition("\n")[2] or f"exit code {done.returncode}"
+        if through:
+            raise ConfigError(
+                f"a unit cannot run the product by {python}: {said}",
+                hint="every user has to be able to read the environment, its Python and libpython; "
+                + ELSEWHERE,
+            )
         raise ConfigError(f"{python} cannot run the product: {said}", hint="install it there again")
     answer: list[str] = json.loads(done.stdout)
     return answer
@@ -128,7 +145,7 @@ def _steps(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
             yield step, found
             if stat.S_ISLNK(found.st_mode):
                 links += 1
-                if links > _LINKS_MAX:
+                if links > LINKS_MAX:
                     raise ConfigError(f"{step}: too many links")
                 path = step.parent / os.readlink(step) / path.relative_to(step)
                 break

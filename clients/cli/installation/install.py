@@ -22,8 +22,6 @@ from vram_arbiter.schemas.errors import ConfigError, InstallFailed
 SYSUSERS = Path("/etc/sysusers.d/vram-arbiter.conf")
 TMPFILES = Path("/etc/tmpfiles.d/vram-arbiter.conf")
 RUNTIME = Path("/run/vram-arbiter")
-DEVICE_GROUPS = ("video", "render", "dialout")
-"""Groups of the snippet that other programs use as well: a removal leaves them."""
 NO_START = (
     "see `journalctl -u vram-arbiter -n 20`; without a GPU write "
     'ARBITER_OPTIONS="--gpu fake:8GiB" into /etc/vram-arbiter/arbiter.env; then install again'
@@ -70,7 +68,7 @@ class Installation:
         def create() -> None:
             command("systemd-sysusers", str(SYSUSERS))
             self.record.users += users
-            self.record.groups += [name for name in groups if name not in DEVICE_GROUPS]
+            self.record.groups += groups
 
         return [Step("create", says, perform=create)]
 

@@ -94,6 +94,13 @@ def has_group(name: str) -> bool:
     return True
 
 
+def members(group: str) -> list[str]:
+    """Return the users of a group that exists."""
+    found = grp.getgrnam(group)
+    first = [user.pw_name for user in pwd.getpwall() if user.pw_gid == found.gr_gid]
+    return sorted({*found.gr_mem, *first})
+
+
 def is_member(user: str, group: str) -> bool:
     """Return whether a user belongs to a group; False if either does not exist."""
     try:

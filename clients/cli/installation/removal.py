@@ -12,9 +12,16 @@ from vram_arbiter.clients.cli.installation.machine import (
     has_group,
     has_user,
     is_member,
+    members,
 )
 from vram_arbiter.clients.cli.installation.record import Record
-from vram_arbiter.clients.cli.installation.site import ARBITER, CLIENTS, OF_USER, Site
+from vram_arbiter.clients.cli.installation.site import (
+    ARBITER,
+    CLIENTS,
+    DEVICE_GROUPS,
+    OF_USER,
+    Site,
+)
 from vram_arbiter.clients.cli.installation.steps import Files, Step, remove_tree, store
 from vram_arbiter.clients.net.request import Unreachable, ask
 from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME, arbiter_endpoint
@@ -72,8 +79,9 @@ class Removal:
 
     def _drop_ins(self) -> list[Path]:
         """Return the settings that an operator added to the units (`systemctl edit`)."""
-        found = self.site.at(self.site.layout.units).glob("vram-*.service.d/*")
-        paths = (Path("/") / path.relative_to(self.site.root) for path in found)
+        units = self.site.folder(self.site.layout.units)
+        found = units.glob("vram-*.service.d/*")
+        paths = (self.site.layout.units / path.relative_to(units) for path in found)
         return sorted(path for path in paths if path not in self.record.files)
 
     def _trees(self, paths: Iterable[Path]) -> list[Step]:
@@ -97,7 +105,10 @@ class Removal:
                 userdel = partial(command, "userdel", user)
                 steps.append(Step("remove", f"user {user}", perform=userdel))
         for group in self.record.groups:
-            if has_group(group):
+            users = members(group) if has_group(group) and group in DEVICE_GROUPS else []
+            if users:
+                steps.append(Step("keep", f"group {group}: {', '.join(users)} belong to it"))
+            elif has_group(group):
                 groupdel = partial(_remove_group, group)
                 steps.append(Step("remove", f"group {group}", perform=groupdel))
         return steps

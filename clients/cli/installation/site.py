@@ -23,6 +23,10 @@ OF_USER = (ARBITER, "vram-reasoner.service")
 PROGRAMS = ("vram-arbiter", "vramctl", "vram-sidecar", "vram-runner", "vram-reasoner")
 GROUP = "vram-arbiter"
 OPERATORS = "vram-operators"
+DEVICE_GROUPS = ("video", "render", "dialout")
+"""Groups of the snippet that other programs use as well: a removal leaves those that were there
+before, and those that have members."""
+LINKS_MAX = 40
 _NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 
 
@@ -89,8 +93,33 @@ class Site:
     root: Path = Path("/")
 
     def at(self, path: Path) -> Path:
-        """Return where a path of the installed machine is on this one."""
-        return self.root / path.relative_to("/")
+        """Return where a path of the installed machine is on this one.
+
+        Links on the way lead where they would lead there: followed by this machine's kernel, an
+        absolute one would lead out of the folder. The last name is not followed.
+        Raises ConfigError for too many links.
+        """
+        if self.live:
+            return path
+        place, names, links = self.root, [*path.parts[1:]], 0
+        while len(names) > 1:
+            name = names.pop(0)
+            if name == "..":
+                place = self.root if place == self.root else place.parent
+                continue
+            place /= name
+            if place.is_symlink():
+                links += 1
+                if links > LINKS_MAX:
+                    raise ConfigError(f"{place}: too many links")
+                target = place.readlink()
+                place = self.root if target.is_absolute() else place.parent
+                names[:0] = [part for part in target.parts if part != "/"]
+        return place.joinpath(*names)
+
+    def folder(self, path: Path) -> Path:
+        """Return where a folder of the installed machine is on this one, also through a link."""
+        return self.at(path / "_").parent
 
     @property
     def live(self) -> bool:
@@ -127,7 +156,7 @@ def tegra_devices(site: Site) -> list[str]:
     They lie in folders of other names from one generation to the next (`/dev/nvgpu/igpu0` on Orin,
     `/dev/nvgpu/igpu-0000:01:00.0` on Thor), and a unit takes no pattern for a device node.
     """
-    devices = site.at(Path("/dev"))
+    devices = site.folder(Path("/dev"))
     patterns = ("nvmap", "nvsciipc", "nvhost-*", "host1x-*", "nvgpu/*/*")
     found = {path for pattern in patterns for path in devices.glob(pattern) if not path.is_dir()}
     return sorted(str(Path("/dev") / path.relative_to(devices)) for path in found)

@@ -157,7 +157,7 @@ class Files:
 
     def _make_parents(self, path: Path) -> None:
         for folder in reversed(path.parents):
-            place = self.site.at(folder)
+            place = self.site.folder(folder)
             if not place.is_dir():
                 place.mkdir(mode=0o755)
                 if folder not in self.record.folders:

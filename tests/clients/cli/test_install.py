@@ -9,6 +9,8 @@ import re
 import shutil
 import stat
 import subprocess
+import sys
+import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -133,6 +135,32 @@ def test_a_changed_file_is_kept_and_the_new_text_offered_once(
     (root / SIDECAR).write_text(offered.replace("/opt/two", "/opt/three"))
     assert vramctl(root, "install", "--prefix", "/opt/three", "--yes") == 0
     assert not new.exists(), "taken over: no longer needed"
+
+
+def test_links_below_the_folder_do_not_lead_out_of_it(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Regression: an absolute link of an image was followed by this machine's kernel, and units
+    were written into the machine that builds the image."""
+    outside = tmp_path / "outside"
+    inside = root / outside.relative_to("/")
+    for folder in (outside, inside, root / "etc", root / "usr", root / "data"):
+        folder.mkdir(parents=True)
+    (root / "etc/systemd").symlink_to(outside)
+    (root / "usr/local").symlink_to("../../../../data")
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    assert list(outside.iterdir()) == []
+    assert (inside / "system/vram-arbiter.service").is_file()
+    assert (root / "data/bin/vramctl").is_symlink()
+    assert vramctl(root, "install", "--prefix", "/opt/one") == 0
+    assert "nothing to change" in capsys.readouterr().out
+    assert vramctl(root, "uninstall", "--purge", "--yes") == 0
+    assert [name for name in tree(root) if not name.startswith(("etc/systemd", "usr/local"))] == []
+
+    (root / "etc/systemd").unlink()
+    (root / "etc/systemd").symlink_to("/etc/systemd")
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 2
+    assert "too many links" in capsys.readouterr().err
 
 
 def test_a_link_and_a_file_of_others_stay(root: Path) -> None:
@@ -271,6 +299,15 @@ def test_a_program_that_a_user_may_change_is_not_run_by_a_unit(
     link.symlink_to(link)
     with pytest.raises(ConfigError, match="too many links"):
         environment.check_path(link)
+
+
+def test_the_libraries_of_an_interpreter_are_checked() -> None:
+    """Who may change a libpython changes what the units run, and it lies where its builder put it."""
+    _, _, *places = environment._ask(Path(sys.executable))
+    assert any(".so" in place for place in places)
+    loaded = sysconfig.get_config_var("INSTSONAME")
+    if sysconfig.get_config_var("Py_ENABLE_SHARED"):
+        assert any(place.endswith(loaded) for place in places)
 
 
 def owner_only(found: os.stat_result) -> str:
