@@ -3,6 +3,7 @@ operator. The client checks structured content against the tools' output schemas
 
 import grp
 import os
+import re
 import shutil
 import sys
 from argparse import ArgumentTypeError, Namespace
@@ -68,6 +69,8 @@ async def test_an_agent_reads_and_the_arbiter_refuses_it_to_act(
             assert set(tools) == {*READS, "evict"}
             assert {name for name, one in tools.items() if one.annotations.read_only_hint} == READS
             assert all(one.output_schema["type"] == "object" for one in tools.values())
+            told_apart = [client.instructions, *(tools[name].description for name in READS)]
+            assert all("never instructions" in " ".join(text.split()) for text in told_apart)
 
             result = await client.call_tool("status")
             status = from_map(StatusReply, result.structured_content)
@@ -85,23 +88,23 @@ async def test_an_agent_reads_and_the_arbiter_refuses_it_to_act(
 
             for name, fields, problem in (
                 ("history", {"since": "soon"}, "bad_request: expected 90s"),
-                ("history", {"limit": 0}, "greater than or equal to 1"),
-                ("why", {}, "required"),
-                ("drain", {"reason": "x"}, "Unknown tool: drain"),
+                ("history", {"limit": 0}, "bad_request: limit: Input should be greater than or"),
+                ("why", {}, "bad_request: consumer: Field required"),
+                ("drain", {"reason": "x"}, "unknown_op: Unknown tool: drain"),
             ):
                 wrong = await client.call_tool(name, fields)
                 assert wrong.is_error, name
-                assert problem in said(wrong)
+                assert said(wrong).startswith(problem)
 
             if os.getuid() == 0:
                 refused = await client.call_tool("evict", {"target": "detector", "reason": "x"})
                 assert refused.is_error
-                assert "not_permitted" in said(refused)
+                assert said(refused).startswith("not_permitted: ")
 
             arbiter.kill()
             gone = await client.call_tool("status")
             assert gone.is_error
-            assert "arbiter_unreachable" in said(gone)
+            assert said(gone).startswith("arbiter_unreachable: ")
             arbiter.start()
             back = await client.call_tool("status")
             assert not back.is_error
@@ -123,7 +126,7 @@ async def test_an_operators_agent_acts_where_it_is_allowed(
             assert "was revoked" in said(evicted)
             unknown = await client.call_tool("evict", {"target": "nobody", "reason": "room"})
             assert unknown.is_error
-            assert "no lease or consumer" in said(unknown)
+            assert re.match(r"[a-z_]+: .*no lease or consumer", said(unknown))
 
 
 async def test_nothing_is_allowed_unless_it_is_named() -> None:
@@ -131,7 +134,7 @@ async def test_nothing_is_allowed_unless_it_is_named() -> None:
         assert {tool.name for tool in (await client.list_tools()).tools} == READS
         assert "Actions offered: none" in client.instructions
         refused = await client.call_tool("evict", {"target": "a", "reason": "b"})
-        assert "Unknown tool: evict" in said(refused)
+        assert said(refused) == "unknown_op: Unknown tool: evict"
 
 
 async def test_an_unknown_action_and_a_missing_package_are_named(
