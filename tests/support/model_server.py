@@ -80,7 +80,8 @@ class ModelServer:
         sent = request.rfile.read(int(request.headers.get("Content-Length", 0)))
         body = json.loads(sent) if sent else None
         self.heard.append((f"{request.command} {request.path}", body))
-        status, answer = self.broken.get(parts.path, 200), "broken <&>\x1b"
+        status = self.broken.get(parts.path, 200)
+        answer: object = "broken <&>\x1b"
         if status == 200:
             answer = self.answer(parts.path, body or dict(parse_qsl(parts.query)))
         if isinstance(answer, Refusal):
