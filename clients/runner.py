@@ -73,7 +73,7 @@ class Goal:
 
     async def cancel(self) -> None:
         """Ask for the end; the result (status `canceled`) still comes."""
-        await self._client.ask_about(self, "cancel")
+        await self._client.ask_about(self.goal_id, "cancel")
 
     def fed(self, push: FeedbackPush) -> None:
         if self._feedback.qsize() >= FEEDBACK_MAX:
@@ -113,6 +113,7 @@ class RunnerClient:
             dropped=self._dropped,
         )
         self._goals: dict[str, Goal] = {}
+        self._drop = asyncio.Event()
 
     async def __aenter__(self) -> Self:
         return self
@@ -123,6 +124,17 @@ class RunnerClient:
     async def close(self) -> None:
         """Goals go on without us."""
         self._rpc.drop(self._lost("the client was closed"))
+
+    @property
+    def connected(self) -> bool:
+        """Whether the runner that answered last still holds the connection."""
+        return self._rpc.proven
+
+    async def until_lost(self) -> None:
+        """Wait until the runner that answered last hangs up; without one return at once."""
+        while self.connected:
+            self._drop.clear()
+            await self._drop.wait()
 
     # -- goals -------------------------------------------------------------------------------------
     async def send_goal(
@@ -136,10 +148,11 @@ class RunnerClient:
         max_ticks: int | None = None,
         goal_id: str | None = None,
         traceparent: str | None = None,
+        session: str = "",
     ) -> Goal:
         """Start a skill; returns once it is accepted. `deadline_s` 0 takes the manifest's;
         `max_ticks` None sets no limit in ticks. The goal's spans join the present trace, or the one
-        of `traceparent`.
+        of `traceparent`. A runner of another `session` refuses it.
 
         Raises GoalRejected (another goal runs), EstopRequested, UnknownSkill, RunnerUnreachable.
         """
@@ -157,6 +170,8 @@ class RunnerClient:
             "goal_params": dict(goal_params or {}),
             "deadline_s": deadline_s,
         }
+        if session:
+            fields["session"] = session
         if max_ticks is not None:
             fields["max_ticks"] = max_ticks
         if traceparent := traceparent or traces.present():
@@ -171,13 +186,13 @@ class RunnerClient:
     async def check_result(self, goal: Goal) -> None:
         """Ask for a result that may have passed us by while contact was lost."""
         try:
-            reply = await self.ask_about(goal, "result")
+            reply = await self.ask_about(goal.goal_id, "result")
         except BadState:
             return  # it runs; the error of a runner that forgot the goal is the caller's
         if reply.get("status") in ENDED:
             self._end(cast(ResultPush, reply))
 
-    async def ask_about(self, goal: Goal, op: str) -> Message:
+    async def ask_about(self, goal_id: str, op: str) -> Message:
         """Ask the runner that accepted the goal: another one that starts does not know it.
 
         Raises RunnerUnreachable at once where no process serves the socket any more.
@@ -192,7 +207,7 @@ class RunnerClient:
             except RunnerUnreachable:
                 if loop.time() > deadline_s:
                     raise
-        return await self.call(op, {"goal_id": goal.goal_id})
+        return await self.call(op, {"goal_id": goal_id})
 
     # -- reads -------------------------------------------------------------------------------------
     async def frame(
@@ -292,6 +307,7 @@ class RunnerClient:
                 self._end(cast(ResultPush, message))
 
     def _dropped(self) -> None:
+        self._drop.set()
         for goal in self._goals.values():
             goal.contact_lost()
 

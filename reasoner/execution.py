@@ -42,11 +42,13 @@ class Execution:
         palette: Palette | None,
         hints: Hints | None,
         *,
+        session: str = "",
         goal_grace_s: float = GOAL_GRACE_S,
     ) -> None:
         self._runner = runner
         self._palette = palette
         self._hints = hints
+        self._session = session
         self._goal_grace_s = goal_grace_s
 
     async def __call__(self, call: ExecuteRskill) -> Outcome:
@@ -102,6 +104,7 @@ class Execution:
                 goal_params=call.goal_params,
                 deadline_s=call.deadline_s,
                 goal_id=goal_id,
+                session=self._session,
             )
         except (asyncio.CancelledError, RunnerUnreachable):
             await asyncio.shield(asyncio.create_task(self._cancel_unheard(goal_id)))
@@ -111,8 +114,8 @@ class Execution:
         """And its end is heard, within `CANCEL_S`."""
         try:
             async with asyncio.timeout(CANCEL_S):
-                await self._runner.call("cancel", {"goal_id": goal_id}, timeout_s=CANCEL_S)
-                await self._untilof_result(goal_id)
+                await self._runner.ask_about(goal_id, "cancel")
+                await self._until_result(goal_id)
         except BadRequest:
             pass  # it never was accepted
         except (VramError, TimeoutError) as error:
@@ -120,10 +123,10 @@ class Execution:
                 "goal %s may run: %s", goal_id, str(error) or "the runner did not say that it ended"
             )
 
-    async def _untilof_result(self, goal_id: str) -> None:
+    async def _until_result(self, goal_id: str) -> None:
         while True:
             try:
-                await self._runner.call("result", {"goal_id": goal_id})
+                await self._runner.ask_about(goal_id, "result")
             except BadState:  # it runs
                 await asyncio.sleep(ASK_AGAIN_S)
             else:

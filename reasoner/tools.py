@@ -40,7 +40,7 @@ class Tools:
     """Dispatch to a runner, a detector, a scene VLM and a reward model, started on demand.
 
     `components` are the sidecars by name that `lifecycle_transition` may load and unload, if the
-    palette allows it.
+    palette allows it. `session` is the runner's when the task began: another one gets no goal.
     """
 
     def __init__(
@@ -53,13 +53,16 @@ class Tools:
         palette: Palette | None = None,
         components: Mapping[str, SidecarClient] | None = None,
         hints: Hints | None = None,
+        session: str = "",
         goal_grace_s: float = GOAL_GRACE_S,
     ) -> None:
         self._runner = runner
         self._palette = palette
         self._components = dict(components or {})
         self._perception = Perception(runner, detector, scene_vlm, judge, palette)
-        self._execution = Execution(runner, palette, hints, goal_grace_s=goal_grace_s)
+        self._execution = Execution(
+            runner, palette, hints, session=session, goal_grace_s=goal_grace_s
+        )
 
     async def __call__(self, call: ToolCall) -> Outcome:
         """Execute a call. Never raises for errors of the other side; they are part of the

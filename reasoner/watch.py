@@ -1,11 +1,12 @@
 """Watch over the robot while an episode runs and the planner thinks.
 
-An emergency stop or a lost runner ends the episode; a sensor or joint state that has become stale
-is reported to the planner. Reads the runner's state once a second on a connection of its own, so
-that no other request delays it.
+An emergency stop or a lost runner ends the episode, a runner that hangs up at once; a sensor or
+joint state that has become stale is reported to the planner. Reads the runner's state once a second
+on a connection of its own, so that no other request delays it.
 """
 
 import asyncio
+import contextlib
 import logging
 
 from vram_arbiter.clients.runner import RunnerClient
@@ -21,19 +22,29 @@ LOST_MAX = 3  # answers missed in a row
 
 
 async def watch(
-    runner: RunnerClient, inbox: Inbox, *, period_s: float = PERIOD_S, answer_s: float = ANSWER_S
+    runner: RunnerClient,
+    inbox: Inbox,
+    session: str = "",
+    *,
+    period_s: float = PERIOD_S,
+    answer_s: float = ANSWER_S,
 ) -> None:
-    """Run until the episode must stop, or until canceled."""
+    """Run until the episode must stop, or until canceled.
+
+    `session` is that of the runner that the task began with; "" is not compared.
+    """
     try:
-        await _watch(runner, inbox, period_s, answer_s)
+        danger = await _danger(runner, inbox, session, period_s, answer_s)
     except Exception as error:
         log.exception("the watch over the robot failed")
-        inbox.put(
-            Danger(f"the robot is not watched any more: {type(error).__name__}: {error}", stop=True)
-        )
+        danger = f"the robot is not watched any more: {type(error).__name__}: {error}"
+    inbox.put(Danger(danger, stop=True))
 
 
-async def _watch(runner: RunnerClient, inbox: Inbox, period_s: float, answer_s: float) -> None:
+async def _danger(
+    runner: RunnerClient, inbox: Inbox, session: str, period_s: float, answer_s: float
+) -> str:
+    """Return why the episode must stop."""
     lost = 0
     told: set[str] = set()  # stale components that the planner has heard of
     while True:
@@ -42,21 +53,24 @@ async def _watch(runner: RunnerClient, inbox: Inbox, period_s: float, answer_s: 
         except VramError as error:
             lost += 1
             log.warning("%s", error)
-            if lost >= LOST_MAX:
-                inbox.put(Danger(f"the runner is gone: {error}", stop=True))
-                return
+            if lost >= LOST_MAX or not runner.connected:
+                return f"the runner is gone: {error}"
         else:
             lost = 0
             if stopped := state.get("estop"):
-                inbox.put(Danger(f"emergency stop: {stopped}", stop=True))
-                return
+                return f"emergency stop: {stopped}"
+            if session and state.get("session") != session:
+                return "the runner was started again"
             stale = _stale(state)
             if new := stale - told:
                 inbox.put(
                     Danger(f"not to be trusted now, too old: {', '.join(sorted(new))}", stop=False)
                 )
             told = stale
-        await asyncio.sleep(period_s)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(period_s):
+                await runner.until_lost()
+            return "the runner is gone: it hung up"
 
 
 def _stale(state: Message) -> set[str]:

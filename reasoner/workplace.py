@@ -78,6 +78,7 @@ class Workplace:
         BadRequest, UnknownSkill or ConfigError.
         """
         installed = await self._runner.skills()
+        session = str(installed.get("session", ""))
         manifests = [RSkillManifest.model_validate(manifest) for manifest in installed["skills"]]
         named: dict[str, SidecarClient | None] = {
             "detector": self._detector,
@@ -91,7 +92,7 @@ class Workplace:
             can_query=self._vlm is not None,
             can_judge=self._reward is not None,
             can_look=self._arguments.look,
-            cameras=(await self._runner.state()).get("cameras") or (),
+            cameras=(await self._watching.state()).get("cameras") or (),
             allow_noncommercial=self._arguments.allow_noncommercial,
             managed=[name for name in self._arguments.manage if name in components],
             topics=[OPERATOR],
@@ -102,7 +103,7 @@ class Workplace:
         async with contextlib.AsyncExitStack() as stack:
             judge = self._judge(task, manifests, stack)
             planner = await self._planner(task, palette, stack)
-            beside = asyncio.create_task(watch(self._watching, inbox))
+            beside = asyncio.create_task(watch(self._watching, inbox, session))
             stack.callback(beside.cancel)
             tools = Tools(
                 self._runner,
@@ -112,6 +113,7 @@ class Workplace:
                 palette=palette,
                 components=components,
                 hints=self._hints,
+                session=session,
             )
             confirm = self._confirmations
             self.busy = True

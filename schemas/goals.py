@@ -28,6 +28,9 @@ class SendGoal(_Call):
     op: Literal["goal"]
     goal_id: Name
     rskill_id: Name
+    session: Annotated[str, Field(max_length=64)] = ""
+    """Of the runner that the task began with (`skills`, `state`): another one refuses the goal with
+    `goal_rejected`. "": any runner executes it."""
     revision: str = ""
     prompt: Annotated[str, Field(max_length=2000)] = ""
     goal_params: dict[str, JsonValue] = Field(default_factory=dict)

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import uuid
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
@@ -29,6 +30,7 @@ from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     EstopRequested,
+    GoalRejected,
     InternalError,
     LimitExceeded,
     UnknownOp,
@@ -126,6 +128,7 @@ class GoalServer:
         self._realtime = realtime
         self._server: RouterServer | None = None
         self._reads = 0
+        self._session = uuid.uuid4().hex[:12]
         self.stopping = stopping or asyncio.Event()
         self._goals = OneGoal(control, robot, catalogue, clock, self._send, self.stopping)
         self.bound = asyncio.Event()
@@ -209,7 +212,13 @@ class GoalServer:
 
     async def _answer(self, peer: Peer, request: Any) -> Message:
         match request:
-            case SendGoal():
+            case SendGoal(session=session):
+                if session not in ("", self._session):
+                    raise GoalRejected(
+                        f"goal {request.goal_id} is for session {session} of a runner, and this is"
+                        f" session {self._session}",
+                        hint="the runner was started again: begin the task anew",
+                    )
                 return self._goals.accept(peer, request)
             case CancelGoal():
                 return self._goals.cancel(request.goal_id)
@@ -233,6 +242,7 @@ class GoalServer:
                     "skills": self._catalogue.as_wire(),
                     "body": self._catalogue.body_as_wire(),
                     "resident": _text(self._goals.resident),
+                    "session": self._session,
                 }
             case GetGroundTruth():
                 if self._ground_truth is None:
@@ -301,6 +311,7 @@ class GoalServer:
             "deadline_misses": robot.deadline_misses,
             "estop": robot.estop.message if robot.estop is not None else None,
             "cameras": list(robot.camera_names()),
+            "session": self._session,
         }
 
     def _world(self) -> Message | None:

@@ -24,6 +24,8 @@ from vram_arbiter.schemas.goals import (
 )
 from vram_arbiter.schemas.plain import Message
 
+SESSION = "this-session"
+
 
 class Runner:
     """One goal at a time, ended by the test; `deaf` ops are never answered."""
@@ -98,8 +100,8 @@ class Runner:
     async def _answer(self, peer: Peer, request: Any) -> Message:
         match request:
             case SendGoal():
-                if self.goal is not None:
-                    raise GoalRejected("another goal is running")
+                if self.goal is not None or request.session not in ("", SESSION):
+                    raise GoalRejected("another goal is running, or it is another runner's")
                 self.goal, self.peer = request, peer
                 self.accepted.set()
                 return {"goal_id": request.goal_id, "accepted": True}
@@ -128,9 +130,10 @@ class Runner:
                     "phase": "idle",
                     "estop": self.estop,
                     "world": {"diagnostics": dict(self.diagnostics)},
+                    "session": SESSION,
                 }
             case GetSkills():
-                return {"skills": self.skills, "resident": None}
+                return {"skills": self.skills, "resident": None, "session": SESSION}
             case GetResult():
                 raise self.result_error or BadRequest("asked too early")
         return {}

@@ -528,6 +528,65 @@ def test_an_emergency_stop_and_a_runner_that_is_gone_reach_the_inbox(a_runner: A
     assert "gone" in gone.text
 
 
+class Persistent:
+    """Grabs whatever became of the last attempt. `asked` counts the decisions."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    async def decide(self, episode: Episode) -> ToolCall | Finish:
+        self.asked += 1
+        return GRAB
+
+
+def test_a_runner_that_hangs_up_ends_the_episode_at_once(a_runner: Any) -> None:
+    """Regression: the episode ended after three unanswered states of 11 s each; meanwhile the
+    planner was asked on and two motions were tried.
+    """
+
+    async def story() -> tuple[int, list[Any], str, int]:
+        inbox, planner = Inbox(), Persistent()
+        palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
+        async with contextlib.AsyncExitStack() as stack:
+            async with a_runner() as runner:
+                client, watching = [
+                    await stack.enter_async_context(
+                        RunnerClient(runner.endpoint, connect_timeout_s=3600.0)
+                    )
+                    for _ in range(2)
+                ]
+                await watching.state()
+                beside = asyncio.create_task(watch(watching, inbox, period_s=3600.0))
+                stack.callback(beside.cancel)
+                episode = asyncio.create_task(
+                    run_episode("x", planner, palette, Tools(client, None, None), inbox=inbox)
+                )
+                await runner.accepted.wait()
+            result = await episode
+            return planner.asked, result["steps"], result["reason"], result["stopped"]
+
+    asked, steps, reason, stopped = play(story)
+    assert stopped
+    assert reason == "stopped: the runner is gone: it hung up"
+    assert asked <= 2, "asked once more at most, in the moment of the hang-up"
+    assert len(steps) == 1, "no further motion was tried"
+
+
+def test_a_runner_that_was_started_again_ends_the_episode_and_gets_no_goal(a_runner: Any) -> None:
+    """Its robot may stand elsewhere, and its goals are those of another task."""
+
+    async def story() -> tuple[str, list[Any], str]:
+        inbox = Inbox()
+        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+            await watch(client, inbox, "the session before")
+            outcome = await Tools(client, None, None, session="the session before")(GRAB)
+            assert runner.goal is None
+            return inbox.take()[0].text, inbox.take(), outcome.code
+
+    danger, more, code = play(story)
+    assert (danger, more, code) == ("the runner was started again", [], "goal_rejected")
+
+
 def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
     async def story() -> tuple[Any, list[str]]:
         async with a_runner() as runner, RunnerClient(runner.endpoint) as client:

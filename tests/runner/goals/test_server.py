@@ -309,6 +309,23 @@ def test_the_same_goal_sent_again_is_the_same_goal(
     on_bench(run_async, bench, endpoint, body)
 
 
+def test_a_goal_of_another_session_moves_nothing(bench: Any, endpoint: str, run_async: Run) -> None:
+    """Regression: a runner that was started again executed the motion of a task that had begun
+    with the runner before it.
+    """
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        session = (await client.skills())["session"]
+        assert (await client.state())["session"] == session
+        with pytest.raises(GoalRejected, match=f"session other .* session {session}"):
+            await client.send_goal(RSKILL, prompt="end", session="other")
+        assert b.made == []
+        goal = await client.send_goal(RSKILL, prompt="end", session=session)
+        assert (await goal.result(60))["success"]
+
+    on_bench(run_async, bench, endpoint, body)
+
+
 def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
     bench: Any, endpoint: str, run_async: Run
 ) -> None:
