@@ -9,6 +9,7 @@ from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
 from vram_arbiter.reasoner.llm.base import LlmPlanner
 from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.llm.http import import_httpx
 from vram_arbiter.reasoner.llm.openai import OpenAiPlanner
 from vram_arbiter.reasoner.llm.scripted import object_of
 from vram_arbiter.reasoner.playbooks import Playbook, load_playbook
@@ -196,6 +197,7 @@ def language_model(
     kind = LLM_PLANNERS.get(arguments.planner)
     if kind is not None:
         llm = LlmConfig.from_environ(environ, base_url=kind.default_base_url)
+        import_httpx()
         return llm, load_playbook(arguments.playbook) if arguments.playbook else None
     playbook = load_playbook(arguments.playbook) if arguments.playbook else None
     unused = [

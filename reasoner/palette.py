@@ -9,7 +9,7 @@ come from the same fields; `check` is asked again for each call.
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Set
 from dataclasses import dataclass, field
 
 from vram_arbiter.reasoner.params import JsonSchema, misfits
@@ -46,11 +46,13 @@ OPERATOR = "/operator"
 OPEN = "open-vocabulary"  # in `objects` of a manifest: any word
 ARTICLES = frozenset({"a", "an", "the"})
 
+FINISH = "finish"  # how a language model ends a task: offered always, and no tool of the robot's
+_ASKED_THROUGH = {
+    "detector": "locate_in_view",
+    "vlm": "query_scene",
+    "reward": "query_task_progress",
+}
 _USED_AS = {
-    "detector": "it is asked through locate_in_view",
-    "segmenter": "nothing here serves it",
-    "vlm": "it is asked through query_scene",
-    "reward": "it judges through query_task_progress and moves nothing",
     "playbook": "it is a text for the planner: --playbook FILE",
     "wam": "nothing here runs world action models",
 }
@@ -169,21 +171,13 @@ class Palette:
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
         """Return why a call is not allowed, or None."""
         if isinstance(call, Wait | StopGoal):
-            return (
-                None
-                if goal_runs
-                else NotPermitted("no goal runs", hint=f"choose from {_list(self.tools)}")
-            )
+            return None if goal_runs else NotPermitted("no goal runs", hint=self.choice())
         if goal_runs:
             return NotPermitted(
-                f"a goal runs: {call.tool} has to wait",
-                hint=f"choose from {_list(WHILE_A_GOAL_RUNS)}",
+                f"a goal runs: {call.tool} has to wait", hint=self.choice(goal_runs=True)
             )
         if self.only is not None and call.tool not in self.only:
-            return NotPermitted(
-                f"{call.tool} is not a tool of this playbook",
-                hint=f"choose from {_list(self.tools)}",
-            )
+            return NotPermitted(f"{call.tool} is not a tool of this playbook", hint=self.choice())
         match call:
             case ExecuteRskill():
                 return self._check_skill(call)
@@ -224,7 +218,6 @@ class Palette:
 
     def _check_skill(self, call: ExecuteRskill) -> CallerError | None:
         skill = self.executable.get(call.rskill_id)
-        choose = f"choose from {_names(self.executable)}"
         if skill is not None:
             wrong = (
                 misfits(call.goal_params, skill.goal_params_schema) if call.goal_params_json else []
@@ -236,15 +229,17 @@ class Palette:
             )
         known = next((known for known in self.skills if known.id == call.rskill_id), None)
         if known is None:
-            return UnknownSkill(f"unknown skill {call.rskill_id}", hint=choose)
+            return UnknownSkill(f"unknown skill {call.rskill_id}", hint=self.choice())
         if known.kind not in EXECUTABLE_KINDS:
-            how = _USED_AS.get(known.kind, "nothing here runs this kind")
-            return NotPermitted(
-                f"{known.id} is of kind {known.kind} and cannot be executed: {how}", hint=choose
-            )
-        if known.barred:
-            return NotPermitted(f"{known.id} must not be used: {known.barred}", hint=choose)
-        return NotPermitted(f"{known.id} could not be started several times", hint=choose)
+            through = _ASKED_THROUGH.get(known.kind)
+            how = _USED_AS.get(known.kind, "nothing here serves it")
+            how = f"it is asked through {through}" if through in self.tools else how
+            why = f"is of kind {known.kind} and cannot be executed: {how}"
+        elif known.barred:
+            why = f"must not be used: {known.barred}"
+        else:
+            why = "could not be started several times"
+        return NotPermitted(f"{known.id} {why}", hint=self.choice())
 
     def permits(self, rskill_id: str) -> CallerError | None:
         """Return whether the model that a perception sidecar serves may be asked.
@@ -257,6 +252,11 @@ class Palette:
         return None
 
     # -- what is offered, and how it is read back
+    def choice(self, *, goal_runs: bool = False) -> str:
+        """Return the hint of a refusal: the names that are offered now, and no others."""
+        names = [str(offer["function"]["name"]) for offer in self.functions(goal_runs=goal_runs)]
+        return f"choose from {_list([*names, FINISH])}"
+
     def functions(self, *, goal_runs: bool = False) -> list[FunctionTool]:
         """Return OpenAI-style descriptions of the tools and executable skills that are allowed
         now.
@@ -380,10 +380,6 @@ def _barred(manifest: RSkillManifest, allow_noncommercial: bool) -> str:
     if manifest.kind in EXECUTABLE_KINDS and manifest.role is not Role.S1:
         return f"its role is {manifest.role}, and only {Role.S1} acts"
     return manifest.license_refusal(allow_noncommercial=allow_noncommercial)
-
-
-def _names(skills: Mapping[str, Skill]) -> str:
-    return ", ".join(skills) or "nothing: no executable skill is installed"
 
 
 def _list(names: Iterable[str]) -> str:

@@ -144,7 +144,8 @@ class NoteRecord(TypedDict):
 
 
 class LlmUsage(TypedDict):
-    """What a language model's decisions cost. Rejected answers were not usable as a decision."""
+    """What a language model's decisions cost. Each try is a request; a failed one that was repeated
+    (a busy server's, say) does not fail the decision. Rejected answers were not usable as one."""
 
     model: str
     requests: int

@@ -14,11 +14,11 @@ from typing import ClassVar, Self
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
 from vram_arbiter.reasoner.llm.config import LlmConfig
-from vram_arbiter.reasoner.llm.http import JsonHttp, Pause, check_installed, without_credentials
+from vram_arbiter.reasoner.llm.http import JsonHttp, Pause, without_credentials
 from vram_arbiter.reasoner.llm.measured import Tally, measured
 from vram_arbiter.reasoner.llm.prompt import instructions
 from vram_arbiter.reasoner.llm.transcript import Transcript
-from vram_arbiter.reasoner.palette import Palette
+from vram_arbiter.reasoner.palette import FINISH, Palette
 from vram_arbiter.reasoner.planner import Episode, Finish, benched
 from vram_arbiter.schemas.errors import BadRequest, LlmError, NotPermitted, UnknownOp
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
@@ -32,10 +32,10 @@ CUT_OFF = frozenset({"length", "max_tokens"})  # what the two APIs say of an ans
 NUDGE = "Answer with exactly one tool call."
 
 
-FINISH: FunctionTool = {
+FINISHING: FunctionTool = {
     "type": "function",
     "function": {
-        "name": "finish",
+        "name": FINISH,
         "description": "End the task.",
         "parameters": {
             "type": "object",
@@ -93,8 +93,13 @@ class LlmPlanner(ABC):
         self._palette = palette
         self._system = instructions(palette, procedure)
         self._transcript = transcript or Transcript(None)
-        check_installed()
-        self._http = JsonHttp(self._headers(), config.timeout_s, busy_s=config.busy_s, pause=pause)
+        self._http = JsonHttp(
+            self._headers(),
+            config.timeout_s,
+            busy_s=config.busy_s,
+            pause=pause,
+            again=self.tally.tried_again,
+        )
 
     async def __aenter__(self) -> Self:
         return self
@@ -121,7 +126,7 @@ class LlmPlanner(ABC):
     async def decide(self, episode: Episode) -> ToolCall | Finish:
         goal_runs = episode.running is not None
         palette = self._palette.without(benched(episode.steps))
-        functions = [*palette.functions(goal_runs=goal_runs), FINISH]
+        functions = [*palette.functions(goal_runs=goal_runs), FINISHING]
         offered = {str(function["function"]["name"]) for function in functions}
         turns = conversation(episode, palette)
         problem, nudged = "", False
@@ -184,14 +189,19 @@ class LlmPlanner(ABC):
 def _decision(
     call: Call, palette: Palette, offered: set[str], *, goal_runs: bool
 ) -> ToolCall | Finish:
-    if call.name == "finish":
+    if call.name == FINISH:
         return _finish(call.arguments)
-    decoded = palette.parse(call.name, call.arguments)
+    try:
+        decoded = palette.parse(call.name, call.arguments)
+    except UnknownOp as error:  # its hint names every tool that there is
+        raise UnknownOp(error.message, hint=palette.choice(goal_runs=goal_runs)) from None
     if call.name not in offered:
         # a skill that cannot be executed, for example: the loop refuses it, with the reason, as a
         # step of the episode
         if goal_runs:
-            raise NotPermitted(f"a goal runs: {call.name} has to wait")
+            raise NotPermitted(
+                f"a goal runs: {call.name} has to wait", hint=palette.choice(goal_runs=True)
+            )
         return decoded
     if isinstance(refusal := palette.check(decoded, goal_runs=goal_runs), BadRequest):
         raise refusal
@@ -199,7 +209,7 @@ def _decision(
 
 
 def _finish(arguments: str | JsonMap) -> Finish:
-    fields = read_arguments("finish", arguments)
+    fields = read_arguments(FINISH, arguments)
     success, reason = fields.get("success"), fields.get("reason")
     if not isinstance(success, bool) or not isinstance(reason, str):
         raise BadRequest("finish: needs success (boolean) and reason (text)")

@@ -10,7 +10,7 @@ and would replace the pauses here but none of the limits.
 """
 
 import asyncio
-import importlib.util
+import importlib
 import json
 import logging
 import math
@@ -23,8 +23,9 @@ from typing import Any, Self
 from urllib.parse import urlsplit, urlunsplit
 
 from vram_arbiter.schemas import strictjson
-from vram_arbiter.schemas.errors import ConfigError, LlmError
+from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.runtime.extras import need
 
 log = logging.getLogger(__name__)
 
@@ -49,16 +50,20 @@ class _TryAgain(Exception):
         self.after_s = after_s
 
 
-def check_installed() -> None:
-    """Raise ConfigError without the reasoner's extra."""
-    if importlib.util.find_spec("httpx") is None:
-        raise ConfigError("httpx is not installed", hint="pip install 'vram-arbiter[reasoner]'")
+def import_httpx() -> None:
+    """Import httpx, which takes longer than many a request, before a time limit counts.
+
+    Raises ConfigError without the reasoner's extra.
+    """
+    need("a language model", "httpx", extra="reasoner")
+    importlib.import_module("httpx")
 
 
 class JsonHttp:
     """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`.
 
-    Redirects are not followed: the key must not reach another server.
+    Redirects are not followed: the key must not reach another server. `again` is called before each
+    further try of a request.
     """
 
     def __init__(
@@ -68,12 +73,17 @@ class JsonHttp:
         *,
         busy_s: float = BUSY_S,
         pause: Pause = asyncio.sleep,
+        again: Callable[[], None] = lambda: None,
     ) -> None:
-        self._headers = dict(headers)
+        import httpx  # only installed with the reasoner's extra
+
         self._timeout_s = timeout_s
         self._busy_s = busy_s
         self._pause = pause
-        self._http: Any = None
+        self._again = again
+        self._http = httpx.AsyncClient(
+            headers=dict(headers), timeout=timeout_s, follow_redirects=False
+        )
         # its line for each request has the whole address in it, with a password or a key; our
         # errors carry the rest
         logging.getLogger("httpx").setLevel(logging.WARNING)
@@ -85,8 +95,7 @@ class JsonHttp:
         await self.close()
 
     async def close(self) -> None:
-        if self._http is not None:
-            await self._http.aclose()
+        await self._http.aclose()
 
     async def post(self, url: str, body: JsonObject) -> JsonObject:
         """Return the answer's JSON object. Raises LlmError for every failure."""
@@ -122,15 +131,12 @@ class JsonHttp:
             asked += 1
             log.warning("%s: %s; asking again in %.1f s", shown, refused, pause_s)
             await self._pause(pause_s)
+            self._again()
 
     async def _once(self, url: str, content: bytes) -> JsonObject:
-        import httpx  # only installed with the reasoner's extra
+        import httpx
 
         shown = without_credentials(url)
-        if self._http is None:
-            self._http = httpx.AsyncClient(
-                headers=self._headers, timeout=self._timeout_s, follow_redirects=False
-            )
         try:
             async with self._http.stream(
                 "POST", url, content=content, headers={"content-type": "application/json"}

@@ -23,13 +23,19 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Tally:
-    """What a task's decisions cost."""
+    """What a task's decisions cost. Each try counts as a request, and one that was repeated as a
+    failed one: a busy server, say.
+    """
 
     requests: int = 0
     failed: int = 0
     rejected: int = 0
     input_tokens: int = 0
     output_tokens: int = 0
+
+    def tried_again(self) -> None:
+        self.requests += 1
+        self.failed += 1
 
     def as_result(self, model: str) -> LlmUsage:
         return {

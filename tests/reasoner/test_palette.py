@@ -229,6 +229,29 @@ def test_beside_a_goal_only_its_going_on_is_allowed() -> None:
         assert isinstance(found.check(ending), NotPermitted)
 
 
+def test_a_refusal_names_what_is_offered_and_nothing_else() -> None:
+    """Regression: refusals named `execute_rskill`, which is offered by the skills' own names, or
+    the skills without their tools, and never `finish`; a detector was said to be asked through a
+    tool that was not there.
+    """
+    palette = palette_of(
+        [manifest_of("ros_action", name="lab/go"), manifest_of("detector")],
+        can_locate=False,
+        can_query=True,
+    )
+    offered = "choose from execute_rskill__lab__go, finish, query_scene"
+    for call, goal_runs, hint in (
+        (Wait(), False, offered),
+        (ExecuteRskill(rskill_id="lab/unknown"), False, offered),
+        (ExecuteRskill(rskill_id="lab/detector"), False, offered),
+        (QueryScene(question="?"), True, "choose from finish, stop_goal, wait"),
+    ):
+        refusal = palette.check(call, goal_runs=goal_runs)
+        assert refusal is not None
+        assert refusal.hint == hint
+        assert "locate_in_view" not in str(refusal)
+
+
 def test_parameters_are_checked_against_the_manifest() -> None:
     schema = {
         "type": "object",

@@ -2,13 +2,19 @@
 is given up. No test waits: the pauses are only written down.
 """
 
+import asyncio
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from typing import Any
 
 import pytest
 
+from tests.support.llm_apis import PALETTE
+from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import BUSY_S, PAUSE_MAX_S, TRIES_MAX, retry_after_s
+from vram_arbiter.reasoner.planner import Episode
 from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.tools import LocateInView
 
@@ -45,6 +51,42 @@ def test_a_server_that_stays_busy_is_given_up_when_its_time_is_over(
         decide(pauses=pauses)
     assert BUSY_S - 2 * PAUSE_MAX_S < sum(pauses) <= BUSY_S
     assert all(pause <= PAUSE_MAX_S for pause in pauses)
+
+
+def test_a_refused_try_counts_as_a_failed_request_and_fails_no_decision(
+    api: Any, stand_in: Any
+) -> None:
+    """Regression: a task whose server had refused three times told of one request and no failure:
+    the rate limit was not to be seen in its result.
+    """
+    for _ in range(3):
+        stand_in.json(OVERLOADED, 429, {"retry-after": "0"})
+    stand_in.json(api.says(LOOK))
+
+    async def once() -> Any:
+        async with api.planner(LlmConfig(stand_in.url + api.base, "m"), PALETTE) as planner:
+            assert await planner.decide(Episode("grab it")) == LocateInView(query="cube")
+            return planner.tally.as_result("m")
+
+    told = asyncio.run(once())
+    assert (told["requests"], told["failed"], told["rejected"]) == (4, 3, 0)
+
+
+def test_httpx_is_imported_at_the_start() -> None:
+    """Regression: the first request imported it within its own time limit; on a busy machine that
+    was most of it. Programs that ask no language model do not import it.
+    """
+    script = (
+        "import sys\n"
+        "from vram_arbiter.reasoner.options import language_model, parser\n"
+        "assert 'httpx' not in sys.modules\n"
+        "flags = parser(None).parse_args(['--task', 'x', '--planner', 'openai'])\n"
+        "prefix = 'VRAM_REASONER_LLM_'\n"
+        "language_model(flags, {prefix + 'BASE_URL': 'http://x', prefix + 'MODEL': 'm'})\n"
+        "assert 'httpx' in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
 
 
 def test_a_pause_beyond_the_time_is_not_begun(stand_in: Any, decide: Any) -> None:

@@ -137,6 +137,31 @@ def test_it_gives_up_after_three_unusable_answers(
         assert problem in " ".join(api.told(stand_in.asked[2]))
 
 
+@pytest.mark.parametrize("running", [None, ExecuteRskill(rskill_id="lab/grab")])
+def test_a_correction_names_what_was_offered_and_nothing_else(
+    api: Any, stand_in: Any, decide: Any, running: ExecuteRskill | None
+) -> None:
+    """Regression: it named every tool that there is, `look` and `wait` among them, and left out
+    `finish`: a model that followed it was refused again.
+    """
+    episode = Episode("grab it", running=running)
+    stand_in.json(api.says(("grab", "{}")))
+    stand_in.json(api.says(("finish", '{"success": false, "reason": "x"}')))
+    decide(episode)
+    offered = ", ".join(sorted(api.offered(stand_in.asked[0])))
+    said = api.told(stand_in.asked[1])[-1]
+    assert f"there is no tool 'grab' (choose from {offered})" in said
+
+
+def test_a_call_that_has_to_wait_is_told_what_was_offered(
+    api: Any, stand_in: Any, decide: Any
+) -> None:
+    stand_in.json(api.says(("execute_rskill__lab__grab", "{}")))
+    stand_in.json(api.says(("wait", "{}")))
+    decide(Episode("grab it", running=ExecuteRskill(rskill_id="lab/grab")))
+    assert "has to wait (choose from finish, stop_goal, wait)" in api.told(stand_in.asked[1])[-1]
+
+
 def test_while_a_goal_runs_only_its_going_on_is_decided(
     api: Any, stand_in: Any, decide: Any
 ) -> None:

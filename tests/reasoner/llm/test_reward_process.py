@@ -150,7 +150,7 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
         ("query_task_progress", "error", "bad_request"),
         ("execute_rskill", "refused", "not_permitted"),
     ]
-    assert "it judges through query_task_progress and moves nothing" in steps[2]["text"]
+    assert "it is asked through query_task_progress" in steps[2]["text"]
     offered = {tool["function"]["name"] for tool in stand_in.asked[0]["tools"]}
     assert "query_task_progress" in offered
     assert not any("progress" in name for name in offered - {"query_task_progress"})
