@@ -64,7 +64,7 @@ def how_it_went(result: ResultPush | None) -> str:
             "the goal was called off, but the runner has not said that it ended: it may still run"
         )
     return (
-        "the goal was cancelled"
+        f"the goal was {result['message'] or 'canceled'}"
         if result["status"] == "canceled"
         else f"it ended by then: {result['status']}"
     )

@@ -192,6 +192,8 @@ class Skill(Stepped, Protocol):
     """
 
     manifest: RSkillManifest
+    phase: str
+    """How far a start is that has not ended, in words; empty: not known."""
 
     @property
     def holds_gpu(self) -> bool:

@@ -215,6 +215,7 @@ class PingResult(TypedDict):
     rskill: str
     pid: int
     boot_id: str
+    consumer: NotRequired[str]  # its name at the arbiter
     state: Literal["unloaded", "waiting", "loading", "resident", "parking", "parked", "unloading"]
     lease_id: NotRequired[str | None]
     token: NotRequired[list[int] | None]

@@ -157,6 +157,7 @@ class SidecarHost:
             "rskill": settings.manifest.name,
             "pid": os.getpid(),
             "boot_id": self._boot_id,
+            "consumer": settings.name,
             "state": residency.state,
             "lease_id": residency.lease.lease_id
             if token is not None and residency.lease is not None

@@ -262,12 +262,13 @@ class OneGoal:
         except Exception as raised:
             log.exception("goal %s failed", goal.goal_id)
             error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")
+        before = _before_motion(running)
         running.phase = FINISHING
         if running.skill is not None:
             await self._finish(running.skill)
         telling.cancel()
         await asyncio.gather(telling, return_exceptions=True)
-        await self._conclude(running, status, error, data)
+        await self._conclude(running, status, error, data, before)
         return status, error
 
     @staticmethod
@@ -310,15 +311,20 @@ class OneGoal:
         return await self._control.run_skill(skill, goal, begun, running.so_far.update)
 
     async def _conclude(
-        self, running: _Running, status: Status, error: VramError | None, data: GoalData
+        self,
+        running: _Running,
+        status: Status,
+        error: VramError | None,
+        data: GoalData,
+        before: str,
     ) -> None:
         goal = running.goal
         message = {
             "succeeded": "",
             "failed": str(error) if error else "failed",
             "canceled": "canceled on request",
-            "deadline": f"not done within {goal.deadline_s:.0f} s",
-        }[status]
+            "deadline": f"not done within {goal.deadline_s:g} s",
+        }[status] + before
         result = ResultPush(
             push="result",
             goal_id=goal.goal_id,
@@ -340,9 +346,10 @@ class OneGoal:
     # -- progress
     async def _tell(self, running: _Running) -> None:
         while True:
-            progress = (
-                self._robot.progress if running.phase == "running" else Progress(0.0, running.phase)
-            )
+            progress = self._robot.progress
+            if running.phase != "running":
+                starting = "" if running.skill is None else running.skill.phase
+                progress = Progress(0.0, running.phase, detail=starting)
             now_s = self._clock.now_s()
             if progress != running.sent or now_s - running.sent_s >= FEEDBACK_QUIET_S:
                 running.sent, running.sent_s = progress, now_s
@@ -365,6 +372,15 @@ class OneGoal:
             if goal.prompt
             else (f"{goal.rskill_id}: {running.phase}",)
         )
+
+
+def _before_motion(running: _Running) -> str:
+    """Return what a goal waited for that ends before its motion, to be added to its message."""
+    if running.phase == "acquiring":
+        return "; its skill had not begun to start"
+    if running.phase == "starting" and running.skill is not None and running.skill.phase:
+        return f"; its model was {running.skill.phase}"
+    return ""
 
 
 def _identity(request: SendGoal) -> str:

@@ -44,6 +44,7 @@ class SkillBase(ABC):
         self.key = SkillKey(manifest.name, revision or manifest.version)
         self.cameras: tuple[str, ...] = ()
         self.fraction = 0.0
+        self.phase = ""
         self.state = SkillState.IDLE
 
     def _move(self, to: SkillState) -> None:
@@ -58,6 +59,7 @@ class SkillBase(ABC):
         """
         self._move(SkillState.STARTING)
         self.fraction = 0.0
+        self.phase = ""
         try:
             await self._start(goal)
         except BaseException:

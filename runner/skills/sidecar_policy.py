@@ -31,6 +31,7 @@ from vram_arbiter.runner.sensors.pictures import as_rgb
 from vram_arbiter.runner.skills.actions import Stepper, Twist
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played, Row
+from vram_arbiter.runner.skills.model_phase import PHASE_S, Explainer, model_phase
 from vram_arbiter.runner.skills.motion import JointRamp, bounded, is_at, joint_positions
 from vram_arbiter.runner.skills.wiring import View, Wiring
 from vram_arbiter.schemas.control import ControlMode
@@ -98,7 +99,7 @@ class Use(Protocol):
     async def end(self) -> None: ...
 
 
-class Arbiter(Protocol):
+class Arbiter(Explainer, Protocol):
     """What is needed of `clients.client.AsyncClient`."""
 
     async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use: ...
@@ -227,8 +228,9 @@ class SidecarPolicy(SkillBase):
         """Take back the load of a goal that is over before the model is there: no eviction for
         it.
         """
+        following = asyncio.create_task(self._follow_phase(), name="phase")
         try:
-            return await self._client.load(timeout_s=goal.deadline_s or None)
+            loaded = await self._client.load(timeout_s=goal.deadline_s or None)
         except (
             asyncio.CancelledError,
             WaitTimeout,
@@ -238,6 +240,17 @@ class SidecarPolicy(SkillBase):
                     if (await self._client.ping(timeout_s=WITHDRAW_S)).get("wanted"):
                         await self._client.unload()
             raise
+        finally:
+            following.cancel()
+        self.phase = ""
+        return loaded
+
+    async def _follow_phase(self) -> None:
+        """Keep `phase` up to date."""
+        while True:
+            with contextlib.suppress(VramError):  # the load itself says what is wrong
+                self.phase = await model_phase(self._client, self._arbiter)
+            await asyncio.sleep(PHASE_S)
 
     async def _finish(self) -> None:
         player, self._player = self._player, None

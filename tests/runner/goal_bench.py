@@ -37,6 +37,7 @@ class Told(SkillBase):
         self.steps = 0
         self.begun.clear()
         if goal.prompt == "hang":
+            self.phase = "loading: 1 GiB of 4 GiB"
             self.begun.set()
             await asyncio.Event().wait()
         if goal.prompt in ("unavailable", "unavailable for ever"):

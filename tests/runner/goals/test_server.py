@@ -245,6 +245,28 @@ def test_a_deadline_is_no_success(bench: Any, endpoint: str, run_async: Run, pro
     on_bench(run_async, bench, endpoint, body)
 
 
+def test_a_goal_that_ends_before_its_model_is_there_says_how_far_that_was(
+    bench: Any, endpoint: str, run_async: Run
+) -> None:
+    """Regression: the result said `canceled on request` or `not done within 20 s`, whether the
+    robot had moved or its model was still on its way.
+    """
+
+    async def body(b: Bench, client: RunnerClient) -> None:
+        goal = await client.send_goal(RSKILL, prompt="hang")
+        async for feedback in goal.feedback():
+            if feedback["detail"]:
+                break
+        assert (feedback["state"], feedback["detail"]) == ("starting", "loading: 1 GiB of 4 GiB")
+        await goal.cancel()
+        told = (await goal.result(60))["message"]
+        assert told == "canceled on request; its model was loading: 1 GiB of 4 GiB"
+        goal = await client.send_goal(RSKILL, prompt="forever", deadline_s=0.3)
+        assert (await goal.result(60))["message"] == "not done within 0.3 s"
+
+    on_bench(run_async, bench, endpoint, body)
+
+
 @pytest.mark.parametrize(
     ("prompt", "code"),
     [("evicted", "evicted"), ("unavailable", "sidecar_unavailable"), ("defect", "internal")],

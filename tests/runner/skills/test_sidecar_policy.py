@@ -13,12 +13,16 @@ from typing import Any
 import pytest
 
 from tests.support.field_server import FieldServer
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from vram_arbiter.runner.skills.sidecar_policy import STEP_SHARE, SidecarPolicy
 from vram_arbiter.runner.skills.wiring import Wiring, wire_up
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
@@ -33,6 +37,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.manifest import RSkillManifest, parse_manifest
 from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.world import FrameEncoding, JointState, SensorFrame, WorldState
 
 pytestmark = pytest.mark.heavy  # arrays: numpy
@@ -86,6 +91,7 @@ class Sidecar:
         self.load_error: VramError | None = None
         self.arbitrated = True
         self.state = "resident"
+        self.consumer: str | None = None  # its name at the arbiter
         self.wanted = False  # somebody waits for the model
         self.late_s = 0.0  # how long it lets a ping wait
         self.loads: asyncio.Event | None = None  # set once a load has come, which is never answered
@@ -153,6 +159,8 @@ class Sidecar:
             }
             if self.wanted:
                 reply["wanted"] = True
+            if self.consumer is not None:
+                reply["consumer"] = self.consumer
         else:
             reply = {"ok": True} | (self.begun if endpoint == "reset" else {})
         if "id" in message:
@@ -183,6 +191,9 @@ class Arbiter:
             raise self.refusals.pop(0)
         self.uses.append(Use())
         return self.uses[-1]
+
+    async def why(self, consumer: str) -> WhyReply:
+        return WhyReply(consumer, ())
 
 
 class Bench:
@@ -784,6 +795,43 @@ def test_a_load_is_taken_back_from_a_sidecar_that_is_slow_to_answer(
         with pytest.raises(asyncio.CancelledError):
             await starting
         assert b.sidecar.calls == ["load", "unload"]
+
+    scenario(run_async, policy_bench(Arbiter()), play)
+
+
+def test_a_start_says_what_its_model_waits_for_and_how_far_it_is(
+    policy_bench: Callable[..., Bench],
+    run_async: Run,
+    arbiter_daemon: ArbiterProcess,
+    connect: Callable[..., WireClient],
+) -> None:
+    """Regression: a goal whose time ended before its model was there told neither of the wait for
+    the GPU nor of the load.
+    """
+    detector, grab = (connect().hello(name) for name in ("detector", "grab"))
+
+    async def says(b: Bench, *words: str) -> None:
+        while not all(word in b.skill.phase for word in words):
+            await asyncio.sleep(0.01)
+
+    async def play(b: Bench) -> None:
+        b.sidecar.consumer, b.sidecar.loads = "grab", asyncio.Event()
+        async with AsyncClient("runner", endpoint=arbiter_daemon.endpoint) as client:
+            b.skill._arbiter = client
+            starting = asyncio.create_task(b.skill.start(GOAL))
+            await b.sidecar.loads.wait()
+            await says(b, "starting: its sidecar imports libraries and reads the weights")
+            held = detector.granted("detector", 6 * GIB, evictable=False)
+            ref = {"lease_id": held["lease_id"], "token": held["token"]}
+            assert detector.ask("ready", **ref)["ok"]
+            grab.acquire("grab", 4 * GIB)
+            await says(b, "waiting for the GPU: waits for detector (is pinned)")
+            assert detector.ask("release", **ref)["ok"]
+            await says(b, "loading: ", " of 4 GiB")
+            starting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await starting
+        assert "loading" in b.skill.phase
 
     scenario(run_async, policy_bench(Arbiter()), play)
 
