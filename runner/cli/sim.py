@@ -125,11 +125,12 @@ def add_parser(
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Build everything, serve until a signal, `shutdown`, `--max-seconds` or the last episode,
-    end.
+    """Build everything, serve until a signal, `shutdown` or `--max-seconds`, or play until the last
+    episode; end.
     """
     endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
-    check_endpoint(endpoint)
+    if args.policy is None:
+        check_endpoint(endpoint)
     need("the simulator", "numpy", "cv2", extra="runner")
     from vram_arbiter.runner.control.clock import SystemClock
     from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
@@ -242,7 +243,7 @@ async def run(args: argparse.Namespace) -> int:
             clock,
             ground_truth=None if arm is None else lambda: truth_as_wire(arm),
             on_bound=bound,
-            reset=None if policy is not None else runner.robot.begin_episode_of,
+            reset=runner.robot.begin_episode_of,
             identity={
                 **runner.identity,
                 "simulated": True,
@@ -256,7 +257,8 @@ async def run(args: argparse.Namespace) -> int:
         install_signals(stopping)
         try:
             async with asyncio.timeout(args.max_seconds):
-                await server.serve()
+                # a policy by itself takes no goals, and has a place beside a runner that does
+                await (server.serve() if policy is None else played(control, stopping))
         except TimeoutError:
             log.info("ending after %.0f s, as asked", args.max_seconds)
     result = runner.result()
@@ -295,6 +297,15 @@ def policy_in(world: World, name: str) -> tuple[Policy, Callable[[], str]]:
         raise ConfigError(f"--policy {EXPERT} grabs in so101, and does nothing else")
     set_task(GRAB, arm, environment)
     return expert_policy(arm, environment), lambda: GRAB.told(arm)[0]
+
+
+async def played(control: ControlThread, stopping: asyncio.Event) -> None:
+    """Wait for the end of the last episode, or for a signal."""
+    stopped = asyncio.create_task(stopping.wait())
+    try:
+        await asyncio.wait({control.ended, stopped}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        stopped.cancel()
 
 
 async def ready(control: ControlThread) -> None:

@@ -106,7 +106,8 @@ class HardwareRobot:
     def open(self, stopping: threading.Event) -> None:
         """Start the cameras, then connect the robot: nothing gets power before it is seen.
 
-        Returns when all of them have given data. Raises FrameStale and StateStale for what stays
+        Returns when all of them have given data; a camera whose source another program has not
+        started yet is waited for without a limit. Raises FrameStale and StateStale for what stays
         silent, Cancelled once `stopping` is set.
         """
         for sensor in (*self._readers, JOINT_STATE):  # so that `increase` sees the first one
@@ -141,7 +142,10 @@ class HardwareRobot:
                 reader.read_synced(slice_ns)
                 return
             except FrameStale as error:
-                if error.details.get("ended") or self._clock.now_ns() >= deadline_ns:
+                now_ns = self._clock.now_ns()
+                if error.details.get("absent"):
+                    deadline_ns = now_ns + round(self._first_data_s * 1e9)
+                elif error.details.get("ended") or now_ns >= deadline_ns:
                     raise
             # a frame may travel longer than a slice and still be young enough
             with contextlib.suppress(FrameStale):

@@ -124,6 +124,7 @@ class RosImageReader(SlotReader):
         self._params = params
         self._domain_id = domain_id
         self._topic = full_topic(params.topic)
+        self._awaits = False  # the first publisher
         self._guard: Any = None
         self._thread: threading.Thread | None = None
 
@@ -157,6 +158,7 @@ class RosImageReader(SlotReader):
             data = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
             for entity in (data, reader, guard):
                 waitset.attach(entity)
+        self._awaits = feed.await_source(f"{self._topic} has no publisher yet")
         self._thread = threading.Thread(
             target=self._run,
             args=(feed, waitset, reader, guard),
@@ -176,10 +178,19 @@ class RosImageReader(SlotReader):
         from cyclonedds.core import DDSException
         from cyclonedds.util import duration
 
+        said = False
         try:
             while not guard.read():
-                waitset.wait(duration(seconds=WAIT_S))
+                woken = waitset.wait(duration(seconds=WAIT_S))
                 self._attend(feed, reader)
+                if self._awaits and not woken and not said:
+                    said = True
+                    log.warning(
+                        "camera %s waits for a publisher on %s, DDS domain %d",
+                        self.sensor_id,
+                        self._topic,
+                        self._domain_id,
+                    )
         except DDSException as error:
             feed.end(f"DDS failed: {error}")
         finally:
@@ -203,6 +214,10 @@ class RosImageReader(SlotReader):
         matched = reader.get_subscription_matched_status()
         refused = reader.get_requested_incompatible_qos_status()
         if matched.current_count:
+            if self._awaits:
+                self._awaits = False
+                feed.interrupt("")
+                log.info("camera %s has a publisher on %s", self.sensor_id, self._topic)
             return
         # pictures that former publishers sent arrive before the notice that they are gone
         self._take(feed, reader)

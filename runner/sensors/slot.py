@@ -43,12 +43,13 @@ class LatestSlot:
         self._frame: SensorFrame | None = None
         self._reason = NOT_STARTED
         self._ended = True
+        self._absent = False
         self._feed: Feed | None = None
 
     def open(self) -> Feed:
         """Forget what was there and begin anew: no frame until the new feed puts one."""
         with self._changed:
-            self._frame, self._reason, self._ended = None, "", False
+            self._frame, self._reason, self._ended, self._absent = None, "", False, False
             self._feed = Feed(self)
             return self._feed
 
@@ -103,7 +104,12 @@ class LatestSlot:
             hint="nothing moves without a picture; look at the camera"
             if self._ended
             else "it may come back by itself",
-            details={"sensor_id": self.sensor_id, "reason": reason, "ended": self._ended},
+            details={
+                "sensor_id": self.sensor_id,
+                "reason": reason,
+                "ended": self._ended,
+                "absent": self._absent,
+            },
         )
 
     def _too_old(self, age_ms: float, limit_ms: float) -> FrameStale:
@@ -134,11 +140,12 @@ class LatestSlot:
             self._changed.notify_all()
             return True
 
-    def _lose(self, feed: Feed, reason: str, *, ended: bool) -> bool:
+    def _lose(self, feed: Feed, reason: str, *, ended: bool, absent: bool = False) -> bool:
         with self._changed:
             if feed is not self._feed or self._ended:
                 return False
-            self._frame, self._reason, self._ended = None, reason, ended
+            self._frame, self._reason = None, reason
+            self._ended, self._absent = ended, absent
             self._changed.notify_all()
             return True
 
@@ -161,6 +168,10 @@ class Feed:
     def interrupt(self, reason: str) -> bool:
         """Report that the source is away for now: its last frame is not served any more."""
         return self._slot._lose(self, reason, ended=False)
+
+    def await_source(self, reason: str) -> bool:
+        """Report that another program has not started the source yet: it is worth waiting for."""
+        return self._slot._lose(self, reason, ended=False, absent=True)
 
     def end(self, reason: str) -> bool:
         """Report that the source is away for good. The first reason stays."""

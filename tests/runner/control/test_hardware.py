@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.manual_clock import ManualClock
 from tests.runner.small_robots import FedCamera, Nod, Twin
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
@@ -508,6 +509,39 @@ def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
     finally:
         over.set()
         thread.join(30)
+    assert twin.story == ["connect"]
+    runner.deactivate()
+
+
+class Later(FedCamera):
+    """A camera whose source another program starts after the runner has waited for `shows_after_s`:
+    each look at it lets a minute pass.
+    """
+
+    looks = 0
+
+    def _run_begins(self, feed: Feed) -> None:
+        self.feed = feed
+        feed.await_source("it has no publisher yet")
+
+    def read_synced(self, deadline_ns: int, after_ns: int | None = None) -> SensorFrame:
+        assert isinstance(self.clock, ManualClock)
+        self.looks += 1
+        self.clock.advance(60.0)
+        if self.looks == 10:
+            self.show()
+        return self.slot.latest()
+
+
+def test_it_waits_for_a_camera_that_another_program_has_not_started(twin: Twin) -> None:
+    """Regression: a runner that came up before the publisher of a `ros2_image` camera ended after
+    15 s, and came up again and again until the other program was there.
+    """
+    clock = ManualClock()
+    camera = Later("front", clock, always=False)
+    runner = hardware_runner(twin, [(camera, 100.0)], gate, clock=clock, first_data_s=15.0)
+    runner.activate()
+    assert camera.looks == 10
     assert twin.story == ["connect"]
     runner.deactivate()
 

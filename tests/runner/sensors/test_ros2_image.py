@@ -4,6 +4,7 @@ which know nothing of the product.
 
 import base64
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 from tests.support.dds import NETWORK
+from tests.support.waiting import until
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors import SlotReader
 from vram_arbiter.runner.sensors.factory import make_reader
@@ -161,6 +163,22 @@ def test_pictures_of_another_process_arrive(
     assert before_ns <= frame.stamp_wall_ns <= SystemClock().wall_ns()
     again = os.urandom(64 * 48 * 3)
     assert picture_now(reader, publisher, again, **image(64, 48)).data == again
+
+
+def test_a_reader_waits_for_its_publisher_and_says_so(
+    topic: str, node: Callable[..., Node], reading: Reading, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Regression: it was as silent as a broken camera, and given up like one."""
+    caplog.set_level(logging.INFO)
+    reader = reading(reader_of(topic))
+    with pytest.raises(FrameStale, match=f"{topic} has no publisher yet") as stale:
+        reader.read_latest()
+    assert stale.value.details["absent"]
+    until(lambda: f"camera front waits for a publisher on {topic}" in caplog.text)
+    publisher = node("publish", topic)
+    assert picture_now(reader, publisher, bytes(12), **image(2, 2)).height == 2
+    assert f"camera front has a publisher on {topic}" in caplog.text
+    assert caplog.text.count("waits for a publisher") == 1
 
 
 def test_a_picture_larger_than_a_datagram_arrives_whole(
