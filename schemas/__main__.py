@@ -45,6 +45,8 @@ def _check(files: Sequence[Path]) -> int:
         path = file / "rskill.yaml" if file.is_dir() else file
         try:
             manifest = load_manifest(path)
+            if problems := manifest.not_executable():
+                raise ManifestError(str(path), problems)
         except ManifestError as error:
             failed += 1
             print(printable_lines(error))

@@ -23,11 +23,11 @@ from vram_arbiter.runner.skills.states import needs_frames as state_needs_frames
 from vram_arbiter.schemas.control import JOINT_MODES
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, RSkillManifest
+from vram_arbiter.schemas.manifest.manifest import IMAGES_PREFIX
 from vram_arbiter.schemas.manifest.problems import Problem
 from vram_arbiter.schemas.sidecar import LEFT_OVER_MAX
 
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
-IMAGES_PREFIX = "observation.images."
 
 
 class View(BaseModel):
@@ -99,16 +99,8 @@ def wire_up(
         robot = RobotDescription(
             "this world", tuple(Joint(name, -math.inf, math.inf, math.inf) for name in robot), {}
         )
-    problems: list[Problem] = []
+    problems = manifest.not_executable()
     cameras = _cameras(manifest)
-    if not cameras:
-        problems.append(
-            Problem(
-                ("sensors_required",),
-                "names no camera: give a sensor of modality rgb a vla_feature_key "
-                f"{IMAGES_PREFIX}…",
-            )
-        )
     order, found = _joint_order(manifest, robot)
     model, lost = _model(manifest, robot)
     problems += found
@@ -167,11 +159,10 @@ def _cameras(manifest: RSkillManifest) -> dict[str, str]:
     aliases = manifest.image_preprocessing.aliases if manifest.image_preprocessing else {}
     robot_name = {model: robot for robot, model in aliases.items()}
     cameras = {}
-    for sensor in manifest.sensors_required:
-        if sensor.modality == "rgb" and sensor.vla_feature_key:
-            name = sensor.vla_feature_key.rpartition(".")[2]
-            camera = robot_name.get(name, name)
-            cameras[camera] = IMAGES_PREFIX + camera
+    for key in manifest.camera_keys:
+        name = key.rpartition(".")[2]
+        camera = robot_name.get(name, name)
+        cameras[camera] = IMAGES_PREFIX + camera
     return cameras
 
 

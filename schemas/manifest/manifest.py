@@ -46,6 +46,7 @@ from vram_arbiter.schemas.manifest.vocabulary import (
     EmbodimentTag,
     Kind,
     License,
+    Modality,
     ModelFamily,
     Role,
     Runtime,
@@ -65,6 +66,7 @@ WeightsUri = Annotated[
 HubUri = Annotated[str, StringConstraints(pattern=rf"^hf://{_REPO}{_REVISION}$")]
 WebUrl = Annotated[str, StringConstraints(pattern=r"^https?://\S+$")]
 
+IMAGES_PREFIX: Final = "observation.images."
 LICENSE_FLAG: Final = "--allow-noncommercial"
 """The flag by which an operator accepts licenses that forbid commercial use."""
 LICENSE_HELP: Final = "also run models whose license does not allow commercial use"
@@ -208,6 +210,27 @@ class RSkillManifest(ManifestBlock):
     def weights_revision(self) -> str:
         """The pinned revision of `weights_uri`, or an empty text."""
         return (self.weights_uri or "").partition("@")[2]
+
+    @property
+    def camera_keys(self) -> tuple[str, ...]:
+        """Feature keys of the rgb sensors through which its policy looks."""
+        return tuple(
+            sensor.vla_feature_key
+            for sensor in self.sensors_required
+            if sensor.modality is Modality.RGB and sensor.vla_feature_key
+        )
+
+    def not_executable(self) -> list[Problem]:
+        """What keeps every runner from executing the skill, although a sidecar may serve it."""
+        if self.kind is not Kind.VLA or self.camera_keys:
+            return []
+        return [
+            Problem(
+                ("sensors_required",),
+                "names no camera: give a sensor of modality rgb a vla_feature_key "
+                f"{IMAGES_PREFIX}…",
+            )
+        ]
 
     def warnings(self) -> list[Problem]:
         """What is allowed but probably not meant, in the same form as errors."""

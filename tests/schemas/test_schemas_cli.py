@@ -47,6 +47,19 @@ def test_check_names_every_wrong_field_and_goes_on(
     assert err == "1 of 2 files are invalid\n"
 
 
+def test_check_refuses_a_policy_that_sees_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Regression: it said ok, and every runner refused the skill."""
+    text = next(path for path in SAMPLES if path.stem == "vla").read_text(encoding="utf-8")
+    camera = ', vla_feature_key: "observation.images.front"'
+    assert camera in text
+    (tmp_path / "rskill.yaml").write_text(text.replace(camera, ""), encoding="utf-8")
+    assert main(["check", str(tmp_path)]) == 1
+    said = capsys.readouterr().out
+    assert "rskill.yaml: sensors_required: names no camera: give a sensor of modality rgb" in said
+
+
 def test_check_of_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path / "none.yaml")]) == 1
     assert (
