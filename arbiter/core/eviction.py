@@ -14,12 +14,11 @@ A holder unloads by itself, at its safe point: `unloading` is refused before tha
 uses any lease is never signalled. A revoke is for someone: when nothing wants the bytes any more
 and the holder has not begun to unload, it is withdrawn.
 
-Public: `ask` revokes a holder; `push_revoke` repeats that at once; `unwanted`, `take_back` and
-`settle` withdraw revokes; `deny` ends a wait with an error; `on_ladder_due` and `on_overstay_due`
-serve the timers.
+Public: `ask` revokes a holder; `push_revoke` repeats that at once; `take_back` and `settle`
+withdraw revokes that nothing wants (`is_wanted`); `deny` ends a wait with an error; `on_ladder_due`
+and `on_overstay_due` serve the timers.
 """
 
-from collections.abc import Iterable
 from typing import Literal
 
 from vram_arbiter.arbiter.core.effects import Signal
@@ -68,7 +67,8 @@ def ask(
         next_push_at=core.now,
         traceparent=None if waiter is None else waiter.request.traceparent,
     )
-    gpu.evictions.append(eviction)
+    if waiter is not None:
+        gpu.evictions.append(eviction)
     core.move(holder, LeaseState.REVOKING, Why.REVOKED)
     core.want_sample(gpu, core.now)
     push_revoke(core, holder)
@@ -86,44 +86,48 @@ def ask(
 
 
 # -- withdrawn
-def unwanted(core: Core, gpu: Gpu) -> list[Eviction]:
-    """Return the evictions of holders that do not unload yet, and whose bytes nothing wants any
-    more: the waiter waits no longer, the pressure is over. An operator's order stands."""
-    return [
-        one
-        for one in gpu.evictions
-        if one.why.order is None
-        and (one.wanted_by not in core.waiting if one.wanted_by else not gpu.pressed)
-        and one.lease in gpu.residents.by_state[LeaseState.REVOKING]
-    ]
+def is_wanted(core: Core, gpu: Gpu, eviction: Eviction) -> bool:
+    """Return whether anything wants the room of a revoked holder: its waiter waits, the GPU is
+    under pressure, or an operator ordered it."""
+    match eviction.why.cause:
+        case "waiter":
+            return eviction.wanted_by in core.waiting
+        case "pressure":
+            return gpu.pressed
+        case _:
+            return True
 
 
-def take_back(core: Core, gpu: Gpu, evictions: Iterable[Eviction]) -> None:
-    """Let scheduling decide anew on holders that were revoked; `settle` has to follow it."""
-    for eviction in evictions:
-        holder = gpu.residents[eviction.lease]
-        gpu.evictions.remove(eviction)
+def take_back(core: Core, gpu: Gpu) -> None:
+    """Let scheduling decide anew on holders that were revoked and do not unload yet, if nothing
+    wants their room any more; `settle` has to follow."""
+    for holder in gpu.in_state(LeaseState.REVOKING):
+        asked = holder.departure.eviction
+        if asked is None or is_wanted(core, gpu, asked):
+            continue
+        core.turn.taken_back.setdefault(holder.id, asked)
         holder.departure.eviction = None
         for timer in ("revoke", "overstay"):
             core.timers.cancel((timer, holder.id))
         core.move(holder, LeaseState.HELD, Why.WITHDRAWN)
 
 
-def settle(core: Core, gpu: Gpu, evictions: Iterable[Eviction]) -> None:
-    """Tell the holders that were not revoked again that they may stay; for the others the
-    acknowledgement counts that they gave."""
-    for eviction in evictions:
-        holder = gpu.residents[eviction.lease]
+def settle(core: Core) -> None:
+    """Tell each holder that was not revoked again that it may stay; for the others the
+    acknowledgement counts that they gave. Forget evictions whose waiter is gone."""
+    for gpu in core.turn.touched.values():
+        gpu.evictions = [one for one in gpu.evictions if one.wanted_by in core.waiting]
+    for lease_id, asked in core.turn.taken_back.items():
+        holder = core.leases[lease_id]
         if (anew := holder.departure.eviction) is not None:
-            anew.acked_at = eviction.acked_at
+            anew.acked_at = asked.acked_at
             continue
         holder.departure.revoked_before = True
         assert holder.token is not None, f"{holder.id} was revoked without a token"
         core.push(holder, RevokeWithdrawnPush(holder.id, holder.token))
-        why, ms = eviction.why, (core.now - eviction.asked_at) * 1e3
+        why, ms = asked.why, (core.now - asked.asked_at) * 1e3
         core.note(RevokeWithdrawnNote(why.wanted_by, why.cause, len(holder.uses), ms), holder)
-        if holder.spec.standby or holder.spec.park_bytes:
-            core.record_lease(holder)
+        core.record_lease(holder)
 
 
 # -- the ladder

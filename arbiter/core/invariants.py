@@ -16,7 +16,7 @@ grow with the number of leases. The tests' drivers also check everything
   8. of a gang that is not complete, all waiting members are charged, or none
 """
 
-from vram_arbiter.arbiter.core.eviction import unwanted
+from vram_arbiter.arbiter.core.eviction import is_wanted
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -42,8 +42,10 @@ def check(core: Core) -> None:
         _check_gpu(gpu)
         if (head := gpu.queue.head) is not None:
             _check_head(core, gpu, head)
-        if gpu.evictions and not gpu.blocked and (vain := unwanted(core, gpu)):
-            raise InvariantViolation(7, f"{vain[0].lease} is revoked, and nothing wants its bytes")
+        for lease in gpu.residents.by_state[LeaseState.REVOKING].values():
+            asked = lease.departure.eviction
+            if asked is None or not is_wanted(core, gpu, asked):
+                raise InvariantViolation(7, f"{lease.id} is revoked, and nothing wants its bytes")
     for token, _ in core.turn.granted:
         if token <= core.last_token:
             raise InvariantViolation(5, f"token {token} after {core.last_token}")

@@ -239,7 +239,7 @@ class Gpu:
     queue: WaitQueue
     residents: Residents = field(default_factory=Residents)
     verifications: dict[str, Verification] = field(default_factory=dict)
-    evictions: list[Eviction] = field(default_factory=list)  # under way, or for a waiter
+    evictions: list[Eviction] = field(default_factory=list)  # for waiters that still wait
     pending_free: PendingFree = field(default_factory=PendingFree)
     # when the newest verdicts fell, and how many bytes left by each
     left: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=LEFT_KEPT))

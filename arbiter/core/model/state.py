@@ -26,11 +26,7 @@ from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
-from vram_arbiter.arbiter.core.model.lease import (
-    Lease,
-    LeaseState,
-    Use,
-)
+from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
@@ -149,6 +145,8 @@ class Turn:
     """Leases of this event's acquire; one that is not granted at once is answered `queued`."""
     granted: list[tuple[Token, GpuId]] = field(default_factory=list)
     """Grants, for the invariants."""
+    taken_back: dict[LeaseId, Eviction] = field(default_factory=dict)
+    """Revokes that nothing wanted any more, by holder; some are decided again, others withdrawn."""
 
 
 class Core:
@@ -364,13 +362,8 @@ class Core:
                     del self.waiters_of[owner]
         self.timers.cancel(("wait", lease.id))
         for gpu_id in lease.request.gpus:
-            gpu = self.gpus[gpu_id]
-            gpu.queue.discard(lease)
-            if gpu.evictions:  # the room that they made is not this lease's any more
-                gpu.evictions = [
-                    one for one in gpu.evictions if not one.verdict or one.wanted_by != lease.id
-                ]
-            self.wake(gpu)
+            self.gpus[gpu_id].queue.discard(lease)
+            self.wake(self.gpus[gpu_id])
 
     def end(self, lease: Lease, error: Refusal | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""

@@ -63,6 +63,8 @@ def begin(core: Core, event: ev.UseBegan) -> None:
             _check_places(core, lease, client)
         core.mark(lease, use)
         lease.uses.last_at = core.now
+        if client.process == lease.process:
+            lease.departure.revoked_before = False  # its holder knows that it may stay
         if _is_kept(lease, use):
             core.record_lease(lease)  # before the reply: from then on its user counts on it
         core.reply(event.client, event.request, UsesReply(len(lease.uses)))

@@ -1,11 +1,12 @@
 """Grants: one pass over the GPUs that changed.
 
 Per GPU, in this order (the numbers stand in `_serve`):
-  0. revokes that nothing wants any more are taken back; those that are not decided again by what
-     follows are withdrawn
+  0. take back revokes that nothing wants any more; what of them no GPU of the pass decides again
+     is withdrawn at its end
   1. under pressure: revoke idle holders, grant nothing
   2. a group of requests loads on the GPU: its feature grants the next one (`Feature.serve`)
-  3. blocked (recovering, drained, reading unknown, a load under way): grant and revoke nothing
+  3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, revoke no
+     holder that was not revoked before
   4. nothing waits, or the request to serve is one of a group: served by features alone
   5. the request fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
      head for which another GPU is being emptied is passed over from here on
@@ -16,7 +17,7 @@ Per GPU, in this order (the numbers stand in `_serve`):
      beside it on the day that they are gone, and may be revoked itself
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import islice
 from typing import Literal
 
@@ -40,8 +41,11 @@ def schedule(core: Core) -> None:
     """
     dirty, last = core.turn.dirty, -1
     while dirty:
+        for gpu in dirty.values():  # first: a choice among GPUs must not count on room of such
+            _prepare(core, gpu)
         last = min([index for index in dirty if index > last] or dirty)
         _serve(core, dirty.pop(last))
+    eviction.settle(core)
 
 
 def on_plan_due(core: Core, gpu_id: str) -> None:
@@ -51,31 +55,14 @@ def on_plan_due(core: Core, gpu_id: str) -> None:
     core.wake(core.gpus[GpuId(gpu_id)])
 
 
-def _serve(core: Core, gpu: Gpu) -> None:
+def _prepare(core: Core, gpu: Gpu) -> None:
     if gpu.pressed or gpu.ledger.pressure_bytes():
         note_pressure(core, gpu)
     gpu.blocked = admission.blocked(core, gpu)
-    unwanted = eviction.unwanted(core, gpu) if gpu.evictions else []
-    if not unwanted or _awaited(core, gpu, unwanted):
-        _decide(core, gpu)
-        return
-    eviction.take_back(core, gpu, unwanted)  # 0
-    _decide(core, gpu)
-    eviction.settle(core, gpu, unwanted)
+    eviction.take_back(core, gpu)  # 0
 
 
-def _awaited(core: Core, gpu: Gpu, unwanted: Sequence[Eviction]) -> bool:
-    """Return whether nothing can be decided now, and the request to serve needs the room of
-    holders that were revoked for another."""
-    if not gpu.blocked or gpu.pressed:
-        return False
-    head, leaving = admission.front(core, gpu), admission.leaving(gpu)
-    for one in unwanted:
-        leaving.pop(one.lease, None)
-    return head is not None and not admission.fits(gpu, head, leaving)
-
-
-def _decide(core: Core, gpu: Gpu) -> None:
+def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.serving:  # 1
         _relieve(core, gpu)
         return
@@ -83,6 +70,8 @@ def _decide(core: Core, gpu: Gpu) -> None:
         gpu.keeper.feature.serve(core, gpu, gpu.keeper)
         return
     if gpu.blocked:  # 3
+        if core.turn.taken_back:
+            _take_over(core, gpu)
         return
     if gpu.queue.head is None:  # 4
         for feature in core.features:
@@ -113,6 +102,20 @@ def _relieve(core: Core, gpu: Gpu) -> None:
         for victim in victims.choose_relief(core, gpu, leaving, over):
             eviction.ask(core, gpu, victim, None)
         victims.wake_when_evictable(core, gpu, None)
+
+
+def _take_over(core: Core, gpu: Gpu) -> None:
+    """Keep holders revoked whose revoke was taken back, if the request to serve would choose them
+    once the GPU grants again."""
+    head, leaving = admission.front(core, gpu), admission.leaving(gpu)
+    if head is None or head.request.group is not None or admission.fits(gpu, head, leaving):
+        return
+    plan = victims.choose_victims(core, gpu, head, leaving) or ()
+    again = [one for one in plan if one.id in core.turn.taken_back]
+    if again and (len(head.request.gpus) == 1 or victims.is_best_place(core, gpu, head, plan)):
+        head.request.planned_gpu = gpu.info.id
+        for holder in again:
+            eviction.ask(core, gpu, holder, head)
 
 
 def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
@@ -241,11 +244,10 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
 
 
 def _take_evictions(core: Core, gpu: Gpu, lease: Lease) -> list[Eviction]:
-    """Take the evictions that were asked for a lease and came to a verdict off the GPU's list:
-    they made its room."""
+    """Return the evictions that were asked for a lease and came to a verdict: they made its room.
+    The list of the GPU is brought up to date at the end of the pass (`eviction.settle`)."""
     made_room = [one for one in gpu.evictions if one.wanted_by == lease.id and one.verdict]
     for one in made_room:
-        gpu.evictions.remove(one)
         core.costs.switched(one.consumer, lease.spec.consumer, core.now)
     return made_room
 

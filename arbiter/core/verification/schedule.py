@@ -311,13 +311,12 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     core.record_residue(gpu, process, retained_bytes)
     core.forget(f"lease:{lease_id}")
     # 2. its eviction, and the waiter that it was for
-    for eviction in [one for one in gpu.evictions if one.lease == lease_id]:
-        eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
-        waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by else None
-        if waiter is None:
-            gpu.evictions.remove(eviction)
-        for gpu_id in () if waiter is None else waiter.request.gpus:
-            core.wake(core.gpus[gpu_id])  # the waiter may fit on another GPU
+    for eviction in gpu.evictions:
+        if eviction.lease == lease_id:
+            eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
+            waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by else None
+            for gpu_id in () if waiter is None else waiter.request.gpus:
+                core.wake(core.gpus[gpu_id])  # the waiter may fit on another GPU
     # 3. the lease
     lease = core.leases.get(lease_id)
     if lease is not None and lease.state is LeaseState.VERIFYING:

@@ -6,10 +6,12 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire.pushes import RevokePush, RevokeWithdrawnPush
 
 GIB = d.GIB
 
@@ -194,6 +196,20 @@ def test_a_release_that_crosses_the_withdrawal_is_that_of_an_eviction() -> None:
     assert parked["comes_back"]
 
 
+def test_a_release_long_after_the_withdrawal_is_the_holders_own() -> None:
+    """A holder that used its lease since has heard that it may stay. What it releases then is not
+    granted again by itself: a holder without a client library of ours does not expect that."""
+    driver = CoreDriver()
+    holder, lease, waiter, wanted = revoked_in_use(driver, standby=True)
+    waiter.cancel(wanted)
+    holder.use_end(lease)
+    holder.use_begin(lease)
+    holder.use_end(lease)
+    driver.advance(60.0)
+    holder.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
 def test_a_withdrawn_holder_keeps_its_place_among_residents() -> None:
     """Residents are listed by when they became ready; a verdict looks at the newest of them."""
     driver = CoreDriver(16 * GIB)
@@ -253,3 +269,89 @@ def test_an_operators_eviction_makes_no_switch() -> None:
     _, later = held(driver, "later", 5)
     (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == later]
     assert not granted["evicted"]
+
+
+def test_of_two_gpus_emptied_for_one_waiter_each_holder_is_told_once() -> None:
+    """The one holder was told to stay, and revoked again for the next waiter, in one event: each
+    GPU was decided by itself, and counted on the room of the other."""
+    driver = CoreDriver(gpus=2)
+    leases: list[LeaseId] = []
+    for name, gpu in (("one", "0"), ("two", "1")):
+        holder, lease = held(driver, name, 5, gpu=gpu)
+        holder.use_begin(lease)
+        leases.append(lease)
+    waiter, later = driver.consumer("waiter"), driver.consumer("later")
+    wanted = waiter.acquire(5 * GIB)
+    driver.advance(31.0)
+    assert [driver.state(lease) for lease in leases] == ["revoking", "revoking"]
+    later.acquire(5 * GIB)
+    before = len(driver.effects)
+    waiter.cancel(wanted)
+    told = [
+        (str(effect.body.TAG[1]), effect.body.lease_id)
+        for effect in driver.effects[before:]
+        if isinstance(effect, Push) and isinstance(effect.body, RevokePush | RevokeWithdrawnPush)
+    ]
+    assert told == [("revoke", leases[0]), ("revoke_withdrawn", leases[1])]
+    assert [driver.state(lease) for lease in leases] == ["revoking", "held"]
+
+
+def drain(driver: CoreDriver) -> None:
+    ops = driver.consumer("ops")
+    driver.post(OperatorAsked(ops.client, driver.next_request(), "drain", "", "ops", "test"))
+
+
+def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too() -> None:
+    """A drain lasts as long as its operator wants."""
+    driver = CoreDriver()
+    _, lease, waiter, wanted = revoked_in_use(driver)
+    small = driver.consumer("small").acquire(GIB)
+    assert driver.state(small) == "loading", "backfilled"
+    drain(driver)
+    waiter.cancel(wanted)
+    assert driver.state(lease) == "held"
+
+
+def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over() -> None:
+    """It kept the name of the waiter that was gone."""
+    driver = CoreDriver()
+    _, lease, waiter, wanted = revoked_in_use(driver)
+    driver.consumer("later").acquire(5 * GIB)
+    drain(driver)
+    waiter.cancel(wanted)
+    assert driver.state(lease) == "revoking"
+    assert not driver.pushes("revoke_withdrawn")
+    assert driver.pushes("revoke", lease)[-1]["wanted_by"] == "later"
+
+
+def test_a_lease_that_waits_again_does_not_inherit_its_earlier_evictions() -> None:
+    """A lease on standby waits under one id again and again. What was revoked for one wait, and
+    hung in its unload, was booked to the grant of the next one."""
+    driver = CoreDriver()
+    det, lease = held(driver, "det", 3, standby=True)
+    hanging, stuck = held(driver, "hanging", 3, priority=40)
+    hanging.use_begin(stuck)
+    evictor = driver.consumer("evictor")
+    first = evictor.acquire(3 * GIB, priority=30)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(first) == "loading")
+    evictor.load(first)
+    hanging.use_end(stuck)
+    det.reacquire(lease)
+    driver.until(lambda: driver.state(stuck) == "revoking")
+    hanging.unloading(stuck)  # and hangs
+    evictor.unload(first)
+    driver.until(lambda: driver.state(lease) == "loading")
+    det.load(lease)
+    driver.advance(31.0)
+    second = evictor.acquire(3 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    det.unload(lease)
+    driver.until(lambda: driver.state(second) == "loading")
+    evictor.load(second)
+    det.reacquire(lease)
+    hanging.unload(stuck)
+    driver.until(lambda: driver.state(lease) == "loading")
+    granted = [note for note in driver.notes("granted") if note["lease_id"] == lease]
+    assert [note["evicted"] for note in granted] == [[], ["evictor"], []]
