@@ -112,7 +112,7 @@ class Departure:
         self._park = park
         self._park_now = False  # the holder itself wants to park
         self._unloaded = False
-        self._announcing = False  # an `unloading` is on its way, and not answered yet
+        self._committed = False  # an `unloading` was sent and not refused: it may be heard
         self._left: anyio.Event | None = None  # set when `_leave` returns; None: it was not started
 
     # -- reasons to leave --------------------------------------------------------------------------
@@ -124,10 +124,10 @@ class Departure:
             self._driver.spawn(self._leave, self._left, name=f"leave {self._record.lease_id}")
 
     def stay_if_withdrawn(self) -> bool:
-        """Allow uses again if the revoke was withdrawn; not while the arbiter is told that the
-        unloading begins, nor where the holder itself leaves. Return whether the lease stays."""
+        """Allow uses again if the revoke was withdrawn; not where the arbiter may have heard that
+        the unloading begins, nor where the holder itself leaves. Return whether the lease stays."""
         leaves = self.own_will or self._park_now or self.unloading or self.gone
-        if not self._record.withdrawn or self._announcing or leaves:
+        if not self._record.withdrawn or self._committed or leaves:
             return False
         self._record.stays()
         self.asked, self._left = False, None  # `_leave` ends
@@ -198,7 +198,7 @@ class Departure:
     def returned(self) -> None:
         """Begin anew: the lease is granted again, and was not revoked since."""
         self.asked = self.own_will = self.unloading = self._unloaded = self._park_now = False
-        self._left = None
+        self._committed, self._left = False, None
 
     def end(self) -> None:
         self.gone = self.over = self.asked = True
@@ -253,16 +253,18 @@ class Departure:
         request = self._driver.protocol.holdings.unloading(
             self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S
         )
-        self._announcing = True
+        self._committed = True
         try:
             await self._driver.reply(request)
         except BadState as error:
             if error.details.get("uses"):
+                self._committed = False
                 await self.progress.wait(RETRY_UNLOADING_S)
                 return False
         except ArbiterUnreachable:
             return False  # stay resident: back in contact or fenced, whichever comes first
         except VramError as error:
+            self._committed = False
             if error.code not in GONE_CODES:  # else the protocol reports the loss
                 log.warning(
                     "%s: its `unloading` was refused and is repeated: %s",
@@ -271,8 +273,6 @@ class Departure:
                 )
             await self.progress.wait(RETRY_UNLOADING_S)
             return False
-        finally:
-            self._announcing = False
         return True
 
     async def _unload_once(self) -> None:

@@ -2,6 +2,7 @@
 SEED=n` one again."""
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from tests.sim.sim_run import run_seed, summary
 from tests.support.simulation.clock import Clock, new_loop
 from tests.support.simulation.daemon import Happening
 from tests.support.simulation.device import Device, SimOutOfMemory
-from tests.support.simulation.world import Entitlement, SimFailure, World
+from tests.support.simulation.world import Entitlement, SimFailure, SimProcess, World
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
@@ -230,3 +231,65 @@ def test_a_lease_that_finds_no_host_ram_to_park_is_released_all_the_same(tmp_pat
 
     assert run_client(made, life)
     assert parked == ["began", "unloaded"]
+
+
+# -- a revoke that is withdrawn
+def connected(made: World, name: str, life: Callable[[SimClient], Awaitable[None]]) -> SimProcess:
+    """A process whose client lives so, connected."""
+    process = made.spawn(name)
+    client = SimClient(made, process)
+
+    async def run() -> None:
+        async with client:
+            await life(client)
+            await asyncio.sleep(1000.0)
+
+    process.loop.enter(lambda: process.loop.create_task(run()))
+    return process
+
+
+def kinds(made: World) -> list[str]:
+    return [note.kind for note in made.machine.history]
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["answered", "its answer is lost"])
+def test_an_unloading_that_crosses_the_withdrawal_completes(tmp_path: Path, lost: bool) -> None:
+    """The holder ended its use, and sent `unloading`, before it heard that its revoke was
+    withdrawn. Where the answer was lost it took the lease for held, and the arbiter waited for the
+    end of its unload for ever."""
+    made = world_with_daemon(tmp_path)
+    holder_ends, parked = asyncio.Event(), list[str]()
+    leases: list[AsyncLease] = []
+
+    async def hold(client: SimClient) -> None:
+        lease = await parked_slowly(client, 5 * GIB, parked, park_bytes=5 * GIB, standby=True)
+        async with lease.use():
+            leases.append(lease)
+            await holder_ends.wait()
+
+    async def give_up(client: SimClient) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.5):
+                await parked_slowly(client, 5 * GIB, parked)
+
+    holder = connected(made, "holder", hold)
+    assert made.run(5.0, lambda: bool(leases))
+    waiter = connected(made, "waiter", give_up)
+    assert made.run(5.0, lambda: "revoke_withdrawn" in kinds(made))
+    assert leases[0].state == "revoking", "it has not heard of it"
+    holder.loop.enter(holder_ends.set)
+    assert made.run(5.0, lambda: "unloading" in kinds(made))
+    if lost:
+        for link in holder.links:
+            link.cut(told=False)
+        daemon = made.daemon
+        assert daemon is not None
+        daemon.loop.freeze()
+        made.run(8.0)  # longer than the holder waits for the answer
+        daemon.loop.thaw()
+    assert made.run(30.0, lambda: "parked" in kinds(made))
+    assert made.run(30.0, lambda: leases[0].state == "loading"), "it comes back as from an eviction"
+    assert parked == ["began"]
+    for process in (holder, waiter):
+        made.kill(process)
+    made.kill_daemon()
