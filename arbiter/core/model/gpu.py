@@ -106,15 +106,17 @@ class Residents(dict[LeaseId, Lease]):
                 if lease.ready_at > since:
                     yield lease
 
-    def ready_since(self, moment: float) -> Iterator[Lease]:
-        """Yield leases that became ready at `moment` or later and do not unload yet."""
+    def loaded_since(self, moment: float) -> Iterator[Lease]:
+        """Yield leases that became ready at `moment` or later, and those that were granted then and
+        leave already."""
         for lease in reversed(self.by_state[LeaseState.HELD].values()):
             if lease.ready_at < moment:
                 break
             yield lease
-        for lease in self.by_state[LeaseState.REVOKING].values():
-            if lease.ready_at >= moment:
-                yield lease
+        for state in LEAVING:
+            for lease in self.by_state[state].values():
+                if max(lease.granted_at, lease.ready_at) >= moment:
+                    yield lease
 
 
 class WaitQueue:

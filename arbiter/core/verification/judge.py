@@ -195,11 +195,14 @@ def _between_lists(
 def _loading_bytes(gpu: Gpu, reading: MemorySampled) -> int:
     """Return what is charged for loads in progress and not seen yet.
 
-    A total cannot tell bytes that arrive from bytes that have not gone.
+    A total cannot tell bytes that arrive from bytes that have not gone. A lease that became ready
+    after the reading began may have loaded during it, also where it has left or was lost since.
     """
-    count = 0
-    # a lease that became ready after the reading began may have loaded during it
-    for lease in (*gpu.in_state(LeaseState.LOADING), *gpu.residents.ready_since(reading.taken_at)):
+    count, at = 0, reading.taken_at
+    for debt in gpu.verifications.values():
+        if debt.lease is not None and debt.lease not in gpu.residents and debt.confirmed_at >= at:
+            count += gpu.ledger.charge_bytes(debt.lease)
+    for lease in (*gpu.in_state(LeaseState.LOADING), *gpu.residents.loaded_since(at)):
         account = gpu.ledger.accounts[lease.process]
         other_charges = account.leased_bytes - gpu.ledger.charge_bytes(lease.id)
         shown_bytes = bytes_of(reading, lease.process) or 0

@@ -249,6 +249,31 @@ def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves:
     assert driver.until(lambda: driver.gpu()["charged_bytes"] == 1 * GIB) > 1.0
 
 
+@pytest.mark.parametrize("ends", ["gives back", "fails to load", "dies"])
+def test_a_newcomer_that_has_left_before_a_reading_ends_hides_no_release(ends: str) -> None:
+    """Regression (leases, seed 80): what was granted and given back while a reading was under way
+    counted as on it, in place of what was going, and 5 GB were granted on bytes in use."""
+    driver = hidden_gpu(lists=False)
+    small, lease = held(driver, "small", 0.5)
+    driver.advance(1.0)
+    driver.device.lag_s = 2.0
+    small.unload(lease)
+    driver.advance(0.01)
+    driver.device.reading_s = 1.0  # the next readings take long
+    driver.advance(0.1)
+    newcomer = driver.consumer("newcomer")
+    wanted = newcomer.acquire(1 * GIB)
+    assert driver.state(wanted) == "loading"
+    if ends == "gives back":
+        newcomer.load(wanted)
+        newcomer.unload(wanted)
+    elif ends == "fails to load":
+        newcomer.release(wanted)
+    else:
+        newcomer.die()
+    assert driver.until(lambda: driver.state(lease) == "over") > 1.5
+
+
 def test_what_its_own_process_loads_hides_no_release() -> None:
     """Regression: after a restart a load of the same process counted as present already and
     verified a release early (seed 20778062337)."""
