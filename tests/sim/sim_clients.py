@@ -8,8 +8,9 @@ end nobody may still be waiting.
 """
 
 import asyncio
+import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 
@@ -96,6 +97,7 @@ class Ask:
     spec: LeaseSpec
     outcome: str = ""
     ended_at: float = 0.0
+    give_up: Callable[[], object] = lambda: None
 
     def __str__(self) -> str:
         return (
@@ -307,6 +309,7 @@ class Consumer(Program):
                 spec, timeout_s, unload=unload, park=unload, restore=restore, on_lost=lost
             )
         )
+        ask.give_up = lambda: self.loop.enter(work.cancel)
         if self.world.clock.chance(self.character.gives_up_waiting):
             self.loop.call_later(self.random.random() * 4.0, work.cancel)
         try:
@@ -351,6 +354,9 @@ class Consumer(Program):
                 await lease.give_up()
             elif lease.state in ("standby", "parked") and self.world.clock.chance(0.1):
                 await self._want_back(lease)
+            elif lease.state == "held" and holding.loaded and self.world.clock.chance(0.1):
+                with contextlib.suppress(VramError):
+                    await self._work(holding)
             elif lease.state == "held" and lease.spec.park_bytes and self.world.clock.chance(0.05):
                 await lease.park()
                 self.world.faults["parked_by_itself"] += 1

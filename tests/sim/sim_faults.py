@@ -9,6 +9,7 @@ from tests.sim.sim_clients import Cast, Program
 from tests.support.simulation.device import ProbeFaults, SimOutOfMemory
 from tests.support.simulation.wire import QUEUE_MAX, WireFaults
 from tests.support.simulation.world import World
+from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
 
@@ -37,6 +38,7 @@ class Nemesis:
         self.table: list[tuple[int, Callable[[], None]]] = [
             (8, self.kill_process),
             (8, self.freeze_process),
+            (8, self.end_a_wait),
             (6, self.cut_link),
             (3, self.cut_link_silently),
             (3, self.slow_reader),
@@ -138,6 +140,41 @@ class Nemesis:
             self.random.choice(FROZEN_S),
             lambda: loop.thaw() if loop.frozen and not loop.dead else None,
         )
+
+    def end_a_wait(self, tries: int = 20) -> None:
+        """The next waiter that a holder in use is revoked for gives up, or dies."""
+        if self.stopped:
+            return
+        asks = [ask for ask in self.cast.asks if not ask.outcome and ask.process.alive]
+        asks = [ask for ask in asks if ask.process.key in self._waited_for()]
+        if not asks:
+            if tries:
+                self.clock.after(0.2, lambda: self.end_a_wait(tries - 1))
+            return
+        self._count("wait_ended_for_a_revoked_holder")
+        ask = self.random.choice(asks)
+        if self.clock.chance(0.7):
+            ask.give_up()
+            return
+        index = next(n for n, one in enumerate(self.running) if one.process is ask.process)
+        self.world.kill(ask.process)
+        self.clock.after(self.random.uniform(0.01, 3.0), lambda: self._respawn(index, None))
+
+    def _waited_for(self) -> set[ProcessKey]:
+        """Return the processes that wait for a holder that is revoked, and in use."""
+        daemon = self.world.daemon
+        if daemon is None or not self.world.serving:
+            return set()
+        core = daemon.core.inspect()
+        revoked = [
+            one.departure.eviction
+            for one in core.leases.values()
+            if one.state is LeaseState.REVOKING and one.uses
+        ]
+        waiters = [
+            core.waiting.get(asked.wanted_by) for asked in revoked if asked and asked.wanted_by
+        ]
+        return {waiter.process for waiter in waiters if waiter is not None}
 
     # -- the wire
     def cut_link(self) -> None:

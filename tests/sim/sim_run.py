@@ -26,10 +26,13 @@ from tests.sim.sim_clients import Cast, Character, Consumer, Observer, Operator,
 from tests.sim.sim_faults import Nemesis, Slot
 from tests.support.simulation.clock import TRACE_LINES
 from tests.support.simulation.world import SimFailure, World, state_folder
+from vram_arbiter.arbiter.core.model.lease import LeaseState
+from vram_arbiter.schemas.ids import LeaseId
 
 TROUBLE_S = 80.0
 SETTLE_S = 150.0  # simulated: every wait, ageing, ladder and verification of the end fits in
 PATIENCE_S = 10.0
+MISBELIEF_S = 15.0  # longer than a holder waits for an answer, and the way back to the arbiter
 CHUNK = 8
 
 
@@ -131,9 +134,30 @@ def _play(world: World, cast: Cast) -> None:
     slots.append(Slot(partial(Observer, cast, "observer")))
     slots.append(Slot(partial(Operator, cast, "operator")))
     nemesis = Nemesis(world, cast, slots)
+    _watch_beliefs(world, cast, {})
     world.run(TROUBLE_S)
     nemesis.calm()
     _settle(world, cast, nemesis)
+
+
+def _watch_beliefs(world: World, cast: Cast, since: dict[str, float]) -> None:
+    """No holder takes its lease for held while the arbiter waits for the end of its unload.
+    `since`: when that was seen first, by lease."""
+    daemon, now = world.daemon, world.clock.now
+    known = daemon.core.inspect().leases if daemon is not None and world.serving else {}
+    odd = [
+        holding.lease.lease_id
+        for holding in cast.living()
+        if not holding.process.loop.frozen
+        and (lease := known.get(LeaseId(holding.lease.lease_id))) is not None
+        and lease.state is LeaseState.UNLOADING
+    ]
+    for lease_id in since.keys() - set(odd):
+        del since[lease_id]
+    for lease_id in odd:
+        if now - since.setdefault(lease_id, now) > MISBELIEF_S:
+            world.fail(f"{lease_id} unloads, says the arbiter, and its holder takes it for held")
+    world.clock.after(1.0, lambda: _watch_beliefs(world, cast, since))
 
 
 def _settle(world: World, cast: Cast, nemesis: Nemesis) -> None:

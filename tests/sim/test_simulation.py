@@ -31,6 +31,12 @@ def test_nothing_that_must_hold_breaks_under_faults(seed: int) -> None:
     assert sum(report.faults.values()) > 20
 
 
+def test_waiters_give_up_while_holders_are_revoked_for_them() -> None:
+    reports = [run_seed(seed) for seed in (2, 5)]
+    assert all(report.notes["revoke_withdrawn"] for report in reports)
+    assert all(report.faults["wait_ended_for_a_revoked_holder"] for report in reports)
+
+
 def test_a_seed_replays_exactly() -> None:
     assert run_seed(11).digest == run_seed(11).digest
     assert run_seed(11).digest != run_seed(12).digest

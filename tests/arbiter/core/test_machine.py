@@ -15,7 +15,7 @@ from typing import Any
 import hypothesis.strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from tests.support.core_driver import Consumer, CoreDriver, as_wire
+from tests.support.core_driver import Consumer, CoreDriver, answer, as_wire
 from tests.support.engine_state import state_of
 from tests.support.machines import walk
 from vram_arbiter.arbiter.core.effects import Push, Reply
@@ -24,6 +24,7 @@ from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.pushes import RevokePush, RevokeWithdrawnPush
 
 CAPACITY = 8 * d.GIB
 SIZES = [450 * d.MIB, 1 * d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_000_000, 7 * d.GIB]
@@ -104,6 +105,7 @@ class Leases(RuleBasedStateMachine):
         self.bounds: dict[LeaseId, float] = {}  # who may wait until when
         self.broke: dict[str, int] = {}  # events until the last breakdown of a kind
         self.tokens: list[Any] = []
+        self.stays: set[LeaseId] = set()  # revoked, and told to stay since
         self.seen = 0  # effects that were looked at
         self.driver.after_event = self.sound
         for n, wish in enumerate(wishes):
@@ -189,19 +191,23 @@ class Leases(RuleBasedStateMachine):
         count = max(sum(self.loaded[process].values()), self.context[process])
         self.driver.device.set(process, count, self.driver.now)
 
-    def unload(self, lease: LeaseId) -> None:
+    def unload(self, lease: LeaseId) -> str:
+        """The holder frees its bytes and releases. Return what the lease becomes."""
         person = self.mine[lease]
         person.unloading(lease)
         del self.loaded[person.process][lease]
         self.show(person.process)
         view = self.driver.view(lease)
-        person.release(lease, parked=view is not None and "parked_bytes" in view)
+        parked = view is not None and "parked_bytes" in view
+        return str(answer(person.release(lease, parked=parked))["next"])
 
     @precondition(some(HELD))
     @rule(n=PICK, who=st.integers(0, PEOPLE - 1))
     def use(self, n: int, who: int) -> None:
         lease = self.pick(n, HELD)
         self.people[who].use_begin(lease, f"u{who}", self.mine[lease].token(lease))
+        if self.people[who] is self.mine[lease]:
+            self.stays.discard(lease)  # it knows
 
     def in_use(self) -> list[LeaseId]:
         return [lease for lease in self.having(HELD, REVOKING) if self.lease(lease).uses]
@@ -267,8 +273,36 @@ class Leases(RuleBasedStateMachine):
     @precondition(some(QUEUED, *AWAY))
     @rule(n=PICK)
     def cancel(self, n: int) -> None:
-        lease = self.pick(n, QUEUED, *AWAY)
+        self.cancel_of(self.pick(n, QUEUED, *AWAY))
+
+    def cancel_of(self, lease: LeaseId) -> None:
         self.mine[lease].cancel(lease)
+
+    def waited_for(self) -> list[LeaseId]:
+        """Requests that a holder is revoked for."""
+        asked = [self.lease(lease).departure.eviction for lease in self.having(REVOKING)]
+        wanted = {one.wanted_by for one in asked if one is not None}
+        return [lease for lease in self.having(QUEUED) if lease in wanted]
+
+    @precondition(lambda self: bool(self.waited_for()))
+    @rule(n=PICK)
+    def give_up(self, n: int) -> None:
+        """The waiter that a holder is revoked for wants nothing any more."""
+        found = self.waited_for()
+        self.cancel_of(found[n % len(found)])
+
+    def told_to_stay(self) -> list[LeaseId]:
+        """Idle holders that were told to stay."""
+        return [lease for lease in self.having(HELD) if lease in self.stays]
+
+    @precondition(lambda self: any(not self.lease(x).uses for x in self.told_to_stay()))
+    @rule(n=PICK)
+    def act_on_a_withdrawn_revoke(self, n: int) -> None:
+        """The holder has not heard that it may stay: it leaves as one that is evicted does."""
+        idle = [lease for lease in self.told_to_stay() if not self.lease(lease).uses]
+        lease = idle[n % len(idle)]
+        after = self.unload(lease)
+        assert after == "standby" or not self.mine[lease].specs[lease].standby
 
     @precondition(lambda self: self.quiet("die"))
     @rule(who=st.integers(0, PEOPLE - 1))
@@ -362,10 +396,18 @@ class Leases(RuleBasedStateMachine):
 
     def tokens_grow(self) -> None:
         for effect in self.driver.effects[self.seen :]:
+            match effect:
+                case Push(_, RevokeWithdrawnPush(lease)):
+                    self.stays.add(LeaseId(lease))
+                case Push(_, RevokePush(lease)):
+                    self.stays.discard(LeaseId(lease))
+                case _:
+                    pass
             view = getattr(effect.body, "lease", None) if isinstance(effect, Reply | Push) else None
             if view is not None and view.state == "loading":
                 assert not self.tokens or view.token > self.tokens[-1]
                 self.tokens.append(view.token)
+                self.stays.discard(view.lease_id)
         self.seen = len(self.driver.effects)
 
     def no_lost_wake_up(self) -> None:
