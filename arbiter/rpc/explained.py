@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
+from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.wire.codes import Block, RevokeCause, Wait
 from vram_arbiter.schemas.wire.explained import (
     Because,
@@ -193,7 +194,7 @@ def _loading(one: Blocker) -> str:
 
 
 def _in_flight(one: Blocker) -> str:
-    label = f' "{one.label}"' if one.label else ""
+    label = f' "{printable(one.label)}"' if one.label else ""
     return f"1 use{label}" if one.uses == 1 else f"{one.uses} uses"
 
 

@@ -12,7 +12,7 @@ import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli.common import (
@@ -302,8 +302,9 @@ def policy_in(world: World, name: str) -> tuple[Policy, Callable[[], str]]:
 async def played(control: ControlThread, stopping: asyncio.Event) -> None:
     """Wait for the end of the last episode, or for a signal."""
     stopped = asyncio.create_task(stopping.wait())
+    ends: set[asyncio.Future[Any]] = {control.ended, stopped}
     try:
-        await asyncio.wait({control.ended, stopped}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
     finally:
         stopped.cancel()
 

@@ -194,7 +194,9 @@ def _kept(
         if event["kind"] != "verified" or not event["resolved"]:
             continue
         process = (
-            _PROCESS.fullmatch(str(event["consumer"])) if event.get("lease_id") is None else None
+            _PROCESS.fullmatch(event.get("consumer") or "")
+            if event.get("lease_id") is None
+            else None
         )
         if process is not None:
             found.append((t, int(process.group(1)), 0))

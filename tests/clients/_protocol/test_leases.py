@@ -140,6 +140,23 @@ def test_a_withdrawn_revoke_is_told_once(link: Wire) -> None:
     assert not record.withdrawn, "and revoked anew"
 
 
+@pytest.mark.parametrize(("state", "stays"), [("held", True), ("revoking", False)])
+def test_a_reattached_holder_learns_whether_it_is_still_revoked(
+    link: Wire, state: str, stays: bool
+) -> None:
+    """The withdrawal may have been lost with the connection, or the revoke with the daemon."""
+    record = link.hold()
+    link.push("revoke", lease_id="L1-1", token=[1, 2], uses=1)
+    link.told()
+    link.reply(
+        link.reconnect(),
+        leases=[{"lease_id": "L1-1", "kept": True, "lease": view("L1-1", [1, 2], state)}],
+    )
+    told = [event for event in link.told() if isinstance(event, r.RevokeWithdrawn)]
+    assert (bool(told), record.withdrawn) == (stays, stays)
+    assert record.revoke is not None, "until the holder has heard of it"
+
+
 def test_a_released_lease_is_neither_renewed_nor_reattached(link: Wire) -> None:
     record = link.hold()
     link.holdings.release(record, False, link.now, 5.0)

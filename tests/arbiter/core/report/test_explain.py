@@ -262,3 +262,14 @@ def test_a_trace_is_carried_from_the_acquire_to_every_note() -> None:
     assert note.about is not None
     assert note.about.traceparent == "00-abc-def-01"
     assert note.about.gpu == GpuId("GPU-0")
+
+
+def test_the_label_of_a_use_is_quoted_safely() -> None:
+    """Any process may choose it, and a client prints the answer in its error."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    det.use_begin(lease, label="look\x1b[2J")
+    driver.consumer("vlm").acquire(5 * GIB)
+    text = why(driver, "vlm")["text"]
+    assert 'finish 1 use "look\\x1b[2J"' in text
+    assert "\x1b" not in text

@@ -160,7 +160,7 @@ def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evicta
     _, lease = held_bytes(driver, "det", 5 * GIB, evictable=evictable)
     waiter = driver.consumer("w").acquire(5 * GIB) if evictable else lease
     alive = refusal(order_of(ops, "release_dead", lease))
-    assert "heard of 0.0 s ago" in alive.message, "it said -0.0 where the lease was just renewed"
+    assert "heard from 0.0 s ago" in alive.message, "it said -0.0 where the lease was just renewed"
     assert (alive.details["problem"], alive.details.get("evictable", True)) == (
         "holder_lives",
         evictable,
