@@ -42,7 +42,6 @@ hold, hides as many bytes more.
 """
 STUCK_S = 60.0
 _LEASE_ID = re.compile(r"L(\d+)-\d+")
-_PROCESS = re.compile(r"(\d+)@\d+")
 
 type Line = Mapping[str, Any]
 type Span = tuple[float, float]
@@ -193,13 +192,8 @@ def _kept(
     for event, t in zip(events, times, strict=True):
         if event["kind"] != "verified" or not event["resolved"]:
             continue
-        process = (
-            _PROCESS.fullmatch(event.get("consumer") or "")
-            if event.get("lease_id") is None
-            else None
-        )
-        if process is not None:
-            found.append((t, int(process.group(1)), 0))
+        if event.get("lease_id") is None:
+            found.append((t, int(event["pid"]), 0))
         elif event["consumer"] in declared:
             pid, most = declared[event["consumer"]]
             found.append((t, pid, min(int(event["residue_bytes"]), most)))
