@@ -280,9 +280,7 @@ def beside_what_is_on_its_way(
         case "exited":
             scene.trace(IDLE, "done")
         case "measured gone":
-            scene.event(
-                "verified", lease_id=None, consumer=f"{IDLE}@5", resolved=True, residue_bytes=0
-            )
+            scene.event("verified", lease_id=None, pid=IDLE, resolved=True, residue_bytes=0)
     scene.grant(B, 1, exclusive=True)
     return [finding.rule for finding in scene.judge().findings]
 
