@@ -24,7 +24,7 @@ _WARNINGS = (
     "journal_put_aside", "record_stopped", "config_refused",
 )  # fmt: skip
 _DETAILS = (
-    "use_began", "use_ended", "use_yielded", "reminded", "revoke_acked", "probe_ok",
+    "use_began", "use_ended", "reminded", "revoke_acked", "probe_ok",
     "refused",  # `RefusalLog` says it, with the client's name and user
 )  # fmt: skip
 _LEVELS = {

@@ -200,7 +200,7 @@ class Session:
     ) -> AsyncForeignUse:
         self.check_open()
         use_id = f"{self.protocol.connection.instance}/{self.new_id()}"
-        use = AsyncForeignUse(self, lease_id, token, use_id)
+        use = AsyncForeignUse(self, lease_id, token, use_id, label)
         request = self.protocol.foreign_uses.begin(
             lease_id,
             token,
@@ -216,7 +216,7 @@ class Session:
         except BaseException:
             await use.end()
             raise
-        use_context.enter(use_id)
+        use_context.enter(use_id, use.name)
         return use
 
     async def events(self) -> AsyncGenerator[JsonMap]:
@@ -441,9 +441,6 @@ class Session:
             case r.Returned():
                 if lease := self._leases.get(event.record.lease_id):
                     lease._returned()
-            case r.Resized():
-                if lease := self._leases.get(event.record.lease_id):
-                    lease._resized(event.error)
             case r.UseLost():
                 if use := self._foreign_uses.get(event.use_id):
                     use._lost = event.error

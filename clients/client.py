@@ -12,8 +12,6 @@ robots.
 """
 
 import os
-import uuid
-from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
@@ -26,11 +24,10 @@ from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
-from vram_arbiter.clients._session import LEAVE_TIMEOUT_S, Session, closed
+from vram_arbiter.clients._session import LEAVE_TIMEOUT_S, Session
 from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.handlers import Handler, Handlers, with_signature_of
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
-from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
@@ -42,7 +39,7 @@ from vram_arbiter.schemas.wire.replies import (
     PrepareReply,
     StatusReply,
 )
-from vram_arbiter.schemas.wire.spec import Gang, LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 CONNECT_TIMEOUT_S: Final = 5.0
 
@@ -155,7 +152,7 @@ class AsyncClient:
 
         Args:
             spec: what is needed; or `vram`, `model` and other fields of LeaseSpec by name.
-            wait_timeout_s: longest wait; None waits without limit.
+            wait_timeout_s: longest wait; None waits without limit, inside a use 30 s.
             vram: bytes, a text such as `5.3GB`, or a Footprint.
             model: model id, for the arbiter's statistics and learned footprints.
             handlers: what to do when the arbiter wants something (`clients.handlers.Handlers`);
@@ -166,14 +163,12 @@ class AsyncClient:
         Raises:
             WaitTimeout: it was not granted in time; details.why says what blocked.
             VramInsufficient: it can never fit.
-            WouldDeadlock: the wait is for what a use of this process keeps.
-            VramError: UnknownGpu, HolderBusy, LimitExceeded or BadRequest.
+            WouldDeadlock: it waited 30 s inside a use, which may keep what it waits for.
+            VramError: UnknownGpu, LimitExceeded or BadRequest.
 
         Canceling the caller gives the place in the queue, or the lease, back.
         """
         wanted = lease_spec(spec, self._name, vram, model, fields)
-        if not use_context.a_use():
-            wanted = replace(wanted, independent=True)
         merged = (handlers or Handlers[AsyncLease]()).merged(
             unload=unload,
             park=park,
@@ -182,55 +177,10 @@ class AsyncClient:
             on_lost=on_lost,
             safe_point_eta_s=safe_point_eta_s,
         )
-        return await self._session.acquire(wanted, merged, wait_timeout_s, traceparent)
+        with use_context.bounded(wanted.consumer, wait_timeout_s) as timeout_s:
+            return await self._session.acquire(wanted, merged, timeout_s, traceparent)
 
     lease = _block(acquire)
-
-    async def gang(
-        self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
-    ) -> AsyncIterator[tuple[int, AsyncLease]]:
-        """Acquire all of these leases or none of them.
-
-        `async for index, lease in client.gang([policy, reward])`: load, then `await lease.ready()`.
-        The next one is granted when the one before is ready. What was granted is the caller's to
-        give up.
-
-        Raises: GangBroken, VramInsufficient, WaitTimeout.
-        """
-        session = self._session
-        gang = Gang(
-            id=f"{session.protocol.connection.instance}/{uuid.uuid4().hex[:12]}", size=len(specs)
-        )
-        grants: deque[tuple[int, Answer[AsyncLease]]] = deque()
-        arrived = [anyio.Event()]
-
-        async def member(index: int, spec: LeaseSpec, end: Answer[AsyncLease]) -> None:
-            try:
-                end.set(await self.acquire(replace(spec, gang=gang), wait_timeout_s))
-            except VramError as error:
-                end.fail(error)
-            finally:
-                end.fail(closed())  # where it is not over yet: the client ends
-                grants.append((index, end))
-                arrived[0].set()
-
-        members = [
-            session.spawn(member, index, spec, Answer[AsyncLease](), name=f"gang {gang.id} {index}")
-            for index, spec in enumerate(specs)
-        ]
-        try:
-            for _ in specs:
-                while not grants:
-                    arrived[0] = anyio.Event()
-                    await arrived[0].wait()
-                index, end = grants.popleft()
-                yield index, end.result()
-        finally:
-            for scope in members:
-                scope.cancel()
-            for _, end in grants:  # granted while the caller turned away: nothing was loaded
-                if end.done and not end.failed:
-                    session.spawn(end.result().release, name=f"unwanted member of gang {gang.id}")
 
     async def begin_use(
         self,

@@ -8,7 +8,6 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
-from dataclasses import replace
 from typing import Literal
 
 from vram_arbiter.clients import use_context
@@ -16,11 +15,9 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord, TokenPair
 from vram_arbiter.clients.eviction import Departure, Driver
 from vram_arbiter.clients.handlers import Handlers, call
-from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
 from vram_arbiter.schemas.wire.pushes import RevokePush
-from vram_arbiter.schemas.wire.replies import AcquireReply
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
 
@@ -49,8 +46,6 @@ class AsyncLease:
         self._handlers = handlers
         self._departure = Departure(driver, record, spec, handlers.unload, handlers.park)
         self._restoring = False
-        self._resizing = False
-        self._resize_error: VramError | None = None
 
     # -- what it is --------------------------------------------------------------------------------
     @property
@@ -64,7 +59,7 @@ class AsyncLease:
 
     @property
     def spec(self) -> LeaseSpec:
-        """What was asked for; `resize` changes its footprint."""
+        """What was asked for."""
         return self._spec
 
     @property
@@ -131,8 +126,7 @@ class AsyncLease:
         """Mark a busy interval: the holder is not evicted inside it.
 
         The first use marks the lease ready, if `ready` was not called. A lease can be *lost* within
-        a use (expired, fenced): check `state` in a long one. A use that waits for something that
-        may need this very room pauses meanwhile: `async with use.yielded(): …`.
+        a use (expired, fenced): check `state` in a long one.
 
         Raises: LeaseRevoking or LeaseLost before the block begins.
         """
@@ -155,30 +149,6 @@ class AsyncLease:
             )
         )
 
-    async def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
-        """Hold more (returns when there is room: allocate then) or less (free first; returns when
-        it is measured gone).
-
-        Raises: VramInsufficient, WaitTimeout, WouldDeadlock, LeaseLost: the lease keeps its size.
-            LeaseRevoking: it was evicted meanwhile.
-        """
-        self._raise_if_leaving()
-        self._resize_error = None
-        request = self._driver.protocol.holdings.resize(
-            self._record, to_map(footprint), wait_timeout_s, self._driver.now()
-        )
-        self._resizing = True
-        reply = await self._driver.reply(request)
-        assert isinstance(reply, AcquireReply)
-        if reply.state == "held":
-            self._resizing = False
-        while self._resizing and not self._departure.gone:
-            await self._departure.progress.wait()
-        self._raise_if_gone()
-        if self._resize_error is not None:
-            raise self._resize_error
-        self._spec = replace(self._spec, footprint=footprint)
-
     async def park(self) -> None:
         """Leave the GPU at the safe point and keep the weights in host RAM; `reacquire` returns.
 
@@ -196,15 +166,16 @@ class AsyncLease:
         """Come back from `standby` or `parked` as a waiter like any other. The `restore` handler
         has begun when this returns.
 
-        Raises: WaitTimeout, VramInsufficient: the lease is over then.
+        Raises: WaitTimeout, WouldDeadlock, VramInsufficient: the lease is over then.
         """
         self._raise_if_gone()
-        await self._driver.reply(
-            self._driver.protocol.holdings.reacquire(
-                self._record, wait_timeout_s, self._driver.now(), traces.present()
+        with use_context.bounded(self.spec.consumer, wait_timeout_s) as timeout_s:
+            await self._driver.reply(
+                self._driver.protocol.holdings.reacquire(
+                    self._record, timeout_s, self._driver.now(), traces.present()
+                )
             )
-        )
-        await self.wait_returned()
+            await self.wait_returned()
 
     async def wait_returned(self) -> None:
         """Wait until an evicted lease is granted again (no wait for any other). Raises what ended
@@ -269,11 +240,6 @@ class AsyncLease:
             with traces.joined(self._record.wanted_by):  # by itself it begins a trace of its own
                 self._driver.spawn(self._restore, name=f"restore {self.lease_id}")
             self._record.wanted_by = None
-        self._departure.progress.changed()
-
-    def _resized(self, error: VramError | None) -> None:
-        """Note the end of a resize that had to wait."""
-        self._resizing, self._resize_error = False, error
         self._departure.progress.changed()
 
     def _lost(self, error: VramError, fenced: bool) -> None:
@@ -364,33 +330,14 @@ class AsyncUse:
         self._use_id = use_id
         self._lease = lease
         self._label = label
+        self.name = use_context.named(label, lease.lease_id)
 
     @property
     def use_id(self) -> str:
         return self._use_id
 
-    @asynccontextmanager
-    async def yielded(self) -> AsyncIterator[None]:
-        """Pause the use: inside the block the holder may be evicted.
-
-        For work that asks for something that may need this very room, such as an LLM.
-        Raises: LeaseRevoking or LeaseLost at the end of the block, if the lease has left meanwhile.
-        """
-        lease = self._lease
-        driver = lease._driver
-        await driver.reply(
-            driver.protocol.holdings.use_yield(lease._record, self.use_id, driver.now())
-        )
-        use_context.leave(self.use_id)
-        lease._departure.uses.discard(self.use_id)
-        lease._departure.progress.changed()
-        try:
-            yield
-        finally:
-            await self._begin()
-
     async def _begin(self) -> None:
-        """Begin the use, or resume it. Raises LeaseRevoking or LeaseLost if the lease leaves."""
+        """Begin the use. Raises LeaseRevoking or LeaseLost if the lease leaves."""
         lease = self._lease
         lease._raise_if_leaving()
         await lease._until_loaded()
@@ -407,14 +354,17 @@ class AsyncUse:
         except BaseException:
             lease._departure.uses.discard(self.use_id)
             raise
-        use_context.enter(self.use_id)
+        use_context.enter(self.use_id, self.name)
 
 
 class AsyncForeignUse:
     """A use on the lease of another process, begun with its token. It ends with the client at the
     latest."""
 
-    def __init__(self, driver: Driver, lease_id: str, token: TokenPair, use_id: str) -> None:
+    def __init__(
+        self, driver: Driver, lease_id: str, token: TokenPair, use_id: str, label: str
+    ) -> None:
+        self.name = use_context.named(label, lease_id)
         self._driver = driver
         self._lease_id = lease_id
         self._token = token

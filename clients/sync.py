@@ -39,7 +39,7 @@ from vram_arbiter.schemas.wire.replies import (
     PrepareReply,
     StatusReply,
 )
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
 class _Portal:
@@ -98,7 +98,7 @@ class Lease:
 
     @property
     def spec(self) -> LeaseSpec:
-        """What was asked for; `resize` changes its footprint."""
+        """What was asked for."""
         return self._lease.spec
 
     @property
@@ -147,7 +147,7 @@ class Lease:
         """Mark a busy interval: the holder is not evicted inside it; see `AsyncLease.use`."""
         interval = self._lease.use(label)
         use = self._portal.call(interval.__aenter__)
-        use_context.enter(use.use_id)  # the background task entered it for itself only
+        use_context.enter(use.use_id, use.name)  # the background task entered it for itself only
         try:
             yield Use(self._portal, use)
         finally:
@@ -156,10 +156,6 @@ class Lease:
     def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
         """Report an allocation that failed; see `AsyncLease.oom`."""
         self._portal.call(self._lease.oom, requested_bytes, allocated_bytes)
-
-    def resize(self, footprint: Footprint, wait_timeout_s: float | None = None) -> None:
-        """Hold more, or less; see `AsyncLease.resize`."""
-        self._portal.call(self._lease.resize, footprint, wait_timeout_s)
 
     def park(self) -> None:
         """Leave the GPU and keep the weights in host RAM; see `AsyncLease.park`."""
@@ -200,17 +196,6 @@ class Use:
     @property
     def use_id(self) -> str:
         return self._use.use_id
-
-    @contextmanager
-    def yielded(self) -> Iterator[None]:
-        """Pause the use: inside the block the holder may be evicted; see `AsyncUse.yielded`."""
-        pause = self._use.yielded()
-        self._portal.call(pause.__aenter__)
-        try:
-            yield
-        finally:
-            self._portal.call(pause.__aexit__, None, None, None)
-            use_context.enter(self.use_id)
 
 
 class ForeignUse:
@@ -363,13 +348,6 @@ class Client:
 
     lease = _block(acquire)
 
-    def gang(
-        self, specs: Sequence[LeaseSpec], wait_timeout_s: float | None = None
-    ) -> Iterator[tuple[int, Lease]]:
-        """Acquire all of these leases or none of them; see `AsyncClient.gang`."""
-        for index, lease in self._iterate(self._client.gang(specs, wait_timeout_s)):
-            yield index, Lease(self._portal, lease)
-
     def begin_use(
         self,
         lease_id: str,
@@ -380,7 +358,7 @@ class Client:
     ) -> ForeignUse:
         """Begin a use on the lease of another process, by its token; `end` it."""
         use = self._portal.call(self._client.begin_use, lease_id, token, label, timeout_s=timeout_s)
-        use_context.enter(use.use_id)
+        use_context.enter(use.use_id, use.name)
         return ForeignUse(self._portal, use)
 
     @contextmanager

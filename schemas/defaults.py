@@ -4,13 +4,14 @@ KIB = 1024
 MIB = 1024 * KIB
 GIB = 1024 * MIB
 
-WIRE_VERSION = 2  # 2: no sub-leases; `parent` and `children` are gone
+WIRE_VERSION = 3  # 3: no gangs, no resizing, no `yield`; a person's `kill`
 
 # Leases
 LEASE_TTL_S = 10.0
 RENEW_FRACTION = 1 / 3  # clients renew every ttl/3
 FENCE_GRACE_S = 5.0  # after ttl + grace without the arbiter a client unloads by itself
 MIN_RESIDENCY_S = 2.0
+WAIT_IN_USE_S = 30.0  # an acquire inside a use, which may keep what it waits for
 PRIORITY = 50
 PRIORITY_MAX = 100
 THRASH_WINDOW_S = (
@@ -23,7 +24,6 @@ AGEING_S_PER_POINT = 5.0  # one priority point per 5 s waited
 REVOKE_RESEND_S = 0.25
 REVOKE_REMIND_S = 2.0
 REVOKE_DEADLINE_S = 30.0
-TERMINATE_GRACE_S = 5.0  # between SIGTERM and SIGKILL, for holders that agreed to be killed
 
 # Measurement
 VERIFY_TIMEOUT_S = 10.0

@@ -125,15 +125,9 @@ class LoadFailing(TransientError):
     code = "load_failing"
 
 
-class GangBroken(TransientError):
-    """Another member was denied, lost or gave up before all were granted: `details.gang`,
-    `why`."""
-
-    code = "gang_broken"
-
-
 class WouldDeadlock(CallerError):
-    """It waits for what a use of this process keeps; `details.cycle` has the uses and waits."""
+    """An acquire inside a use of this process waited 30 s: it may wait for what that use keeps.
+    `details.uses` names the uses."""
 
     code = "would_deadlock"
 
@@ -184,12 +178,6 @@ class WaitTimeout(TransientError):
     """The wait's own time limit ended; `details.why` explains what blocked."""
 
     code = "wait_timeout"
-
-
-class HolderBusy(TransientError):
-    """A holder outstayed the deadline of its revocation, and the lease asked for `deny`."""
-
-    code = "holder_busy"
 
 
 class Cancelled(CallerError):

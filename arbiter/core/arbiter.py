@@ -2,16 +2,9 @@
 same effects.
 
 `handle` is one decision tree:
-  1. what happened
-     1.1 connections: hello, bye, death of a process
-     1.2 requests: acquire, reacquire and cancel · ready, uses, renew, oom · revoke_ack, unloading,
-     release · reattach · operators
-     1.3 the machine: a reading, a failed reading, a failed journal write, a journal from before the
-     restart, a resume from suspend, changed constants
-     1.4 time: every timer that is due
+  1. what happened, by `_STEPS`
   2. recovery ends when every lease is accounted for
-  3. waits that could never end are denied; broken gangs end; GPUs are granted (its own numbered
-     tree: `grants`); an acquire that has to wait is answered
+  3. GPUs are granted (its own numbered tree: `grants`); an acquire that has to wait is answered
   4. the next reading of each GPU is planned
   5. invariants
 It must not know how effects are performed, nor that a wire exists.
@@ -22,11 +15,8 @@ from dataclasses import replace
 from typing import Any
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import eviction, invariants
+from vram_arbiter.arbiter.core import eviction, invariants, standby
 from vram_arbiter.arbiter.core.effects import Effect
-from vram_arbiter.arbiter.core.features.gangs import Gangs
-from vram_arbiter.arbiter.core.features.resizing import Resizing
-from vram_arbiter.arbiter.core.features.standby import Standby
 from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.refusals import NoSession, Refused
@@ -34,8 +24,15 @@ from vram_arbiter.arbiter.core.model.state import Core, Turn
 from vram_arbiter.arbiter.core.report import status, usage, why
 from vram_arbiter.arbiter.core.report.status import Figures, PageKey
 from vram_arbiter.arbiter.core.report.usage import GpuUsage
-from vram_arbiter.arbiter.core.requests import operators, recovery, requests, sessions, uses
-from vram_arbiter.arbiter.core.scheduling import deadlock, grants
+from vram_arbiter.arbiter.core.requests import (
+    limits,
+    operators,
+    recovery,
+    requests,
+    sessions,
+    uses,
+)
+from vram_arbiter.arbiter.core.scheduling import grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
@@ -48,26 +45,35 @@ thousands of waits that end together do not hold the loop."""
 IDLE_PROBE_S = 10.0
 """How long after the last client a GPU is still read in the background."""
 
-type _Step = Callable[[Core, Any], None]
 
-_FACTS: Mapping[type, _Step] = {
-    # 1.1 connections
+def _on_reading(core: Core, reading: ev.MemorySampled) -> None:
+    schedule.on_reading(core, reading)
+    gpu = core.gpus.get(reading.gpu)
+    if not core.serving and gpu is not None and gpu.sample is reading:  # it counts
+        recovery.account_for_the_empty(core, gpu, reading)
+
+
+def _on_tick(core: Core, tick: ev.Tick) -> None:
+    for _ in range(DUE_MAX):
+        due = core.timers.pop_due(core.now)
+        if due is None:
+            return
+        kind, subject = due
+        _DUE[kind](core, subject)
+
+
+_STEPS: Mapping[type, Callable[[Core, Any], None]] = {
+    # connections
     ev.ClientConnected: sessions.on_connected,
     ev.ClientLeft: sessions.on_left,
     ev.ProcessDied: sessions.on_died,
-    # 1.3 the machine
-    ev.ProbeFailed: schedule.on_probe_failed,
-    ev.JournalFailed: sessions.on_journal_failed,
-    ev.Recovered: recovery.on_recovered,
-    ev.Resumed: recovery.on_resumed,
-    ev.SettingsChanged: operators.on_settings,
-}
-_REQUESTS: Mapping[type, _Step] = {
+    # requests: each raises Refused before it has changed anything
+    ev.AcquireRequested: requests.acquire,
+    ev.Reacquired: requests.reacquire,
     ev.CancelRequested: requests.cancel,
     ev.ReadyReported: requests.ready,
     ev.UseBegan: uses.begin,
     ev.UseEnded: uses.end,
-    ev.UseYielded: uses.yield_,
     ev.Renewed: requests.renew,
     ev.OomReported: requests.oom,
     ev.RevokeAcknowledged: requests.revoke_ack,
@@ -75,32 +81,36 @@ _REQUESTS: Mapping[type, _Step] = {
     ev.ReleaseReported: requests.release,
     ev.Reattached: recovery.on_reattached,
     ev.OperatorAsked: operators.on_operator,
+    # the machine
+    ev.MemorySampled: _on_reading,
+    ev.ProbeFailed: schedule.on_probe_failed,
+    ev.JournalFailed: sessions.on_journal_failed,
+    ev.Recovered: recovery.on_recovered,
+    ev.Resumed: recovery.on_resumed,
+    ev.SettingsChanged: operators.on_settings,
+    # time
+    ev.Tick: _on_tick,
 }
-"""1.2, beside those of features: each raises Refused before it has changed anything."""
 _DUE: Mapping[str, Callable[[Core, str], None]] = {
     "ttl": sessions.expire,
     "wait": requests.on_wait_timeout,
     "revoke": eviction.on_ladder_due,
-    "overstay": eviction.on_overstay_due,
     "verify": schedule.on_poll_due,
     "probe": schedule.on_probe_due,
     "users": uses.on_users_due,
+    "away": standby.on_away_due,
     "recover": recovery.account_for,
     "plan": grants.on_plan_due,
     "return": grants.on_plan_due,
 }
-"""1.4, beside those of features, by kind of timer."""
+"""By kind of timer."""
 
 
 class Arbiter:
     """The one owner of all leases. Not thread-safe: one task calls it. Its state is data only."""
 
     def __init__(self, settings: Settings, now: float) -> None:
-        self._resizing = Resizing()
-        self._gangs = Gangs()
-        self._standby = Standby(settings.host_ram_budget_bytes)
-        features = (self._resizing, self._gangs, self._standby)
-        self._core = Core(settings, now, features)
+        self._core = Core(settings, now)
         for gpu_id in self._core.gpus:
             self._core.timers.set(("probe", gpu_id), now)  # the first reading
 
@@ -111,22 +121,13 @@ class Arbiter:
         """
         core = self._core
         core.now = max(core.now, now)
-        match event:  # 1
-            case ev.ClientRequest():  # 1.2
-                self._requested(event)
-            case ev.MemorySampled():  # 1.3
-                self._on_reading(event)
-            case ev.Tick():  # 1.4
-                self._on_tick()
-            case _:  # 1.1, 1.3
-                _FACTS[type(event)](core, event)
+        if isinstance(event, ev.ClientRequest):  # 1
+            self._requested(event)
+        else:
+            _STEPS[type(event)](core, event)
         if not core.serving and not core.recovering:  # 2
             recovery.serve(core)
-        if core.turn.suspects:  # 3
-            deadlock.resolve(core)
-        if self._gangs.by_name:
-            self._gangs.settle(core)
-        if core.turn.dirty:
+        if core.turn.dirty:  # 3
             grants.schedule(core)
         if core.turn.unanswered:
             requests.answer_queued(core)
@@ -141,60 +142,11 @@ class Arbiter:
             core.refuse(event.client, event.request, NoSession())
             return
         try:
-            match event:
-                case ev.AcquireRequested():
-                    self._acquire(event)
-                case ev.Reacquired():
-                    self._standby.reacquire(core, event)
-                case ev.ResizeAsked():
-                    self._resizing.resize(core, event)
-                case _:
-                    _REQUESTS[type(event)](core, event)
+            _STEPS[type(event)](core, event)
         except Refused as refused:
             core.refuse(event.client, event.request, refused.refusal)
-            if isinstance(event, ev.AcquireRequested | ev.Reacquired | ev.ResizeAsked):
-                requests.note_refused(core, event, refused.refusal)
-
-    def _acquire(self, event: ev.AcquireRequested) -> None:
-        """Queue a lease. A lease that is away comes back for it; a gang waits until it is whole."""
-        core = self._core
-        spec = event.spec
-        if self._standby.away and self._standby.acquire(core, event):
-            return
-        if spec.gang is None:
-            lease = requests.acquire(core, event)
-        else:
-            lease = self._gangs.acquire(core, event, spec.gang.id, spec.gang.size)
-        if lease is not None and (spec.standby or spec.park_bytes):
-            self._standby.watch(lease)
-
-    def _on_reading(self, reading: ev.MemorySampled) -> None:
-        core = self._core
-        schedule.on_reading(core, reading)
-        gpu = core.gpus.get(reading.gpu)
-        if gpu is None or gpu.sample is not reading:
-            return  # it does not count
-        if self._resizing.resizes:
-            self._resizing.on_reading(core, gpu, reading)
-        if not core.serving:
-            recovery.account_for_the_empty(core, gpu, reading)
-
-    def _on_tick(self) -> None:
-        core = self._core
-        for _ in range(DUE_MAX):
-            due = core.timers.pop_due(core.now)
-            if due is None:
-                return
-            kind, subject = due
-            match kind:
-                case "shrink":
-                    self._resizing.on_shrink_due(core, subject)
-                case "gang":
-                    self._gangs.on_gang_due(core, subject)
-                case "away":
-                    self._standby.on_away_due(core, subject)
-                case _:
-                    _DUE[kind](core, subject)
+            if isinstance(event, ev.AcquireRequested | ev.Reacquired):
+                limits.note_refused(core, event, refused.refusal)
 
     def _keep_reading(self) -> None:
         """Plan the next reading of each GPU that the event touched, while a load or a client, a
@@ -235,7 +187,7 @@ class Arbiter:
         """Return a page of the status. `reader`: the process that asks; None: an operator, for all
         tokens. `details`: with those of each lease."""
         self._core.now = max(self._core.now, now)
-        page = status.status(self._core, self._standby.host_ram(), reader, after, limit)
+        page = status.status(self._core, reader, after, limit)
         if details:
             shown = why.details(self._core, [lease.lease_id for lease in page.leases])
             page = replace(page, details=shown)
@@ -244,8 +196,7 @@ class Arbiter:
     def leases(self, ids: Iterable[LeaseId], now: float) -> StatusReply:
         """Return the status with these leases alone, without tokens."""
         self._core.now = max(self._core.now, now)
-        host_ram = self._standby.host_ram()
-        return status.status(self._core, host_ram, ProcessKey(0, 0), only=ids)
+        return status.status(self._core, ProcessKey(0, 0), only=ids)
 
     def why(self, consumer: str, now: float) -> WhyReply:
         """Explain why a consumer is not running."""

@@ -80,8 +80,8 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """Send a signal to a process that agreed to it (`on_overstay`), by the descriptor that its
-    start was checked with. One that is gone already is fine: its death is told as an event."""
+    """Send a signal to a process, by an operator's order, by the descriptor that its start was
+    checked with. One that is gone already is fine: its death is told as an event."""
 
     process: ProcessKey
     kind: Literal["term", "kill"]

@@ -15,7 +15,7 @@ from vram_arbiter.schemas.ids import (
     Token,
     UseId,
 )
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 DOUBT_KEY: Final = "doubt"
 """Key of a journal record that says why leases may be missing among the others. It outlives
@@ -104,13 +104,6 @@ class UseEnded(LeaseRequest):
 
 
 @dataclass(frozen=True, slots=True)
-class UseYielded(LeaseRequest):
-    """A use pauses: until it is begun again it prevents no eviction."""
-
-    use: UseId
-
-
-@dataclass(frozen=True, slots=True)
 class Renewed(ClientRequest):
     """The holder lives."""
 
@@ -153,14 +146,6 @@ class Reacquired(LeaseRequest):
 
 
 @dataclass(frozen=True, slots=True)
-class ResizeAsked(LeaseRequest):
-    """The holder gave bytes back, or needs more. `wait_timeout_s` bounds a growth's wait."""
-
-    footprint: Footprint
-    wait_timeout_s: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class ReattachedLease:
     lease: LeaseId
     token: Token
@@ -192,7 +177,7 @@ class OperatorAsked(ClientRequest):
     `target` is a lease or a consumer ("" for drain and resume).
     """
 
-    action: Literal["evict", "pin", "unpin", "drain", "resume", "release_dead"]
+    action: Literal["evict", "kill", "pin", "unpin", "drain", "resume", "release_dead"]
     target: str
     by: str
     reason: str
@@ -284,14 +269,12 @@ Event = (
     | ReadyReported
     | UseBegan
     | UseEnded
-    | UseYielded
     | Renewed
     | RevokeAcknowledged
     | UnloadStarted
     | ReleaseReported
     | CancelRequested
     | Reacquired
-    | ResizeAsked
     | Reattached
     | OomReported
     | OperatorAsked

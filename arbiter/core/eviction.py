@@ -5,24 +5,19 @@
 | push      | at once, then every `revoke_resend_s` while the holder | `revoke`                        |
 |           | has not acknowledged, or is at its safe point          |                                 |
 | remind    | `revoke_remind_s` after the first push                 | a note                          |
-| deadline  | `revoke_deadline_s` after it, and again so long after  | the bytes are not counted on;   |
-|           | the unloading began                                    | the waiter may be denied        |
-| signal    | `revoke_deadline_s` after it, after the last use and   | SIGTERM, then SIGKILL, if the   |
-|           | after the last step towards the exit                   | lease agreed to (`on_overstay`) |
+| deadline  | `revoke_deadline_s` after it, and again so long after  | a note; the bytes are not       |
+|           | the unloading began                                    | counted on                      |
 
-A holder unloads by itself, at its safe point: `unloading` is refused before that. A process that
-uses any lease is never signalled. A revoke is for someone: when nothing wants the bytes any more
-and the holder has not begun to unload, it is withdrawn.
+A holder unloads by itself, at its safe point: `unloading` is refused before that. The engine waits;
+ending a stuck holder is a person's order (`operators.kill`). A revoke is for someone: when nothing
+wants the bytes any more and the holder has not begun to unload, it is withdrawn.
 
 Public: `ask` revokes a holder; `push_revoke` repeats that at once; `take_back` and `settle`
 withdraw revokes that nothing wants (`is_wanted`); `deny` ends a wait with an error; `on_ladder_due`
-and `on_overstay_due` serve the timers.
+serves the timer.
 """
 
-from typing import Literal
-
-from vram_arbiter.arbiter.core.effects import Signal
-from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core import standby
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -35,7 +30,6 @@ from vram_arbiter.schemas.wire.notes import (
     RemindedNote,
     RevokeAskedNote,
     RevokeWithdrawnNote,
-    SignalledNote,
 )
 from vram_arbiter.schemas.wire.pushes import DeniedPush, RevokePush, RevokeWithdrawnPush
 
@@ -55,8 +49,7 @@ def ask(
     if waiter is None:
         why = RevokeCause("operator" if order else "pressure", order=order)
     else:
-        gang = "" if waiter.spec.gang is None else waiter.spec.gang.id
-        why = RevokeCause("waiter", waiter.spec.consumer, gang)
+        why = RevokeCause("waiter", waiter.spec.consumer)
     eviction = holder.departure.eviction = Eviction(
         lease=holder.id,
         consumer=holder.spec.consumer,
@@ -70,16 +63,14 @@ def ask(
     if waiter is not None:
         gpu.evictions.append(eviction)
     core.move(holder, LeaseState.REVOKING, Why.REVOKED)
+    standby.on_revoked(core, holder, why.wanted_by)
     core.want_sample(gpu, core.now)
     push_revoke(core, holder)
-    if holder.spec.on_overstay != "wait":
-        core.timers.set(("overstay", holder.id), core.now + core.settings.revoke_deadline_s)
     asked = RevokeAskedNote(
         wanted_by=why.wanted_by,
         wanted_by_lease=eviction.wanted_by,
         uses=len(holder.uses),
         cause=why.cause,
-        gang=why.gang,
         order=why.order,
     )
     core.note(asked, holder)
@@ -107,8 +98,7 @@ def take_back(core: Core, gpu: Gpu) -> None:
             continue
         core.turn.taken_back.setdefault(holder.id, asked)
         holder.departure.eviction = None
-        for timer in ("revoke", "overstay"):
-            core.timers.cancel((timer, holder.id))
+        core.timers.cancel(("revoke", holder.id))
         core.move(holder, LeaseState.HELD, Why.WITHDRAWN)
 
 
@@ -152,11 +142,10 @@ def push_revoke(core: Core, holder: Lease, *, extra: bool = False) -> None:
             wanted_by=why.wanted_by,
             deadline_in_s=max(0.0, eviction.asked_at + core.settings.revoke_deadline_s - core.now),
             cause=why.cause,
-            gang=why.gang,
             order=why.order,
             priority=None if waiter is None else waiter.spec.priority,
             uses=len(holder.uses),
-            park=bool(holder.features) and any(one.can_park(holder) for one in holder.features),
+            park=standby.can_park(core, holder),
             traceparent=eviction.traceparent or "",
         ),
     )
@@ -203,53 +192,13 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
 
 
 def _pass_deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
-    """Look for other victims and other GPUs, and deny the waiter if that is its wish.
-
-    The `revoke` stands in any case.
-    """
+    """Note a late holder, and look for other victims and other GPUs. The `revoke` stands."""
     wanted_by, consumer = (eviction.wanted_by, eviction.why.wanted_by) if eviction else (None, "")
     core.note(DeadlinePassedNote(len(holder.uses), consumer), holder)
     core.wake(core.gpu_of(holder))
     waiter = None if wanted_by is None else core.waiting.get(wanted_by)
-    if waiter is None:
-        return
-    for gpu_id in waiter.request.gpus:
+    for gpu_id in () if waiter is None else waiter.request.gpus:
         core.wake(core.gpus[gpu_id])  # it may be served on another GPU now
-    if waiter.spec.on_deadline == "deny":
-        deadline_s, uses = core.settings.revoke_deadline_s, len(holder.uses)
-        deny(core, waiter, no.HolderOutstays(holder.id, holder.spec.consumer, uses, deadline_s))
-
-
-def on_overstay_due(core: Core, lease_id: str) -> None:
-    """Signal the process of a holder that outstayed, as its lease agreed to.
-
-    A process that uses any lease, or whose leases are used, is left alone and looked at again.
-    """
-    holder, deadline_s = core.leases[LeaseId(lease_id)], core.settings.revoke_deadline_s
-    eviction = holder.departure.eviction
-    if eviction is None or holder.state not in (LeaseState.REVOKING, LeaseState.UNLOADING):
-        return
-    due_at = max(eviction.asked_at, holder.uses.last_at, holder.since) + deadline_s
-    if eviction.signalled:
-        due_at = core.now
-    if holder.process in core.users or any(one.uses for one in core.leases_of(holder.process)):
-        due_at = core.now + deadline_s
-    if due_at > core.now:
-        core.timers.set(("overstay", holder.id), due_at)
-        return
-    kind: Literal["term", "kill"] = "kill" if eviction.signalled else "term"
-    eviction.signalled = kind
-    core.turn.effects.append(Signal(holder.process, kind))
-    signalled = SignalledNote(
-        signal=kind,
-        pid=holder.process.pid,
-        wanted_by=eviction.why.wanted_by,
-        asked_s=core.now - eviction.asked_at,
-        on_overstay=holder.spec.on_overstay,
-    )
-    core.note(signalled, holder)
-    if kind == "term" and holder.spec.on_overstay == "kill":
-        core.timers.set(("overstay", holder.id), core.now + core.settings.terminate_grace_s)
 
 
 def deny(core: Core, waiter: Lease, refusal: Refusal) -> None:
@@ -257,7 +206,7 @@ def deny(core: Core, waiter: Lease, refusal: Refusal) -> None:
     core.move(waiter, LeaseState.DENIED, refusal.code)
     core.dequeue(waiter)
     if waiter.request.answered or waiter.request.id is None:
-        core.push(waiter, DeniedPush(waiter.request.extends or waiter.id, refusal.view()))
+        core.push(waiter, DeniedPush(waiter.id, refusal.view()))
     else:  # it has only just asked
         core.refuse(waiter.client, waiter.request.id, refusal)
     core.note(DeniedNote(refusal), waiter)

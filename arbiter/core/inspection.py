@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, Self
 
-from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning import Costs, Footprints
+from vram_arbiter.arbiter.core.ledger import HostRam
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refusals, Timers
@@ -21,12 +21,12 @@ class Inspection:
     gpus: Mapping[GpuId, Gpu]
     leases: Mapping[LeaseId, Lease]
     waiting: Mapping[LeaseId, Lease]
-    unqueued: Mapping[LeaseId, Lease]
+    away: Mapping[LeaseId, Lease]
     ended: Mapping[LeaseId, Ended]
     nonces: Mapping[tuple[ProcessKey, str], LeaseId]
     clients: Mapping[ClientId, Client]
     users: Mapping[ProcessKey, Mapping[tuple[LeaseId, UseId], Lease]]
-    features: tuple[Feature, ...]
+    host_ram: HostRam
     costs: Costs
     refusals: Mapping[ProcessKey, Refusals]
     footprints: Footprints
@@ -40,7 +40,3 @@ class Inspection:
             for name, table in tables.items()
         }
         return cls(**shown)
-
-    def feature[F: Feature](self, kind: type[F]) -> F:
-        """Return the feature of a class, with its records."""
-        return next(feature for feature in self.features if isinstance(feature, kind))

@@ -9,16 +9,15 @@ grow with the number of leases. The tests' drivers also check everything
      measured gone; one lease at a time loads on a GPU
   3. a lease in use is not unloaded
   4. bytes stay charged until a verdict: a resident is charged, a charged lease is resident, under
-     measurement or reserved; a lease on standby is neither; parked weights fit the host RAM budget
+     measurement; a lease that is away is neither; parked weights fit the host RAM budget
   5. tokens only grow
   6. every waiter is in a queue, a bounded one has a timer, and its GPU has a next reading planned
   7. a holder is revoked for someone: a waiter, pressure or an operator
-  8. of a gang that is not complete, all waiting members are charged, or none
 """
 
 from vram_arbiter.arbiter.core.eviction import is_wanted
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 
 _UNUSED = (LeaseState.LOADING, LeaseState.UNLOADING, LeaseState.VERIFYING)
@@ -51,12 +50,24 @@ def check(core: Core) -> None:
             raise InvariantViolation(5, f"token {token} after {core.last_token}")
         core.last_token = token
     queued = sum([len(gpu.queue.by_arrival) for gpu in core.gpus.values()])
-    waiting = len(core.waiting) - len(core.unqueued)
+    waiting = len(core.waiting)
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
-    for feature in core.features:  # 4, 8
-        if feature.live:
-            feature.check(core)
+    _check_away(core)
+
+
+def _check_away(core: Core) -> None:
+    """Leases that are away have no GPU and do not wait; what is parked fits."""
+    ram = core.host_ram
+    fitted = sum(count for lease, count in ram.booked.items() if lease not in ram.found)
+    if fitted > ram.budget_bytes:
+        raise InvariantViolation(4, f"{fitted} bytes are parked, budget {ram.budget_bytes}")
+    for lease in core.away.values():
+        if lease.state not in AWAY or lease.id not in core.leases:
+            raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
+        if lease.gpu is not None or lease.id in core.waiting:
+            told = f"{lease.id} is {lease.state}, yet it has a GPU or waits for one"
+            raise InvariantViolation(4, told)
 
 
 def _check_grant(gpu: Gpu) -> None:
@@ -93,7 +104,7 @@ def _check_gpu(gpu: Gpu) -> None:
             1, f"{approved} bytes approved on {gpu.info.id}, budget {ledger.budget_bytes}"
         )
     for lease in [lease for state in _UNUSED for lease in residents.by_state[state].values()]:
-        if uses := len(lease.uses) + len(lease.uses.paused):
+        if uses := len(lease.uses):
             raise InvariantViolation(3, f"{lease.id} is {lease.state} with {uses} uses")
         if lease.state is LeaseState.VERIFYING and lease.id not in gpu.verifications:
             raise InvariantViolation(
@@ -109,18 +120,15 @@ def _check_gpu(gpu: Gpu) -> None:
             raise InvariantViolation(4, f"{lease_id} is {state} and not charged")
         if lease_id in residents or not charged:
             gpu.debts.discard(lease_id)
-        elif lease_id not in gpu.verifications and lease_id not in ledger.reserved:
+        elif lease_id not in gpu.verifications:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
 
 
 def _check_head(core: Core, gpu: Gpu, head: Lease) -> None:
-    extends = head.request.extends
     if head.id not in core.waiting:
         raise InvariantViolation(
             6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
         )
-    if extends is not None and extends not in gpu.residents:
-        raise InvariantViolation(6, f"{head.id} waits to extend {extends}, which is not there")
     if head.request.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
         raise InvariantViolation(6, f"{head.id} has a bound and no timer")
     if ("probe", gpu.info.id) not in core.timers:

@@ -190,7 +190,7 @@ def on_evidence(core: "Core", gpu: "Gpu") -> None:
         if lease.state is LeaseState.LOADING:
             if held > observed.peak_bytes:
                 observed.peak_bytes, observed.grew_at = held, core.now
-        elif lease.state in _RESIDENT and not observed.shrinks:
+        elif lease.state in _RESIDENT:
             observed.steady_bytes = max(observed.steady_bytes, held)
             if held > lease.spec.footprint.steady_bytes:
                 _note_drift(core, lease, "steady", held)
@@ -255,7 +255,7 @@ def held_bytes(gpu: "Gpu", lease: Lease) -> int:
 def drift_bytes(core: "Core", gpu: "Gpu", lease: Lease) -> int:
     """Return how far a resident lease is above (below: negative) what it declared; 0 within the
     tolerance and where it is unknown."""
-    if lease.state not in _RESIDENT or lease.observed.shrinks:
+    if lease.state not in _RESIDENT:
         return 0
     declared = lease.spec.footprint.steady_bytes
     drift = (held_bytes(gpu, lease) or declared) - declared

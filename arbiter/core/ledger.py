@@ -1,5 +1,5 @@
-"""The bytes of one GPU: charges, bytes that live processes retain, stowaways; and what a reading
-tells beside its total (`bytes_of`, `bytes_by_process`).
+"""The bytes of one GPU: charges, bytes that live processes retain, stowaways; what a reading tells
+beside its total (`bytes_of`, `bytes_by_process`); and host RAM for parked weights (`HostRam`).
 
 Ledger and measurement are two gates. A charge is what was granted; evidence (readings per process)
 is only added on top where a process holds more than it is charged. Knows nothing of states, order
@@ -34,16 +34,13 @@ class Account:
     retained_floor_bytes: int = 0  # declared; more was measured and may shrink down to this
     measured_bytes: int = 0  # evidence newer than the last change; 0: none
     shown_in: MemorySampled | None = None  # newest reading that listed bytes of the process
-    # sums over the charges: all, what fitted when it was granted, what is reserved
+    # sums over the charges: all, what fitted when it was granted
     leased_bytes: int = 0
     leased_approved_bytes: int = 0
-    reserved_bytes: int = 0
-    # the larger of charged and retained bytes: all, without what is reserved, what fitted
+    # the larger of charged and retained bytes: all, what fitted
     charged_bytes: int = 0
-    granted_bytes: int = 0
     approved_bytes: int = 0
     held_bytes: int = 0  # charged, or more where more was measured
-    present_bytes: int = 0  # granted, or more where more was measured
 
 
 @dataclass(slots=True)
@@ -54,7 +51,6 @@ class Charge:
     account: Account = field(repr=False)
     charged_bytes: int
     approved_bytes: int
-    reserved: bool = False  # for a request that is not granted yet
 
 
 class GpuLedger:
@@ -66,7 +62,6 @@ class GpuLedger:
         self.budget_bytes = info.capacity_bytes - info.reserve_bytes
         self.accounts: dict[ProcessKey, Account] = {}
         self.charges: dict[LeaseId, Charge] = {}
-        self.reserved: set[LeaseId] = set()  # charged for requests that are not granted yet
         self.touched: set[LeaseId] = set()  # charged or dropped since the last check of invariants
         self.stowaways: dict[ProcessKey, ProcessUse] = {}  # listed processes without an account
         self.unattributed_bytes = 0  # used, but in no process's list, beyond the fixed reserve
@@ -79,7 +74,6 @@ class GpuLedger:
         self.charged_bytes = 0
         self.approved_bytes = 0
         self._held_bytes = 0
-        self._present_bytes = 0
 
     # -- reading
     def total_bytes(self) -> int:
@@ -148,32 +142,22 @@ class GpuLedger:
             total += max(account.leased_bytes + more_bytes, least_bytes) - account.held_bytes
         return total
 
-    def total_if_moved(self, lease: LeaseId, count: int, to: ProcessKey) -> int:
-        """Return the total if so much of a charge were another process's: evidence that it covered
-        counts from then on."""
-        account = self.charges[lease].account
-        if account.process == to:
-            return self.total_bytes()
-        left = max(account.leased_bytes - count, account.retained_bytes, account.measured_bytes)
-        return self.total_bytes() + left - account.held_bytes + count
-
     def after_bytes(
         self, process: ProcessKey, going: Mapping[LeaseId, int], *, dead: bool
     ) -> tuple[int, int]:
         """Return what a process, and what all together, may still hold once these leases of it are
-        gone: the most that a verification expects. Reserved bytes are not there yet.
+        gone: the most that a verification expects.
 
         A dead process without other debts retains nothing.
         """
-        total = self._present_bytes + self.stowaway_bytes
+        total = self.total_bytes()
         account = self.accounts.get(process)
         if account is None:
             return 0, total
-        held = account.leased_bytes - account.reserved_bytes
-        held -= sum(self.charge_bytes(lease) for lease in going)
+        held = account.leased_bytes - sum(self.charge_bytes(lease) for lease in going)
         if not dead:
             held = max(held, account.retained_floor_bytes, *going.values())
-        return held, total - account.present_bytes + held
+        return held, total - account.held_bytes + held
 
     # -- changing
     def charge(
@@ -188,26 +172,14 @@ class GpuLedger:
         account = self.accounts.get(process) or self._open(process, now)
         self._change(lease, Charge(account, charged_bytes, approved_bytes), now)
 
-    def reserve(self, lease: LeaseId, process: ProcessKey, count: int, now: float) -> None:
-        """Charge bytes for a request that is granted later; `charge` makes it a grant, `withdraw`
-        ends it.
-        """
-        account = self.accounts.get(process) or self._open(process, now)
-        self._change(lease, Charge(account, count, count, reserved=True), now)
-
-    def recharge(
-        self, lease: LeaseId, charged_bytes: int, now: float, approved_bytes: int | None = None
-    ) -> None:
-        """Charge what a holder says it holds: what exceeds the grant was never approved. With
-        `approved_bytes`: what a larger grant gives it."""
+    def recharge(self, lease: LeaseId, charged_bytes: int, now: float) -> None:
+        """Charge what a holder says it holds: what exceeds the grant was never approved."""
         before = self.charges[lease]
-        if approved_bytes is None:
-            approved_bytes = min(before.approved_bytes, charged_bytes)
+        approved_bytes = min(before.approved_bytes, charged_bytes)
         self._change(lease, Charge(before.account, charged_bytes, approved_bytes), now)
 
     def withdraw(self, lease: LeaseId, now: float) -> None:
-        """Take a charge back that no load has used, or a grant that was never sent: the
-        account is as it was before."""
+        """Take a grant back that was never sent: the account is as it was before."""
         self._change(lease, None, now)
 
     def drop(self, lease: LeaseId, retained_bytes: int, floor_bytes: int, now: float) -> int:
@@ -321,15 +293,11 @@ class GpuLedger:
             if one is not None:
                 account.leased_bytes += sign * one.charged_bytes
                 account.leased_approved_bytes += sign * one.approved_bytes
-                account.reserved_bytes += sign * one.charged_bytes if one.reserved else 0
-        self.reserved.discard(lease)
         self.touched.add(lease)
         if charge is None:
             del self.charges[lease], account.charges[lease]
         else:
             self.charges[lease] = account.charges[lease] = charge
-            if charge.reserved:
-                self.reserved.add(lease)
         account.changed_at, account.measured_bytes = now, 0  # older evidence says nothing of it
         self._count(account)
 
@@ -339,17 +307,52 @@ class GpuLedger:
         retained, measured = account.retained_bytes, account.measured_bytes
         charged = max(account.leased_bytes, retained)
         approved = max(account.leased_approved_bytes, retained)
-        granted = max(account.leased_bytes - account.reserved_bytes, retained)
-        held, present = max(charged, measured), max(granted, measured)
+        held = max(charged, measured)
         self.charged_bytes += charged - account.charged_bytes
         self.approved_bytes += approved - account.approved_bytes
         self._held_bytes += held - account.held_bytes
-        self._present_bytes += present - account.present_bytes
         account.charged_bytes, account.approved_bytes = charged, approved
-        account.granted_bytes = granted
-        account.held_bytes, account.present_bytes = held, present
+        account.held_bytes = held
         if not account.charges and not retained:
             del self.accounts[account.process]
+
+
+@dataclass(slots=True)
+class HostRam:
+    """Host RAM for parked weights, by lease. A budget of 0: nothing is parked."""
+
+    budget_bytes: int
+    booked: dict[LeaseId, int] = field(default_factory=dict)
+    found: set[LeaseId] = field(default_factory=set)
+    """Booked as found after a restart, whatever the budget is now."""
+
+    def taken_bytes(self) -> int:
+        """Return what is booked for all leases together."""
+        return sum(self.booked.values())
+
+    def fits(self, lease: LeaseId, count: int) -> bool:
+        """Return whether bytes fit in place of what is booked for the lease already."""
+        others = self.taken_bytes() - self.booked.get(lease, 0)
+        return others + count <= self.budget_bytes
+
+    def book(self, lease: LeaseId, count: int) -> bool:
+        """Book bytes in place of what is booked already. Return whether there are bytes to book
+        and they fit."""
+        if not count or not self.fits(lease, count):
+            return False
+        self.booked[lease] = count
+        self.found.discard(lease)
+        return True
+
+    def find(self, lease: LeaseId, count: int) -> None:
+        """Book bytes that are there already, fitting or not: the budget may have changed."""
+        self.booked[lease] = count
+        self.found.add(lease)
+
+    def free(self, lease: LeaseId) -> None:
+        """The weights of a lease are not in host RAM any more."""
+        self.booked.pop(lease, None)
+        self.found.discard(lease)
 
 
 # -- what a reading tells

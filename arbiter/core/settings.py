@@ -32,7 +32,6 @@ class Settings:
     revoke_deadline_s: float = d.REVOKE_DEADLINE_S
     thrash_window_s: float = d.THRASH_WINDOW_S
     thrash_hold_max_s: float = d.THRASH_HOLD_MAX_S
-    terminate_grace_s: float = d.TERMINATE_GRACE_S
     verify_timeout_s: float = d.VERIFY_TIMEOUT_S
     verify_poll_s: tuple[float, ...] = d.VERIFY_POLL_S
     verify_poll_until_s: tuple[float, ...] = d.VERIFY_POLL_UNTIL_S

@@ -41,7 +41,7 @@ EVENTS_MAX = 200
 """Events of the history in one message."""
 RECENT_EVENTS, USES_MAX = 2000, 50
 """A new page gets its events from these many, which memory holds; of uses fewer."""
-USE_KINDS = ("use_began", "use_ended", "use_yielded")
+USE_KINDS = ("use_began", "use_ended")
 _TOLD_KINDS = tuple(kind for kind in (*NOTES, *DAEMON_KINDS) if kind not in USE_KINDS)
 
 type PageKey = tuple[int, float, int]

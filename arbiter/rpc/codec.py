@@ -135,8 +135,6 @@ def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event:
             return ev.UseBegan(*on, UseId(request.use_id), request.label)
         case w.UseEnd():
             return ev.UseEnded(*on, UseId(request.use_id))
-        case w.Yield():
-            return ev.UseYielded(*on, UseId(request.use_id))
         case w.Renew(leases=leases):
             held = tuple((LeaseId(lease.lease_id), Token(*lease.token)) for lease in leases)
             return ev.Renewed(client, re, held)
@@ -150,11 +148,9 @@ def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event:
             return ev.CancelRequested(client, re, LeaseId(request.lease_id))
         case w.Reacquire():
             return ev.Reacquired(*on, request.wait_timeout_s, request.traceparent)
-        case w.Resize(footprint=size):
-            return ev.ResizeAsked(*on, size, request.wait_timeout_s)
         case w.Reattach():
             return ev.Reattached(client, re, tuple(map(_reattached, request.leases)))
-        case w.Evict() | w.Pin() | w.Unpin() | w.ReleaseDead() | w.Drain() | w.Resume():
+        case w.ByHand():
             target = request.target if isinstance(request, w.ByHandOn) else ""
             return ev.OperatorAsked(client, re, request.op, target, operator, request.reason)
         case w.Oom():

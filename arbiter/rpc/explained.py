@@ -16,7 +16,7 @@ from vram_arbiter.schemas.wire.explained import (
     Situation,
     Step,
 )
-from vram_arbiter.schemas.wire.views import BlockView, GangView, GpuView
+from vram_arbiter.schemas.wire.views import BlockView, GpuView
 
 WAIT: Final[Mapping[Wait, str]] = {
     Wait.MAKING_ROOM: "room is being made",
@@ -58,7 +58,6 @@ _BLOCKS: Final[Mapping[Block, str]] = {
     Block.UNREADABLE: "the GPU cannot be read: {why.problem}",
     Block.UNREAD: "the GPU has not been read yet",
     Block.LOADING: "{names} is loading",
-    Block.GANG: "gang {names} is loading",
     Block.PRESSURE: "pressure: {why.bytes} bytes more than the budget are held",
     Block.NOT_FREE: WAIT[Wait.NOT_FREE],
 }
@@ -71,14 +70,7 @@ def wait_for(why: BlockView | None) -> str:
 
 # -- waiters
 def _needs(told: Explanation) -> str:
-    together = ""
-    if told.gang is not None and told.condition is Situation.GANG_WAITS:
-        together = f" with gang {told.gang.id}"
-    kept = " or kept for it" if told.kept else ""
-    head = (
-        f"{told.consumer}{together} needs {gib(told.needed_bytes)}, {gib(told.free_bytes)} are "
-        f"free{kept}"
-    )
+    head = f"{told.consumer} needs {gib(told.needed_bytes)}, {gib(told.free_bytes)} are free"
     head += f", {gib(told.deficit_bytes)} are missing" if told.deficit_bytes else ""
     if told.expected_bytes is not None:
         declared = told.footprint.declared_bytes["load_peak"]
@@ -87,13 +79,9 @@ def _needs(told: Explanation) -> str:
 
 
 def _waiter(told: Explanation) -> str:
-    gang = told.gang
     match told.condition:
-        case Situation.GATHERING | Situation.GANG_LOADS | Situation.GANG_WAITS if gang is not None:
-            return _in_gang(told, gang)
         case Situation.BEHIND:
-            member = "" if gang is None else f" as one of gang {gang.id}"
-            return f"waits{member} behind {told.ahead} as number {told.position}"
+            return f"waits behind {told.ahead} as number {told.position}"
         case Situation.MAKING_ROOM:
             return "; ".join(map(_leaving, told.leaving))
         case Situation.BLOCKED if told.block is not None:
@@ -107,27 +95,6 @@ def _waiter(told: Explanation) -> str:
     if told.measuring:
         return f"waits until the bytes of {', '.join(told.measuring)} are measured gone"
     return WAIT[told.wait or Wait.READING]
-
-
-def _in_gang(told: Explanation, gang: GangView) -> str:
-    if told.condition is Situation.GATHERING:
-        return f"waits for the rest of gang {gang.id}: {gang.members} of {gang.size} have come"
-    if told.condition is Situation.GANG_LOADS:
-        if told.wait is Wait.NOT_FREE:
-            return "its bytes are kept for it, but measured memory is not free yet"
-        if told.wait is not None:
-            return WAIT[told.wait]
-        return (
-            f"its bytes are kept for it; it loads when those of gang {gang.id} before it are ready"
-        )
-    why = {
-        Wait.MAKING_ROOM: "room is being made for the whole gang",
-        Wait.NO_VICTIM: "no holder that could make room for the whole gang may be revoked now",
-    }
-    return (
-        f"waits as one of gang {gang.id}: "
-        f"{'behind others' if told.wait is None else why.get(told.wait) or WAIT[told.wait]}"
-    )
 
 
 def _leaving(one: Blocker) -> str:
@@ -167,7 +134,6 @@ _CONDITIONS: Final[Mapping[Condition, str]] = {
     "{one.pid})",
     Condition.MEASURED: "released, its bytes are being measured",
     Condition.NOT_BACK: "has not reattached since the restart, is given up in {seconds:.1f} s",
-    Condition.GANG: "belongs to gang {one.by}, which is not complete",
     Condition.PINNED: "is pinned",
     Condition.RESIDENCY: "may stay {seconds:.1f} s more (minimum residency)",
     Condition.THRASHING: "may stay {seconds:.1f} s more (they keep evicting each other)",
@@ -182,7 +148,6 @@ _CONDITIONS: Final[Mapping[Condition, str]] = {
     Condition.DEBT_KEPT: "is over, and its process (pid {one.pid}) keeps its bytes until it frees "
     "them or ends",
     Condition.STOWAWAY: "holds bytes without a lease",
-    Condition.TURN: "has its bytes kept for its turn in gang {one.by}",
 }
 
 
@@ -199,20 +164,12 @@ def _in_flight(one: Blocker) -> str:
 
 
 def _uses(one: Blocker) -> str:
-    paused = f", {one.paused} paused" if one.paused else ""
-    running = f"{_in_flight(one)} running" if one.uses else "idle"
-    return running + paused
+    return f"{_in_flight(one)} running" if one.uses else "idle"
 
 
 # -- leases that are granted
 def _resident(told: Explanation) -> str:
     says = _away(told) if told.holder is None else _holder(told, told.holder)
-    if told.gang is not None:
-        lacks = [f"{one.consumer} ({one.lease_id}) is {one.state}" for one in told.lacks]
-        missing = told.gang.size - told.gang.members
-        lacks += [f"{missing} of {told.gang.size} have to come back"] if missing else []
-        until = f"gang {told.gang.id} is complete once {'all are' if lacks else 'it is'} held"
-        says += f"; {until}" + (f": {', '.join(lacks)}" if lacks else "")
     if told.drifted:
         held, declared = told.footprint.held_bytes or 0, told.footprint.declared_bytes["steady"]
         says += f"; it holds {gib(held)}, {gib(declared)} were declared"
@@ -282,7 +239,6 @@ _ACTIONS: Final[Mapping[NextAction, str]] = {
     NextAction.DEADLINE: "waits{when} for {step.consumer} to release",
     NextAction.WAIT: "waits for {step.consumer} to release{when}",
     NextAction.SERVE: "grants again{when}",
-    NextAction.BREAK: "gives up gang {step.gang}{when}",
     NextAction.GIVE_UP: "gives up{when}",
 }
 
@@ -297,20 +253,16 @@ _BECAUSE: Final[Mapping[Because, str]] = {
     Because.AGEING: "when the waiter's priority has aged to its own",
     Because.TOGETHER: "when enough may be revoked together",
     Because.ONE_LOAD: "only one model loads at a time",
-    Because.KEPT: "its bytes are kept for it, but the GPU has to show them",
     Because.UNREADABLE: "nothing is granted on a GPU that cannot be read",
     Because.MEASUREMENT: "the ledger has room, but the GPU has to show it",
     Because.ACCOUNTED: "when every holder has reattached or its time is over",
-    Because.INCOMPLETE: "if the rest has not come back",
-    Because.SHORT: "if its memory is not free then",
     Because.NOT_BACK: "unless it reattaches before that",
     Because.NO_VICTIM: "those that could make room are pinned or in use above its priority",
     Because.VERDICT: "a verdict comes in {latest_s:.1f} s at the latest",
     Because.MEASURED_GONE: "until its bytes are measured gone",
     Because.HANGING: "its unloading may hang",
     Because.LEAVING: "it is being evicted",
-    Because.DENIED: "after that {step.waiter} is denied",
-    Because.WAITS_ON: "after that {step.waiter} continues to wait, and the holder's own rule applies",
+    Because.WAITS_ON: "after that {step.waiter} continues to wait",
     Because.TIMEOUT: "when its wait timeout is over",
 }
 

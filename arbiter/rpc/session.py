@@ -65,7 +65,7 @@ _READS = frozenset(("status", "why", "history", "subscribe", "ping", "bye", "hel
 """Ops that no event of the engine answers; all that an observer may do."""
 _HOLDING = frozenset(("acquire", "reacquire", "reattach", "use_begin"))
 """Ops that can make the engine remember something of a client beyond its connection."""
-_BY_HAND = frozenset(("evict", "pin", "unpin", "release_dead", "drain", "resume"))
+_BY_HAND = frozenset(("evict", "kill", "pin", "unpin", "release_dead", "drain", "resume"))
 """Ops for operators only."""
 _KINDS = frozenset((*NOTES, *DAEMON_KINDS))
 

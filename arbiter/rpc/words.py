@@ -31,16 +31,12 @@ WHY: Final[Mapping[Why, str]] = {
     Why.NOT_BACK: "its holder did not reattach after the restart",
     Why.NOT_HELD: "it is no longer held",
     Why.UNKNOWN: "it is not known",
-    Why.OVER: "the lease is over",
     Why.ENDED: "ended",
-    Why.PAUSED: "unloaded while it paused",
     Why.USER_NOT_BACK: "its process did not come back to it after the restart",
     Why.LET_GO: "released by its holder",
     Why.LET_GO_BEFORE: "released before the restart, according to its holder",
     Why.EXITS: "its process exits",
     Why.BYE: "its client said bye",
-    Why.LEAVES: "the lease is unloaded",
-    Why.RESIZED: "another size was requested",
 }
 
 
@@ -61,7 +57,6 @@ type _Words = tuple[str, str]
 """What is wrong, and what to do."""
 
 _ACQUIRE = "unload, then acquire again"
-_AGAIN = "ask for all of it again"
 _LOOK = "see `vramctl status`"
 _END_PINNED = "end its program: a pinned holder is never evicted"
 
@@ -73,12 +68,10 @@ _MISFITS: Final[Mapping[r.Misfit, str]] = {
     r.Misfit.NOT_LOADING: "only a loading lease becomes ready",
     r.Misfit.NOT_HELD: "only a held lease can be used",
     r.Misfit.NOT_UNLOADABLE: "only a held lease is unloaded; a loading one is released",
-    r.Misfit.NOT_RESIZABLE: "only a held lease is resized",
     r.Misfit.IN_USE: "{no.uses} uses still run; wait for the `revoke` that says 0 uses",
     r.Misfit.EXITS: "it cannot be parked: a process that exits keeps nothing",
     r.Misfit.NO_PARK_BYTES: "it cannot be parked: its spec has no park_bytes",
     r.Misfit.HOLDS_NOTHING: "it holds nothing",
-    r.Misfit.NO_SUCH_USE: "it has no use {no.use_id} of yours to yield",
     r.Misfit.NOT_REATTACHED: "the arbiter was restarted: reattach it first",
 }
 
@@ -90,6 +83,10 @@ _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
     r.Impractical.NOT_HELD: ("{no.lease_id} is {no.state}: it has no holder", _LOOK),
     r.Impractical.IN_USE: (
         "{no.lease_id} is {no.state}: it is in use; a holder in use is never given up", _LOOK
+    ),
+    r.Impractical.OTHERS_USE: (
+        "{no.lease_id} is {no.state}: its process and another one are in the middle of a use",
+        "end the use first, such as the robot's goal",
     ),
     r.Impractical.PINNED_BY_OPERATOR: (
         "{no.lease_id} is pinned: an operator pinned it", "unpin it first"
@@ -118,7 +115,7 @@ _LIMITS: Final[Mapping[r.Limit, _Words]] = {
         "leases are held or asked for", "release some, or raise limits.leases_per_client_max"
     ),
     "uses_per_lease_max": (
-        "uses of {no.lease_id} run or pause", "end some, or raise limits.uses_per_lease_max"
+        "uses of {no.lease_id} run", "end some, or raise limits.uses_per_lease_max"
     ),
 }  # fmt: skip
 
@@ -129,15 +126,6 @@ _SHARES: Final[Mapping[r.Share, str]] = {
     r.Share.ALL: "of all users",
     r.Share.HOLDER: "of its holder",
     r.Share.OTHERS: "of processes other than its holder",
-}
-
-_GANG_ENDS: Final[Mapping[r.GangEnd, str]] = {
-    r.GangEnd.REFUSED: "a member was refused",
-    r.GangEnd.FALLEN: "{no.consumer} ({no.lease_id}) is {no.state}",
-    r.GangEnd.INCOMPLETE: "not all of it came back after the restart",
-    r.GangEnd.MEMBER_TOO_LARGE: "a member holds more than it declared, the rest no longer fits",
-    r.GangEnd.OTHERS_TOO_LARGE: "others hold more than they were granted, the rest no longer fits",
-    r.GangEnd.NOT_FREED: "measured memory did not come back, the rest no longer fits",
 }
 
 
@@ -173,9 +161,7 @@ def _too_large(no: r.TooLarge) -> _Words:
 
 def _revoked(no: r.Revoked) -> _Words:
     told = "" if no.revoked is None else f": {cause(no.revoked)}"
-    leave = "unload; request the new size when it is granted again"
-    hint = leave if no.wanted == "resize" else "wait until it is granted again"
-    return f"{no.consumer} was revoked{told}", hint
+    return f"{no.consumer} was revoked{told}", "wait until it is granted again"
 
 
 def _limit(no: r.LimitReached) -> _Words:
@@ -204,31 +190,6 @@ def _lost(no: r.Lost) -> _Words:
             return f"{no.lease_id}: {_why(no.why)}", "acquire again"
 
 
-def _mismatch(no: r.GangMismatch) -> _Words:
-    if no.size != no.asked:
-        return f"gang {no.gang} has {no.size} members, not {no.asked}", "agree on one size"
-    told = f"all {no.size} members of gang {no.gang} have come"
-    return told, "use a separate id for each gang"
-
-
-def _broken_gang(no: r.BrokenGang) -> _Words:
-    because = " ({no.because})" if no.because else ""
-    return _filled((f"gang {{no.gang}}: {_GANG_ENDS[no.why]}{because}", _AGAIN), no)
-
-
-def _deadlock(no: r.Deadlock) -> _Words:
-    def names(leases: tuple[r.NamedLease, ...]) -> str:
-        return " and ".join(f"{one.consumer} ({one.lease_id})" for one in leases)
-
-    def told(link: r.CycleLink) -> str:
-        uses = f"uses {names(link.holds)} and " if link.holds else ""
-        return f"{link.consumer} (pid {link.pid}) {uses}waits for {names(link.waits_for)}"
-
-    story = "; ".join(map(told, no.cycle))
-    hint = "`yield` the use, release first, or mark the wait `independent`"
-    return f"this wait would never end: {story}", hint
-
-
 _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
     r.NoSession: ("this connection has not said hello", "say hello, then reattach"),
     r.NoLease: (
@@ -250,11 +211,6 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
     r.Revoked: _revoked,
     r.UnknownGpu: ("there is no GPU {no.gpu!r}", "give a UUID, an index or `any`"),
     r.TooLarge: _too_large,
-    r.GrowthTooLarge: (
-        "{no.consumer} would need {no.needed_bytes} bytes; alone on its GPU it can have "
-        "{no.room_bytes}",
-        "stay smaller",
-    ),
     r.NoHostRam: (
         "{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} "
         "{no.booked_bytes} are booked",
@@ -269,24 +225,12 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
     r.TimedOut: (
         "{no.consumer} waited {no.waited_s:.1f} s: {no.why.text}", "wait longer, or make room"
     ),
-    r.HolderOutstays: (
-        "{no.consumer} did not leave within {no.deadline_s:g} s",
-        "try again later, or wait: on_deadline=wait",
-    ),
     r.Expired: _expired,
     r.Lost: _lost,
     r.NotJournaled: (
         "the grant of {no.lease_id} could not be written: {no.problem}",
         "look at the daemon's log and its disk",
     ),
-    r.GangMismatch: _mismatch,
-    r.GangTooLarge: (
-        "gang {no.gang}: its {no.members} members need {no.needed_bytes} bytes together, more than "
-        "the GPUs can ever hold",
-        _AGAIN,
-    ),
-    r.BrokenGang: _broken_gang,
-    r.Deadlock: _deadlock,
 }  # fmt: skip
 """Templates with the refusal as `no`, or what makes the words of a class with variants."""
 
@@ -337,8 +281,7 @@ def cause(why: RevokeCause | RevokePush) -> str:
         return f"evicted by {why.order}"
     if why.cause == "pressure":
         return "the GPU holds more than its budget"
-    who = f"gang {why.gang}" if why.gang else why.wanted_by
-    return f"{who} needs the room"
+    return f"{why.wanted_by} needs the room"
 
 
 def _why(code: str, by: str = "") -> str:
@@ -373,26 +316,18 @@ def _reason(body: notes.AnyNote, about: notes.About | None) -> str:
             return f"fits after {', '.join(evicted)} left" if evicted else "fits"
         case notes.ReleasedNote(why=why):
             return WHY.get(why, why)
-        case notes.QueuedNote(grows=grows, more_bytes=more_bytes) if grows:
-            return f"{grows} grows by {more_bytes}"
         case notes.QueuedNote(behind=behind, position=position) if behind:
             return f"waits behind {behind} as number {position}"
         case notes.QueuedNote(wait=wait, block=block):
             return explained.wait_for(block) if wait is None else explained.WAIT[wait]
         case notes.DeniedNote(refusal) | notes.RefusedNote(_, refusal):
             return error_view(refusal).message
-        case notes.GangNote(phase=phase, refusal=refusal):
-            if refusal is not None:
-                return error_view(refusal).message
-            return {"loading": "all fit", "complete": "all are held"}.get(phase, "")
-        case notes.RevokeAskedNote(wanted_by, _, _, why, gang, order):
-            return cause(RevokeCause(why, wanted_by, gang, order))
+        case notes.RevokeAskedNote(wanted_by, _, _, why, order):
+            return cause(RevokeCause(why, wanted_by, order))
         case notes.RevokeWithdrawnNote(cause="waiter", wanted_by=wanted_by):
             return f"{wanted_by} needs the room no longer"
         case notes.RevokeWithdrawnNote():
             return "the GPU is within its budget again"
-        case notes.SignalledNote(asked_s=asked_s, on_overstay=on_overstay):
-            return f"asked {asked_s:.1f} s ago, idle, and its lease says on_overstay={on_overstay}"
         case notes.ExpiredNote(Why.NOT_RENEWED, ttl_s):
             return f"{lease_id} was not renewed for {ttl_s:g} s"
         case notes.LostNote(pid=int(pid)):
@@ -400,10 +335,6 @@ def _reason(body: notes.AnyNote, about: notes.About | None) -> str:
         case notes.StandbyNote(comes_back=by_itself) | notes.ParkedNote(comes_back=by_itself):
             back = "by itself when there is room" if by_itself else "when its holder asks"
             return f"comes back {back}"
-        case notes.ResizedNote(changed_bytes=0):
-            return "the bytes did not come back in time"
-        case notes.ResizedNote(changed_bytes=changed):
-            return "grown" if changed > 0 else "shrunk"
         case notes.OomNote(learnt_load_peak_bytes=None):
             return "another process holds what it was granted"
         case notes.OomNote():

@@ -18,7 +18,6 @@ from vram_arbiter.clients._protocol.records import (
     LeaseRecord,
     OnError,
     OnReply,
-    Resized,
     Returned,
     RevokeAsked,
     RevokeWithdrawn,
@@ -29,7 +28,6 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
     LeaseLost,
-    LeaseRevoking,
     VramError,
     WaitTimeout,
 )
@@ -49,7 +47,7 @@ GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_t
 AWAY = ("standby", "parked")
 _MEANINGLESS = frozenset({"revoke_ack", "use_end"})
 """Requests that are dropped with their lease."""
-_AWAITED = frozenset({"ready", "use_begin", "yield", "resize", "oom"})
+_AWAITED = frozenset({"ready", "use_begin", "oom"})
 """Requests whose caller waits for the arbiter while it holds the lease, and not longer."""
 
 
@@ -85,20 +83,6 @@ class Holdings:
         message = {"op": "use_end", **record.ref(), "use_id": use_id}
         return self._connection.ask(message, now, quiet=True)
 
-    def use_yield(self, record: LeaseRecord, use_id: str, now: float) -> int:
-        """Pause the use: `use_begin` with the same id resumes it."""
-        record.uses.discard(use_id)
-        return self._ask(record, {"op": "yield", **record.ref(), "use_id": use_id}, now)
-
-    def resize(
-        self, record: LeaseRecord, footprint: Message, wait_timeout_s: float | None, now: float
-    ) -> int:
-        """Hold more, or less. The reply is `held` when it is done; else `Resized` comes."""
-
-        record.resizing = footprint
-        record.resizing_until = None if wait_timeout_s is None else now + wait_timeout_s
-        return self._send_resize(record, footprint, now)
-
     def oom(
         self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float
     ) -> int:
@@ -131,9 +115,6 @@ class Holdings:
         """
         record.released = True
         self.held.pop(record.lease_id, None)
-        if record.resizing is not None:  # the arbiter drops it too, without a push
-            left = f"{record.lease_id} left the GPU before it had the size that was asked for"
-            self._resized(record, LeaseRevoking(left, hint="ask again when it is granted again"))
         if asleep:
             record.asleep = asleep
             self.asleep[record.lease_id] = record
@@ -191,15 +172,9 @@ class Holdings:
         self._connection.events.append(Returned(record))
 
     def denied(self, lease_id: str, error: VramError) -> None:
-        """Apply the end of a wait without a grant: of a resize, or of a reacquire."""
-        if record := self.held.get(lease_id):
-            self._resized(record, error)
-        elif record := self.asleep.get(lease_id):
+        """Apply the end of a reacquire without a grant."""
+        if record := self.asleep.get(lease_id):
             self._gone(record, error)
-
-    def resized(self, lease_id: str) -> None:
-        if record := self.held.get(lease_id):
-            self._resized(record)
 
     def revoked(self, push: RevokePush) -> None:
         record = self.held.get(push.lease_id)
@@ -238,13 +213,10 @@ class Holdings:
                 self._gone(record, error_of(entry.error))
 
     def say_again(self, now: float) -> None:
-        """Repeat what a reattachment does not say: that a lease is wanted, or another size."""
+        """Repeat what a reattachment does not say: that a lease is wanted."""
         for record in self.asleep.values():
             if record.wanted and not self._connection.awaits(record.reacquire_id):
                 self._send_reacquire(record, now, quiet=True)
-        for record in self.held.values():
-            if record.resizing is not None and not self._connection.awaits(record.resize_id):
-                self._send_resize(record, record.resizing, now, quiet=True)
 
     # -- time --------------------------------------------------------------------------------------
     def deadlines(self) -> Iterator[float]:
@@ -376,35 +348,6 @@ class Holdings:
             message, now, on_reply=replied, on_error=refused, quiet=quiet
         )
         return record.reacquire_id
-
-    def _send_resize(
-        self, record: LeaseRecord, footprint: Message, now: float, *, quiet: bool = False
-    ) -> int:
-        """`quiet`: a repetition, so its end is reported whatever it is."""
-
-        def replied(reply: AnyReply, _: float) -> None:
-            assert isinstance(reply, AcquireReply)
-            record.spec = {**record.spec, "footprint": footprint}
-            if reply.state == "held" and quiet:
-                self._resized(record)
-            elif reply.state == "held":
-                record.resizing = None
-
-        def refused(error: VramError, _: float) -> None:
-            record.resizing = None
-            if quiet:
-                self._resized(record, error)
-
-        left_s = None if record.resizing_until is None else max(0.0, record.resizing_until - now)
-        message = {"op": "resize", **record.ref(), "footprint": footprint, "wait_timeout_s": left_s}
-        record.resize_id = self._ask(
-            record, message, now, on_reply=replied, on_error=refused, quiet=quiet
-        )
-        return record.resize_id
-
-    def _resized(self, record: LeaseRecord, error: VramError | None = None) -> None:
-        record.resizing = None
-        self._connection.events.append(Resized(record, error))
 
     def _cancel(self, record: LeaseRecord, now: float) -> None:
         self._connection.ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)

@@ -24,7 +24,6 @@ from vram_arbiter.schemas.wire.pushes import (
     GrantedPush,
     LostPush,
     PreparePush,
-    ResizedPush,
     RevokePush,
     RevokeWithdrawnPush,
 )
@@ -97,8 +96,6 @@ class ClientProtocol:
                 error = error_of(push.error)
                 if not self.waits.pushed_denial(push.lease_id, error):
                     self.holdings.denied(push.lease_id, error)
-            case ResizedPush():
-                self.holdings.resized(push.lease_id)
             case RevokePush():
                 self.holdings.revoked(push)
             case RevokeWithdrawnPush():

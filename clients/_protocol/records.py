@@ -122,14 +122,6 @@ class Returned:
 
 
 @dataclass(frozen=True, slots=True)
-class Resized:
-    """The end of a resize; `error`: why the size did not change."""
-
-    record: "LeaseRecord"
-    error: VramError | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class UseLost:
     """A use on the lease of another process could not be resumed after a reconnect."""
 
@@ -161,7 +153,6 @@ Event = (
     | RevokeWithdrawn
     | Gone
     | Returned
-    | Resized
     | UseLost
     | HistoryEvent
     | PrepareAsked
@@ -192,9 +183,6 @@ class LeaseRecord:
     wanted_until: float | None = None  # None: no limit
     wanted_by: str | None = None  # traceparent of the reacquire
     reacquire_id: int | None = None  # the newest request that asked for it
-    resizing: Message | None = None  # the footprint that its owner waits for
-    resizing_until: float | None = None  # None: no limit
-    resize_id: int | None = None  # the newest request that asked for it
 
     def stays(self) -> None:
         """Forget the revoke that was withdrawn."""

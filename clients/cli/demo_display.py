@@ -23,7 +23,7 @@ from vram_arbiter.schemas.units import format_bytes
 BAR_CELLS = 60
 EVENTS_SHOWN = 9
 QUIET_KINDS = frozenset(
-    {"use_began", "use_ended", "use_yielded", "queued", "revoke_acked", "released", "probe_ok"}
+    {"use_began", "use_ended", "queued", "revoke_acked", "released", "probe_ok"}
 )
 COLOURS = {"detector": "red", "scene-vlm": "blue", "grab": "green"}
 

@@ -8,8 +8,9 @@ from vram_arbiter.clients.cli.replies import answer
 from vram_arbiter.clients.net.request import ask
 
 DESCRIPTIONS = {
-    "evict": "Revoke a lease. A use in flight finishes first; a pinned lease is refused. "
-    "Operators only.",
+    "evict": "Revoke a lease. A use in flight finishes first; a pinned lease is refused. With "
+    "--kill end the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again; "
+    "refused while it and another process are in the middle of a use. Operators only.",
     "pin": "Protect a lease from eviction until it is unpinned. Operators only.",
     "unpin": "Undo an operator's pin. Operators only.",
     "drain": "Grant nothing new until `vramctl resume`; holders keep their leases. Outlives the "
@@ -30,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
             type=arguments.name,
             help="a lease (L3-17), or a consumer that has exactly one",
         )
+    if command == "evict":
+        parser.add_argument(
+            "--kill", action="store_true", help="end its process: SIGTERM; asked for again, SIGKILL"
+        )
     optional = command in _WITHOUT_REASON
     parser.add_argument(
         "-r",
@@ -44,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    action = args.command_name.replace("-", "_")
+    kill = args.command_name == "evict" and args.kill
+    action = "kill" if kill else args.command_name.replace("-", "_")
     fields = {"reason": args.reason}
     if args.command_name in _WITH_TARGET:
         fields["target"] = args.target

@@ -226,6 +226,11 @@ def by_hand_lines(action: str, reply: JsonMap) -> list[str]:
         return [f"{name} is pinned: it is not evicted until `vramctl unpin {lease['lease_id']}`"]
     if action == "unpin":
         return [f"{name} is no longer pinned by an operator"]
+    if action == "kill":
+        return [
+            f"the process of {name}, pid {lease['pid']}, was told to end",
+            "if it stays: ask for --kill once more, which sends SIGKILL",
+        ]
     uses = lease["uses"]
     wait = f"finishes {plural(uses, 'use')}, then unloads" if uses else "unloads now"
     return [f"{name} was revoked: it {wait}; follow it with `vramctl why {lease['consumer']}`"]
@@ -245,9 +250,7 @@ def _footprint_lines(footprint: JsonMap | None) -> list[str]:
 
 
 # -- events
-QUIET_KINDS = frozenset(
-    {"use_began", "use_ended", "use_yielded", "revoke_acked", "reminded", "unloading"}
-)
+QUIET_KINDS = frozenset({"use_began", "use_ended", "revoke_acked", "reminded", "unloading"})
 """Steps that other events sum up; `arbiter/http/static/story.js` has the same list."""
 
 

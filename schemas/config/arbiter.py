@@ -88,11 +88,8 @@ class RevokeConfig(_Section):
     remind_s: Seconds = d.REVOKE_REMIND_S
     """After this long without a safe point the history says so."""
     deadline_s: Seconds = d.REVOKE_DEADLINE_S
-    """After this long the waiter's own policy applies: keep waiting (`wait`) or a typed error
-    (`deny`)."""
-    terminate_grace_s: Seconds = d.TERMINATE_GRACE_S
-    """A holder whose lease says `on_overstay: kill` is killed so long after it was told to
-    terminate."""
+    """After this long the history says that the holder is late, and its bytes are not counted
+    on: other holders and other GPUs are tried. The holder is never touched."""
 
 
 class VerifyConfig(_Section):
@@ -328,7 +325,7 @@ class ArbiterConfig(_Section):
 
 LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
     "scheduling": ("thrash_hold_max_s",),
-    "revoke": ("resend_s", "remind_s", "deadline_s", "terminate_grace_s"),
+    "revoke": ("resend_s", "remind_s", "deadline_s"),
     "verify": ("timeout_s", "confirm_s", "slow_poll_s"),
     "probe": ("period_s", "load_s", "sample_max_age_s"),
     "limits": ("waiters_max", "priority_reserve", "leases_per_client_max", "uses_per_lease_max"),

@@ -3,7 +3,7 @@
 Request   {"op": …, "id": n, …fields, "traceparent"?}            client → arbiter Reply     {"re":
 n, "epoch": e, "ok": true, …}                   arbiter → client
           {"re": n, "epoch": e, "ok": false, "error": {"code", "message", "hint", "details"}}
-Push      {"push": "revoke" | "granted" | "denied" | "resized" | "lost" | "event", "seq": n,
+Push      {"push": "revoke" | "granted" | "denied" | "lost" | "event", "seq": n,
 "epoch": e, …}
 
 `requests` holds the pydantic models that the arbiter validates. Everything that the arbiter sends

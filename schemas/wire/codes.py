@@ -24,12 +24,10 @@ by hand."""
 
 @dataclass(frozen=True, slots=True)
 class RevokeCause:
-    """Why a holder is revoked. `wanted_by`: the consumer of the waiter; `gang`: the waiter's, if it
-    has one."""
+    """Why a holder is revoked. `wanted_by`: the consumer of the waiter."""
 
     cause: Cause
     wanted_by: str = ""
-    gang: str = ""
     order: Order | None = None
 
 
@@ -51,10 +49,6 @@ class Why(StrEnum):
     RECOVERED = "recovered"  # from the journal
     ADOPTED = "adopted"  # the journal did not know it
     WANTED = "wanted"  # again, by its holder
-    GROWTH = "growth"
-    MERGED = "merged"  # a growth, into its lease
-    RESIZED = "resized"  # another size is asked for
-    LEAVES = "leaves"  # the lease unloads or released
     # ends
     HOLDER_GAVE_UP = "holder_gave_up"
     CLIENT_LEFT = "client_left"
@@ -65,10 +59,8 @@ class Why(StrEnum):
     NOT_BACK = "not_back"  # its holder, after a restart
     NOT_HELD = "not_held"  # it is over since before a restart
     UNKNOWN = "unknown"  # neither the journal nor the engine knows it
-    OVER = "over"
     # uses
     ENDED = "ended"
-    PAUSED = "paused"  # and the lease was unloaded
     USER_NOT_BACK = "user_not_back"  # its process, after a restart
 
 
@@ -90,6 +82,5 @@ class Block(StrEnum):
     UNREADABLE = "unreadable"
     UNREAD = "unread"  # no reading yet
     LOADING = "loading"
-    GANG = "gang"
     PRESSURE = "pressure"
     NOT_FREE = "not_free"

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Literal
 
 from vram_arbiter.schemas.wire.codes import RevokeCause, Wait
-from vram_arbiter.schemas.wire.views import BlockView, GangView
+from vram_arbiter.schemas.wire.views import BlockView
 
 
 class Condition(StrEnum):
@@ -22,7 +22,6 @@ class Condition(StrEnum):
     HANGING = "hanging"  # unloading for `seconds`, longer than a deadline
     MEASURED = "measured"  # it released; its bytes are verified
     NOT_BACK = "not_back"  # since a restart; given up in `seconds`
-    GANG = "gang"  # its gang is not complete
     PINNED = "pinned"  # `by`: the operator
     RESIDENCY = "residency"  # `seconds` of its minimum residency are left
     THRASHING = "thrashing"  # it and the waiter evict each other; `seconds` are left
@@ -34,7 +33,6 @@ class Condition(StrEnum):
     DEBT = "debt"  # the lease is over; its bytes are measured
     DEBT_KEPT = "debt_kept"  # the lease is over, and its process keeps the bytes
     STOWAWAY = "stowaway"
-    TURN = "turn"  # kept for a member of gang `by` that waits for its turn to load
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +46,9 @@ class Blocker:
     uses: int
     condition: Condition
     label: str = ""  # of its oldest use
-    paused: int = 0  # uses that pause
     seconds: float | None = None
     pid: int | None = None
-    by: str = ""  # operator or gang
+    by: str = ""  # operator
     loaded_bytes: int | None = None  # of a long load, as readings show it
     quiet_s: float | None = None  # for so long a load has not grown
     priority: int | None = None
@@ -69,7 +66,6 @@ class NextAction(StrEnum):
     DEADLINE = "deadline"  # of a holder that was revoked
     WAIT = "wait"
     SERVE = "serve"  # grant again after a restart
-    BREAK = "break"  # a gang
     GIVE_UP = "give_up"  # the request
 
 
@@ -81,19 +77,15 @@ class Because(StrEnum):
     AGEING = "ageing"  # the waiter's priority reaches the holder's
     TOGETHER = "together"  # enough holders may be revoked together
     ONE_LOAD = "one_load"  # one lease loads at a time
-    KEPT = "kept"  # its bytes are charged, the GPU has to show them
     UNREADABLE = "unreadable"
     MEASUREMENT = "measurement"  # the ledger has room, but the GPU has to show it
     ACCOUNTED = "accounted"  # all holders reattached or ran out of time
-    INCOMPLETE = "incomplete"  # a gang, after a restart
-    SHORT = "short"  # measured memory for a gang
     NOT_BACK = "not_back"
     NO_VICTIM = "no_victim"
     VERDICT = "verdict"  # comes in `latest_s` at the latest
     MEASURED_GONE = "measured_gone"
     HANGING = "hanging"
     LEAVING = "leaving"
-    DENIED = "denied"  # then the waiter is denied
     WAITS_ON = "waits_on"
     TIMEOUT = "timeout"  # the waiter's own
 
@@ -107,7 +99,6 @@ class Step:
     lease_id: str | None
     in_s: float | None
     because: Because
-    gang: str = ""
     waiter: str = ""
     latest_s: float | None = None
     text: str = ""
@@ -130,9 +121,6 @@ class Situation(StrEnum):
     BLOCKED = "blocked"
     MEASURING = "measuring"
     NO_ROOM = "no_room"
-    GATHERING = "gathering"  # its gang
-    GANG_WAITS = "gang_waits"
-    GANG_LOADS = "gang_loads"
     RESIDENT = "resident"
     AWAY = "away"
 
@@ -174,10 +162,7 @@ class Explanation:
     block: BlockView | None = None
     leaving: tuple[Blocker, ...] = ()  # holders whose room is being made
     measuring: tuple[str, ...] = ()  # consumers whose bytes are verified
-    kept: bool = False  # its bytes are charged already: it is a member of a gang that loads
     expected_bytes: int | None = None  # load peak, where more than the declared was measured
-    gang: GangView | None = None
-    lacks: tuple[Blocker, ...] = ()  # members of its gang that are not held
     holder: Blocker | None = None  # the lease itself, where it is resident
     revoked: RevokeCause | None = None
     drifted: bool = False  # it holds more or less than declared

@@ -32,7 +32,7 @@ class About:
 # -- waiting and granting
 @dataclass(frozen=True, slots=True)
 class QueuedNote:
-    """A request, or the growth of a lease, waits."""
+    """A request waits."""
 
     TAG: ClassVar = ("kind", "queued")
 
@@ -40,8 +40,6 @@ class QueuedNote:
     wait: Wait | None
     behind: str  # consumer of the request before it
     block: BlockView | None = None  # why nothing is granted on its GPU
-    grows: LeaseId | None = None  # the lease that asks for `more_bytes`
-    more_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,15 +134,6 @@ class UseBeganNote:
 
 
 @dataclass(frozen=True, slots=True)
-class UseYieldedNote:
-    TAG: ClassVar = ("kind", "use_yielded")
-
-    use_id: UseId
-    label: str
-    uses: int
-
-
-@dataclass(frozen=True, slots=True)
 class UseEndedNote:
     TAG: ClassVar = ("kind", "use_ended")
 
@@ -166,7 +155,6 @@ class RevokeAskedNote:
     wanted_by_lease: LeaseId | None
     uses: int
     cause: Cause
-    gang: str = ""
     order: Order | None = None
 
 
@@ -208,15 +196,14 @@ class DeadlinePassedNote:
 
 @dataclass(frozen=True, slots=True)
 class SignalledNote:
-    """A holder that outstayed was told to end, as its lease allows."""
+    """An operator ended the process of a holder."""
 
     TAG: ClassVar = ("kind", "signalled")
 
     signal: Literal["term", "kill"]
     pid: int
-    wanted_by: str
-    asked_s: float
-    on_overstay: str
+    by: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +262,7 @@ class VerifiedNote:
     culprits: tuple[Culprit, ...]
 
 
-# -- features
+# -- standby
 @dataclass(frozen=True, slots=True)
 class StandbyNote:
     """A lease is away. `comes_back`: by itself."""
@@ -296,24 +283,6 @@ class ParkedNote:
     left_for: str
     parked_bytes: int
     comes_back: bool
-
-
-@dataclass(frozen=True, slots=True)
-class GangNote:
-    TAG: ClassVar = ("kind", "gang")
-
-    gang: str
-    phase: Literal["loading", "complete", "broken"]
-    members: tuple[LeaseId, ...]
-    refusal: Refusal | None = field(default=None, metadata=_CODE)
-
-
-@dataclass(frozen=True, slots=True)
-class ResizedNote:
-    TAG: ClassVar = ("kind", "resized")
-
-    charge_bytes: int
-    changed_bytes: int
 
 
 # -- measurements
@@ -453,7 +422,6 @@ type AnyNote = (
     | RefusedNote
     | CancelledNote
     | UseBeganNote
-    | UseYieldedNote
     | UseEndedNote
     | RevokeAskedNote
     | RevokeWithdrawnNote
@@ -468,8 +436,6 @@ type AnyNote = (
     | VerifiedNote
     | StandbyNote
     | ParkedNote
-    | GangNote
-    | ResizedNote
     | OomNote
     | DriftNote
     | PressureNote

@@ -28,7 +28,6 @@ class RevokePush:
     park: bool  # host RAM for its weights is booked: release with `parked`
     reason: str = ""  # the cause in words; the engine leaves it empty
     cause: str = ""  # waiter, pressure, operator
-    gang: str = ""  # of the request that wants the room
     order: Order | None = None  # an operator wants it
     priority: int | None = None  # of the request that wants the room
     traceparent: str = ""  # of the eviction, or of the waiter: the unloading belongs to that trace
@@ -64,18 +63,6 @@ class DeniedPush:
 
 
 @dataclass(frozen=True, slots=True)
-class ResizedPush:
-    """The lease has this size now: it has grown or shrunk, or it was not measured smaller
-    in time."""
-
-    TAG: ClassVar = ("push", "resized")
-
-    lease_id: str
-    token: Token
-    charge_bytes: int
-
-
-@dataclass(frozen=True, slots=True)
 class LostPush:
     """The lease is over and its holder did not end it (expired, fenced): unload and
     acquire again."""
@@ -106,14 +93,7 @@ class PreparePush:
 
 
 type AnyPush = (
-    RevokePush
-    | RevokeWithdrawnPush
-    | GrantedPush
-    | DeniedPush
-    | ResizedPush
-    | LostPush
-    | EventPush
-    | PreparePush
+    RevokePush | RevokeWithdrawnPush | GrantedPush | DeniedPush | LostPush | EventPush | PreparePush
 )
 
 PUSHES: Final[Mapping[str, type[Any]]] = MappingProxyType(

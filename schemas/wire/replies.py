@@ -36,8 +36,7 @@ class PingReply:
 
 @dataclass(frozen=True, slots=True)
 class AcquireReply:
-    """Answer to `acquire` and `reacquire` (`loading`, `queued`), and to `resize` (`held`,
-    `shrinking`, `growing`)."""
+    """Answer to `acquire` and `reacquire`: `loading` or `queued`."""
 
     state: str
     lease: LeaseView
@@ -140,7 +139,7 @@ class HistoryReply:
 
 @dataclass(frozen=True, slots=True)
 class OperatorReply:
-    """Answer to `evict`, `pin`, `unpin` and `release_dead`; `lease` is None when it is over."""
+    """Answer to `evict`, `kill`, `pin`, `unpin` and `release_dead`; `lease` is None when it is over."""
 
     state: str
     lease: LeaseView | None = None
@@ -190,11 +189,9 @@ REPLIES: Final[Mapping[str, type[Any]]] = MappingProxyType(
         "subscribe": DoneReply,
         "acquire": AcquireReply,
         "reacquire": AcquireReply,
-        "resize": AcquireReply,
         "ready": ReadyReply,
         "use_begin": UsesReply,
         "use_end": UsesReply,
-        "yield": UsesReply,
         "revoke_ack": StateReply,
         "unloading": StateReply,
         "cancel": StateReply,
@@ -206,6 +203,7 @@ REPLIES: Final[Mapping[str, type[Any]]] = MappingProxyType(
         "why": WhyReply,
         "history": HistoryReply,
         "evict": OperatorReply,
+        "kill": OperatorReply,
         "pin": OperatorReply,
         "unpin": OperatorReply,
         "release_dead": OperatorReply,

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.limits import Bytes, Name, Seconds
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
 TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
@@ -89,14 +89,6 @@ class UseEnd(OnLease):
     use_id: Name
 
 
-class Yield(OnLease):
-    """The use pauses: it no longer keeps the lease from being evicted. `use_begin` with the same id
-    resumes it, if it may."""
-
-    op: Literal["yield"]
-    use_id: Name
-
-
 class Renew(_Request):
     op: Literal["renew"]
     leases: Annotated[
@@ -141,15 +133,6 @@ class Reacquire(OnLease):
     late repeat asks for nothing."""
 
     op: Literal["reacquire"]
-    wait_timeout_s: Seconds | None = None
-
-
-class Resize(OnLease):
-    """The holder freed bytes, or needs more. Reply state `held`, `shrinking` or `growing`; then
-    push `resized`, or `denied` for a growth."""
-
-    op: Literal["resize"]
-    footprint: Footprint
     wait_timeout_s: Seconds | None = None
 
 
@@ -210,14 +193,14 @@ class Subscribe(_Request):
     op: Literal["subscribe"]
 
 
-class _ByHand(_Request):
+class ByHand(_Request):
     """An operator's action. `reason` is kept with the operator's name in history and, for pins and
     drains, in the journal."""
 
     reason: Reason
 
 
-class ByHandOn(_ByHand):
+class ByHandOn(ByHand):
     target: Name  # a lease id, or a consumer that has exactly one lease
 
 
@@ -225,6 +208,13 @@ class Evict(ByHandOn):
     """Ask a holder to leave. In use it finishes first; a pinned one is refused."""
 
     op: Literal["evict"]
+
+
+class Kill(ByHandOn):
+    """End the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again. Refused
+    while it and another process are in the middle of a use of each other's leases."""
+
+    op: Literal["kill"]
 
 
 class Pin(ByHandOn):
@@ -244,13 +234,13 @@ class ReleaseDead(ByHandOn):
     op: Literal["release_dead"]
 
 
-class Drain(_ByHand):
+class Drain(ByHand):
     """No new grants until `resume`; what is held is kept. Outlives the daemon, not the machine."""
 
     op: Literal["drain"]
 
 
-class Resume(_ByHand):
+class Resume(ByHand):
     op: Literal["resume"]
 
 
@@ -279,14 +269,12 @@ Request = Annotated[
     | Ready
     | UseBegin
     | UseEnd
-    | Yield
     | Renew
     | RevokeAck
     | Unloading
     | Release
     | Cancel
     | Reacquire
-    | Resize
     | Reattach
     | Oom
     | Status
@@ -294,6 +282,7 @@ Request = Annotated[
     | History
     | Subscribe
     | Evict
+    | Kill
     | Pin
     | Unpin
     | ReleaseDead

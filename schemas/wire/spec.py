@@ -23,17 +23,6 @@ class Footprint:
 
 
 @dataclass(frozen=True, slots=True)
-class Gang:
-    """Several leases, of whatever processes, that are granted together or not at all. One id for
-    each time."""
-
-    __pydantic_config__: ClassVar = _STRICT
-
-    id: Name
-    size: Annotated[int, Limits(ge=2, le=16)]
-
-
-@dataclass(frozen=True, slots=True)
 class LeaseSpec:
     """What a lease is to be. `evictable=False` pins it: it is never evicted."""
 
@@ -52,17 +41,10 @@ class LeaseSpec:
     """Seconds without a renewal after which the lease expires; the client renews by itself."""
     min_residency_s: Seconds = d.MIN_RESIDENCY_S
     """Seconds after the load in which it is not revoked."""
-    on_deadline: Literal["wait", "deny"] = "wait"
-    """What the waiter gets when a holder outstays the deadline of its revocation."""
-    on_overstay: Literal["wait", "terminate", "kill"] = "wait"
-    """What may be done to the holder's own process if it outstays the deadline idle."""
     standby: bool = False
     """Evicted, it returns by itself when there is room."""
     park_bytes: Bytes = 0
     """Host RAM that keeps its weights while it is away; 0: it is not parked."""
-    gang: Gang | None = None
-    independent: bool = False
-    """The process's own uses do not wait for this lease (a prefetch): no deadlock is seen in it."""
 
     @property
     def model(self) -> str:

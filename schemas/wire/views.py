@@ -7,21 +7,10 @@ from vram_arbiter.schemas.wire.codes import Block
 
 
 @dataclass(frozen=True, slots=True)
-class GangView:
-    """A gang that is not complete: `members` of `size` have asked."""
-
-    id: str
-    phase: str  # gathering, waiting, loading
-    members: int
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
 class BlockView:
     """Why nothing is granted on a GPU.
 
-    `names`: holders that have not reattached, the consumer that loads, or the gang; `more` of them
-    are not named. `text`: the same in words; the engine leaves it empty.
+    `names`: holders that have not reattached, or the consumer that loads; `more` are not named. `text`: the same in words; the engine leaves it empty.
     """
 
     code: Block
@@ -47,21 +36,17 @@ class LeaseView:
     priority: int
     evictable: bool
     charge_bytes: int
-    uses: int  # busy ones
+    uses: int
     pid: int
     since_s: float  # seconds in this state
     waited_s: float = 0.0
     granted_s: float | None = None  # seconds since the grant, also across restarts of the daemon
-    position: int | None = None  # in its queue; 0: in none, its gang is not complete or loads
+    position: int | None = None  # in its queue
     ttl_left_s: float | None = None
     pinned: str = ""  # the operator that pinned it, and why
     standby: bool = False  # once evicted, it comes back by itself
     parked_bytes: int | None = None  # host RAM that is booked for it
     drift_bytes: int = 0  # measured less declared, where that is more than the tolerance
-    yielded: int = 0  # uses that pause
-    grows: str | None = None  # the lease that this request asks more bytes for
-    resizing: str = ""  # growing or shrinking
-    gang: GangView | None = None  # until all of it is held
 
 
 @dataclass(frozen=True, slots=True)

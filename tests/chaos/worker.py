@@ -85,7 +85,6 @@ class Consumer:
             min_residency_s=draw.choice([0.0, 0.2, 0.4]),
             mode=draw.choice(["shared", "shared", "shared", "exclusive"]),
             priority=draw.choice([40, 50, 50, 60]),
-            on_deadline=draw.choice(["wait", "wait", "deny"]),
             footprint=Footprint(
                 load_peak_bytes=peak, steady_bytes=steady, residue_bytes=self._residue
             ),

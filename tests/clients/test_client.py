@@ -209,7 +209,7 @@ async def test_revoked_at_the_safe_point_and_not_before(
         )
         await lease.ready()
         async with lease.use("first"):
-            wanted = beside(waiter.acquire(spec("b", 5, independent=True)))
+            wanted = beside(waiter.acquire(spec("b", 5)))
             while not lease.revoking:
                 await anyio.sleep(0.01)
             with pytest.raises(LeaseRevoking):
@@ -239,7 +239,7 @@ async def test_a_holder_stays_when_nothing_wants_its_room_any_more(
         for name in ("first", "second"):
             async with lease.use(name):
                 with pytest.raises(WaitTimeout):
-                    await waiter.acquire(spec("b", 5, independent=True), wait_timeout_s=0.5)
+                    await waiter.acquire(spec("b", 5), wait_timeout_s=0.5)
                 with anyio.fail_after(WAIT_S):
                     while (state := lease.state) != "held":
                         await lease.wait_change(state)
@@ -268,7 +268,7 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
         lease = await sidecar.acquire(spec("a", 5), unload=unload)
         await lease.ready()
         async with runner.use(lease.lease_id, lease.token, "goal"):
-            wanted = beside(runner.acquire(spec("b", 5, independent=True)))
+            wanted = beside(runner.acquire(spec("b", 5)))
             while not lease.revoking:
                 await anyio.sleep(0.01)
             while (await states(runner))["a"] != "revoking":
@@ -321,7 +321,7 @@ async def test_wait_timeout_says_who_blocked(arbiter_daemon: ArbiterProcess, spe
         await lease.ready()
         async with lease.use():
             with pytest.raises(WaitTimeout) as late:
-                await client.acquire(spec("b", 5, independent=True), 0.2)
+                await client.acquire(spec("b", 5), 0.2)
             assert late.value.details["why"]["blockers"][0]["consumer"] == "a"
 
 
@@ -332,7 +332,7 @@ async def test_a_cancelled_acquire_leaves_the_queue(
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         async with lease.use():
-            waiting = beside(client.acquire(spec("b", 5, independent=True)))
+            waiting = beside(client.acquire(spec("b", 5)))
             while "b" not in await states(client):
                 await anyio.sleep(0.01)
             waiting.cancel()

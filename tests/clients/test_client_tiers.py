@@ -10,19 +10,18 @@ import pytest
 from tests.support.beside import Start, within
 from tests.support.leases import states
 from tests.support.process import ArbiterProcess
+from vram_arbiter.clients import use_context
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.lease import AsyncLease, AsyncUse, LeaseState
+from vram_arbiter.clients.lease import AsyncLease, LeaseState
 from vram_arbiter.schemas.errors import (
     BadState,
-    GangBroken,
     LeaseRevoking,
-    VramError,
-    VramInsufficient,
+    WaitTimeout,
     WouldDeadlock,
 )
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.pushes import RevokePush
-from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [
@@ -52,12 +51,6 @@ class Model:
     async def load(self, lease: AsyncLease) -> None:
         self.did.append("load")
         await lease.ready()
-
-
-async def lend(use: AsyncUse, work: Awaitable[object]) -> None:
-    """Wait for something without keeping the lease meanwhile."""
-    async with use.yielded():
-        await work
 
 
 async def on_standby(client: AsyncClient, spec: Spec, model: Model) -> AsyncLease:
@@ -223,129 +216,26 @@ async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
         assert (detector.state, model.did) == ("gone", ["park", "unload"])
 
 
-async def test_a_yielded_use_lets_the_holder_go_and_says_so_at_its_end(
-    arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
-    model = Model()
-    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
-        job = await client.acquire(spec("job", 5), unload=model.unload)
-        await job.ready()
-        async with job.use("render") as use:
-            async with use.yielded():
-                assert (await client.status()).leases[0].uses == 0
-            assert (await client.status()).leases[0].uses == 1
-            with pytest.raises(VramError):
-                await lend(use, client.acquire(spec("llm", 5), WAIT_S))
-        assert model.did == ["unload"]
-
-
-async def test_a_gang_is_granted_together_one_load_after_the_other(
-    arbiter_daemon: ArbiterProcess, spec: Spec
-) -> None:
-    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
-        held: list[AsyncLease] = []
-        async for _, lease in client.gang([spec("policy", 4), spec("reward", 3)], WAIT_S):
-            assert [other.state for other in held] == ["held"] * len(held)
-            await lease.ready()
-            held.append(lease)
-        assert sorted(lease.spec.consumer for lease in held) == ["policy", "reward"]
-        with pytest.raises((VramInsufficient, GangBroken)):
-            await anext(client.gang([spec("a", 5), spec("b", 5)], WAIT_S))
-        assert set(await states(client)) == {"policy", "reward"}
-
-
-async def test_a_lease_grows_and_shrinks(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
-    def size(gib: int) -> Footprint:
-        return Footprint(load_peak_bytes=gib * GIB, steady_bytes=gib * GIB, residue_bytes=0)
-
-    async def charged(client: AsyncClient) -> int:
-        return int((await client.status()).leases[0].charge_bytes)
-
-    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
-        cache = await client.acquire(spec("cache", 2))
-        await cache.ready()
-        await cache.resize(size(4), WAIT_S)
-        assert await charged(client) == 4 * GIB
-        await cache.resize(size(1))
-        assert await charged(client) == 1 * GIB
-        with pytest.raises(VramInsufficient):
-            await cache.resize(size(9))
-        assert (cache.state, cache.spec.footprint.steady_bytes) == ("held", 1 * GIB)
-
-
-def five_gib() -> Footprint:
-    return Footprint(load_peak_bytes=5 * GIB, steady_bytes=5 * GIB, residue_bytes=0)
-
-
-async def test_a_resize_ends_with_the_stay_on_the_gpu(
-    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
-) -> None:
-    """Regression: what a lease that was revoked had waited for was dropped, and its `resize`
-    never returned."""
-    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
-        cache = await client.acquire(spec("cache", 2, standby=True))
-        await cache.ready()
-        busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)
-        await busy.ready()
-        async with AsyncClient("u", endpoint=arbiter_daemon.endpoint) as other, busy.use():
-            growing = beside(cache.resize(five_gib()))
-            await until_growing(client)
-            policy = await other.acquire(spec("policy", 4, priority=95), WAIT_S)
-            with pytest.raises(LeaseRevoking):
-                await growing
-            assert cache.state == "standby"
-            await policy.release()
-
-
-async def test_a_resize_that_waits_outlives_the_daemon(
-    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until, beside: Start
-) -> None:
-    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
-        cache = await client.acquire(spec("cache", 2))
-        memory = FakeMemory(arbiter_daemon.gpu_folder, "t", 0)
-        memory.allocate("cache", 2 * GIB)
-        await cache.ready()
-        busy = await client.acquire(spec("busy", 3, priority=90), WAIT_S)
-        block = memory.allocate("busy", 3 * GIB)
-        await busy.ready()
-        async with busy.use():
-            growing = beside(cache.resize(five_gib()))
-            await until_growing(client)
-            arbiter_daemon.kill()
-            arbiter_daemon.start()
-            await until(lambda: client.connected)
-            await until_growing(client)
-        memory.free(block)
-        memory.empty_cache()
-        await busy.give_up()
-        async with within(WAIT_S):
-            await growing
-        assert cache.spec.footprint.steady_bytes == 5 * GIB
-
-
-async def until_growing(client: AsyncClient) -> None:
-    async with within(WAIT_S):
-        while not any(lease.resizing for lease in (await client.status()).leases):
-            await anyio.sleep(0.02)
-
-
 async def test_a_job_that_waits_for_its_own_room_is_told(
-    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It holds in use what it would itself have to give up: that would never end. Another task of
-    the process may wait."""
+    the process, and a wait with a limit of its own, are as any other."""
+    monkeypatch.setattr(use_context, "WAIT_IN_USE_S", 0.2)
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         job = await client.acquire(spec("job", 5))
         await job.ready()
         inside = anyio.Event()
         another = beside(asked_when(inside, client, spec("another request", 5)))
-        async with job.use():
+        async with job.use("render"):
             inside.set()
             with pytest.raises(WouldDeadlock) as told:
                 await client.acquire(spec("llm", 5))
-            assert [link["consumer"] for link in told.value.details["cycle"]] == ["llm"]
-            assert "job" in str(told.value)
-            prefetch = beside(client.acquire(spec("next", 5, independent=True), WAIT_S))
+            assert told.value.details["uses"] == [f"use 'render' of {job.lease_id}"]
+            assert told.value.details["waited"]["why"]["consumer"] == "llm"
+            with pytest.raises(WaitTimeout):
+                await client.acquire(spec("llm", 5), 0.1)
+            prefetch = beside(client.acquire(spec("next", 5), WAIT_S))
         await job.give_up()
         assert (await another).state == "loading"
         await (await another).give_up()

@@ -25,7 +25,6 @@ from vram_arbiter import (
     ForeignUse,
     Handlers,
     Lease,
-    LeaseSpec,
     Use,
     VramError,
 )
@@ -186,16 +185,6 @@ class TestThreads:
             with first.use():  # waits until it is loaded
                 assert loaded.is_set()
             assert first.state == "held"
-
-    def test_a_gang_is_acquired_by_threads_too(self, arbiter_daemon: ArbiterProcess) -> None:
-        def spec(name: str) -> LeaseSpec:
-            footprint = Footprint(load_peak_bytes=GIB, steady_bytes=GIB, residue_bytes=0)
-            return LeaseSpec(consumer=name, model_id=name, footprint=footprint)
-
-        with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
-            for _, lease in arbiter.gang([spec("policy"), spec("reward")], DEADLINE_S):
-                lease.ready()
-            assert sorted(lease.spec.consumer for lease in arbiter.leases) == ["policy", "reward"]
 
     def test_a_call_that_waits_ends_with_the_client(self, arbiter_daemon: ArbiterProcess) -> None:
         """A thread that waited for an event kept the client's thread, and so its end, for ever."""

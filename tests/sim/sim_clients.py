@@ -131,7 +131,6 @@ class Character:
     exclusive: float = 0.15
     standby: float = 0.2
     parks: float = 0.2
-    yields: float = 0.25
     leases: int = 1
 
 
@@ -281,10 +280,8 @@ class Consumer(Program):
                 "evictable": not chance(self.character.pinned),
                 "ttl_s": choice((2.0, 5.0, 10.0)),
                 "min_residency_s": choice((0.0, 0.5, 2.0)),
-                "on_deadline": choice(("wait", "wait", "deny")),
                 "standby": chance(self.character.standby),
                 "park_bytes": steady if chance(self.character.parks) else 0,
-                "independent": chance(0.2),
             }
         )
 
@@ -466,12 +463,8 @@ class Consumer(Program):
             await self.pause(1.0)
             if lease.state != "held":
                 return
-            async with lease.use("work") as use:
+            async with lease.use("work"):
                 await self.pause(self.random.choice((0.05, 0.5, 3.0)))
-                if self.world.clock.chance(self.character.yields):
-                    self.world.faults["yielded"] += 1
-                    async with use.yielded():
-                        await self.pause(2.0)
 
     async def _unload(self, holding: Holding) -> None:
         """Called by the library at the safe point, or after a loss."""

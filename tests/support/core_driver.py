@@ -13,7 +13,7 @@ sleeps.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import msgpack
 
@@ -49,13 +49,11 @@ from vram_arbiter.arbiter.core.events import (
     Recovered,
     ReleaseReported,
     Renewed,
-    ResizeAsked,
     RevokeAcknowledged,
     Tick,
     UnloadStarted,
     UseBegan,
     UseEnded,
-    UseYielded,
 )
 from vram_arbiter.arbiter.core.model.refusals import NotJournaled
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
@@ -74,7 +72,7 @@ from vram_arbiter.schemas.ids import (
 )
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import AcquireReply
-from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 READING_S = 0.001
 """How long a simulated reading takes."""
@@ -407,13 +405,9 @@ class Consumer:
         gpu: str = "any",
         ttl_s: float = 3600.0,
         min_residency_s: float = 0.0,
-        deny_on_deadline: bool = False,
-        on_overstay: Literal["wait", "terminate", "kill"] = "wait",
         standby: bool = False,
         park_bytes: int = 0,
         key: str | None = None,
-        independent: bool = False,
-        gang: tuple[str, int] | None = None,
     ) -> LeaseSpec:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked
         for.
@@ -429,12 +423,8 @@ class Consumer:
             evictable=evictable,
             ttl_s=ttl_s,
             min_residency_s=min_residency_s,
-            on_deadline="deny" if deny_on_deadline else "wait",
             standby=standby,
-            on_overstay=on_overstay,
             park_bytes=park_bytes,
-            independent=independent,
-            gang=None if gang is None else Gang(*gang),
         )
 
     def acquire(
@@ -521,19 +511,6 @@ class Consumer:
             )
         )
 
-    def use_yield(
-        self, lease: LeaseId, use: str = "u1", token: Token | None = None
-    ) -> list[Effect]:
-        return self.driver.post(
-            UseYielded(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                token or self.token(lease),
-                UseId(use),
-            )
-        )
-
     def renew(self, *leases: tuple[LeaseId, Token]) -> list[Effect]:
         return self.driver.post(Renewed(self.client, self.driver.next_request(), leases))
 
@@ -584,31 +561,6 @@ class Consumer:
                 self.traceparent,
             )
         )
-
-    def resize(
-        self,
-        lease: LeaseId,
-        steady_bytes: int,
-        *,
-        load_peak_bytes: int = 0,
-        residue_bytes: int = 0,
-        wait_timeout_s: float | None = None,
-    ) -> list[Effect]:
-        peak = max(load_peak_bytes, steady_bytes)
-        effects = self.driver.post(
-            ResizeAsked(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                self.token(lease),
-                Footprint(peak, steady_bytes, residue_bytes),
-                wait_timeout_s,
-            )
-        )
-        if any(isinstance(effect, Reply) for effect in effects):  # what it loads from now on
-            footprint = Footprint(peak, steady_bytes, residue_bytes)
-            self.specs[lease] = replace(self.specs[lease], footprint=footprint)
-        return effects
 
     def oom(
         self, lease: LeaseId, requested_bytes: int, allocated_bytes: int | None = None

@@ -55,7 +55,7 @@ COSTLY: Final[Mapping[str, bytes]] = {
     "wrong uses": _reattach(20, use_ids=["\x01" * 128] * USES_PER_LEASE_MAX),
     "leases of unknown keys": _pack(op="reattach", leases=[{"spec": _junk()}] * 48),
     "unknown keys in every map": _pack(
-        op="acquire", nonce="n", spec={**_junk(55), "footprint": _junk(), "gang": _junk()},
+        op="acquire", nonce="n", spec={**_junk(55), "footprint": _junk()},
         **_junk(55)
     ),
     "kinds": _pack(op="history", kinds=["k" * 4000] * LISTED_MAX),

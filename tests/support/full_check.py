@@ -9,11 +9,10 @@ from collections import Counter
 from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.arbiter import Arbiter
-from vram_arbiter.arbiter.core.features.gangs import Gangs
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import Residents
-from vram_arbiter.arbiter.core.model.lease import LeaseState
+from vram_arbiter.arbiter.core.model.lease import AWAY, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core, Turn
 from vram_arbiter.schemas.ids import ClientId, ProcessKey
 
@@ -33,19 +32,18 @@ def check_all(core: Core) -> None:
         gpu.ledger.touched.update(gpu.ledger.charges, gpu.residents)
         for lease in gpu.residents.values():
             in_use = lease.state in (LeaseState.HELD, LeaseState.REVOKING)
-            if not in_use and (uses := len(lease.all_uses())):
+            if not in_use and (uses := len(lease.uses)):
                 raise InvariantViolation(3, f"{lease.id} is {lease.state} with {uses} uses")
-    for feature in core.features:
-        if isinstance(feature, Gangs):
-            feature.settled.update(feature.by_name)
-        feature.check(core)
     turn, core.turn = core.turn, Turn(granted=core.turn.granted)
     core.turn.touched.update((gpu.info.index, gpu) for gpu in core.gpus.values())
     invariants.check(core)
     core.turn = turn
     unqueued = core.waiting.keys() - {lease.id for gpu in core.gpus.values() for lease in gpu.queue}
-    if unqueued != core.unqueued.keys():
-        raise InvariantViolation(0, f"{sorted(unqueued)} wait in no queue, see {core.unqueued}")
+    if unqueued:
+        raise InvariantViolation(0, f"{sorted(unqueued)} wait in no queue")
+    away = [lease.id for lease in core.leases.values() if lease.state in AWAY]
+    if sorted(core.away) != sorted(away):
+        raise InvariantViolation(0, f"{sorted(away)} are away, kept as {sorted(core.away)}")
 
 
 def owners_disagree(core: Core) -> str:
@@ -58,15 +56,10 @@ def owners_disagree(core: Core) -> str:
             return f"{lease.id} is not listed under its process and its client"
     if by_process or by_client:
         return f"{sorted({**by_process, **by_client})} are listed and gone"
-    for paused, table in ((False, core.users), (True, core.pausing)):
-        marked = {
-            (*use, lease.id)
-            for lease in core.leases.values()
-            for use in (lease.uses.paused if paused else lease.uses)
-        }
-        listed_uses = {(who, use, lease) for who, mine in table.items() for lease, use in mine}
-        if odd := marked ^ listed_uses:
-            return f"{sorted(odd)}: uses are listed otherwise than they are"
+    marked = {(*use, lease.id) for lease in core.leases.values() for use in lease.uses}
+    listed_uses = {(who, use, lease) for who, mine in core.users.items() for lease, use in mine}
+    if odd := marked ^ listed_uses:
+        return f"{sorted(odd)}: uses are listed otherwise than they are"
     owners = Counter(
         owner for lease in core.waiting.values() for owner in (lease.process, lease.request.uid)
     )
@@ -82,16 +75,15 @@ def owners_disagree(core: Core) -> str:
 
 def ledger_disagrees(ledger: GpuLedger) -> str:
     """Return where the kept sums and the accounts disagree, "" if nowhere."""
-    charges, sums = {}, [0, 0, 0, 0]
+    charges, sums = {}, [0, 0, 0]
     for process, account in ledger.accounts.items():
         charges.update(account.charges)
         owed = account.charges.values()
         booked = sum(charge.charged_bytes for charge in owed)
         approved = sum(charge.approved_bytes for charge in owed)
-        reserved = sum(charge.charged_bytes for charge in owed if charge.reserved)
-        kept = (account.leased_bytes, account.leased_approved_bytes, account.reserved_bytes)
-        if (booked, approved, reserved) != kept:
-            return f"{process} is charged {(booked, approved, reserved)}, kept as {kept}"
+        kept = (account.leased_bytes, account.leased_approved_bytes)
+        if (booked, approved) != kept:
+            return f"{process} is charged {(booked, approved)}, kept as {kept}"
         for lease, charge in account.charges.items():
             if charge.approved_bytes > charge.charged_bytes:
                 return (
@@ -101,19 +93,11 @@ def ledger_disagrees(ledger: GpuLedger) -> str:
         sums[0] += max(booked, retained)
         sums[1] += max(approved, retained)
         sums[2] += max(booked, retained, measured)
-        sums[3] += max(booked - reserved, retained, measured)
-    kept_sums = [
-        ledger.charged_bytes,
-        ledger.approved_bytes,
-        ledger._held_bytes,
-        ledger._present_bytes,
-    ]
+    kept_sums = [ledger.charged_bytes, ledger.approved_bytes, ledger._held_bytes]
     if kept_sums != sums:
         return f"the sums are {sums}, kept as {kept_sums}"
     if ledger.charges != charges:
         return f"the charges are {charges}, kept as {ledger.charges}"
-    if ledger.reserved != {lease for lease, charge in charges.items() if charge.reserved}:
-        return f"{ledger.reserved} are kept as reserved"
     stowaways = sum(use.held_bytes for use in ledger.stowaways.values()) + ledger.unattributed_bytes
     kept_bytes = ledger.stowaway_bytes
     return "" if kept_bytes == stowaways else f"stowaways have {stowaways}, kept as {kept_bytes}"

@@ -58,7 +58,6 @@ PLAIN: Mapping[str, Mapping[str, Any]] = {
     "ready": {"lease": view()},
     "use_begin": {"uses": 1},
     "use_end": {"uses": 0},
-    "yield": {"uses": 0},
     "revoke_ack": {"state": "revoking"},
     "unloading": {"state": "unloading"},
     "cancel": {"state": "over"},

@@ -12,10 +12,8 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from math import inf
 
 from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.hooks import Group
 from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_by_process, bytes_of
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Eviction, Lease, LeaseState, Verification
 from vram_arbiter.arbiter.core.settings import GpuInfo
@@ -32,7 +30,7 @@ class Residents(dict[LeaseId, Lease]):
     """Leases of one GPU by id, oldest grant first, with tables of the few that a decision asks
     about.
 
-    A GPU may have ten thousand small leases while one loads and two leave. `Lease.move` keeps the
+    A GPU may have ten thousand small leases while one loads and two leave. `Core.move` keeps the
     tables, so that a decision costs what has changed and not what is there.
     """
 
@@ -41,7 +39,7 @@ class Residents(dict[LeaseId, Lease]):
         self.by_state: dict[LeaseState, dict[LeaseId, Lease]] = {state: {} for state in LeaseState}
         self.exclusive: dict[LeaseId, Lease] = {}
         self.recent: dict[LeaseId, Lease] = {}
-        """Leases granted, enlarged or ready since the newest reading began; may hold more."""
+        """Leases granted or ready since the newest reading began; may hold more."""
         self.touched: set[LeaseId] = set()
         """Leases that came or went since the last check of the invariants."""
 
@@ -50,7 +48,6 @@ class Residents(dict[LeaseId, Lease]):
         """A lease is granted here, or found after a restart."""
         self[lease.id] = self.by_state[lease.state][lease.id] = self.recent[lease.id] = lease
         self.touched.add(lease.id)
-        lease.roster = self
         if lease.spec.exclusive:
             self.exclusive[lease.id] = lease
 
@@ -58,14 +55,14 @@ class Residents(dict[LeaseId, Lease]):
         """Take a lease off the GPU, if it is there."""
         if lease.id not in self:
             return
-        lease.roster = None
-        lease.observed.enlarged_at = -inf
         for table in (self, self.by_state[lease.state], self.exclusive, self.recent):
             table.pop(lease.id, None)
         self.touched.add(lease.id)
 
     def moved(self, lease: Lease, before: LeaseState) -> None:
-        """A lease of this GPU came to another state."""
+        """A lease came to another state; it may not be here yet."""
+        if lease.id not in self:
+            return
         self.by_state[before].pop(lease.id, None)
         now_there = self.by_state[lease.state]
         now_there[lease.id] = lease
@@ -83,13 +80,11 @@ class Residents(dict[LeaseId, Lease]):
 
     # -- reading
     def unseen(self, taken_at: float) -> list[Lease]:
-        """Return leases granted, enlarged or ready after a reading began: it cannot show their
-        bytes.
-        """
+        """Return leases granted or ready after a reading began: it cannot show their bytes."""
         return [lease for lease in self.recent.values() if self._after(lease, taken_at)]
 
     def _after(self, lease: Lease, taken_at: float) -> bool:
-        return max(lease.granted_at, lease.ready_at, lease.observed.enlarged_at) > taken_at
+        return max(lease.granted_at, lease.ready_at) > taken_at
 
     def filling(self, since: float) -> Iterator[Lease]:
         """Yield leases that load, or became ready after `since`.
@@ -167,8 +162,6 @@ class WaitQueue:
 
     def rank(self, lease: Lease) -> Rank:
         """Return the key by which any queue orders this request."""
-        if lease.request.rank is not None:
-            return (lease.request.rank, lease.request.arrival)
         return (
             lease.request.arrived_at - lease.spec.priority * self._ageing_s,
             lease.request.arrival,
@@ -254,7 +247,6 @@ class Gpu:
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
     changed_at: float = 0.0  # last grant, ready or verdict
     blocked: Block | None = None
-    keeper: Group | None = None  # loads on it: no other request is granted meanwhile
     pressed: bool = False  # a pressure note is out
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 

@@ -10,19 +10,13 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from math import inf
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Wait
 from vram_arbiter.schemas.wire.spec import LeaseSpec
-
-if TYPE_CHECKING:
-    from vram_arbiter.arbiter.core.hooks import Feature, Group
-    from vram_arbiter.arbiter.core.model.gpu import Residents
 
 
 class LeaseState(StrEnum):
@@ -51,8 +45,7 @@ _GONE = {_S.EXPIRED, _S.LOST}
 
 TRANSITIONS: Mapping[LeaseState, frozenset[LeaseState]] = MappingProxyType(
     {
-        # released from queued: a growth that was merged into its lease
-        _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED, _S.RELEASED}),
+        _S.QUEUED: frozenset({_S.LOADING, _S.DENIED, _S.CANCELLED}),
         # denied from loading: the grant could not be journalled, so it was never sent
         _S.LOADING: frozenset({_S.HELD, _S.VERIFYING, _S.DENIED, *_GONE}),
         _S.HELD: frozenset({_S.REVOKING, _S.UNLOADING, _S.VERIFYING, *_GONE}),
@@ -118,7 +111,6 @@ class Eviction:
     acked_at: float | None = None
     reminded: bool = False
     overdue: bool = False  # the ladder's deadline has passed
-    signalled: str = ""  # what was sent to its process: "", "term" or "kill"
     unloading_at: float | None = None
     released_at: float | None = None
     verdict_at: float | None = None
@@ -143,10 +135,6 @@ class Request:
     traceparent: str | None = None
     reason: Wait | None = None  # why it waits
     planned_gpu: GpuId | None = None  # where holders were revoked for it
-    extends: LeaseId | None = None  # a request for more bytes of that resident lease
-    rank: float | None = None  # a place in the queues that a feature gave it
-    group: "Group | None" = field(default=None, repr=False, compare=False)  # granted with others
-    needs: Mapping[ProcessKey, int] | None = None  # of a group of requests that count as one
     evicted: list[Eviction] = field(default_factory=list)  # made room for it
     earlier_nonces: deque[str] = field(default_factory=lambda: deque(maxlen=NONCES_MAX))
 
@@ -171,8 +159,6 @@ class Observed:
     grew_at: float = 0.0  # when that last rose
     steady_bytes: int = 0  # largest reading or report since it is ready
     drifted: set[str] = field(default_factory=set)  # parts of the footprint that were noted
-    enlarged_at: float = -inf  # when it was last granted more bytes
-    shrinks: bool = False  # readings may show bytes that its holder has freed already
 
 
 class Uses(dict[tuple[ProcessKey, UseId], Use]):
@@ -180,12 +166,23 @@ class Uses(dict[tuple[ProcessKey, UseId], Use]):
 
     def __init__(self) -> None:
         super().__init__()
-        self.paused: dict[tuple[ProcessKey, UseId], Use] = {}
-        """Uses that yielded: no departure waits for their end."""
         self.last_at = 0.0
-        """When a use last began, ended or paused, or the lease became ready."""
+        """When a use last began or ended, or the lease became ready."""
         self.unclaimed = False
         """The lease came back by itself and was not used since: it has no minimum residency."""
+
+
+@dataclass(slots=True)
+class Standby:
+    """How a lease leaves its GPU and lives on without bytes, and how it comes back (`standby`)."""
+
+    left_for: str = ""  # consumer that it was last revoked for
+    dismissed: bool = False  # an operator evicted it: it does not come back by itself
+    comes_back: bool = False  # by itself, once its bytes are measured gone and there is room
+    parks: bool = False  # its weights stay in host RAM
+    since: float = 0.0  # when it was measured away
+    recalled_at: float | None = None  # its holder wants it back before it is away
+    returned: bool = False  # it came back by itself the last time
 
 
 RECOVERED = frozenset({_S.LOADING, _S.HELD, _S.UNLOADING, _S.VERIFYING, *AWAY})
@@ -194,7 +191,7 @@ RECOVERED = frozenset({_S.LOADING, _S.HELD, _S.UNLOADING, _S.VERIFYING, *AWAY})
 
 @dataclass(slots=True)
 class Lease:
-    """A lease from its request to its end. The spec is what was asked for; a resize replaces it."""
+    """A lease from its request to its end. The spec is what was asked for."""
 
     id: LeaseId
     spec: LeaseSpec
@@ -212,10 +209,9 @@ class Lease:
     attached: bool = True  # False after a restart until its holder reattached
     pinned: Order | None = None  # by an operator
     departure: Departure = field(default_factory=Departure)
+    standby: Standby = field(default_factory=Standby)
     observed: Observed = field(default_factory=Observed)
     story: list[tuple[float, LeaseState, str]] = field(default_factory=list)  # last STORY_MAX steps
-    roster: "Residents | None" = field(default=None, repr=False, compare=False)  # of its GPU
-    features: tuple["Feature", ...] = field(default=(), repr=False, compare=False)  # concerned
 
     @classmethod
     def recovered(cls, record: LeaseRecord, request: Request, now: float, why: str) -> "Lease":
@@ -240,15 +236,24 @@ class Lease:
             attached=False,
             pinned=None if record.pinned is None else Order(*record.pinned),
             departure=Departure(revoked_before=revoked, exiting=record.exiting),
+            standby=Standby(
+                left_for=record.left_for,
+                dismissed=record.dismissed,
+                comes_back=record.comes_back,
+                parks=record.parks,
+                since=now,
+            ),
             observed=Observed(record.measured_bytes),
             story=[(now, state, why)],
         )
         lease.uses.last_at = now
         return lease
 
-    def record(self, charge_bytes: int, *, debt: bool = False) -> LeaseRecord:
+    def record(
+        self, charge_bytes: int, parked_bytes: int = 0, *, debt: bool = False
+    ) -> LeaseRecord:
         """Return the record of a lease that is resident, away, or over with its bytes still charged
-        (`debt`)."""
+        (`debt`). `parked_bytes`: host RAM that is booked for its weights."""
         assert self.token is not None, f"{self.id} is recorded without a token"
         state = "debt" if debt else self.state.value
         if not debt and self.departure.revoked_before and self.state is LeaseState.HELD:
@@ -269,17 +274,20 @@ class Lease:
             held_from=self.held_from,
             pinned=None if self.pinned is None else (self.pinned.by, self.pinned.reason),
             users=tuple([(*use.process, use.id, use.label) for use in self.users()]),
+            comes_back=self.standby.comes_back,
+            parks=self.standby.parks,
+            parked_bytes=parked_bytes,
+            left_for=self.standby.left_for,
+            dismissed=self.standby.dismissed,
         )
 
     def move(self, to: LeaseState, now: float, why: str) -> None:
         """Go to another state. Raises IllegalTransition, and then nothing has changed."""
         if to not in TRANSITIONS[self.state]:
             raise IllegalTransition(self, to)
-        before, self.state = self.state, to
+        self.state = to
         self.story.append((now, to, why))
         del self.story[:-STORY_MAX]
-        if self.roster is not None:
-            self.roster.moved(self, before)
 
     @property
     def since(self) -> float:
@@ -306,10 +314,6 @@ class Lease:
             oldest.setdefault(use.process, use)
         oldest.pop(self.process, None)
         return list(oldest.values())
-
-    def all_uses(self) -> list[Use]:
-        """Busy and pausing ones."""
-        return [*self.uses.values(), *self.uses.paused.values()]
 
     @property
     def evictable(self) -> bool:

@@ -46,7 +46,6 @@ class LeaseRecord:
     held_from: Seconds | None = None  # on the monotonic clock
     pinned: tuple[Text, Text] | None = None  # by whom, why
     users: Annotated[tuple[UserRecord, ...], Limits(max_length=1 << 17)] = ()
-    gang: tuple[Id, Annotated[int, Limits(ge=1, le=16)]] | None = None
     comes_back: bool = False
     parks: bool = False
     parked_bytes: Bytes = 0

@@ -4,8 +4,6 @@ They hold codes and values only. Words are made in `arbiter.rpc.words`, so rewor
 changes no decision and no replay. The fields are the `details` of the error on the wire.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
@@ -57,12 +55,10 @@ class Misfit(StrEnum):
     NOT_LOADING = "not_loading"
     NOT_HELD = "not_held"
     NOT_UNLOADABLE = "not_unloadable"
-    NOT_RESIZABLE = "not_resizable"
     IN_USE = "in_use"
     EXITS = "exits"
     NO_PARK_BYTES = "no_park_bytes"
     HOLDS_NOTHING = "holds_nothing"
-    NO_SUCH_USE = "no_such_use"
     NOT_REATTACHED = "not_reattached"
 
 
@@ -74,7 +70,6 @@ class BadLeaseState(Refusal, code="bad_state"):
     uses: int
     misfit: Misfit
     story: str
-    use_id: str = ""
 
 
 class Impractical(StrEnum):
@@ -84,6 +79,7 @@ class Impractical(StrEnum):
     LEAVING = "leaving"
     NOT_HELD = "not_held"
     IN_USE = "in_use"
+    OTHERS_USE = "others_use"
     PINNED_BY_OPERATOR = "pinned_by_operator"
     PINNED_BY_HOLDER = "pinned_by_holder"
     NOT_PINNED = "not_pinned"
@@ -135,11 +131,10 @@ class TargetOver(Refusal):
 
 
 class Revoked(Refusal, code="lease_revoking"):
-    """The holder was asked to leave, so no use begins (`use`) and no size changes (`resize`)."""
+    """The holder is revoked, so no use begins."""
 
     consumer: str
     state: str
-    wanted: Literal["use", "resize"]
     revoked: RevokeCause | None = None
 
 
@@ -158,16 +153,6 @@ class TooLarge(Refusal, code="vram_insufficient"):
     consumer: str
     needed_bytes: int
     declared_bytes: int
-    capacity_bytes: int
-    reserve_bytes: int
-
-
-class GrowthTooLarge(Refusal, code="vram_insufficient"):
-    """A lease can never grow so far; `room_bytes`: what it can have alone on its GPU."""
-
-    consumer: str
-    needed_bytes: int
-    room_bytes: int
     capacity_bytes: int
     reserve_bytes: int
 
@@ -233,15 +218,6 @@ class TimedOut(Refusal, code="wait_timeout"):
     why: Explanation
 
 
-class HolderOutstays(Refusal, code="holder_busy"):
-    """A holder did not leave in time, and the waiter did not want to wait longer."""
-
-    lease_id: str
-    consumer: str
-    uses: int
-    deadline_s: float
-
-
 class Expired(Refusal, code="lease_expired"):
     """The lease was not renewed in time, or an operator gave its silent holder up."""
 
@@ -270,71 +246,3 @@ class NotJournaled(Refusal, code="journal_unavailable"):
     lease_id: str
     key: str
     problem: str
-
-
-# -- gangs
-class GangMismatch(Refusal, code="bad_request"):
-    """A member does not fit its gang: another size (`asked`), or all members have asked already."""
-
-    gang: str
-    size: int
-    asked: int
-
-
-class GangTooLarge(Refusal, code="vram_insufficient"):
-    """All members together can never fit."""
-
-    gang: str
-    members: int
-    needed_bytes: int
-    budget_bytes: Mapping[str, int]
-
-
-class GangEnd(StrEnum):
-    """Why a gang is broken."""
-
-    REFUSED = "refused"  # a member was
-    FALLEN = "fallen"  # a member ended
-    INCOMPLETE = "incomplete"  # after a restart
-    MEMBER_TOO_LARGE = "member_too_large"  # one holds more than it declared
-    OTHERS_TOO_LARGE = "others_too_large"
-    NOT_FREED = "not_freed"  # measured memory did not come back
-
-
-class BrokenGang(Refusal, code="gang_broken"):
-    """The gang will not be granted. `consumer`, `lease_id`, `state`: the fallen member; `because`:
-    its refusal."""
-
-    gang: str
-    why: GangEnd
-    consumer: str = ""
-    lease_id: str = ""
-    state: str = ""
-    because: str = ""  # wire code
-
-
-# -- deadlocks
-@dataclass(frozen=True, slots=True)
-class NamedLease:
-    """A lease in a cycle."""
-
-    lease_id: str
-    consumer: str
-    state: str
-
-
-@dataclass(frozen=True, slots=True)
-class CycleLink:
-    """A process in a cycle: it uses what it holds, and waits."""
-
-    pid: int
-    consumer: str
-    lease_id: str
-    waits_for: tuple[NamedLease, ...]
-    holds: tuple[NamedLease, ...]
-
-
-class Deadlock(Refusal, code="would_deadlock"):
-    """The wait would never end."""
-
-    cycle: tuple[CycleLink, ...]

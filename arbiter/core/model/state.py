@@ -22,11 +22,10 @@ from vram_arbiter.arbiter.core.effects import (
     Reply,
     Sample,
 )
-from vram_arbiter.arbiter.core.hooks import Feature
 from vram_arbiter.arbiter.core.learning import Costs, Footprints
-from vram_arbiter.arbiter.core.ledger import GpuLedger
+from vram_arbiter.arbiter.core.ledger import GpuLedger, HostRam
 from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
-from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState, Use
+from vram_arbiter.arbiter.core.model.lease import AWAY, Eviction, Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
@@ -139,8 +138,6 @@ class Turn:
     """GPUs by index whose records may have changed: their next reading is planned, their invariants
     are checked.
     """
-    suspects: set[ProcessKey] = field(default_factory=set)
-    """Processes that use and wait since this event: they may be in a circle (`deadlock`)."""
     unanswered: list[Lease] = field(default_factory=list)
     """Leases of this event's acquire; one that is not granted at once is answered `queued`."""
     granted: list[tuple[Token, GpuId]] = field(default_factory=list)
@@ -152,9 +149,8 @@ class Turn:
 class Core:
     """State plus the effects of the event being handled."""
 
-    def __init__(self, settings: Settings, now: float, features: tuple[Feature, ...]) -> None:
+    def __init__(self, settings: Settings, now: float) -> None:
         self.settings = settings
-        self.features = features
         self.started_at = now
         self.now = now
         self.turn = Turn()
@@ -177,12 +173,13 @@ class Core:
         self.nonces: dict[tuple[ProcessKey, str], LeaseId] = {}
         self.ended: OrderedDict[LeaseId, Ended] = OrderedDict()
         self.refusals: dict[ProcessKey, Refusals] = {}  # the latest last
-        # waits and uses
+        self.terminated: set[ProcessKey] = set()  # told to end by an operator, and alive
+        # waits, uses, and leases without bytes on a GPU in the order of their leaving
         self.waiting: dict[LeaseId, Lease] = {}
-        self.unqueued: dict[LeaseId, Lease] = {}  # waiters that a feature keeps out of the queues
         self.waiters_of: dict[ProcessKey | int, int] = {}  # how many, by process and by uid
         self.users: dict[ProcessKey, dict[_UseKey, Lease]] = {}  # leases that a process uses
-        self.pausing: dict[ProcessKey, dict[_UseKey, Lease]] = {}  # those where its uses pause
+        self.away: dict[LeaseId, Lease] = {}
+        self.host_ram = HostRam(settings.host_ram_budget_bytes)
         # numbers: tokens are ahead of `serial` by `token_offset`
         self.serial = self.token_offset = self.arrivals = 0
         self.last_token = Token(settings.epoch, 0)
@@ -292,69 +289,48 @@ class Core:
         return list(self._of_process.get(process, {}).values())
 
     def mark(self, lease: Lease, use: Use) -> None:
-        """A use is busy from now on."""
-        if (use.process, use.id) in lease.uses.paused:
-            self.unmark(lease, use)
+        """A use begins."""
         lease.uses[use.process, use.id] = use
         self.users.setdefault(use.process, {})[lease.id, use.id] = lease
         lease.uses.unclaimed = False
-        if use.process in self.waiters_of:
-            self.turn.suspects.add(use.process)
-
-    def pause(self, lease: Lease, use: Use) -> None:
-        """A busy use pauses."""
-        self.unmark(lease, use)
-        lease.uses.paused[use.process, use.id] = use
-        self.pausing.setdefault(use.process, {})[lease.id, use.id] = lease
 
     def unmark(self, lease: Lease, use: Use) -> None:
-        """A use ends, busy or paused."""
-        key = (use.process, use.id)
-        busy = key in lease.uses
-        del (lease.uses if busy else lease.uses.paused)[key]
-        _take_out(self.users if busy else self.pausing, use.process, (lease.id, use.id))
+        """A use ends."""
+        del lease.uses[use.process, use.id]
+        _take_out(self.users, use.process, (lease.id, use.id))
 
     def used_by(self, process: ProcessKey) -> list[Lease]:
-        """Return the live leases with a use of a process, busy or paused; some twice."""
-        tables = (self.users.get(process, {}), self.pausing.get(process, {}))
-        return [lease for table in tables for lease in table.values()]
+        """Return the live leases with a use of a process; some twice."""
+        return list(self.users.get(process, {}).values())
 
     def move(self, lease: Lease, to: LeaseState, why: str) -> None:
-        """Move a lease to another state and tell its features. Raises IllegalTransition."""
+        """Move a lease to another state, in the tables too. Raises IllegalTransition."""
         before = lease.state
         lease.move(to, self.now, why)
-        for feature in lease.features:
-            feature.on_moved(self, lease, before)
+        if lease.gpu is not None:
+            self.gpus[lease.gpu].residents.moved(lease, before)
+        if to in AWAY:
+            self.away[lease.id] = lease
+        else:
+            self.away.pop(lease.id, None)
+        if to is LeaseState.HELD or (to is LeaseState.VERIFYING and not lease.standby.parks):
+            self.host_ram.free(lease.id)  # its weights are on the GPU, or nowhere
 
-    def next_state(self, lease: Lease) -> LeaseState | None:
-        """Where a released lease goes once its bytes are measured gone; None: it is over then."""
-        for feature in lease.features:
-            if (state := feature.next_state(lease)) is not None:
-                return state
-        return None
-
-    def enqueue(self, lease: Lease, *, hold_back: bool = False) -> None:
-        """A request waits in the queue of every candidate GPU; held back, it waits in none yet."""
+    def enqueue(self, lease: Lease) -> None:
+        """A request waits in the queue of every candidate GPU."""
         request = lease.request
         if lease.id not in self.waiting:
             self.waiting[lease.id] = lease
             for owner in (lease.process, request.uid):
                 self.waiters_of[owner] = self.waiters_of.get(owner, 0) + 1
-            if lease.process in self.users:
-                self.turn.suspects.add(lease.process)
             if request.wait_timeout_s is not None:
                 self.timers.set(("wait", lease.id), request.arrived_at + request.wait_timeout_s)
-        if hold_back:
-            self.unqueued[lease.id] = lease
-            return
-        self.unqueued.pop(lease.id, None)
         for gpu_id in request.gpus:
             self.gpus[gpu_id].queue.add(lease)
             self.wake(self.gpus[gpu_id])
 
     def dequeue(self, lease: Lease) -> None:
         """A request waits no more."""
-        self.unqueued.pop(lease.id, None)
         if self.waiting.pop(lease.id, None) is not None:
             for owner in (lease.process, lease.request.uid):
                 self.waiters_of[owner] -= 1
@@ -370,8 +346,9 @@ class Core:
         del self.leases[lease.id]
         _take_out(self._of_process, lease.process, lease.id)
         _take_out(self.of_client, lease.client, lease.id)
-        for kind in ("ttl", "revoke", "overstay", "users"):
+        for kind in ("ttl", "revoke", "users", "away"):
             self.timers.cancel((kind, lease.id))
+        self.host_ram.free(lease.id)
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.remove(lease)
@@ -397,9 +374,7 @@ class Core:
         happened; a stale record makes a later recovery more careful.
         """
         charge_bytes = 0 if lease.gpu is None else self.gpu_of(lease).ledger.charge_bytes(lease.id)
-        record = lease.record(charge_bytes, debt=debt)
-        for feature in lease.features:
-            record = feature.to_record(lease, record)
+        record = lease.record(charge_bytes, self.host_ram.booked.get(lease.id, 0), debt=debt)
         self.journal(f"lease:{lease.id}", record, gates=gates)
 
     def record_residue(self, gpu: Gpu, process: ProcessKey, residue_bytes: int) -> None:

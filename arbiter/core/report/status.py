@@ -31,7 +31,7 @@ from vram_arbiter.schemas.wire.views import (
 
 RESIDUES = "(residues)"
 """Stands for bytes that no resident lease has: residues of living processes, debts of leases that
-are over, what a gang keeps free."""
+are over."""
 STOWAWAYS = "(stowaways)"
 """Stands for processes without a lease."""
 UNATTRIBUTED = "(unattributed)"
@@ -59,7 +59,7 @@ def view(core: Core, lease: Lease) -> LeaseView:
             ttl_left_s = max(0.0, lease.expires_at - core.now)
         if lease.state is not LeaseState.LOADING:
             drift_bytes = learning.drift_bytes(core, gpu, lease)
-    shown = LeaseView(
+    return LeaseView(
         lease_id=lease.id,
         token=lease.token,
         state=lease.state,
@@ -79,17 +79,13 @@ def view(core: Core, lease: Lease) -> LeaseView:
         ttl_left_s=ttl_left_s,
         pinned="" if lease.pinned is None else str(lease.pinned),
         drift_bytes=drift_bytes,
-        yielded=len(lease.uses.paused),
+        standby=lease.spec.standby,
+        parked_bytes=core.host_ram.booked.get(lease.id),
     )
-    for feature in lease.features:
-        shown = feature.view(shown, lease)
-    return shown
 
 
 def position(core: Core, lease: Lease) -> int:
-    """Return the best place of a request in a queue; 0: it is in none."""
-    if lease.id in core.unqueued:
-        return 0
+    """Return the best place of a request in a queue."""
     return min([core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.request.gpus])
 
 
@@ -132,8 +128,6 @@ def block_view(core: Core, gpu: Gpu) -> BlockView | None:
         case Block.LOADING:
             loading = gpu.in_state(LeaseState.LOADING)[:1]
             return BlockView(code, tuple(one.spec.consumer for one in loading))
-        case Block.GANG:
-            return BlockView(code, (gpu.keeper.name if gpu.keeper else "",))
         case Block.PRESSURE:
             return BlockView(code, bytes=gpu.ledger.pressure_bytes())
         case _:
@@ -162,7 +156,6 @@ def _processes(gpu: Gpu) -> Iterator[ProcessView]:
 
 def status(
     core: Core,
-    host_ram: HostRamView,
     reader: ProcessKey | None = None,
     after: PageKey | None = None,
     limit: int | None = None,
@@ -192,7 +185,7 @@ def status(
         ),
         totals=Totals(leases=len(core.leases), waiting=len(core.waiting)),
         clients=len(core.clients),
-        host_ram=host_ram,
+        host_ram=HostRamView(core.host_ram.budget_bytes, core.host_ram.taken_bytes()),
         drained="" if core.drain is None else str(core.drain),
         problems=(),
         next=_page_key(core, leases[-1]) if more else None,
@@ -208,18 +201,17 @@ def _page_key(core: Core, lease: Lease) -> PageKey:
 def _listed(core: Core, after: PageKey, limit: int | None) -> Iterator[Lease]:
     """Yield leases with bytes or away by arrival, then the waiters in the order of the queues.
 
-    Each once. Waiters that a feature keeps out of the queues are listed at their rank.
+    Each once.
     """
     key = partial(_page_key, core)
     if after[0] == 0:
         granted = [one for one in core.leases.values() if one.state is not LeaseState.QUEUED]
         rest = [one for one in granted if key(one) > after]
         yield from nsmallest(len(rest) if limit is None else limit, rest, key=key)
-    unqueued = sorted((one for one in core.unqueued.values() if key(one) > after), key=key)
     rank = after[1:] if after[0] else (-inf, 0)
     queued = [gpu.queue.after(rank) for gpu in core.gpus.values()]
     last: Lease | None = None
-    for lease in merge(unqueued, *queued, key=key):
+    for lease in merge(*queued, key=key):
         if lease is not last:  # else it waits for several GPUs
             yield lease
         last = lease

@@ -1,22 +1,21 @@
 """Answers to `why`: what a lease waits for, what is in its way, and what happens next.
 
 `explain` composes them in this order, as codes and values without words:
-  1. standing: the GPU and the company of a request, as its feature tells
-  2. blockers: the bytes of each holder, and the condition on which they come free
-  3. situation: the one thing that the lease waits for now
-  4. plan: the next steps of the arbiter, and the instants at which they are planned
-  5. estimate: seconds until the lease is loaded, from learned medians
+  1. blockers: the bytes of each holder, and the condition on which they come free
+  2. situation: the one thing that the lease waits for now
+  3. plan: the next steps of the arbiter, and the instants at which they are planned
+  4. estimate: seconds until the lease is loaded, from learned medians
 Reads only, and only when asked: the plan costs a search for victims per instant.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from heapq import nlargest
 from itertools import islice
 from math import inf
 
-from vram_arbiter.arbiter.core import learning
+from vram_arbiter.arbiter.core import learning, standby
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -35,7 +34,6 @@ from vram_arbiter.schemas.wire.explained import (
     Step,
     WhyReply,
 )
-from vram_arbiter.schemas.wire.views import GangView
 
 EXPLAINED_MAX = 8
 """Leases of one answer to `why`."""
@@ -61,23 +59,6 @@ _PHASES_LEFT = {
     LeaseState.VERIFYING: ("verify_s",),
 }
 """Learned phases that a leaving lease has before it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """A request's GPU, company and prospects."""
-
-    gpu: Gpu  # where it is, where room is made for it, or where it may be placed
-    request: Lease  # as it is admitted there: the requests of a group count as one
-    fellows: tuple[Lease, ...]  # requests that have one place in the queues together
-    loads: tuple[Lease, ...] | None  # to be loaded there, up to this one; None: not known yet
-    gang: GangView | None = None  # that it is granted with
-    lacks: tuple[Lease, ...] = ()  # other members of it that are not held
-    back: Return | None = None  # what it waits for where it is away
-    ahead: str = ""  # consumer before it then
-    due_s: float | None = None
-    reserved_bytes: int = 0  # charged already, for its turn to load
-    gives_up: tuple[float, Because] | None = None  # when its gang is broken, and why
 
 
 def why(core: Core, consumer: str) -> WhyReply:
@@ -115,10 +96,8 @@ def explain(core: Core, lease: Lease, *, plan: bool = False, brief: bool = False
     `plan`: with the next steps. They also give an estimate where no holder was revoked yet.
     `brief`: without the blockers of a request behind others, which are the head's own.
     """
-    standing = standing_of(core, lease)
-    gpu, kept = standing.gpu, standing.reserved_bytes
-    free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes() + kept
-    away = lease.state in AWAY
+    gpu, away = _gpu_of(core, lease), lease.state in AWAY
+    free = gpu.ledger.budget_bytes - gpu.ledger.total_bytes()
     told = Explanation(
         lease_id=lease.id,
         consumer=lease.spec.consumer,
@@ -133,46 +112,66 @@ def explain(core: Core, lease: Lease, *, plan: bool = False, brief: bool = False
         eta_source="none",
         footprint=learning.footprint(core, lease),
         plan=(),
-        ahead=standing.ahead,
         block=status.block_view(core, gpu),
-        gang=standing.gang,
     )
     if lease.state is LeaseState.QUEUED:
-        return _explain_waiter(core, lease, standing, free, told, plan=plan, brief=brief)
+        return _explain_waiter(core, lease, gpu, free, told, plan=plan, brief=brief)
+    if away:
+        return _explain_away(core, lease, gpu, told)
     eviction = lease.departure.eviction
     return replace(
         told,
-        lacks=tuple(holder(core, standing_of(core, one).gpu, one) for one in standing.lacks),
-        holder=None if away else holder(core, gpu, lease),
+        holder=holder(core, gpu, lease),
         revoked=None if eviction is None else eviction.why,
         drifted=bool(learning.drift_bytes(core, gpu, lease)),
-        back=standing.back,
-        due_s=standing.due_s,
     )
+
+
+def _gpu_of(core: Core, lease: Lease) -> Gpu:
+    """Return where a lease is, where room is made for it, or where it may be placed first."""
+    return core.gpus[lease.gpu or lease.request.planned_gpu or lease.request.gpus[0]]
+
+
+def _explain_away(core: Core, lease: Lease, gpu: Gpu, told: Explanation) -> Explanation:
+    """Tell what a lease that is away waits for on the first GPU that it may return to."""
+    head, due_at = gpu.queue.head, standby.quiet_at(gpu, lease)
+    if not lease.attached:
+        return replace(told, back=Return.HOLDER)
+    if not lease.standby.comes_back:
+        return replace(told, back=Return.ASKED)
+    if head is not None:
+        return replace(told, back=Return.BEHIND, ahead=head.spec.consumer)
+    if admission.blocked(core, gpu):
+        return replace(told, back=Return.BLOCKED)
+    if standby.left_for_is_here(gpu, lease):
+        return replace(told, back=Return.LEFT_FOR, ahead=lease.standby.left_for)
+    if not admission.fits(gpu, lease):
+        return replace(told, back=Return.NO_ROOM)
+    if due_at > core.now:
+        return replace(told, back=Return.QUIET, due_s=due_at - core.now)
+    return replace(told, back=Return.READING)
 
 
 def _explain_waiter(
     core: Core,
     lease: Lease,
-    standing: Standing,
+    gpu: Gpu,
     free: int,
     told: Explanation,
     *,
     plan: bool,
     brief: bool,
 ) -> Explanation:
-    gpu, request, kept = standing.gpu, lease.request, standing.reserved_bytes
-    needed = request.load_peak_bytes if kept else admission.added_bytes(gpu, standing.request)
+    request, needed = lease.request, admission.added_bytes(gpu, lease)
     deficit = max(0, needed - free)
     raised = request.load_peak_bytes > lease.spec.footprint.load_peak_bytes
-    # a gang has the place of its foremost member
-    position = min(status.position(core, member) for member in standing.fellows)
+    position = status.position(core, lease)
     behind = brief and position > 1
-    blockers = () if behind else _blockers(core, gpu, standing.request, deficit)
-    situation = _situation(core, standing, lease, position, blocked=bool(blockers))
+    blockers = () if behind else _blockers(core, gpu, lease, deficit)
+    situation = _situation(core, gpu, lease, position, blocked=bool(blockers))
     leaving = _leaving(gpu) if situation is Situation.MAKING_ROOM else ()
-    steps = _steps(core, standing, lease) if plan else ()
-    eta_s = _eta_s(core, standing, steps) if position <= 1 else _eta_behind_s(core, gpu, lease)
+    steps = _steps(core, gpu, lease) if plan else ()
+    eta_s = _eta_s(core, gpu, lease, steps) if position <= 1 else _eta_behind_s(core, gpu, lease)
     return replace(
         told,
         position=position,
@@ -187,43 +186,26 @@ def _explain_waiter(
         wait=request.reason,
         leaving=tuple(holder(core, gpu, one) for one in leaving),
         measuring=tuple(one.consumer for one in gpu.verifications.values()),
-        kept=bool(kept),
         expected_bytes=request.load_peak_bytes if raised else None,
     )
-
-
-# -- 1. standing -----------------------------------------------------------------------------------
-def standing_of(core: Core, lease: Lease) -> Standing:
-    """Return the standing of a request, or of a granted lease whose group is not complete."""
-    for feature in lease.features:
-        told = feature.standing(core, lease)
-        if told is not None:
-            return told
-    gpu = core.gpus[lease.gpu or lease.request.planned_gpu or lease.request.gpus[0]]
-    return Standing(gpu, lease, (lease,), (lease,))
 
 
 def ahead_of(core: Core, lease: Lease) -> str:
     """Return the consumer of the request before this one; "" for the head, which alone has
     blockers of its own."""
-    fellows = standing_of(core, lease).fellows
-    foremost = min(fellows, key=lambda member: status.position(core, member))
-    if status.position(core, foremost) <= 1:
+    if status.position(core, lease) <= 1:
         return ""
-    before = standing_of(core, foremost).gpu.queue.ahead_of(foremost)
+    before = _gpu_of(core, lease).queue.ahead_of(lease)
     return core.waiting[before].spec.consumer if before else "others"
 
 
-# -- 2. blockers -----------------------------------------------------------------------------------
+# -- 1. blockers -----------------------------------------------------------------------------------
 def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> tuple[Blocker, ...]:
     """List what holds bytes that the waiter lacks, or holds the GPU alone.
 
-    Everything charged on the GPU is listed: holders, members of a gang that wait for their turn,
-    contexts, debts, stowaways.
+    Everything charged on the GPU is listed: holders, contexts, debts, stowaways.
     """
     loading = gpu.in_state(LeaseState.LOADING)
-    if waiter.id in gpu.ledger.reserved:  # it has its bytes, and waits for its turn
-        return tuple(holder(core, gpu, lease, waiter) for lease in loading)
     alone = waiter.spec.exclusive or gpu.residents.exclusive
     if not deficit and not alone and not loading:
         return ()
@@ -232,7 +214,7 @@ def _blockers(core: Core, gpu: Gpu, waiter: Lease, deficit: int) -> tuple[Blocke
         charge_of = gpu.ledger.charge_bytes
         residents = nlargest(BLOCKERS_MAX, residents, lambda lease: charge_of(lease.id))
     holders = [holder(core, gpu, lease, waiter) for lease in residents]
-    return tuple([*holders, *_reserved(core, gpu), *_keepers(core, gpu, waiter)][:BLOCKERS_MAX])
+    return tuple([*holders, *_keepers(core, gpu, waiter)][:BLOCKERS_MAX])
 
 
 def holder(core: Core, gpu: Gpu, lease: Lease, waiter: Lease | None = None) -> Blocker:
@@ -240,10 +222,6 @@ def holder(core: Core, gpu: Gpu, lease: Lease, waiter: Lease | None = None) -> B
     condition, seconds = _condition(core, lease, waiter)
     long = condition is Condition.LOADING and core.now - lease.granted_at >= LONG_LOAD_S
     quiet_s = core.now - max(lease.observed.grew_at, lease.granted_at)
-    group = lease.request.group
-    by = group.name if group is not None and condition is Condition.GANG else ""
-    if condition is Condition.PINNED and lease.pinned:
-        by = str(lease.pinned)
     blocker = Blocker(
         lease_id=lease.id,
         consumer=lease.spec.consumer,
@@ -252,10 +230,9 @@ def holder(core: Core, gpu: Gpu, lease: Lease, waiter: Lease | None = None) -> B
         uses=len(lease.uses),
         label=next((use.label for use in lease.uses.values()), ""),
         condition=condition,
-        paused=len(lease.uses.paused),
         seconds=seconds,
         pid=lease.process.pid if condition is Condition.HANGING else None,
-        by=by,
+        by=str(lease.pinned) if condition is Condition.PINNED and lease.pinned else "",
         loaded_bytes=lease.observed.peak_bytes if long else None,
         quiet_s=quiet_s if long and quiet_s >= LONG_LOAD_S else None,
     )
@@ -280,8 +257,6 @@ def _condition(core: Core, lease: Lease, waiter: Lease | None) -> tuple[Conditio
             return Condition.MEASURED, None
     if not lease.attached:
         return Condition.NOT_BACK, lease.expires_at - core.now
-    if lease.request.group is not None:
-        return Condition.GANG, None
     if not lease.evictable:
         return Condition.PINNED, None
     if waiter is not None:
@@ -297,20 +272,6 @@ def _condition(core: Core, lease: Lease, waiter: Lease | None) -> tuple[Conditio
     return Condition.IDLE, None
 
 
-def _reserved(core: Core, gpu: Gpu) -> list[Blocker]:
-    """List requests whose bytes are charged here and that wait for their turn to load. The next
-    one has the headroom too."""
-    reserved, blockers = gpu.ledger.reserved, list[Blocker]()
-    for lease in [lease for lease in core.waiting.values() if lease.id in reserved]:
-        count = gpu.ledger.charge_bytes(lease.id)
-        if not blockers:
-            count = standing_of(core, lease).reserved_bytes
-        name, gang = lease.spec.consumer, gpu.keeper.name if gpu.keeper else ""
-        turn = Blocker(lease.id, name, count, lease.state, 0, Condition.TURN, by=gang)
-        blockers.append(turn)
-    return blockers
-
-
 def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
     """List processes without a resident lease that hold bytes: contexts of live processes, debts,
     stowaways."""
@@ -318,11 +279,11 @@ def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
     names = {client.process: client.name for client in core.clients.values()}
     kept: list[Blocker] = []
     for process, account in ledger.accounts.items():
-        count, pid = account.granted_bytes, process.pid
+        count, pid = account.charged_bytes, process.pid
         resident = not gpu.residents.keys().isdisjoint(account.charges)
         if process == waiter.process or not count or resident:
             continue
-        if any(lease not in ledger.reserved for lease in account.charges):
+        if account.charges:
             debts = [one for one in gpu.verifications.values() if one.process == process]
             keeps = any(one.overdue and one.alive for one in debts)
             state, condition = "debt", Condition.DEBT_KEPT if keeps else Condition.DEBT
@@ -339,17 +300,11 @@ def _keepers(core: Core, gpu: Gpu, waiter: Lease) -> list[Blocker]:
     return kept
 
 
-# -- 3. situation ----------------------------------------------------------------------------------
-def _situation(
-    core: Core, standing: Standing, lease: Lease, position: int, *, blocked: bool
-) -> Situation:
+# -- 2. situation ----------------------------------------------------------------------------------
+def _situation(core: Core, gpu: Gpu, lease: Lease, position: int, *, blocked: bool) -> Situation:
     """Return the one thing that a request waits for now."""
-    gpu = standing.gpu
     if position > 1:
         return Situation.BEHIND
-    if standing.gang is not None:
-        phases = {"gathering": Situation.GATHERING, "loading": Situation.GANG_LOADS}
-        return phases.get(standing.gang.phase, Situation.GANG_WAITS)
     leaving = _leaving(gpu)
     if leaving and lease.request.planned_gpu == gpu.info.id:
         return Situation.MAKING_ROOM
@@ -360,22 +315,11 @@ def _situation(
     return Situation.NO_ROOM if blocked and not gpu.verifications else Situation.MEASURING
 
 
-# -- 4. plan ---------------------------------------------------------------------------------------
-def _steps(core: Core, standing: Standing, waiter: Lease) -> tuple[Step, ...]:
+# -- 3. plan ---------------------------------------------------------------------------------------
+def _steps(core: Core, gpu: Gpu, waiter: Lease) -> tuple[Step, ...]:
     """Return the next steps for a request, the nearest first, those without an instant last."""
-    gpu, request = standing.gpu, waiter.request
-    found: list[Step] = []
-    if waiter.id not in core.unqueued:
-        first = admission.front(core, gpu)
-        if any(first is one for one in standing.fellows):
-            found = _steps_of_head(core, gpu, standing.request)
-    else:  # it waits for the rest of its gang, or with its bytes reserved for its turn to load
-        if standing.reserved_bytes:
-            found = _ends_of_loads(core, gpu) or [_next_reading(core, gpu, Because.KEPT)]
-        if standing.gives_up is not None:
-            gang = "" if standing.gang is None else standing.gang.id
-            broken = _step(core, NextAction.BREAK, None, *standing.gives_up)
-            found.append(replace(broken, gang=gang))
+    request, first = waiter.request, admission.front(core, gpu)
+    found = _steps_of_head(core, gpu, waiter) if first is waiter else []
     if request.wait_timeout_s is not None:
         at = request.arrived_at + request.wait_timeout_s
         found.append(_step(core, NextAction.GIVE_UP, waiter, at, Because.TIMEOUT))
@@ -439,10 +383,8 @@ def _of_leaving(core: Core, gpu: Gpu, waiter: Lease, leaving: Lease) -> Step:
         return _step(core, NextAction.WAIT, leaving, None, because)
     unloads = leaving.state is LeaseState.UNLOADING
     at = (leaving.since if unloads else eviction.asked_at) + core.settings.revoke_deadline_s
-    because = Because.DENIED if waiter.spec.on_deadline == "deny" else Because.WAITS_ON
-    return replace(
-        _step(core, NextAction.DEADLINE, leaving, at, because), waiter=waiter.spec.consumer
-    )
+    step = _step(core, NextAction.DEADLINE, leaving, at, Because.WAITS_ON)
+    return replace(step, waiter=waiter.spec.consumer)
 
 
 def _ends_of_loads(core: Core, gpu: Gpu) -> list[Step]:
@@ -470,23 +412,18 @@ def _step(
     )
 
 
-# -- 5. estimate -----------------------------------------------------------------------------------
-def _eta_s(core: Core, standing: Standing, steps: Sequence[Step]) -> float | None:
+# -- 4. estimate -----------------------------------------------------------------------------------
+def _eta_s(core: Core, gpu: Gpu, waiter: Lease, steps: Sequence[Step]) -> float | None:
     """Return the seconds until a request is loaded, if every phase takes as long as usual.
 
     None: a phase on the way was never seen, or nothing is planned.
     """
-    gpu, load_s = standing.gpu, 0.0
-    if standing.loads is None:
+    load_s = core.costs.learnt_s(waiter.spec.consumer, "load_s")
+    if load_s is None:
         return None
-    for one in standing.loads:  # those of its gang that load before it, too
-        usual_s = core.costs.learnt_s(one.spec.consumer, "load_s")
-        if usual_s is None:
-            return None
-        load_s += usual_s
-    emptied_s, kept = _emptied_s(core, gpu), standing.reserved_bytes
-    if emptied_s or (emptied_s is not None and (kept or admission.fits(gpu, standing.request))):
-        turn_s = 0.0 if kept else _loaded_s(core, gpu)
+    emptied_s = _emptied_s(core, gpu)
+    if emptied_s or (emptied_s is not None and admission.fits(gpu, waiter)):
+        turn_s = _loaded_s(core, gpu)
         return None if turn_s is None else max(emptied_s, turn_s) + load_s
     left_s = 0.0
     asked = [step for step in steps if step.action is NextAction.ASK]
@@ -506,20 +443,19 @@ def _eta_behind_s(core: Core, gpu: Gpu, lease: Lease) -> float | None:
     queued = list(islice(gpu.queue, BEHIND_MAX))
     if lease not in queued:
         return None
-    head, *others = queued[: queued.index(lease) + 1]
-    together = [standing_of(core, one) for one in (head, *others)]
-    if any(len(one.fellows) > 1 or one.request.spec.exclusive for one in together):
+    head, *others = together = queued[: queued.index(lease) + 1]
+    if any(one.spec.exclusive for one in together):
         return None
-    steps = _steps(core, together[0], head)
+    steps = _steps(core, gpu, head)
     going = admission.leaving(gpu)
     going |= {one: core.leases[one].residue_bytes for one in _asked(steps)}
     joining: Counter[ProcessKey] = Counter()
     for one in together:
-        joining.update(dict(admission.joining(one.request)))
+        joining.update(dict(admission.joining(one)))
     if gpu.ledger.total_if(going, joining.items()) > gpu.ledger.budget_bytes:
         return None
     loads = [core.costs.learnt_s(one.spec.consumer, "load_s") for one in others]
-    known = [_eta_s(core, together[0], steps), *loads]
+    known = [_eta_s(core, gpu, head, steps), *loads]
     return sum(one for one in known if one is not None) if None not in known else None
 
 

@@ -1,17 +1,18 @@
-"""What an operator may do by hand: evict, pin and unpin, drain and resume, give up the lease of a
-dead holder, change constants.
+"""What an operator may do by hand: evict, pin and unpin, drain and resume, end a stuck holder, give
+up the lease of a dead one, change constants.
 
 Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does,
-and a lease in use is never given up. Every action is a note with the operator and the reason; a pin
+and a lease that others use is never given up. Every action is a note with the operator and the reason; a pin
 and a drain are journaled, so they outlive the daemon. The role was checked where the request came
 in.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal
 
-from vram_arbiter.arbiter.core import eviction
+from vram_arbiter.arbiter.core import eviction, standby
+from vram_arbiter.arbiter.core.effects import Signal
 from vram_arbiter.arbiter.core.events import DRAIN_KEY, OperatorAsked, SettingsChanged
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
@@ -23,7 +24,7 @@ from vram_arbiter.arbiter.core.requests.requests import over
 from vram_arbiter.arbiter.core.requests.sessions import expire
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Order
-from vram_arbiter.schemas.wire.notes import OperatorNote
+from vram_arbiter.schemas.wire.notes import OperatorNote, SignalledNote
 from vram_arbiter.schemas.wire.replies import DrainReply, OperatorReply
 
 SILENT_SHARE = 2 / 3
@@ -100,8 +101,26 @@ def _dismiss(core: Core, lease: Lease, order: Order) -> None:
     asked = lease.departure.eviction
     if asked is not None:
         asked.why = replace(asked.why, cause="operator", order=order)
-    for feature in lease.features:
-        feature.on_dismissed(core, lease, order)
+    standby.dismiss(core, lease, order)
+
+
+def kill(core: Core, lease: Lease, order: Order) -> None:
+    """End the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again.
+
+    Its lease is lost with it, and its bytes are measured gone as ever. Refused while its process
+    and another one are in the middle of a use of each other's leases: a robot may be moving.
+    """
+    if lease.state not in EXPIRING:
+        raise _impractical(lease, Impractical.NOT_HELD)
+    process = lease.process
+    uses = [use for one in core.leases_of(process) for use in one.uses.values()]
+    used = core.users.get(process, {}).values()
+    if any(use.process != process for use in uses) or any(one.process != process for one in used):
+        raise _impractical(lease, Impractical.OTHERS_USE)
+    signal: Literal["term", "kill"] = "kill" if process in core.terminated else "term"
+    core.terminated.add(process)
+    core.turn.effects.append(Signal(process, signal))
+    core.note(SignalledNote(signal, process.pid, order.by, order.reason), lease)
 
 
 def pin(core: Core, lease: Lease, order: Order) -> None:
@@ -174,6 +193,7 @@ def _impractical(lease: Lease, problem: Impractical, silent_s: float | None = No
 
 _TO_LEASE: Final[Mapping[str, Callable[[Core, Lease, Order], None]]] = {
     "evict": evict,
+    "kill": kill,
     "pin": pin,
     "unpin": unpin,
     "release_dead": release_dead,

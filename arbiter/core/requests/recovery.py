@@ -12,10 +12,10 @@ not count until holders and readings say it again.
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import eviction, learning
+from vram_arbiter.arbiter.core import eviction, learning, standby
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState, Request, Use
+from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
 from vram_arbiter.arbiter.core.model.records import (
     DoubtRecord,
     DrainRecord,
@@ -26,13 +26,14 @@ from vram_arbiter.arbiter.core.model.refusals import Refused
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.requests import uses
-from vram_arbiter.arbiter.core.requests.requests import become_held, keep, over
+from vram_arbiter.arbiter.core.requests.requests import become_held, keep, over, released
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.verification.schedule import begin_again, begin_for_lease
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.notes import ReattachedNote, RecoveredNote, ResumedNote, ServingNote
+from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
 
 EMPTY_JOURNAL = LeaseId("journal")
@@ -102,9 +103,11 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
         core.remember(Ended(lease.id, lease.process, nonce, token, LeaseState.LOST, lost))
         return lease
     core.add(lease)
-    for feature in core.features:
-        feature.from_record(core, lease, record)
+    if record.parked_bytes:
+        core.host_ram.find(lease.id, record.parked_bytes)
     if gpu is None:  # 3
+        core.away[lease.id] = lease
+        core.timers.set(("away", lease.id), core.now + lease.spec.ttl_s + grace_s)
         return lease
     gpu.residents.add(lease)
     if lease.state is LeaseState.VERIFYING:  # 4
@@ -201,8 +204,8 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
         lease.ready_at = core.now
         if lease.gpu is not None:
             core.gpu_of(lease).residents.recent[lease.id] = lease
-    for feature in core.features:  # 3
-        feature.on_reattached(core, lease, item)
+    if item.state in AWAY:  # 3
+        _reattach_away(core, lease, item)
     if lease.state is LeaseState.LOADING and item.state == "held":
         become_held(core, lease, item.measured_bytes)
         core.record_lease(lease)
@@ -212,6 +215,21 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     account_for(core, lease.id)
     core.note(ReattachedNote(len(lease.uses), lease.state), lease)
     return lease
+
+
+def _reattach_away(core: Core, lease: Lease, item: ev.ReattachedLease) -> None:
+    """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
+    if lease.state in AWAY:
+        core.timers.cancel(("away", lease.id))
+        standby.wake(core, lease)
+    elif lease.token != item.token:
+        core.push(lease, GrantedPush(status.view(core, lease)))
+    elif lease.state in EXPIRING:
+        lease.standby.comes_back = lease.spec.standby and not lease.standby.dismissed
+        lease.standby.parks = item.state == "parked"
+        if lease.standby.parks and lease.id not in core.host_ram.booked:
+            core.host_ram.find(lease.id, lease.spec.park_bytes)
+        released(core, lease, exiting=False, why=Why.LET_GO_BEFORE)
 
 
 def _settle_token(core: Core, lease: Lease, client: Client, item: ev.ReattachedLease) -> None:
@@ -246,7 +264,7 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ev.ReattachedL
     if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
         for use_id in item.uses:
             key = (client.process, use_id)
-            known = lease.uses.get(key) or lease.uses.paused.get(key)
+            known = lease.uses.get(key)
             began = Use(use_id, client.id, client.process, "", core.now)
             core.mark(lease, began if known is None else replace(known, client=client.id))
     if lease.departure.eviction is not None:

@@ -6,26 +6,24 @@ process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import eviction, learning
+from vram_arbiter.arbiter.core import eviction, learning, standby
 from vram_arbiter.arbiter.core.learning import check_load
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
-from vram_arbiter.arbiter.core.model.refusals import Limit, LimitReached, Misfit, Refused, Share
-from vram_arbiter.arbiter.core.model.state import Client, Core, Refusals
+from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
+from vram_arbiter.arbiter.core.model.state import Client, Core
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.report.why import ahead_of, explain
+from vram_arbiter.arbiter.core.requests.limits import check_shares, check_waiters
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
-from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 from vram_arbiter.schemas.wire.codes import Why
-from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.notes import (
     CancelledNote,
     OomNote,
     QueuedNote,
     ReadyNote,
-    RefusedNote,
     ReleasedNote,
     RevokeAckedNote,
     UnloadingNote,
@@ -40,10 +38,6 @@ from vram_arbiter.schemas.wire.replies import (
     RenewReply,
     StateReply,
 )
-
-AT_ONCE = 16
-"""Refusals of one process that are noted one by one; after that one a second."""
-PROCESSES_REMEMBERED = 1024
 
 
 # -- leases
@@ -87,43 +81,43 @@ def keep(core: Core, lease: Lease, grace_s: float = 0.0) -> None:
         core.timers.set(("ttl", lease.id), lease.expires_at)
 
 
-def bad_state(lease: Lease, misfit: Misfit, use_id: str = "") -> Refused:
+def bad_state(lease: Lease, misfit: Misfit) -> Refused:
     """Return the refusal of a request that does not fit the state of its lease."""
-    story, uses = lease.told(), len(lease.uses)
-    return Refused(no.BadLeaseState(lease.id, lease.state, uses, misfit, story, use_id))
+    refusal = no.BadLeaseState(lease.id, lease.state, len(lease.uses), misfit, lease.told())
+    return Refused(refusal)
 
 
 # -- waiting
-def acquire(core: Core, event: ev.AcquireRequested) -> Lease | None:
-    """Queue a new lease, unless it is of a gang. Return it; None: it was asked for already.
+def acquire(core: Core, event: ev.AcquireRequested) -> None:
+    """Queue a lease. The scheduling after this event may grant it at once, and answers either way.
 
-    The scheduling after this event may grant it at once, and answers either way. Raises Refused.
-      1. A repeat, known by its nonce, is answered as its lease is.
-      2. The request fits on some GPU, as far as its model is known.
-      3. There is a place for one waiter and one lease more.
-      4. The model does not crash in every load.
-      5. The lease is new.
-      6. It waits in the queues.
+    Raises Refused.
+      1. A lease of this process for the model that is away comes back for it.
+      2. A repeat, known by its nonce, is answered as its lease is.
+      3. The request fits on some GPU, as far as its model is known.
+      4. There is a place for one waiter and one lease more.
+      5. The model does not crash in every load.
+      6. The lease is new, and waits in the queues.
     """
-    client, spec = core.clients[event.client], event.spec
-    known = known_by(core, event)  # 1
-    if known is not None:
+    client, spec, known = core.clients[event.client], event.spec, _known_by(core, event)
+    away = standby.wanted(core, event, known)
+    if away is not None:  # 1
+        standby.call_back(core, away, event, spec if known is None else away.spec)
+        return
+    if known is not None:  # 2
         _answer_again(core, event, known)
-        return None
-    load_peak, steady = learning.expected_bytes(core, spec)  # 2
+        return
+    load_peak, steady = learning.expected_bytes(core, spec)  # 3
     gpus = admission.places(core, spec, load_peak)
-    check_waiters(core, client, spec.priority)  # 3
+    check_waiters(core, client, spec.priority)  # 4
     owned, most = len(core.of_client.get(client.id, ())), core.settings.leases_per_client_max
     check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
-    if core.costs.failures and spec.gang is None:  # 4
+    if core.costs.failures:  # 5
         check_load(core, spec, load_peak, gpus)
-    lease = _new_lease(core, event, client, load_peak, steady, gpus)  # 5
-    if spec.gang is None:
-        core.enqueue(lease)  # 6
-    return lease
+    core.enqueue(_new_lease(core, event, client, load_peak, steady, gpus))  # 6
 
 
-def known_by(core: Core, event: ev.AcquireRequested) -> Lease | None:
+def _known_by(core: Core, event: ev.AcquireRequested) -> Lease | None:
     """Return the lease that an earlier acquire with the same nonce asked for. Raises Refused where
     it is over."""
     lease_id = core.nonces.get((core.clients[event.client].process, event.nonce))
@@ -179,6 +173,25 @@ def _new_lease(
     return lease
 
 
+def reacquire(core: Core, event: ev.Reacquired) -> None:
+    """Queue a lease that is away, or on its way there. Raises Refused."""
+    lease = lease_for(core, event)
+    if lease.process != core.clients[event.client].process:
+        raise Refused(no.NotHolder(lease.id, lease.process.pid))
+    if lease.state in AWAY:
+        standby.call_back(core, lease, event, lease.spec)
+        return
+    if lease.state is LeaseState.VERIFYING and standby.next_state(lease) is not None:
+        lease.request.traceparent = event.traceparent
+        if lease.standby.recalled_at is None:
+            lease.standby.recalled_at = core.now
+            lease.request.wait_timeout_s = event.wait_timeout_s
+    elif lease.state is not LeaseState.QUEUED:
+        raise bad_state(lease, Misfit.NOT_AWAY)
+    core.hand_to(lease, event.client)
+    core.reply(event.client, event.request, AcquireReply("queued", status.view(core, lease)))
+
+
 def answer_queued(core: Core) -> None:
     """Tell requests of this event that the scheduling did not grant that they wait, and why."""
     for lease in core.turn.unanswered:
@@ -206,7 +219,7 @@ def cancel(core: Core, event: ev.CancelRequested) -> None:
     if lease.process != core.clients[event.client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     refusal = no.CancelledRequest(lease.id, Why.HOLDER_GAVE_UP)
-    if any(f.give_up(core, lease, LeaseState.CANCELLED, refusal) for f in lease.features):
+    if standby.give_up(core, lease, LeaseState.CANCELLED, refusal):
         if lease.state is LeaseState.VERIFYING:  # over with its verdict
             core.record_lease(lease)
     elif lease.state is LeaseState.QUEUED:
@@ -230,64 +243,6 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
     waited_s = core.now - lease.request.arrived_at
     why = explain(core, lease)
     eviction.deny(core, lease, no.TimedOut(lease.spec.consumer, waited_s, why))
-
-
-# -- limits and refusals
-def check_waiters(core: Core, client: Client, priority: int) -> None:
-    """Refuse one waiter too many of a client, of its user or of all.
-
-    The last places are kept for requests above the default priority, of each user's share too.
-    """
-    settings, places, taken = core.settings, core.settings.waiters_max, core.waiters_of
-    mine, users = taken.get(client.process, 0), taken.get(client.uid, 0)
-    kept = 0.0 if priority > defaults.PRIORITY else settings.priority_reserve
-    check_shares(
-        "waiters_max",
-        (Share.PROCESS, mine, places * settings.process_share),
-        (Share.USER, users, places * (settings.user_share * (1 - kept))),
-        (Share.ALL, len(core.waiting), places * (1 - kept)),
-        uid=client.uid,
-    )
-
-
-def check_shares(
-    limit: Limit, *shares: tuple[Share, int, float], lease_id: str = "", uid: int | None = None
-) -> None:
-    """Refuse one place more for the first share that is used up; each has one place at least.
-
-    No process and no user can take so many places that others find none. Sessions, connections and
-    rates are limited before a request becomes an event (`rpc`).
-
-    Args:
-        shares: Whose share, places taken, places allowed.
-    """
-    for share, count, most in shares:
-        if count >= max(1, int(most)):
-            user = uid if share is Share.USER else None
-            raise Refused(LimitReached(limit, max(1, int(most)), share, count, lease_id, user))
-
-
-def note_refused(
-    core: Core, event: ev.AcquireRequested | ev.Reacquired | ev.ResizeAsked, refusal: Refusal
-) -> None:
-    """Note that a request for bytes was refused at once, by whom it was sent, and why.
-
-    A process that asks and is refused thousands of times a second must not push everything else
-    out of the history: beyond a number at once its refusals are counted, and the next note says how
-    many were left out.
-    """
-    process = core.clients[event.client].process
-    seen = learning.newest(core.refusals, process, lambda: Refusals(core.now), PROCESSES_REMEMBERED)
-    seen.noted = max(0.0, seen.noted - (core.now - seen.at))
-    seen.at = core.now
-    if seen.noted > AT_ONCE - 1:
-        seen.left_out += 1
-        return
-    seen.noted += 1
-    lease = None if isinstance(event, ev.AcquireRequested) else core.leases.get(event.lease)
-    consumer = event.spec.consumer if isinstance(event, ev.AcquireRequested) else ""
-    core.note(RefusedNote(process.pid, refusal, consumer, seen.left_out), lease)
-    seen.left_out = 0
 
 
 # -- holding
@@ -381,8 +336,6 @@ def unloading(core: Core, event: ev.UnloadStarted) -> None:
     if lease.uses:
         raise bad_state(lease, Misfit.IN_USE)
     gpu, departure = core.gpu_of(lease), lease.departure
-    if lease.uses.paused:
-        end_uses(core, lease, Why.PAUSED)
     core.move(lease, LeaseState.UNLOADING, Why.SAFE_POINT)
     departure.hangs, departure.baseline = False, gpu.sample
     core.timers.set(("revoke", lease.id), core.now + core.settings.revoke_deadline_s)
@@ -410,19 +363,19 @@ def release(core: Core, event: ev.ReleaseReported) -> None:
         return
     lease = own_lease(core, event)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:
-        for feature in core.features if event.parked else lease.features:
-            feature.on_release(core, event, lease)
+        if event.parked and (event.exiting or not lease.spec.park_bytes):
+            raise bad_state(lease, Misfit.EXITS if event.exiting else Misfit.NO_PARK_BYTES)
+        standby.decide(core, lease, parked=event.parked, exiting=event.exiting)
         why = Why.EXITS if event.exiting else Why.LET_GO
         released(core, lease, exiting=event.exiting, why=why)
-    after = core.next_state(lease) or LeaseState.RELEASED
+    after = standby.next_state(lease) or LeaseState.RELEASED
     core.reply(event.client, event.request, ReleaseReply(lease.state, after))
 
 
 def released(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
     """Verify that the bytes of a resident lease return. Uses that others left on it end."""
     gpu, departure, before = core.gpu_of(lease), lease.departure, lease.state
-    if lease.uses or lease.uses.paused:
-        end_uses(core, lease, why)
+    end_uses(core, lease, why)
     departure.exiting = exiting
     core.move(lease, LeaseState.VERIFYING, why)
     core.timers.cancel(("ttl", lease.id))
@@ -437,8 +390,8 @@ def released(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
 
 
 def end_uses(core: Core, lease: Lease, why: Why) -> None:
-    """End every use that is still on a lease whose bytes go, paused ones too."""
-    for use in lease.all_uses():
+    """End every use that is still on a lease whose bytes go."""
+    for use in list(lease.uses.values()):
         core.unmark(lease, use)
         note_ended(core, lease, use, why)
 

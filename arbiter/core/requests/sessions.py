@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core import standby
 from vram_arbiter.arbiter.core.learning import model_name
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
@@ -34,10 +35,9 @@ def on_connected(core: Core, event: ev.ClientConnected) -> None:
     if (earlier := next(same, None)) is not None:
         core.part(earlier)
         for lease in core.used_by(event.process):
-            for table in (lease.uses, lease.uses.paused):
-                for key, use in table.items():
-                    if use.client == earlier:
-                        table[key] = replace(use, client=event.client)
+            for key, use in lease.uses.items():
+                if use.client == earlier:
+                    lease.uses[key] = replace(use, client=event.client)
         for lease in list(core.of_client.get(earlier, {}).values()):
             core.hand_to(lease, event.client)
     core.join(Client(event.client, event.process, event.name, event.instance, event.uid))
@@ -58,7 +58,7 @@ def on_left(core: Core, event: ev.ClientLeft) -> None:
     core.last_client_at = core.now
     own = core.of_client.get(client.id, {}).values()
     for lease in _by_arrival(own, core.used_by(client.process)):
-        for use in [use for use in lease.all_uses() if use.client == client.id]:
+        for use in [use for use in lease.uses.values() if use.client == client.id]:
             end_use(core, lease, use, Why.CLIENT_LEFT, event.reason)
         if lease.client != client.id or lease.process != client.process:
             continue
@@ -66,8 +66,7 @@ def on_left(core: Core, event: ev.ClientLeft) -> None:
             cancel_waiter(core, lease, Why.CLIENT_LEFT, event.reason)
         elif lease.state not in EXPIRING:
             refusal = no.CancelledRequest(lease.id, Why.CLIENT_LEFT, event.reason)
-            for feature in lease.features:
-                feature.give_up(core, lease, LeaseState.CANCELLED, refusal)
+            standby.give_up(core, lease, LeaseState.CANCELLED, refusal)
         elif event.reason == ev.BYE:
             released(core, lease, exiting=False, why=Why.BYE)
 
@@ -84,7 +83,7 @@ def concerns(core: Core, client: ClientId) -> bool:
         return True
     known = core.clients.get(client)
     used = [] if known is None else core.used_by(known.process)
-    return any(use.client == client for lease in used for use in lease.all_uses())
+    return any(use.client == client for lease in used for use in lease.uses.values())
 
 
 def on_died(core: Core, event: ev.ProcessDied) -> None:
@@ -92,6 +91,7 @@ def on_died(core: Core, event: ev.ProcessDied) -> None:
     free."""
     process = event.process
     core.refusals.pop(process, None)
+    core.terminated.discard(process)
     for client in list(core.connected.get(process, ())):
         core.part(client)
         core.last_client_at = core.now
@@ -99,7 +99,7 @@ def on_died(core: Core, event: ev.ProcessDied) -> None:
         if process in gpu.ledger.accounts:
             on_process_died(core, gpu, process)
     for lease in _by_arrival(core.leases_of(process), core.used_by(process)):
-        for use in [use for use in lease.all_uses() if use.process == process]:
+        for use in [use for use in lease.uses.values() if use.process == process]:
             end_use(core, lease, use, Why.PROCESS_DIED)
         if lease.process != process:
             continue
@@ -111,8 +111,7 @@ def on_died(core: Core, event: ev.ProcessDied) -> None:
             core.note(LostNote(Why.PROCESS_DIED, process.pid), lease)
             lose(core, lease, refusal)
         else:  # a verification goes on: only the residue is no longer expected
-            for feature in lease.features:
-                feature.give_up(core, lease, LeaseState.LOST, refusal)
+            standby.give_up(core, lease, LeaseState.LOST, refusal)
 
 
 # -- ends without the holder's word
@@ -167,7 +166,7 @@ def lose(
     gpu, asked = core.gpu_of(lease), lease.departure.eviction
     if lease.state is LeaseState.LOADING:
         core.costs.load_failed(model_name(lease.spec), refusal.why, core.now)
-    for use in lease.all_uses():
+    for use in list(lease.uses.values()):
         core.unmark(lease, use)
     core.record_lease(lease, debt=True)
     if asked is not None:

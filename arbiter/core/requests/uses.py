@@ -1,9 +1,7 @@
 """Uses: busy intervals on a lease, marked by any client that knows its exact token (that is how a
 runner marks a goal on its policy sidecar's lease). A lease in use is not at its safe point.
 
-A use that yields pauses: it stays known, but no departure waits for its end. Beginning it again
-resumes it, unless its holder was asked to leave meanwhile. Must not know why a holder is asked to
-leave (`eviction`).
+Must not know why a holder is revoked (`eviction`).
 
 What others than the holder mark outlives the daemon: the journal names one use of each such
 process, which is enough to know the processes to wait for. It is written when a process begins to
@@ -21,16 +19,12 @@ from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Us
 from vram_arbiter.arbiter.core.model.records import UserRecord
 from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
 from vram_arbiter.arbiter.core.model.state import Client, Core
-from vram_arbiter.arbiter.core.requests.requests import (
-    bad_state,
-    check_shares,
-    lease_for,
-    note_ended,
-)
+from vram_arbiter.arbiter.core.requests.limits import check_shares
+from vram_arbiter.arbiter.core.requests.requests import bad_state, lease_for, note_ended
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, UseId
 from vram_arbiter.schemas.wire.codes import Why
-from vram_arbiter.schemas.wire.notes import UseBeganNote, UseYieldedNote
+from vram_arbiter.schemas.wire.notes import UseBeganNote
 from vram_arbiter.schemas.wire.replies import UsesReply
 
 FROM_JOURNAL: Final = ClientId("")
@@ -38,29 +32,28 @@ FROM_JOURNAL: Final = ClientId("")
 
 
 def begin(core: Core, event: ev.UseBegan) -> None:
-    """Mark a use, or resume one that pauses. Refused once the holder was asked to leave.
+    """Mark a use. Refused once the holder is revoked.
 
     A repeat, perhaps on a new connection, is answered again: the use ends with that connection.
     """
     client = core.clients[event.client]
     lease = lease_for(core, event)
     key = (client.process, event.use)
-    known = lease.uses.get(key) or lease.uses.paused.get(key)
+    known = lease.uses.get(key)
     use = Use(event.use, client.id, client.process, event.label, core.now)
     use = use if known is None else replace(known, client=client.id)
-    if key in lease.uses:
+    if known is not None:
         lease.uses[key] = use
         core.reply(event.client, event.request, UsesReply(len(lease.uses)))
-        if known is not None and known.client != FROM_JOURNAL:
+        if known.client != FROM_JOURNAL:
             return
     else:
         if lease.state in LEAVING:
             revoked = None if lease.departure.eviction is None else lease.departure.eviction.why
-            raise Refused(no.Revoked(lease.spec.consumer, lease.state, "use", revoked))
+            raise Refused(no.Revoked(lease.spec.consumer, lease.state, revoked))
         if lease.state is not LeaseState.HELD:
             raise bad_state(lease, Misfit.NOT_HELD)
-        if known is None:
-            _check_places(core, lease, client)
+        _check_places(core, lease, client)
         core.mark(lease, use)
         lease.uses.last_at = core.now
         if client.process == lease.process:
@@ -75,7 +68,7 @@ def _check_places(core: Core, lease: Lease, client: Client) -> None:
     """Refuse one use too many. The holder's own uses are counted apart: others cannot take its
     places."""
     settings, places = core.settings, core.settings.uses_per_lease_max
-    uses = lease.all_uses()
+    uses = list(lease.uses.values())
     others = [use for use in uses if use.process != lease.process]
     if client.process == lease.process:
         own = (Share.HOLDER, len(uses) - len(others), places)
@@ -99,56 +92,23 @@ def _is_kept(lease: Lease, use: Use) -> bool:
     return use.process != lease.process and use in lease.users()
 
 
-def yield_(core: Core, event: ev.UseYielded) -> None:
-    """Pause a use of one's own; a repeat changes nothing.
-
-    A lease without busy uses is at its safe point.
-    """
-    client = core.clients[event.client]
-    lease = lease_for(core, event)
-    key = (client.process, event.use)
-    use = lease.uses.get(key)
-    if use is not None:
-        _pause(core, lease, use)
-        lease.uses.paused[key] = replace(use, client=client.id)
-        core.note(UseYieldedNote(use.id, use.label, len(lease.uses)), lease)
-        _safe_point(core, lease)
-    elif key not in lease.uses.paused:
-        raise bad_state(lease, Misfit.NO_SUCH_USE, event.use)
-    core.reply(event.client, event.request, UsesReply(len(lease.uses)))
-
-
 def end(core: Core, event: ev.UseEnded) -> None:
     """End a use; one that is not there (any more) is fine."""
     lease = lease_for(core, event)
-    key = (core.clients[event.client].process, event.use)
-    use = lease.uses.get(key) or lease.uses.paused.get(key)
+    use = lease.uses.get((core.clients[event.client].process, event.use))
     if use is not None:
         end_use(core, lease, use, Why.ENDED)
     core.reply(event.client, event.request, UsesReply(len(lease.uses)))
 
 
 def end_use(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> None:
-    """End a use, whether it is busy or paused."""
-    busy = (use.process, use.id) in lease.uses
-    if busy:
-        _pause(core, lease, use)
-    core.unmark(lease, use)
-    note_ended(core, lease, use, why, by)
-    if busy:
-        _safe_point(core, lease)
-
-
-def _pause(core: Core, lease: Lease, use: Use) -> None:
-    """Mark a use as not busy any more, in the journal too."""
+    """End a use, in the journal too. After the last one its holder is at its safe point."""
     kept = _is_kept(lease, use)
-    core.pause(lease, use)
+    core.unmark(lease, use)
     lease.uses.last_at = core.now
     if kept:
         core.record_lease(lease)
-
-
-def _safe_point(core: Core, lease: Lease) -> None:
+    note_ended(core, lease, use, why, by)
     if not lease.uses:
         eviction.push_revoke(core, lease)
         core.wake(core.gpu_of(lease))

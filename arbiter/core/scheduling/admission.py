@@ -4,7 +4,7 @@ A grant passes two gates: the ledger (`fits`), and the newest reading (`measured
 `measured_need_bytes`). Changes nothing.
 """
 
-from collections.abc import Collection, Mapping, Set
+from collections.abc import Callable, Collection, Mapping, Set
 
 from vram_arbiter.arbiter.core.ledger import NOTHING
 from vram_arbiter.arbiter.core.model import refusals as no
@@ -76,8 +76,6 @@ def blocked(core: Core, gpu: Gpu) -> Block | None:
         return Block.UNREAD
     if gpu.residents.by_state[LeaseState.LOADING]:
         return Block.LOADING
-    if gpu.keeper is not None:
-        return Block.GANG
     return Block.PRESSURE if gpu.pressed else None
 
 
@@ -106,9 +104,7 @@ def residue_under_measurement(gpu: Gpu) -> bool:
 
 # -- the ledger's gate
 def joining(lease: Lease) -> Collection[tuple[ProcessKey, int]]:
-    """Return what a grant charges by process: a load peak, or what a group needs together."""
-    if lease.request.needs is not None:
-        return lease.request.needs.items()
+    """Return what a grant charges, by process: the load peak."""
     return ((lease.process, lease.request.load_peak_bytes),)
 
 
@@ -122,7 +118,7 @@ def fits(gpu: Gpu, lease: Lease, going: Mapping[LeaseId, int] = NOTHING) -> bool
         apart: Set[LeaseId | None] = gpu.ledger.charges.keys()
     else:
         apart = {
-            *(gpu.residents.exclusive.keys() - {lease.request.extends}),
+            *gpu.residents.exclusive,
             *[one.lease for one in gpu.verifications.values() if one.exclusive],
         }
     if not apart <= going.keys():
@@ -142,10 +138,28 @@ def excess_bytes_alone(gpu: Gpu, lease: Lease) -> int:
     return gpu.ledger.total_if(others, joining(lease)) - gpu.ledger.budget_bytes
 
 
-def largest_growth_bytes(gpu: Gpu, lease: Lease) -> int:
-    """Return the most that a resident could ever get on top, once every other lease has ended."""
-    going = {other.id: 0 for other in gpu.residents.values() if other is not lease}
-    return gpu.ledger.budget_bytes - gpu.ledger.total_if(going)
+def spare_unplanned_bytes(
+    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool]
+) -> tuple[int, bool]:
+    """Return what a later request may take without delaying a head without a plan, and whether the
+    head waits for bytes of no holder.
+
+    Every lease may leave some day, except those that took their room while the head waited before
+    them (`stays`). If the head would not fit even then, it is served when stowaways leave, and else
+    when processes with retained bytes end. Only what remains beside it on that day may be taken
+    now.
+    """
+    ledger, joins, residents = gpu.ledger, joining(head), gpu.residents.values()
+    everything = {**{one.id: one.residue_bytes for one in residents}, **going}
+    movable = {**{one.id: one.residue_bytes for one in residents if not stays(one)}, **going}
+    day = ledger.total_if(everything, joins)
+    stay_bytes = ledger.total_if(movable, joins) - day
+    stuck = day > ledger.budget_bytes
+    if stuck:
+        day = ledger.total_if(everything, joins, stowaways=False)
+    if day > ledger.budget_bytes:
+        day = sum(count for _, count in joins)
+    return ledger.budget_bytes - day - stay_bytes, stuck
 
 
 # -- the reading's gate
@@ -173,19 +187,12 @@ def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
 
 
 def measured_need_bytes(gpu: Gpu, lease: Lease) -> int:
-    """Return what the reading must show as free: what a grant charges, less what its processes hold
-    already beside their leases (contexts).
-
-    Bytes that are reserved for a lease are not held by its process yet.
-    """
-    needed = 0
-    for process, count in joining(lease):
-        account = gpu.ledger.accounts.get(process)
-        if account is not None and not account.charges.keys() <= gpu.ledger.reserved:
-            needed += count
-            continue
-        own = gpu.shown_bytes(process)
-        if own is None:
-            own = 0 if account is None else account.retained_bytes
-        needed += max(0, count - own)
-    return needed
+    """Return what the reading must show as free: what a grant charges, less what a process without
+    other leases holds already (its context)."""
+    needed, account = lease.request.load_peak_bytes, gpu.ledger.accounts.get(lease.process)
+    if account is not None and account.charges:
+        return needed
+    own = gpu.shown_bytes(lease.process)
+    if own is None:
+        own = 0 if account is None else account.retained_bytes
+    return max(0, needed - own)

@@ -4,31 +4,29 @@ Per GPU, in this order (the numbers stand in `_serve`):
   0. take back revokes that nothing wants any more; what of them no GPU of the pass decides again
      is withdrawn at its end
   1. under pressure: revoke idle holders, grant nothing
-  2. a group of requests loads on the GPU: its feature grants the next one (`Feature.serve`)
-  3. blocked (recovering, drained, reading unknown, a load under way): grant nothing, revoke no
+  2. blocked (recovering, drained, reading unknown, a load under way): grant nothing, revoke no
      holder that was not revoked before
-  4. nothing waits, or the request to serve is one of a group: served by features alone
-  5. the request fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
+  3. nothing waits: a lease on standby comes back
+  4. the request fits by ledger: grant it if the measurement agrees, else ask for a fresh reading; a
      head for which another GPU is being emptied is passed over from here on
-  6. it does not fit: revoke the cheapest victims that cover it, unless enough bytes are pending
+  5. it does not fit: revoke the cheapest victims that cover it, unless enough bytes are pending
      free
-  7. backfill: the first request behind the head that fits without an eviction and cannot delay the
+  6. backfill: the first request behind the head that fits without an eviction and cannot delay the
      head; behind one that waits for bytes that no revoke brings (a stowaway's), only what fits
      beside it on the day that they are gone, and may be revoked itself
 """
 
-from collections.abc import Callable, Mapping
 from itertools import islice
 from typing import Literal
 
-from vram_arbiter.arbiter.core import eviction
+from vram_arbiter.arbiter.core import eviction, standby
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState, Standby
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.scheduling import admission, victims
 from vram_arbiter.arbiter.core.verification.judge import note_pressure
-from vram_arbiter.schemas.ids import GpuId, LeaseId
+from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
 from vram_arbiter.schemas.wire.notes import GrantedNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush
@@ -66,30 +64,22 @@ def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.pressed and core.serving:  # 1
         _relieve(core, gpu)
         return
-    if gpu.keeper is not None:  # 2
-        gpu.keeper.feature.serve(core, gpu, gpu.keeper)
-        return
-    if gpu.blocked:  # 3
+    if gpu.blocked:  # 2
         if core.turn.taken_back:
             _take_over(core, gpu)
         return
-    if gpu.queue.head is None:  # 4
-        for feature in core.features:
-            if feature.live:
-                feature.on_idle(core, gpu)
+    if gpu.queue.head is None:  # 3
+        if core.away:
+            _bring_back(core, gpu)
         return
     head = admission.front(core, gpu)
     if head is None:
         return
-    group = head.request.group
-    if group is not None:  # 4
-        group.feature.serve(core, gpu, group)
-        return
-    if admission.fits(gpu, head):  # 5
+    if admission.fits(gpu, head):  # 4
         grant_if_measured(core, gpu, head)
         return
-    planned = _make_room(core, gpu, head)  # 6
-    if len(gpu.queue.by_arrival) > 1:  # 7
+    planned = _make_room(core, gpu, head)  # 5
+    if len(gpu.queue.by_arrival) > 1:  # 6
         later = choose_later(core, gpu, head, planned=planned)
         if later is not None:
             grant_if_measured(core, gpu, later)
@@ -104,11 +94,22 @@ def _relieve(core: Core, gpu: Gpu) -> None:
         victims.wake_when_evictable(core, gpu, None)
 
 
+def _bring_back(core: Core, gpu: Gpu) -> None:
+    lease = standby.first_to_return(core, gpu)
+    if lease is None:
+        return
+    due_at = standby.quiet_at(gpu, lease)
+    if due_at <= core.now:
+        grant_if_measured(core, gpu, lease)
+    else:
+        core.timers.set(("return", gpu.info.id), due_at)
+
+
 def _take_over(core: Core, gpu: Gpu) -> None:
     """Keep holders revoked whose revoke was taken back, if the request to serve would choose them
     once the GPU grants again."""
     head, leaving = admission.front(core, gpu), admission.leaving(gpu)
-    if head is None or head.request.group is not None or admission.fits(gpu, head, leaving):
+    if head is None or admission.fits(gpu, head, leaving):
         return
     plan = victims.choose_victims(core, gpu, head, leaving) or ()
     again = [one for one in plan if one.id in core.turn.taken_back]
@@ -154,7 +155,7 @@ def settle_for_less(core: Core, lease: Lease) -> bool:
     themselves wait behind this request. Nothing is settled while bytes are being measured.
     """
     request, gpus = lease.request, [core.gpus[gpu_id] for gpu_id in lease.request.gpus]
-    if request.extends is not None or any(gpu.verifications for gpu in gpus):
+    if any(gpu.verifications for gpu in gpus):
         return False
     excess = min(admission.excess_bytes_alone(gpu, lease) for gpu in gpus)
     less = request.load_peak_bytes - excess
@@ -182,18 +183,15 @@ def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
 
 
 def measured_wait(
-    core: Core, gpu: Gpu, lease: Lease, *, crowded: bool = False
+    core: Core, gpu: Gpu, lease: Lease
 ) -> Literal[Wait.READING, Wait.NOT_FREE] | None:
     """Return what a lease that fits by the ledger waits for; None: a reading shows its bytes free.
 
     A reading that is too old, or began before the last grant, `ready` or verdict, cannot deny: a
     newer one is asked for.
-
-    Args:
-        crowded: Whether the ledger says that the bytes cannot be free yet, whatever is shown.
     """
     room = admission.measured_room_bytes(core, gpu)
-    if not crowded and room is not None and room >= admission.measured_need_bytes(gpu, lease):
+    if room is not None and room >= admission.measured_need_bytes(gpu, lease):
         return None
     if room is not None and gpu.sample is not None and gpu.sample.taken_at >= gpu.changed_at:
         return Wait.NOT_FREE
@@ -208,11 +206,11 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     """
     request = lease.request
     request.evicted = _take_evictions(core, gpu, lease)
-    for feature in lease.features:
-        if feature.grant(core, gpu, lease):
-            return
     core.dequeue(lease)
     by_itself = lease.state is not LeaseState.QUEUED
+    if by_itself:  # it has not waited
+        request.arrived_at = core.now
+    lease.standby = Standby(returned=by_itself)
     lease.token = token = core.next_token()
     lease.gpu = gpu.info.id
     core.move(lease, LeaseState.LOADING, Why.RETURNED if by_itself else Why.GRANTED)
@@ -270,7 +268,9 @@ def choose_later(core: Core, gpu: Gpu, head: Lease, *, planned: bool) -> Lease |
     if planned:
         spare = ledger.budget_bytes - ledger.total_if(going, admission.joining(head))
     else:
-        spare, stuck = spare_unplanned_bytes(gpu, head, going, lambda one: _passed(gpu, one, head))
+        spare, stuck = admission.spare_unplanned_bytes(
+            gpu, head, going, lambda one: _passed(gpu, one, head)
+        )
     if smallest > spare or (stuck and admission.residue_under_measurement(gpu)):
         return None
     most = min(free, spare) + fold
@@ -278,10 +278,9 @@ def choose_later(core: Core, gpu: Gpu, head: Lease, *, planned: bool) -> Lease |
     for lease in islice(queue, 1, None):
         if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
             continue  # seen at a glance: thousands may wait
-        if lease is head or lease.request.group:
+        if lease is head:
             continue
-        extends = lease.request.extends
-        if stuck and not (lease if extends is None else core.leases[extends]).evictable:
+        if stuck and not lease.evictable:
             continue  # the head may need its bytes once a stowaway leaves
         if admission.added_bytes(gpu, lease) <= spare and admission.fits(gpu, lease):
             return lease
@@ -305,32 +304,6 @@ def _room_is_coming(gpu: Gpu) -> bool:
 
 
 def _passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:
-    """Return whether a lease was granted or grew while `head` waited before it."""
-    arrived_at, rank = head.request.arrived_at, gpu.queue.rank
-    overtook = lease.granted_at >= arrived_at and rank(head) < rank(lease)
-    return overtook or lease.observed.enlarged_at >= arrived_at
-
-
-def spare_unplanned_bytes(
-    gpu: Gpu, head: Lease, going: Mapping[LeaseId, int], stays: Callable[[Lease], bool]
-) -> tuple[int, bool]:
-    """Return what a later request may take without delaying a head without a plan, and whether the
-    head waits for bytes of no holder.
-
-    Every lease may leave some day, except those that took their room while the head waited before
-    them (`stays`). If the head would not fit even then, it is served when stowaways leave, and else
-    when processes with retained bytes end. Only what remains beside it on that day may be taken
-    now.
-    """
-    ledger, joins = gpu.ledger, admission.joining(head)
-    others = [one for one in gpu.residents.values() if one.id != head.request.extends]
-    everything = {**{one.id: one.residue_bytes for one in others}, **going}
-    movable = {**{one.id: one.residue_bytes for one in others if not stays(one)}, **going}
-    day = ledger.total_if(everything, joins)
-    stay_bytes = ledger.total_if(movable, joins) - day
-    stuck = day > ledger.budget_bytes
-    if stuck:
-        day = ledger.total_if(everything, joins, stowaways=False)
-    if day > ledger.budget_bytes:
-        day = sum(count for _, count in joins)
-    return ledger.budget_bytes - day - stay_bytes, stuck
+    """Return whether a lease was granted while `head` waited before it."""
+    rank = gpu.queue.rank
+    return lease.granted_at >= head.request.arrived_at and rank(head) < rank(lease)

@@ -15,6 +15,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling.admission import blocked, fits, leaving
+from vram_arbiter.arbiter.core.standby import can_park
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Block
 
@@ -26,12 +27,11 @@ _WAKE_SLACK_S = 0.001  # so that rounding does not wake a GPU before the waiter 
 
 # -- who may be revoked
 def may_ask(lease: Lease) -> bool:
-    """Return whether a holder may be revoked for others: not before it reattached after a restart,
-    nor before its group is complete.
+    """Return whether a holder may be revoked for others: not before it reattached after a restart.
 
     Processes that use a lease that has not reattached may be on their way back to it.
     """
-    return lease.evictable and lease.attached and lease.request.group is None
+    return lease.evictable and lease.attached
 
 
 def residency_ends_at(core: Core, lease: Lease, waiter: Lease | None) -> float:
@@ -67,8 +67,7 @@ def choose_victims(
     willing: list[Lease] = []
     ripe: list[Lease] = []
     for lease in gpu.residents.by_state[LeaseState.HELD].values():
-        in_the_way = may_ask(lease) and lease.id != waiter.request.extends
-        if in_the_way and (not lease.uses or lease.spec.priority <= priority):
+        if may_ask(lease) and (not lease.uses or lease.spec.priority <= priority):
             willing.append(lease)
             if residency_ends_at(core, lease, waiter) <= at:
                 ripe.append(lease)
@@ -138,7 +137,7 @@ def _search(
         for one in candidates
     }
     if len(candidates) > EXACT_SEARCH_MAX:
-        return _greedy(candidates, covers, freed)
+        return _greedy(core, candidates, covers, freed)
     return _exact(core, candidates, covers, freed)
 
 
@@ -151,7 +150,7 @@ def _exact(
 
     def cost(plan: Sequence[Lease]) -> tuple[int, float, int, float, list[int]]:
         return (
-            len([one for one in plan if not _can_park(one)]),
+            len([one for one in plan if not can_park(core, one)]),
             sum(core.costs.reload_s(one.spec.consumer) for one in plan),
             sum(freed[one.id] for one in plan),
             max(one.uses.last_at for one in plan),
@@ -177,7 +176,7 @@ def _exact(
 
 
 def _greedy(
-    candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
+    core: Core, candidates: Sequence[Lease], covers: _Covers, freed: Mapping[LeaseId, int]
 ) -> list[Lease]:
     """Take cheap classes first, the largest of a class first, until they cover; then give back what
     is not needed.
@@ -185,7 +184,7 @@ def _greedy(
 
     def cost(one: Lease) -> tuple[float, ...]:
         age = (one.uses.last_at, one.request.arrival)
-        return (bool(one.uses), one.spec.priority, not _can_park(one), -freed[one.id], *age)
+        return (bool(one.uses), one.spec.priority, not can_park(core, one), -freed[one.id], *age)
 
     order = sorted(candidates, key=cost)
     size = 1 + bisect_left(range(1, len(order)), True, key=lambda n: covers(order[:n]))
@@ -201,10 +200,6 @@ def _in_use(plan: Sequence[Lease]) -> int:
     return len([one for one in plan if one.uses])
 
 
-def _can_park(lease: Lease) -> bool:
-    return any(feature.can_park(lease) for feature in lease.features)
-
-
 # -- which of several GPUs
 def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) -> bool:
     """Return whether emptying this GPU is the cheapest of its candidates. Wakes a better one."""
@@ -214,7 +209,7 @@ def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) ->
         if other is gpu or other.queue.head is not waiter:
             continue
         going, block = leaving(other), blocked(core, other)
-        if block is Block.LOADING and other.keeper is None and not other.pressed:
+        if block is Block.LOADING and not other.pressed:
             (load,) = other.residents.by_state[LeaseState.LOADING].values()
             load_ends_by = load.granted_at + core.settings.revoke_deadline_s
             if load_ends_by > core.now and fits(other, waiter, going):

@@ -147,7 +147,7 @@ def others_since(
     # 1. leaving holders, verdicts since the baseline, and what is pending free
     leaving = {other.process for other in gpu.verifications.values()} - {process}
     accounts = gpu.ledger.accounts
-    left_bytes = sum([accounts[other].granted_bytes for other in leaving if other in accounts])
+    left_bytes = sum([accounts[other].charged_bytes for other in leaving if other in accounts])
     left_bytes += sum([left for at, left in gpu.left if at > baseline.taken_at])
     left_bytes += gpu.pending_free.since(baseline.taken_at - pending_s)
     # 2. charges of loads that began since the baseline
@@ -341,7 +341,7 @@ def _may_hold_bytes(verification: Verification, ledger: GpuLedger, reading: Memo
     unlisted = ledger.unlisted_bytes(reading)
     most = reading.used_bytes if unlisted is None else unlisted
     account = ledger.accounts.get(verification.process)
-    return 0 if account is None else min(account.granted_bytes, most)
+    return 0 if account is None else min(account.charged_bytes, most)
 
 
 # -- after the deadline ----------------------------------------------------------------------------

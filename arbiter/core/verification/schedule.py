@@ -8,7 +8,7 @@
 The bytes stay charged until then. A failed reading means unknown: it frees nothing.
 """
 
-from vram_arbiter.arbiter.core import learning
+from vram_arbiter.arbiter.core import learning, standby
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
 from vram_arbiter.arbiter.core.ledger import bytes_of
@@ -297,7 +297,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     core.wake(gpu)
     process, lease_id = verification.process, verification.lease
     account = gpu.ledger.accounts[process]
-    held_bytes = account.granted_bytes
+    held_bytes = account.charged_bytes
     if lease_id is None:
         gpu.left.append((core.now, held_bytes))
         gpu.ledger.retain(process, 0, core.now)
@@ -307,7 +307,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     retained_bytes = gpu.ledger.drop(
         lease_id, judgement.residue_bytes, verification.retained_bytes, core.now
     )
-    gpu.left.append((core.now, held_bytes - account.granted_bytes))
+    gpu.left.append((core.now, held_bytes - account.charged_bytes))
     core.record_residue(gpu, process, retained_bytes)
     core.forget(f"lease:{lease_id}")
     # 2. its eviction, and the waiter that it was for
@@ -320,8 +320,10 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     # 3. the lease
     lease = core.leases.get(lease_id)
     if lease is not None and lease.state is LeaseState.VERIFYING:
-        lives_on = core.next_state(lease)
-        core.move(lease, lives_on or LeaseState.RELEASED, str(judgement.verdict))
-        if lives_on is None:
+        lives_on = standby.next_state(lease)
+        if lives_on is not None:
+            standby.go_away(core, lease, lives_on, str(judgement.verdict))
+        else:
+            core.move(lease, LeaseState.RELEASED, str(judgement.verdict))
             core.end(lease, None)
     core.recovering.discard(lease_id)

@@ -53,7 +53,6 @@ from vram_arbiter.schemas.wire.notes import (
     ReadyNote,
     ReleasedNote,
     RemindedNote,
-    ResizedNote,
     RevokeAckedNote,
     RevokeAskedNote,
     RevokeWithdrawnNote,
@@ -89,7 +88,6 @@ class _Acquire:
     queue: trace.Span | None = None
     load: trace.Span | None = None
     asked_ns: int | None = None  # when the first holder was revoked for it
-    grows: str = ""  # it is no lease of its own: that one waits for more bytes
 
 
 @dataclass(slots=True)
@@ -113,7 +111,6 @@ class LeaseTelemetry:
         self._wall_ns = wall_ns
         self._acquires: OrderedDict[str, _Acquire] = OrderedDict()
         self._leaving: OrderedDict[str, _Leaving] = OrderedDict()
-        self._growths: dict[str, str] = {}  # lease → the waiter for its growth
 
     # -- what the core wants done
     def outgoing(self, effects: Sequence[fx.Effect]) -> None:
@@ -193,8 +190,6 @@ class LeaseTelemetry:
                 self._counts.out_of_memory()
             case VerifiedNote() as verdict:
                 span = self._verdict(about, verdict, at_ns)
-            case ResizedNote() if lease_id in self._growths:
-                span = self._end_acquire(self._growths[lease_id], at_ns)
             case body if type(body) in _STEPS:
                 span = self._step(lease_id, _STEPS[type(body)], body, at_ns)
         return named_by(about) if span is None else ids_of(span)
@@ -212,9 +207,6 @@ class LeaseTelemetry:
     def _queued(self, about: About, queued: QueuedNote, reason: str, at_ns: int) -> trace.Span:
         lease_id = str(about.lease_id)
         acquire = self._acquire(lease_id, about.consumer, about.traceparent, at_ns)
-        if queued.grows is not None:
-            acquire.grows = queued.grows
-            self._growths[queued.grows] = lease_id
         if acquire.queue is None:
             acquire.queue = self._child(names.SPAN_QUEUE, acquire.span, at_ns)
         acquire.queue.set_attribute(names.ATTR_REASON, reason[:REASON_CHARS])
@@ -284,8 +276,6 @@ class LeaseTelemetry:
         acquire = self._acquires.pop(lease_id, None)
         if acquire is None:
             return None  # granted before the daemon started, or never asked for here
-        if acquire.grows and self._growths.get(acquire.grows) == lease_id:
-            del self._growths[acquire.grows]
         for child in (acquire.queue, acquire.load):
             if child is not None:
                 child.set_attributes(attributes or {})

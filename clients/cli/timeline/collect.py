@@ -26,7 +26,7 @@ from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import LeaseView
 
-SIZES = ("granted", "ready", "resized", "verified", "released", "standby", "parked", "queued")
+SIZES = ("granted", "ready", "verified", "released", "standby", "parked", "queued")
 """Kinds of events that tell the bytes and the GPU of a lease; of earlier times no others count."""
 BACK = 8
 """By this factor the look back grows until every lease's beginning is found."""

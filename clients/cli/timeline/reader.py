@@ -35,13 +35,11 @@ _NEXT = {
 """State after an event of this kind."""
 _BEFORE = {
     "ready": "loading",
-    "resized": "held",
     "revoke_asked": "held",
     "revoke_acked": "revoking",
     "revoke_withdrawn": "revoking",
     "use_began": "held",
     "use_ended": "held",
-    "use_yielded": "held",
     "unloading": "held",
     "verified": "verifying",
     "oom": "loading",
@@ -98,7 +96,6 @@ class Reader:
         self._leases: dict[str, _Open] = {}
         self._evictions: list[EvictionStory] = []
         self._leaving: dict[str, EvictionStory] = {}
-        self._growths: dict[str, str] = {}  # lease → the request for more bytes of it
         self._gpus: dict[str, GpuStory] = {}
         self._pressed: dict[str, tuple[float, str]] = {}
         self._marks: list[Mark] = []
@@ -176,13 +173,8 @@ class Reader:
         self._use(known, at_s, kind, event)
         self._eviction(known, at_s, kind, event)
         charge = event.get("charge_bytes")
-        if kind in ("granted", "ready", "resized") and isinstance(charge, int):
+        if kind in ("granted", "ready") and isinstance(charge, int):
             known.story.charges.append((at_s, charge))
-        if kind == "queued" and event.get("grows"):
-            self._growths[str(event["grows"])] = lease_id
-        growth = self._leases.get(self._growths.pop(lease_id, "")) if kind == "resized" else None
-        if growth is not None and not growth.ended:
-            self._end(growth, at_s)  # merged into its lease
         if kind == "reattached":
             self._move(known, str(event.get("state", known.state)), at_s)
         elif kind == "verified" and event.get("resolved"):
@@ -234,7 +226,7 @@ class Reader:
         label = str(event.get("label") or "use")
         if kind == "use_began":
             lease.running[use_id] = (at_s, label)
-        elif kind in ("use_ended", "use_yielded"):
+        elif kind == "use_ended":
             since = max(self._begin_s, at_s - float(event.get("ms") or 0.0) / 1e3)
             began_s, label = lease.running.pop(use_id, (since, label))
             if kind == "use_ended" or began_s < at_s:

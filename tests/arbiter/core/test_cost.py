@@ -2,7 +2,6 @@
 which no neighbour disturbs."""
 
 import sys
-from dataclasses import replace
 from types import FrameType
 from typing import Any
 
@@ -23,7 +22,7 @@ from vram_arbiter.schemas.ids import (
     UseId,
 )
 from vram_arbiter.schemas.wire.replies import AcquireReply
-from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 GPU = GpuId("GPU-0")
 FEW, MANY = 5, 500
@@ -132,23 +131,6 @@ def test_no_event_costs_more_beside_a_hundred_times_as_many_leases_and_connectio
         name: (before[name], after[name]) for name in before if after[name] > 1.1 * before[name]
     }
     assert not grown, f"instructions with {FEW} and with {MANY}"
-
-
-def test_no_event_costs_more_beside_gangs_that_gather() -> None:
-    """Each event looked at every gang: two thousand that wait for their second member made a
-    renewal cost 160 times as much."""
-
-    def renewal(gangs: int) -> int:
-        counted = Counted(1, listed=True)
-        lease = counted.acquire(ClientId("busy"))
-        counted.tell(ev.ReadyReported(ClientId("busy"), counted.request(), *lease, None))
-        for number in range(gangs):
-            asking = counted.asking(ClientId("idle0"))
-            counted.tell(replace(asking, spec=replace(asking.spec, gang=Gang(f"g{number}", 2))))
-        counted.tell(ev.Tick())
-        return counted.counted(ev.Renewed(ClientId("busy"), counted.request(), (lease,)))
-
-    assert renewal(200) == renewal(2)
 
 
 def test_clients_come_and_go_at_no_cost_beside_leases_that_others_use() -> None:

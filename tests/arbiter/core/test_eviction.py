@@ -60,24 +60,6 @@ def test_a_waiter_that_is_patient_waits_past_the_deadline() -> None:
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
-def test_a_waiter_that_said_deny_is_denied_at_the_deadline() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
-    det.ack(lease)
-    waiter = driver.consumer("vlm").acquire(5 * GIB, deny_on_deadline=True)
-    driver.advance(30.1)
-    (denied,) = driver.pushes("denied", waiter)
-    assert denied["error"]["code"] == "holder_busy"
-    assert denied["error"]["details"] == {
-        "lease_id": lease,
-        "consumer": "det",
-        "uses": 1,
-        "deadline_s": 30.0,
-    }
-    assert driver.state(lease) == "held", "nothing wants its bytes any more"
-
-
 def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leaving() -> None:
     """Another idle holder is asked instead, so that the waiter does not hang on a deaf one."""
     driver = CoreDriver(8 * GIB)

@@ -42,11 +42,10 @@ class Broken:
         invariants.check(self.core)
 
 
-def force(lease: Lease, state: LeaseState) -> None:
+def force(b: Broken, lease: Lease, state: LeaseState) -> None:
     """Go where the table of transitions does not lead."""
     before, lease.state = lease.state, state
-    assert lease.roster is not None
-    lease.roster.moved(lease, before)
+    b.gpu.residents.moved(lease, before)
 
 
 def idle(b: Broken) -> None:
@@ -80,7 +79,7 @@ def beside_exclusive_debt(b: Broken) -> None:
 
 def two_loads(b: Broken) -> None:
     idle(b)
-    force(b.held, LeaseState.LOADING)
+    force(b, b.held, LeaseState.LOADING)
     b.queued.state = LeaseState.LOADING
     b.gpu.ledger.charge(b.queued.id, X, 1, 1, 0.0)
     b.gpu.residents.add(b.queued)
@@ -89,7 +88,7 @@ def two_loads(b: Broken) -> None:
 
 def unloads_in_use(b: Broken) -> None:
     b.core.mark(b.held, Use(UseId("u"), ClientId("c"), X, "", 0.0))
-    force(b.held, LeaseState.UNLOADING)
+    force(b, b.held, LeaseState.UNLOADING)
 
 
 def resident_without_charge(b: Broken) -> None:
@@ -98,7 +97,7 @@ def resident_without_charge(b: Broken) -> None:
 
 def verifying_without_verification(b: Broken) -> None:
     idle(b)
-    force(b.held, LeaseState.VERIFYING)
+    force(b, b.held, LeaseState.VERIFYING)
 
 
 def charged_for_ever(b: Broken) -> None:
@@ -126,11 +125,18 @@ def no_next_reading(b: Broken) -> None:
     b.core.timers.cancel(("probe", b.gpu.info.id))
 
 
-def half_a_gang(b: Broken) -> None:
-    one = b.driver.consumer("one")
-    lease = b.core.leases[one.acquire(GIB, gang=("g", 2))]
-    lease.gpu = b.gpu.info.id
-    b.gpu.ledger.reserve(lease.id, lease.process, 1, 0.0)
+def parked_beyond_the_budget(b: Broken) -> None:
+    b.core.host_ram.booked[b.held.id] = b.core.host_ram.budget_bytes + 1
+
+
+def away_with_a_gpu(b: Broken) -> None:
+    idle(b)
+    force(b, b.held, LeaseState.PARKED)
+    b.core.away[b.held.id] = b.held
+
+
+def away_and_held(b: Broken) -> None:
+    b.core.away[b.held.id] = b.held
 
 
 @pytest.mark.parametrize(
@@ -149,7 +155,9 @@ def half_a_gang(b: Broken) -> None:
         (6, waiter_in_no_queue, "are in queues"),
         (6, queue_without_waiter, "is the head"),
         (6, bound_without_timer, "no timer"),
-        (8, half_a_gang, "is gathering"),
+        (4, parked_beyond_the_budget, "bytes are parked, budget"),
+        (4, away_with_a_gpu, "it has a GPU"),
+        (4, away_and_held, "it counts as away"),
         (6, no_next_reading, "is planned"),
     ],
 )

@@ -65,23 +65,6 @@ def test_a_residue_is_never_more_than_what_was_charged() -> None:
     assert books.drop(LA, 450, 450, 2.0) == 40
 
 
-def test_reserved_bytes_are_charged_and_not_there_yet() -> None:
-    books = ledger()
-    books.charge(LA, A, 300, 300, 1.0)
-    books.reserve(LA2, A, 200, 1.0)
-    assert (books.total_bytes(), books.accounts[A].granted_bytes, books.reserved) == (
-        500,
-        300,
-        {LA2},
-    )
-    assert books.after_bytes(A, {LA: 50}, dead=False) == (50, 50)
-    assert books.after_bytes(B, {}, dead=False) == (0, 300)
-    books.charge(LA2, A, 200, 200, 2.0)
-    assert (books.accounts[A].granted_bytes, books.reserved) == (500, set())
-    books.withdraw(LA2, 3.0)
-    assert books.total_bytes() == books.accounts[A].granted_bytes == 300
-
-
 def test_an_account_without_bytes_is_closed() -> None:
     books = ledger()
     books.charge(LA, A, 300, 300, 1.0)

@@ -244,26 +244,6 @@ class Leases(RuleBasedStateMachine):
         lease = self.pick(n, *AWAY, LeaseState.VERIFYING)
         self.mine[lease].reacquire(lease)
 
-    @precondition(some(HELD))
-    @rule(n=PICK, less=st.sampled_from([0, 100 * d.MIB, 1 * d.GIB]))
-    def shrink(self, n: int, less: int) -> None:
-        lease = self.pick(n, HELD)
-        person = self.mine[lease]
-        spec = person.specs[lease]
-        size = max(self.loaded[person.process][lease] - less, spec.footprint.residue_bytes)
-        self.loaded[person.process][lease] = size
-        self.show(person.process)
-        person.resize(lease, size, residue_bytes=spec.footprint.residue_bytes)
-
-    @precondition(some(HELD))
-    @rule(n=PICK, more=st.sampled_from([100 * d.MIB, 1 * d.GIB]))
-    def grow(self, n: int, more: int) -> None:
-        """Asks only: what it was granted it may use, and need not."""
-        lease = self.pick(n, HELD)
-        person = self.mine[lease]
-        size = self.loaded[person.process][lease] + more
-        person.resize(lease, size, residue_bytes=person.specs[lease].footprint.residue_bytes)
-
     @precondition(some(LOADING))
     @rule()
     def fail_to_load(self) -> None:

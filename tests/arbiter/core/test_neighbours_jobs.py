@@ -2,7 +2,7 @@
 models. Numbers are those of the list.
 """
 
-from tests.support.core_driver import CoreDriver, refusal
+from tests.support.core_driver import CoreDriver
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -50,41 +50,3 @@ def test_3_the_end_of_a_ttl_and_an_unload_do_not_block_each_other() -> None:
             limit_s=20.0,
         )
         assert driver.state(lease) == "over"
-
-
-def test_15_a_job_that_calls_a_model_in_its_middle_yields_and_is_loaded_again_afterwards() -> None:
-    """Berth#299: the LLM waits for the job, the job for the LLM."""
-    driver = CoreDriver(8 * GIB)
-    comfy, llm = driver.consumer("comfy"), driver.consumer("llm")
-    job = comfy.acquire(5 * GIB)
-    comfy.load(job)
-    comfy.use_begin(job, "render")
-    driver.advance(0.01)
-    called = llm.acquire(5 * GIB)
-    driver.advance(40.0)
-    assert driver.state(called) == "queued", (
-        "without a word nobody is evicted in the middle of a job"
-    )
-    comfy.use_yield(job, "render")
-    comfy.unload(job)
-    driver.until(lambda: driver.state(called) == "loading")
-    llm.load(called)
-    driver.advance(0.01)
-    again = comfy.acquire(5 * GIB)
-    llm.unload(called)
-    driver.until(lambda: driver.state(again) == "loading")
-
-
-def test_15_and_a_job_that_does_not_is_told_instead_of_hanging() -> None:
-    """The job's own process asks for the LLM's lease in the middle of its use."""
-    driver = CoreDriver(8 * GIB)
-    comfy = driver.consumer("comfy")
-    job = comfy.acquire(5 * GIB)
-    comfy.load(job)
-    comfy.use_begin(job, "render")
-    driver.advance(0.01)
-    refused = refusal(comfy.try_acquire(5 * GIB))
-    assert refused.code == "would_deadlock"
-    assert refused.details["cycle"][0]["consumer"] == "comfy"
-    assert "yield" in refused.hint
-    assert driver.state(job) == "held", "and it was not revoked"

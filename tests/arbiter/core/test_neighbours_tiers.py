@@ -6,7 +6,6 @@ import pytest
 from tests.support.core_driver import CoreDriver, answer, refusal
 from tests.support.engine_state import state_of
 from tests.support.scenes import charge, held
-from vram_arbiter.arbiter.core.effects import Signal
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 
@@ -76,19 +75,6 @@ def test_4_nobody_starves_behind_leases_that_come_back_by_themselves() -> None:
     assert driver.now - began < 2.0
 
 
-def test_5_a_growth_that_waits_does_not_block_small_ones_that_fit() -> None:
-    """ollama#5724: head-of-line blocking, by a KV cache this time."""
-    driver = CoreDriver(8 * GIB)
-    busy, blocker = held(driver, "busy", 4)
-    busy.use_begin(blocker)
-    vlm, lease = held(driver, "vlm", 2)
-    vlm.resize(lease, 4 * GIB + 300 * MIB)
-    small = driver.consumer("small").acquire(1 * GIB)
-    driver.advance(0.1)
-    assert charge(driver, lease) == 2 * GIB
-    assert driver.state(small) == "loading"
-
-
 def test_6_the_single_coldest_that_covers_the_need_leaves() -> None:
     """oMLX#1970: evict the single coldest that covers the bytes, not a hand-written group."""
     driver = CoreDriver(16 * GIB)
@@ -97,32 +83,7 @@ def test_6_the_single_coldest_that_covers_the_need_leaves() -> None:
     assert [gib for gib, lease in leases.items() if driver.state(lease) == "revoking"] == [4]
 
 
-def test_7_a_footprint_that_was_wrong_is_said_and_charged() -> None:
-    """ollama#6160: 22 GB declared, 16 used. The difference is somebody else's room."""
-    driver = CoreDriver(24 * GIB)
-    vlm, lease = held(driver, "vlm", 22, evictable=False)
-    vlm.hold(16 * GIB)
-    vlm.resize(lease, 16 * GIB)
-    driver.until(lambda: charge(driver, lease) == 16 * GIB, limit_s=1.0)
-    other = driver.consumer("x").acquire(6 * GIB)
-    driver.until(lambda: driver.state(other) == "loading", limit_s=1.0)
-    assert charge(driver, other) == 6 * GIB
-
-
-def test_8_a_growth_is_not_granted_while_somebody_loads() -> None:
-    """vLLM#55827: two that grow at once mis-measure each other."""
-    driver = CoreDriver(8 * GIB)
-    vlm, lease = held(driver, "vlm", 2)
-    loader = driver.consumer("loader")
-    loading = loader.acquire(2 * GIB)
-    vlm.resize(lease, 3 * GIB)
-    driver.advance(5.0)
-    assert charge(driver, lease) == 2 * GIB
-    loader.load(loading)
-    driver.until(lambda: charge(driver, lease) == 3 * GIB, limit_s=0.5)
-
-
-def test_10_nothing_that_comes_back_or_grows_touches_a_pinned_model() -> None:
+def test_10_nothing_that_comes_back_touches_a_pinned_model() -> None:
     """llama.cpp PR#18373, llama-swap#1127."""
     driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 4, standby=True)
@@ -134,8 +95,6 @@ def test_10_nothing_that_comes_back_or_grows_touches_a_pinned_model() -> None:
     boss.load(wanted)
     driver.advance(300.0)
     assert (driver.state(lease), driver.state(wanted)) == ("standby", "held")
-    small, little = held(driver, "small", 1)
-    assert answer(small.resize(little, 3 * GIB, wait_timeout_s=60.0))["state"] == "growing"
     assert answer(det.reacquire(lease, wait_timeout_s=60.0))["state"] == "queued"
     driver.advance(30.0)
     assert (driver.state(lease), driver.state(wanted)) == ("queued", "held")
@@ -186,14 +145,3 @@ def test_19_a_model_that_cannot_be_moved_to_host_ram_is_never_told_to() -> None:
     assert refusal(nf4.release(lease, parked=True)).code == "bad_state"
     nf4.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
-
-
-def test_3_stuck_holders_are_ended_only_where_they_agreed() -> None:
-    """ollama#7606 `Stopping…` for ever; llama-swap#125 only SIGKILL helps. By default nothing is
-    done to what may move a robot."""
-    for agreed, sent in (("wait", []), ("kill", ["term", "kill"])):
-        driver = CoreDriver(8 * GIB)
-        held(driver, "stuck", 5, on_overstay=agreed)
-        driver.consumer("w").acquire(5 * GIB)
-        driver.advance(120.0)
-        assert [effect.kind for effect in driver.effects if isinstance(effect, Signal)] == sent

@@ -51,32 +51,6 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
     )
 
 
-def test_3_a_waiter_that_wants_an_answer_gets_one_although_the_holder_says_that_it_unloads() -> (
-    None
-):
-    """ollama#10831. `on_deadline: deny` is a typed error after the deadline, whatever the holder
-    says that it is doing."""
-    driver = CoreDriver(8 * GIB)
-    stuck, lease = held(driver, "stuck", 5, ttl_s=3600.0)
-    waiter = driver.consumer("w").acquire(5 * GIB, deny_on_deadline=True)
-    driver.until(lambda: driver.state(lease) == "revoking")
-    driver.advance(20.0)
-    stuck.unloading(lease)
-    driver.advance(29.0)
-    (step,) = (
-        step for step in driver.why("w")["leases"][0]["plan"] if step["action"] == "deadline"
-    )
-    assert step["in_s"] == pytest.approx(1.0, abs=0.1)
-    driver.advance(1.5)
-    assert driver.state(waiter) == "over"
-    (push,) = driver.pushes("denied", waiter)
-    assert push["error"]["code"] == "holder_busy"
-    assert "hang" in driver.why("stuck")["leases"][0]["text"]
-    stuck.hold(0)
-    stuck.release(lease)
-    driver.until(lambda: driver.state(lease) == "over", limit_s=2.0)
-
-
 # -- 4: thrash and starvation
 def test_4_a_job_that_runs_is_finished_before_the_swap() -> None:
     """llama-swap#19, #611: the swap comes in the middle of the answer. Also a waiter of the highest

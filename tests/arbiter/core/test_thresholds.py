@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import held, why
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, ProcessUse, Resumed
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -215,15 +215,6 @@ def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
     assert driver.state(idle) == "revoking"
 
 
-def test_a_gang_that_loads_is_not_waited_for() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    _, idle = held(driver, "idle", 6, gpu="0")
-    for name in ("a", "b"):
-        driver.consumer(name).acquire(1 * GIB, gpu="1", gang=("g", 2))
-    driver.consumer("w").acquire(4 * GIB)
-    assert driver.state(idle) == "revoking"
-
-
 # -- who has not come back
 @pytest.mark.parametrize("count", [1, 3, 4])
 def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
@@ -238,19 +229,6 @@ def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
     )
 
 
-# -- gangs that load
-def gang_of(driver: CoreDriver, *sizes: tuple[int, int]) -> list[tuple[Consumer, LeaseId]]:
-    """Members with these load peaks and steady bytes, the first of which loads."""
-    found = []
-    for n, (peak, steady) in enumerate(sizes):
-        who = driver.consumer(f"member{n}")
-        found.append((who, who.acquire(peak, steady, gang=("g", len(sizes)))))
-    assert [driver.state(lease) for _, lease in found] == ["loading"] + ["queued"] * (
-        len(sizes) - 1
-    )
-    return found
-
-
 def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = None) -> None:
     """Loaded: it holds so much, and readings have seen it."""
     who, lease = member
@@ -258,135 +236,6 @@ def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = 
     who.driver.advance(1.1)
     who.ready(lease, count if says is None else says)
     who.driver.advance(0.1)
-
-
-@pytest.mark.parametrize(("beyond", "after"), [(0, "loading"), (1, "over")])
-def test_a_member_may_hold_more_than_it_declared_as_long_as_the_rest_fits(
-    beyond: int, after: str
-) -> None:
-    driver = CoreDriver(8 * GIB)
-    one, (_, second) = gang_of(driver, (4608 * MIB, 4 * GIB), (3500 * MIB, 3 * GIB))
-    ready_with(one, BUDGET - 3500 * MIB + beyond)
-    assert driver.state(second) == after
-    if beyond:
-        assert (
-            "holds more than it declared" in driver.pushes("denied", second)[0]["error"]["message"]
-        )
-
-
-@pytest.mark.parametrize("says", [3200 * MIB, 3250 * MIB])
-@pytest.mark.parametrize(("beyond", "after"), [(0, "held"), (1, "revoking")])
-def test_who_grew_is_asked_to_leave_for_a_gang_by_the_byte_that_it_lacks(
-    beyond: int, after: str, says: int
-) -> None:
-    driver = CoreDriver(8 * GIB)
-    other, lease = held(driver, "other", 1)
-    one, (_, second) = gang_of(driver, (3300 * MIB, 3200 * MIB), (3300 * MIB, 3200 * MIB))
-    other.hold(BUDGET - 3300 * MIB - says + beyond)
-    ready_with(one, says)
-    assert (driver.state(lease), driver.state(second)) == (after, "queued" if beyond else "loading")
-    asked = [(push["reason"], push["wanted_by"]) for push in driver.pushes("revoke", lease)]
-    assert asked[:1] == [("gang g needs the room", "member1")][:beyond]
-
-
-def test_while_one_leaves_for_a_gang_nobody_else_is_asked() -> None:
-    driver = CoreDriver(8 * GIB)
-    other, lease = held(driver, "other", 1)
-    _, idle = held(driver, "idle", 1)
-    one, (_, second) = gang_of(driver, (2800 * MIB, 2700 * MIB), (2800 * MIB, 2700 * MIB))
-    other.hold(BUDGET - 5500 * MIB - 1 * GIB + 1)
-    ready_with(one, 2700 * MIB)
-    driver.advance(2.0)
-    assert sorted((driver.state(lease), driver.state(idle))) == ["held", "revoking"]
-    assert driver.state(second) == "queued"
-
-
-@pytest.mark.parametrize("says", [3 * GIB, 3 * GIB + 100 * MIB])
-@pytest.mark.parametrize(("shown", "after"), [(0, "loading"), (1, "queued")])
-def test_the_next_member_loads_once_the_last_byte_is_on_its_way_back(
-    shown: int, after: str, says: int
-) -> None:
-    """What the one before still shows of its peak may be there as long as all of it fits beside the
-    load."""
-    driver = CoreDriver(8 * GIB)
-    one, (_, second) = gang_of(driver, (4 * GIB, 3 * GIB), (4 * GIB, 3 * GIB))
-    ready_with(one, 4 * GIB + 1, says)
-    assert driver.state(second) == "queued"
-    one[0].hold(BUDGET - 4 * GIB + shown)
-    driver.advance(0.1)
-    assert driver.state(second) == after
-
-
-def test_what_a_process_shows_of_its_peak_may_be_what_is_kept_for_its_next_member() -> None:
-    driver = CoreDriver(8 * GIB)
-    who, third = driver.consumer("two"), driver.consumer("third")
-    first, second = (who.acquire(3 * GIB, 1 * GIB, gang=("g", 3)) for _ in range(2))
-    third.acquire(3 * GIB, gang=("g", 3))
-    ready_with((who, first), 5 * GIB + 1, 1 * GIB)
-    assert driver.state(second) == "queued", "the GPU has no room for its peak"
-    who.hold(3500 * MIB)
-    driver.until(lambda: driver.state(second) == "loading", limit_s=2.0)
-
-
-def test_the_headroom_goes_to_the_loading_member_and_the_rest_of_it_stays_for_the_next() -> None:
-    driver = CoreDriver(8 * GIB)
-    sizes = [(2100 * MIB, 2000 * MIB), (2500 * MIB, 2000 * MIB), (2300 * MIB, 2000 * MIB)]
-    members = gang_of(driver, *sizes)
-    assert driver.gpu()["charged_bytes"] == 6500 * MIB
-    driver.consumer("w").acquire(3 * GIB)
-    blockers = {one["consumer"]: one for one in why(driver, "w")["blockers"]}
-    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [
-        2100 * MIB,
-        2400 * MIB,
-        2000 * MIB,
-    ]
-    assert blockers["member1"] == {
-        "lease_id": members[1][1],
-        "consumer": "member1",
-        "bytes": 2400 * MIB,
-        "state": "queued",
-        "uses": 0,
-        "condition": "turn",
-        "by": "g",
-        "text": "has its bytes kept for its turn in gang g",
-    }
-    ready_with(members[0], 2000 * MIB)
-    assert driver.state(members[1][1]) == "loading"
-    assert driver.gpu()["charged_bytes"] == 6500 * MIB
-    blockers = {one["consumer"]: one for one in why(driver, "w")["blockers"]}
-    assert [blockers[f"member{n}"]["bytes"] for n in range(3)] == [
-        2000 * MIB,
-        2500 * MIB,
-        2000 * MIB,
-    ]
-
-
-def test_a_gang_over_two_gpus_keeps_no_bytes_for_a_member_elsewhere() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    a, b, c = (driver.consumer(name) for name in "abc")
-    a.acquire(3 * GIB, gang=("g", 3), gpu="0")
-    b.acquire(3 * GIB, gang=("g", 3), gpu="1")
-    c.acquire(3 * GIB, gang=("g", 3), gpu="1")
-    driver.consumer("w").acquire(6 * GIB, gpu="0")
-    assert [one["consumer"] for one in why(driver, "w")["blockers"]] == ["a"]
-
-
-def test_a_gang_that_may_be_given_up_says_when_and_why() -> None:
-    driver = CoreDriver(8 * GIB)
-    one, (_, second) = gang_of(driver, (4608 * MIB, 3 * GIB), (4608 * MIB, 3 * GIB))
-    ready_with(one, 4 * GIB, 3 * GIB)
-    assert driver.state(second) == "queued"
-    step = why(driver, "member1")["plan"][-1]
-    gives_up_at = driver.now + step["in_s"]
-    assert step["action"] == "break"
-    assert (
-        step["text"] == f"gives up gang g in {step['in_s']:.1f} s, if its memory is not free then"
-    )
-    assert "lease_id" not in step or step["lease_id"] is None
-    driver.advance(gives_up_at - 0.2 - driver.now)
-    assert driver.state(second) == "queued"
-    driver.advance(0.7)
-    assert driver.state(second) == "over"
 
 
 # -- residues in the journal

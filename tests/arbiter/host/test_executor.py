@@ -17,7 +17,7 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Reque
 from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.notes import About, GrantedNote, ReleasedNote
-from vram_arbiter.schemas.wire.pushes import AnyPush, GrantedPush, ResizedPush, RevokePush
+from vram_arbiter.schemas.wire.pushes import AnyPush, GrantedPush, RevokePush, RevokeWithdrawnPush
 from vram_arbiter.schemas.wire.replies import AcquireReply, StateReply
 
 A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
@@ -27,7 +27,7 @@ RECORD = DrainRecord("operator", "service")
 WRITTEN = {"by": "operator", "reason": "service"}
 ABOUT = About(LeaseId("L1-1"), "det", GPU)
 REVOKE = revoke("L1-9")
-RESIZED = ResizedPush("L1-1", Token(1, 2), 5)
+WITHDRAWN = RevokeWithdrawnPush("L1-1", Token(1, 2))
 
 
 class Recorder:
@@ -136,7 +136,7 @@ def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be
         [
             fx.JournalPut("lease:L1-0", RECORD),
             fx.Reply(A, RequestId(2), StateReply("verifying")),
-            fx.Push(A, RESIZED),
+            fx.Push(A, WITHDRAWN),
             fx.JournalPut("lease:L1-1", RECORD, gates=True),
             fx.Push(A, GRANTED),
         ]
@@ -145,7 +145,7 @@ def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be
         ("post", ev.JournalFailed("lease:L1-0", "disk full", gates=False)),
         ("post", ev.JournalFailed("lease:L1-1", "disk full")),
         ("reply", A, RequestId(2), StateReply("verifying")),
-        ("push", A, RESIZED),
+        ("push", A, WITHDRAWN),
     ]
 
 

@@ -136,7 +136,7 @@ def test_a_lease_a_wait_and_an_eviction_are_shown_as_they_happen(page: Page) -> 
     assert len(set(chips)) == 2
     assert set(chips) < set(parts)  # a consumer has one color
 
-    waiter = client.acquire("grab", 4 * GIB, independent=True)["lease"]["lease_id"]
+    waiter = client.acquire("grab", 4 * GIB)["lease"]["lease_id"]
     reason = f"[data-lease={waiter!r}] .reason"
     page.until(lambda: "5.00 GiB from detector, in use" in page.text(reason), "the wait's reason")
     assert "needs 4.00 GiB" in page.text(f"[data-lease={waiter!r}]")

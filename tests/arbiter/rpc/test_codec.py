@@ -15,10 +15,10 @@ from vram_arbiter.schemas.defaults import VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.errors import ErrorView
-from vram_arbiter.schemas.wire.pushes import ResizedPush
+from vram_arbiter.schemas.wire.pushes import RevokeWithdrawnPush
 from vram_arbiter.schemas.wire.replies import UsesReply
 from vram_arbiter.schemas.wire.requests import Acquire, Ping, Reattach
-from vram_arbiter.schemas.wire.spec import Footprint, Gang, LeaseSpec
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 LIMIT = 1 << 20
 
@@ -150,9 +150,7 @@ def test_a_client_with_all_its_leases_and_many_uses_reattaches() -> None:
     """The limit of values must not refuse what an honest client holds: then its leases would
     expire."""
     size = {"load_peak_bytes": 5, "steady_bytes": 4, "residue_bytes": 1}
-    spec = to_map(
-        LeaseSpec(consumer="c", model_id="m", footprint=Footprint(**size), gang=Gang("g", 2))
-    )
+    spec = to_map(LeaseSpec(consumer="c", model_id="m", footprint=Footprint(**size)))
     lease = {"lease_id": "L", "token": [1, 1], "state": "held", "spec": spec, "measured_bytes": 4}
     leases = [
         {**lease, "use_ids": [f"use-{n}" for n in range(16)]}
@@ -230,12 +228,11 @@ def test_replies_have_the_shape_of_the_wire() -> None:
     error = {"code": "bad_frame", "message": "m", "hint": "h", "details": {"a": 1}}
     refusal = codec.refusal(None, 2, ErrorView("bad_frame", "m", "h", {"a": 1}))
     assert msgpack.unpackb(refusal) == {"re": None, "epoch": 2, "ok": False, "error": error}
-    push = codec.push(8, 2, ResizedPush("L1-1", Token(1, 2), 5))
+    push = codec.push(8, 2, RevokeWithdrawnPush("L1-1", Token(1, 2)))
     assert msgpack.unpackb(push) == {
-        "push": "resized",
+        "push": "revoke_withdrawn",
         "lease_id": "L1-1",
         "token": [1, 2],
-        "charge_bytes": 5,
         "seq": 8,
         "epoch": 2,
     }

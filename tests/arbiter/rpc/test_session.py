@@ -252,12 +252,8 @@ def test_requests_of_leases_that_come_back(session_bench: Bench) -> None:
     wanted = {"consumer": "detector", "model_id": "m", "footprint": FOOTPRINT, "standby": True}
     session_bench.ask("reacquire", **on, wait_timeout_s=4.0)
     session_bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "standby"}])
-    session_bench.ask("resize", **on, footprint=FOOTPRINT, wait_timeout_s=2.0)
-    reacquired, reattached, resized = session_bench.events
-    assert resized == ev.ResizeAsked(
-        me, RequestId(session_bench.next_id), LEASE, token, Footprint(10, 8, 2), 2.0
-    )
-    assert reacquired == ev.Reacquired(me, RequestId(session_bench.next_id - 2), LEASE, token, 4.0)
+    reacquired, reattached = session_bench.events
+    assert reacquired == ev.Reacquired(me, RequestId(session_bench.next_id - 1), LEASE, token, 4.0)
     assert isinstance(reattached, ev.Reattached)
     (item,) = reattached.leases
     assert (item.state, item.spec.standby) == ("standby", True)
@@ -269,7 +265,7 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
     me, token, on = session_bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
     wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT,
     "mode": "exclusive",
-              "priority": 60, "evictable": False, "on_deadline": "deny"}  # fmt: skip
+              "priority": 60, "evictable": False}  # fmt: skip
     spec = LeaseSpec(
         consumer="detector",
         model_id="m",
@@ -278,14 +274,12 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
         footprint=Footprint(10, 8, 2),
         priority=60,
         evictable=False,
-        on_deadline="deny",
     )
     trace = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
     session_bench.ask("acquire", nonce="n1", spec=wanted, wait_timeout_s=4.0, traceparent=trace)
     session_bench.ask("ready", **on, measured_bytes=5)
     session_bench.ask("use_begin", **on, use_id="u", label="goal")
     session_bench.ask("use_end", **on, use_id="u")
-    session_bench.ask("yield", **on, use_id="u")
     session_bench.ask("renew", leases=[on])
     session_bench.ask("revoke_ack", **on, safe_point_eta_s=1.5)
     session_bench.ask("unloading", **on)
@@ -295,14 +289,13 @@ def test_every_request_on_leases_becomes_its_event(session_bench: Bench) -> None
         "reattach", leases=[{**on, "spec": wanted, "state": "held", "use_ids": ["u"]}]
     )
     session_bench.ask("oom", **on, requested_bytes=11, allocated_bytes=12)
-    first = session_bench.next_id - 11
-    ids = iter([RequestId(first + n) for n in range(12)])
+    first = session_bench.next_id - 10
+    ids = iter([RequestId(first + n) for n in range(11)])
     assert session_bench.events == [
         ev.AcquireRequested(me, next(ids), "n1", spec, 4.0, trace),
         ev.ReadyReported(me, next(ids), LEASE, token, 5),
         ev.UseBegan(me, next(ids), LEASE, token, USE, "goal"),
         ev.UseEnded(me, next(ids), LEASE, token, USE),
-        ev.UseYielded(me, next(ids), LEASE, token, USE),
         ev.Renewed(me, next(ids), ((LEASE, token),)),
         ev.RevokeAcknowledged(me, next(ids), LEASE, token, 1.5),
         ev.UnloadStarted(me, next(ids), LEASE, token),
@@ -321,7 +314,7 @@ def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(session_bench:
     session_bench.hello(via=b"o", role="operator", name="ops")
     session_bench.events.clear()
     for via in (b"c", b"v"):
-        for op in ("evict", "pin", "unpin", "release_dead"):
+        for op in ("evict", "kill", "pin", "unpin", "release_dead"):
             assert code(session_bench.ask(op, via, target="det", reason="r")) == "not_permitted"
         for op in ("drain", "resume"):
             assert code(session_bench.ask(op, via, reason="r")) == "not_permitted"
@@ -351,7 +344,7 @@ def test_every_op_of_the_wire_is_dispatched(session_bench: Bench) -> None:
         "spec": {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}},
         "use_begin": {**on, "use_id": "u"}, "use_end": {**on, "use_id": "u"},
         "renew": {"leases": []},
-        "cancel": {"lease_id": "L"}, "reacquire": on, "resize": {**on, "footprint": FOOTPRINT},
+        "cancel": {"lease_id": "L"}, "reacquire": on,
         "reattach": {"leases": []}, "oom": {**on, "requested_bytes": 1},
         "why": {"consumer": "c"},
         **dict.fromkeys(("ready", "revoke_ack", "unloading", "release"), on),

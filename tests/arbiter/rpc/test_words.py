@@ -74,7 +74,7 @@ def test_every_block_has_words(code: Block) -> None:
 @pytest.mark.parametrize("action", NextAction)
 @pytest.mark.parametrize("because", Because)
 def test_every_step_has_words(action: NextAction, because: Because) -> None:
-    step = Step(action, "{det}", "L1-1", 1.0, because, gang="{g}", waiter="{w}")
+    step = Step(action, "{det}", "L1-1", 1.0, because, waiter="{w}")
     assert explained.step_words(step)
 
 
@@ -113,15 +113,6 @@ def test_an_operators_order_is_quoted_where_it_ended_a_lease() -> None:
     order = Order("ops (uid 0, pid 7)", "hangs since noon")
     given_up = words.error_view(r.Expired("L1-1", 600.0, Why.GIVEN_UP, order))
     assert given_up.message == "L1-1 was given up by ops (uid 0, pid 7): hangs since noon"
-
-
-def test_a_deadlock_is_told_link_by_link() -> None:
-    job = r.NamedLease("L1-1", "job", "held")
-    told = words.error_view(r.Deadlock((r.CycleLink(7, "job", "L1-2", (job,), (job,)),)))
-    assert told.message == (
-        "this wait would never end: job (pid 7) uses job (L1-1) and waits for job (L1-1)"
-    )
-    assert "`yield`" in told.hint
 
 
 def test_a_process_without_a_lease_is_named_by_its_pid() -> None:

@@ -109,7 +109,7 @@ class Rules(ABC):
                         Refuse(
                             client,
                             request,
-                            Revoked(self._models[lease].spec.consumer, "leaving", "use"),
+                            Revoked(self._models[lease].spec.consumer, "leaving"),
                         )
                     )
                 else:

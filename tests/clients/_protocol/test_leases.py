@@ -9,10 +9,7 @@ from vram_arbiter.schemas.errors import (
     BadState,
     LeaseExpired,
     LeaseLost,
-    LeaseRevoking,
     StaleToken,
-    VramInsufficient,
-    WaitTimeout,
 )
 
 
@@ -227,93 +224,3 @@ def test_bad_state_is_no_loss(link: Wire) -> None:
     assert isinstance(failed, r.Failed)
     assert isinstance(failed.error, BadState)
     assert link.holdings.held
-
-
-def test_a_resize_ends_by_reply_push_or_denial(link: Wire) -> None:
-    record = link.hold()
-    footprint = {"load_peak_bytes": 9, "steady_bytes": 9, "residue_bytes": 1}
-    link.holdings.resize(record, footprint, None, link.now)
-    link.reply(link.one("resize"), state="growing", lease=view())
-    assert record.spec["footprint"] == footprint
-    link.told()
-    link.push("resized", lease_id=record.lease_id, token=list(record.token), charge_bytes=9)
-    assert link.told() == [r.Resized(record)]
-    link.push(
-        "denied",
-        lease_id=record.lease_id,
-        error={"code": "wait_timeout", "message": "", "hint": "", "details": {}},
-    )
-    (resized,) = link.told()
-    assert isinstance(resized, r.Resized)
-    assert isinstance(resized.error, WaitTimeout)
-
-
-FOOTPRINT = {"load_peak_bytes": 9, "steady_bytes": 9, "residue_bytes": 1}
-
-
-@pytest.mark.parametrize("ends", ["held", "resized", "refused"])
-def test_a_resize_outlives_the_daemon(link: Wire, ends: str) -> None:
-    """Regression: the daemon that was to tell its end was another one, and `resize` never
-    returned."""
-    record = link.hold()
-    link.holdings.resize(record, FOOTPRINT, 5.0, link.now)
-    link.reply(link.one("resize"), state="growing", lease=view())
-    link.told()
-    link.now += 2.0
-    attach = link.reconnect()
-    link.reply(
-        attach, leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(state="held")}]
-    )
-    again = link.one("resize")
-    assert (again["footprint"], again["wait_timeout_s"]) == (FOOTPRINT, 3.0)
-    if ends == "refused":
-        link.refuse(again, "vram_insufficient")
-    else:
-        link.reply(again, state="held" if ends == "held" else "growing", lease=view())
-        if ends == "resized":
-            link.push("resized", lease_id=record.lease_id, token=list(record.token), charge_bytes=9)
-    (resized,) = [event for event in link.told() if isinstance(event, r.Resized)]
-    assert isinstance(resized.error, VramInsufficient) == (ends == "refused")
-    link.reply(
-        link.reconnect(), leases=[{"lease_id": record.lease_id, "kept": True, "lease": view()}]
-    )
-    assert link.said("resize") == [], "its end was told"
-
-
-@pytest.mark.parametrize("first", ["held", "refused", "silent"])
-def test_a_resize_that_was_answered_or_is_on_the_way_is_said_once(link: Wire, first: str) -> None:
-    record = link.hold()
-    link.holdings.resize(record, FOOTPRINT, None, link.now)
-    if first != "silent":
-        message = link.one("resize")
-        if first == "held":
-            link.reply(message, state="held", lease=view())
-        else:
-            link.refuse(message, "vram_insufficient")
-    link.told()
-    link.reply(
-        link.reconnect(), leases=[{"lease_id": record.lease_id, "kept": True, "lease": view()}]
-    )
-    assert len(link.said("resize")) == (1 if first == "silent" else 0)
-
-
-def test_a_resize_ends_when_the_lease_leaves_the_gpu(link: Wire) -> None:
-    """Regression: the arbiter drops a growth whose lease unloads and says nothing of it; `resize`
-    never returned."""
-    record = link.hold()
-    link.holdings.resize(record, FOOTPRINT, None, link.now)
-    link.reply(link.one("resize"), state="growing", lease=view())
-    link.told()
-    link.holdings.release(record, False, link.now, 5.0, asleep="standby")
-    (resized,) = [event for event in link.told() if isinstance(event, r.Resized)]
-    assert isinstance(resized.error, LeaseRevoking)
-
-
-def test_a_yielded_use_is_not_attached_again(link: Wire) -> None:
-    record = link.hold()
-    link.holdings.use_begin(record, "u1", "", link.now)
-    link.reply(link.one("use_begin"), uses=1)
-    link.holdings.use_yield(record, "u1", link.now)
-    link.reply(link.one("yield"), uses=0)
-    link.told()
-    assert link.reconnect()["leases"][0]["use_ids"] == []

@@ -38,7 +38,6 @@ def spec(consumer: str, gib: float) -> LeaseSpec:
         footprint=Footprint(size, size, 0),
         min_residency_s=0.0,
         ttl_s=600.0,
-        independent=True,
     )
 
 
@@ -169,12 +168,10 @@ def read_back(*events: Mapping[str, Any], end_s: float = 100.0) -> Story:
     return reader.story(end_s)
 
 
-def test_standby_growth_loss_and_pressure() -> None:
+def test_standby_loss_and_pressure() -> None:
     story = read_back(
         made_event(1, "granted", charge_bytes=4),
         made_event(2, "ready", charge_bytes=3),
-        made_event(3, "queued", "grown", grows="L-a"),
-        made_event(4, "resized", charge_bytes=5),
         made_event(5, "revoke_asked", wanted_by="b"),
         made_event(6, "released", was="revoking"),
         made_event(7, "verified", resolved=False, verdict="late"),
@@ -191,12 +188,11 @@ def test_standby_growth_loss_and_pressure() -> None:
     )
     assert lease_states(story) == {
         "a": ["loading", "held", "revoking", "verifying", "standby", "loading", "verifying"],
-        "grown": ["queued"],
         "old": ["held", "verifying"],
         "never": ["queued"],
     }
     lease = story.leases[0]
-    assert lease.charges == [(1, 4), (2, 3), (4, 5), (8, 0), (10, 4), (12, 0)]
+    assert lease.charges == [(1, 4), (2, 3), (8, 0), (10, 4), (12, 0)]
     (eviction,) = story.evictions
     assert [(one.name, one.end_s - one.begin_s) for one in eviction.phases(99)] == [
         ("unload", 1), ("verify", 2)
@@ -207,7 +203,7 @@ def test_standby_growth_loss_and_pressure() -> None:
     assert [span.name for span in part.leases[0].states] == [
         "held", "revoking", "verifying", "standby"
     ]  # fmt: skip
-    assert part.leases[0].charges == [(4.5, 5), (8, 0)]
+    assert part.leases[0].charges == [(4.5, 3), (8, 0)]
 
 
 # -- forms

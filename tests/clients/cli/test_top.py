@@ -50,7 +50,6 @@ def lease_spec(consumer: str, gib: float, priority: int = 50) -> LeaseSpec:
         min_residency_s=0.0,
         priority=priority,
         ttl_s=600.0,
-        independent=True,
     )
 
 

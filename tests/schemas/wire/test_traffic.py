@@ -92,20 +92,16 @@ def recorded(arbiter_daemon: ArbiterProcess) -> Iterator[Callable[..., RecordedC
 
 
 def everything(connect: Callable[..., RecordedClient]) -> list[RecordedClient]:
-    """Use every op of the wire once at least, and cause every push but a late resize's."""
+    """Use every op of the wire once at least, and cause every push."""
     holder, other, operator = connect(), connect(), connect(role="operator")
     operator.ask("subscribe")
     lease = holder.granted("detector", 5 * GIB, standby=True)
     ref = {"lease_id": lease["lease_id"], "token": lease["token"]}
     holder.ask("ready", **ref, measured_bytes=5 * GIB)
     holder.ask("use_begin", **ref, use_id="u1", label="detect")
-    holder.ask("yield", **ref, use_id="u1")
-    holder.ask("use_begin", **ref, use_id="u1")
     holder.ask("use_end", **ref, use_id="u1")
     holder.ask("renew", leases=[ref])
     holder.ask("oom", **ref, requested_bytes=GIB, allocated_bytes=5 * GIB)
-    footprint = {"load_peak_bytes": 4 * GIB, "steady_bytes": 4 * GIB, "residue_bytes": 0}
-    holder.ask("resize", **ref, footprint=footprint)
     assert other.acquire("chat", GIB, gpu="no-such-gpu")["ok"] is False
     for op in ("status", "ping"):
         other.ask(op)
@@ -135,6 +131,7 @@ def everything(connect: Callable[..., RecordedClient]) -> list[RecordedClient]:
     footprint = {"load_peak_bytes": 6 * GIB, "steady_bytes": 6 * GIB, "residue_bytes": 0}
     spec = {"consumer": "grab", "model_id": "grab", "footprint": footprint, "ttl_s": 600.0}
     other.ask("reattach", leases=[{**held, "spec": spec, "state": "loading"}])
+    operator.ask("kill", target="no-such-consumer", reason="test")
     operator.push("event")
     other.ask("bye")
     return [holder, other, operator]

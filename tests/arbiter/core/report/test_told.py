@@ -1,7 +1,7 @@
 """What is told, word for word: views, records, notes and refusals are what clients, a restart and
 the history stand on."""
 
-from dataclasses import astuple, replace
+from dataclasses import astuple
 from typing import Any
 
 import pytest
@@ -13,7 +13,6 @@ from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Wait, Why
-from vram_arbiter.schemas.wire.spec import Footprint
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -108,14 +107,6 @@ def test_an_estimate_says_that_it_was_learnt() -> None:
     assert driver.state(waiting) == "queued"
     told = only(driver.why("vlm")["leases"])
     assert (told["eta_s"], told["eta_source"]) == (3.0, "learnt"), "after the other's"
-
-
-def test_a_circle_names_its_leases_with_their_states() -> None:
-    driver = CoreDriver(8 * GIB)
-    job, lease = held(driver, "job", 5)
-    job.use_begin(lease)
-    (link,) = refusal(job.try_acquire(5 * GIB)).details["cycle"]
-    assert link["holds"] == [{"lease_id": lease, "consumer": "job", "state": "held"}]
 
 
 # -- answers
@@ -236,31 +227,6 @@ def test_who_is_parked_is_noted_with_its_host_ram() -> None:
     assert only(driver.notes("parked"))["parked_bytes"] == 2 * GIB
 
 
-# -- who grows
-def test_a_growth_waits_for_its_bytes_alone() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(
-        driver, "det", 3, exclusive=False, residue_bytes=450 * MIB, standby=True, park_bytes=GIB
-    )
-    other, busy = held(driver, "other", 4)
-    other.use_begin(busy)
-    answer(det.resize(lease, 5 * GIB, residue_bytes=450 * MIB))
-    waiting = LeaseId(
-        only([note for note in driver.notes("queued") if "grows by" in note["reason"]])["lease_id"]
-    )
-    note = driver.notes("queued")[-1]
-    assert (note["lease_id"], note["position"]) == (waiting, 1)
-    assert note["reason"] == f"{lease} grows by {2 * GIB}"
-    growth = core_lease(driver, waiting)
-    assert growth.spec == replace(
-        core_lease(driver, lease).spec,
-        evictable=False,
-        standby=False,
-        park_bytes=0,
-        footprint=Footprint(2 * GIB, 2 * GIB, 0),
-    )
-
-
 # -- the journal
 def test_a_record_holds_all_that_was_asked_for() -> None:
     driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 3 * GIB})
@@ -273,18 +239,15 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "gpu": "0",
         "ttl_s": 77.0,
         "min_residency_s": 1.5,
-        "deny_on_deadline": True,
-        "on_overstay": "kill",
         "standby": True,
         "park_bytes": GIB,
         "key": "grasp",
-        "independent": True,
     }
     spec = det.spec(3 * GIB, 2 * GIB, **wishes)
     same = sum(
         a == b for a, b in zip(astuple(spec), astuple(det.spec(1 * GIB, GIB // 2)), strict=True)
     )
-    assert same == 3, "all differ but the consumer's name, the revision and the gang"
+    assert same == 2, "all differ but the consumer's name and the revision"
     lease = det.acquire(3 * GIB, 2 * GIB, **wishes)
     det.load(lease)
     record = driver.journal[f"lease:{lease}"]
@@ -374,29 +337,6 @@ def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
     waiting = driver.consumer("vlm").acquire(3 * GIB)
     assert core_lease(driver, waiting).request.reason == Wait.RESIDUE
     assert driver.state(lease) == "held"
-
-
-def test_a_gang_beside_a_pin_waits_for_its_end() -> None:
-    driver = CoreDriver(8 * GIB)
-    pinner, pinned = held(driver, "pinned", 4, evictable=False)
-    first = driver.consumer("policy").acquire(2 * GIB, gang=("grasp", 2))
-    last = driver.consumer("reward").acquire(2 * GIB, gang=("grasp", 2))
-    driver.advance(10.0)
-    assert (driver.state(first), driver.state(last)) == ("queued", "queued")
-    pinner.unload(pinned)
-    driver.until(lambda: driver.state(first) == "loading")
-
-
-def test_a_gang_that_has_asked_on_one_gpu_asks_nobody_on_the_other_as_well() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    _, stays = held(driver, "stays", 5, gpu="0", min_residency_s=5.0)
-    leaves, asked = held(driver, "leaves", 5, gpu="1")
-    leaves.use_begin(asked)
-    driver.consumer("policy").acquire(3 * GIB, gang=("grasp", 2))
-    driver.consumer("reward").acquire(3 * GIB, gang=("grasp", 2))
-    driver.until(lambda: driver.state(asked) == "revoking")
-    driver.advance(6.0)  # the other one might be asked now too
-    assert driver.state(stays) == "held"
 
 
 def test_an_answer_to_revoke_is_noted_with_its_lease() -> None:

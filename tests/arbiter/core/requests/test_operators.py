@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from vram_arbiter.arbiter.core.effects import Effect, Note
+from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
 from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 BY = "ops (uid 0, pid 7)"
@@ -401,3 +401,51 @@ def test_the_history_names_the_operator_that_evicts(driver: CoreDriver, ops: Con
     (note,) = driver.notes("revoke_asked")
     assert note["reason"] == f"evicted by {BY}: service"
     assert note["order"] == {"by": BY, "reason": "service"}
+
+
+# -- kill
+def signals(effects: list[Effect]) -> list[tuple[ProcessKey, str]]:
+    return [(effect.process, effect.kind) for effect in effects if isinstance(effect, Signal)]
+
+
+def test_a_stuck_holder_is_told_to_end_and_killed_when_asked_twice(
+    driver: CoreDriver, ops: Consumer
+) -> None:
+    """Its own use may be what is stuck: it protects it from an eviction, not from a person."""
+    det, lease = held_bytes(driver, "det", 5 * GIB)
+    det.use_begin(lease)
+    for signal in ("term", "kill", "kill"):
+        effects = order_of(ops, "kill", "det", "it hangs")
+        assert signals(effects) == [(det.process, signal)]
+        assert answer(effects)["state"] == "held"
+    told = driver.notes("signalled")[0]
+    assert (told["signal"], told["pid"]) == ("term", det.process.pid)
+    assert (told["by"], told["reason"]) == (BY, "it hangs")
+    det.die()
+    assert driver.state(lease) == "over"
+    other, _ = held_bytes(driver, "det", 5 * GIB)
+    assert signals(order_of(ops, "kill", "det")) == [(other.process, "term")]
+
+
+def test_no_process_is_killed_in_the_middle_of_anothers_use(
+    driver: CoreDriver, ops: Consumer
+) -> None:
+    """A robot may be moving: the runner uses the policy's lease, and holds one to render with."""
+    policy, lease = held_bytes(driver, "policy", 4 * GIB)
+    runner, rendering = held_bytes(driver, "runner", GIB)
+    runner.use_begin(lease, "goal", policy.token(lease))
+    for name in ("policy", "runner"):
+        effects = order_of(ops, "kill", name)
+        refused = refusal(effects)
+        assert (refused.code, refused.details["problem"]) == ("bad_state", "others_use")
+        assert signals(effects) == []
+    runner.use_end(lease, "goal", policy.token(lease))
+    runner.use_begin(rendering)
+    assert signals(order_of(ops, "kill", "runner")) == [(runner.process, "term")]
+    assert signals(order_of(ops, "kill", "policy")) == [(policy.process, "term")]
+
+
+def test_what_holds_nothing_is_not_killed(driver: CoreDriver, ops: Consumer) -> None:
+    held_bytes(driver, "det", 5 * GIB, evictable=False)
+    driver.consumer("waits").acquire(5 * GIB)
+    assert refusal(order_of(ops, "kill", "waits")).details["problem"] == "not_held"

@@ -354,23 +354,6 @@ def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash() -> None:
     assert "revoking" in {driver.state(lease), driver.state(LeaseId("L1-50"))}
 
 
-def test_a_lease_that_shrank_just_before_the_restart_is_not_taken_for_gone() -> None:
-    """Regression: a resize that is not journaled made a nearly empty GPU look as if a larger lease
-    had gone."""
-    driver = CoreDriver(8 * GIB)
-    driver.device.lists_processes = False
-    det, lease, token = held_with_token(driver, "det", 1)
-    small = 330 * MIB  # as much as an empty GPU may show
-    det.hold(small)
-    det.resize(lease, small)
-    driver.restart()  # before any reading
-    assert driver.state(lease) == "held"
-    det.connect()
-    (kept,) = answer(det.reattach(lease, token))["leases"]
-    assert kept["kept"] is True
-    assert driver.gpu()["charged_bytes"] >= small
-
-
 def test_a_lost_journal_and_an_empty_gpu_serve_at_once() -> None:
     driver = CoreDriver(8 * GIB)
     driver.restart(keep_journal=False)

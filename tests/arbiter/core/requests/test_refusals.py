@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, refusal
 from tests.support.scenes import held
-from vram_arbiter.arbiter.core.requests.requests import AT_ONCE, PROCESSES_REMEMBERED
+from vram_arbiter.arbiter.core.requests.limits import AT_ONCE, PROCESSES_REMEMBERED
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -33,12 +33,6 @@ def beyond_the_queue(person: Consumer) -> None:
     person.try_acquire(7 * GIB)
 
 
-def grown_too_large(person: Consumer) -> None:
-    lease = person.acquire(GIB)
-    person.load(lease)
-    person.resize(lease, 9 * GIB)
-
-
 def called_back_though_it_is_here(person: Consumer) -> None:
     lease = person.acquire(GIB)
     person.load(lease)
@@ -51,7 +45,6 @@ def called_back_though_it_is_here(person: Consumer) -> None:
         (too_large, "vram_insufficient", False),
         (on_no_gpu, "unknown_gpu", False),
         (beyond_the_queue, "limit_exceeded", False),
-        (grown_too_large, "vram_insufficient", True),
         (called_back_though_it_is_here, "bad_state", True),
     ],
 )

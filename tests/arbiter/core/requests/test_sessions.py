@@ -265,10 +265,10 @@ def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_
     det.use_begin(held, "mine")
     det.use_begin(lent, "theirs", other.token(lent))
     other.use_begin(lent, "its own")
-    queued = det.acquire(7 * GIB, independent=True)
+    queued = det.acquire(7 * GIB)
     beside = Consumer(driver, "beside", det.process, ClientId("beside"))
     beside.connect()
-    theirs = beside.acquire(7 * GIB, nonce="theirs", independent=True)
+    theirs = beside.acquire(7 * GIB, nonce="theirs")
     for number in range(3):
         det.client = ClientId(f"new{number}")
         driver.post(ClientConnected(det.client, det.process, 1000, "det", "det-c101"))

@@ -9,7 +9,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import held, shown
 from vram_arbiter.arbiter.core.effects import Effect, JournalPut, Reply
-from vram_arbiter.arbiter.core.events import ProcessDied, Resumed
+from vram_arbiter.arbiter.core.events import OperatorAsked, ProcessDied, Resumed
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, Token
@@ -171,18 +171,6 @@ def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
     assert answer(sidecar.unload(lease))["next"] == "standby"
 
 
-def test_a_use_that_yields_after_a_restart_is_its_clients_own() -> None:
-    driver = CoreDriver(8 * GIB)
-    sidecar, lease, token, runner = used(driver)
-    restarted(driver, sidecar, lease, token)
-    runner.connect()
-    assert answer(runner.use_yield(lease, "goal", token))["uses"] == 0
-    assert "users" not in driver.journal[f"lease:{lease}"], "nobody waits for a use that pauses"
-    runner.leave("gone")
-    ended = driver.notes("use_ended")[-1]
-    assert (ended["why"], ended["by"]) == ("client_left", "gone")
-
-
 def test_a_record_of_an_older_daemon_names_no_users() -> None:
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, _ = used(driver)
@@ -199,8 +187,6 @@ def test_the_holders_own_uses_are_not_written() -> None:
     sidecar, lease = held(driver, "sidecar", 5)
     for use in ("u1", "u2"):
         assert writes(sidecar.use_begin(lease, use)) == []
-    assert writes(sidecar.use_yield(lease, "u1")) == []
-    assert writes(sidecar.use_begin(lease, "u1")) == []
     for use in ("u1", "u2"):
         assert writes(sidecar.use_end(lease, use)) == []
 
@@ -223,8 +209,6 @@ def test_one_use_of_each_other_process_is_written_before_it_is_answered() -> Non
     assert writes(runner.use_end(lease, "u1", token)) == [["u3", "w1"]], (
         "another of its uses runs on"
     )
-    assert writes(watcher.use_yield(lease, "w1", token)) == [["u3"]]
-    assert writes(watcher.use_begin(lease, "w1", token)) == [["u3", "w1"]]
     assert writes(watcher.leave("dropped")) == [["u3"]]
     assert writes(runner.use_end(lease, "u3", token)) == [[]]
     assert writes(runner.use_end(lease, "u3", token)) == []
@@ -237,8 +221,7 @@ def _key(person: Consumer) -> tuple[int, int]:
 def test_whatever_is_written_of_a_lease_names_its_users() -> None:
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver)
-    sidecar.resize(lease, 6 * GIB)
-    driver.advance(1.0)
+    driver.post(OperatorAsked(sidecar.client, driver.next_request(), "pin", lease, "ada", ""))
     assert writes(driver.effects)[-1] == ["goal"]
     runner.use_end(lease, "goal", token)
     sidecar.unload(lease)

@@ -319,37 +319,6 @@ def test_a_newcomer_of_higher_priority_overtakes_on_its_gpu_only_until_the_other
     assert (place(driver, old), driver.state(young), driver.state(fills)) == (ONE, "queued", "held")
 
 
-# -- gangs
-def test_a_gang_behind_a_head_that_is_placed_elsewhere_is_served() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    busy, lease = held(driver, "busy", 6, gpu="0", priority=10)
-    there, used = held(driver, "there", 3, gpu="1", priority=90)
-    there.use_begin(used)
-    busy.use_begin(lease)
-    head = driver.consumer("head").acquire(6 * GIB, gpu="any")
-    assert (driver.state(head), driver.state(lease)) == ("queued", "revoking")
-    members = [
-        driver.consumer(f"m{n}").acquire(2 * GIB, gpu="1", gang=("pair", 2), priority=40)
-        for n in (0, 1)
-    ]
-    driver.until(lambda: driver.state(members[0]) == "loading", limit_s=1.0)
-    assert [place(driver, member) for member in members] == [ONE, ONE]
-
-
-def test_a_gang_over_two_gpus_waits_for_both_of_which_one_cannot_be_read() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    driver.devices[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
-    driver.advance(1.5)
-    members = [
-        driver.consumer(f"m{n}").acquire(6 * GIB, gpu=str(n), gang=("pair", 2)) for n in (0, 1)
-    ]
-    driver.advance(10.0)
-    assert [driver.state(member) for member in members] == ["queued", "queued"]
-    assert driver.gpu(0)["charged_bytes"] == 0, "nothing is kept for half a gang"
-    driver.devices[ONE].failing = ""
-    driver.until(lambda: [driver.state(m) for m in members] == ["loading", "loading"], limit_s=2.0)
-
-
 # -- standby
 def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
     """A detector that left GPU 0 for a policy which is there now; GPU 1 is in use, and by nobody

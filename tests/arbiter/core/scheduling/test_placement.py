@@ -71,19 +71,6 @@ def test_whoever_names_another_gpu_or_is_too_large_waits_only_where_it_may_be(
     assert (waiting[named].request.gpus, waiting[any_gpu].request.gpus) == ((ZERO,), (ZERO, ONE))
 
 
-def test_a_growth_stays_on_its_gpu(two_gpus: CoreDriver) -> None:
-    _, _, keeper, pinned = busy_and_pinned(two_gpus)
-    small, lease = held(two_gpus, "small", 1)
-    assert place(two_gpus, lease) == ZERO
-    small.use_begin(lease)
-    assert answer(small.resize(lease, 3 * GIB))["state"] == "growing"
-    keeper.unload(pinned)
-    two_gpus.until(lambda: two_gpus.state(pinned) == "over")
-    two_gpus.advance(1.0)
-    (growth,) = two_gpus.arbiter.inspect().waiting.values()
-    assert growth.request.gpus == (ZERO,)
-
-
 # -- away
 def gone_for_policy(
     two_gpus: CoreDriver, **spec: Any

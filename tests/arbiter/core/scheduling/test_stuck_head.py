@@ -97,20 +97,6 @@ def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
     assert driver.state(other) == "held", "those behind it pass both"
 
 
-def test_a_growth_passes_if_its_lease_may_be_asked() -> None:
-    driver = CoreDriver(8 * GIB)
-    first, lease = held_after_peak(driver, "first", 1)
-    second, pinned = held_after_peak(driver, "second", 1, evictable=False)
-    stowaway(driver, 3)
-    head = driver.consumer("head").acquire(5 * GIB)
-    driver.advance(0.1)
-    assert driver.state(head) == "queued"
-    second.resize(pinned, int(1.2 * GIB))
-    first.resize(lease, int(1.2 * GIB))
-    driver.advance(1.0)
-    assert [len(driver.pushes("resized", one)) for one in (lease, pinned)] == [1, 0]
-
-
 def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway() -> None:
     driver = CoreDriver(8 * GIB)
     stowaway(driver, 4)
@@ -297,24 +283,6 @@ def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
     driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
 
 
-def test_a_growing_lease_does_not_free_itself() -> None:
-    """Regression: what a waiter behind a growth may take was counted as if the lease that grows
-    left for it."""
-    driver = CoreDriver(8 * GIB)
-    a, grows = held_after_peak(driver, "a", 3)
-    b, busy = held_after_peak(driver, "b", 2, priority=90)
-    a.use_begin(grows)
-    b.use_begin(busy)
-    a.resize(grows, 6 * GIB)
-    small = driver.consumer("small").acquire(2 * GIB)
-    driver.advance(1.0)
-    assert driver.state(small) == "queued", "3 + 3 + 2 do not fit, whoever leaves"
-    b.use_end(busy)
-    driver.until(lambda: driver.state(busy) == "revoking", limit_s=1.0)
-    b.unload(busy)
-    driver.until(lambda: bool(driver.pushes("resized", grows)), limit_s=1.0)
-
-
 def away() -> tuple[CoreDriver, list[tuple[Consumer, LeaseId]]]:
     """Three are on standby, the one that loads with 5 GiB left first, and a stowaway of 4 GiB came
     as the one went that they left for."""
@@ -385,13 +353,3 @@ def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
         "queued",
         "held",
     )
-
-
-def test_what_grew_while_the_head_stood_before_it_stays() -> None:
-    driver, busy, lease, head = unplanned()
-    driver.advance(0.1)
-    busy.resize(lease, int(3.5 * GIB))
-    driver.until(lambda: bool(driver.pushes("resized", lease)), limit_s=1.0)
-    small = driver.consumer("small").acquire(GIB)
-    driver.advance(2.0)
-    assert (driver.state(small), driver.state(head)) == ("queued", "queued")

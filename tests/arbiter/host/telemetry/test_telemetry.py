@@ -241,15 +241,6 @@ def test_what_is_refused_at_once_is_counted_once(driver: CoreDriver, heard: List
     }
 
 
-def test_what_is_refused_and_told_counts_once(driver: CoreDriver, heard: Listener) -> None:
-    first, second = driver.consumer("one"), driver.consumer("two")
-    first.acquire(5 * GIB, gang=("g", 2))
-    second.try_acquire(5 * GIB, gang=("g", 2))
-    assert [note["code"] for note in driver.notes("denied")] == ["vram_insufficient"] * 2
-    assert heard.numbers("vram_arbiter.lease.denials") == {("vram_insufficient",): 2}
-    assert {str(failed(span)).partition(":")[0] for span in heard.spans()} == {"vram_insufficient"}
-
-
 def test_a_holder_that_dies_while_it_loads_fails_its_spans(
     driver: CoreDriver, heard: Listener
 ) -> None:
@@ -323,27 +314,6 @@ def test_a_lease_that_is_lost_while_away_leaves_nothing_open(
     assert driver.state(lease) == "over"
     heard.telemetry.close()
     assert len(heard.spans()) == count
-
-
-def test_a_growth_is_an_acquire_until_the_lease_has_its_new_size(
-    driver: CoreDriver, heard: Listener
-) -> None:
-    det, lease = held(driver, "det", 2)
-    vlm, other = held(driver, "vlm", 5)
-    heard.exporter.clear()
-    det.resize(lease, 4 * GIB)
-    driver.until(lambda: driver.state(other) == "revoking")
-    vlm.unload(other)
-    driver.until(lambda: bool(driver.notes("resized")))
-    acquire, evict = heard.span("lease.acquire"), heard.span("lease.evict")
-    assert parent_of(evict) == acquire.context.span_id
-    assert failed(acquire) is None
-    assert {span.name for span in heard.spans()} == {
-        "lease.acquire",
-        "lease.queue",
-        "lease.evict",
-        "lease.verify",
-    }
 
 
 def test_an_unresolved_verdict_is_an_event_of_its_verification(

@@ -73,14 +73,10 @@ class Crowd:
                 person.hold(person.specs[lease].footprint.steady_bytes // 2, gpu=view["gpu"])
             case "loading":
                 person.load(lease)
-            case "held" if "resizing" not in view and self.has_grown(person, lease):
-                person.hold(person.specs[lease].footprint.steady_bytes, gpu=view["gpu"])
             case "held" if view["uses"]:
                 person.use_end(lease)
             case "held" if chance < 0.4:
                 person.use_begin(lease)
-            case "held" if chance < 0.5:
-                self.resize(person, lease, view["charge_bytes"])
             case "held" if chance < 0.6:
                 person.unload(lease, parked=False)
             case "revoking" if view["uses"]:
@@ -95,23 +91,6 @@ class Crowd:
                 person.cancel(lease)
             case _:
                 pass
-
-    def has_grown(self, person: Consumer, lease: LeaseId) -> bool:
-        view = self.driver.view(lease)
-        assert view is not None
-        held = self.driver.devices[view["gpu"]].held[person.process]
-        return bool(view["charge_bytes"] >= person.specs[lease].footprint.steady_bytes > held)
-
-    def resize(self, person: Consumer, lease: LeaseId, charge: int) -> None:
-        size = charge + self.draw.choice([-GIB // 2, GIB // 2])
-        spec = person.specs[lease]
-        if size < max(spec.footprint.residue_bytes, GIB // 4):
-            return
-        view = self.driver.view(lease)
-        assert view is not None
-        if size < charge:
-            person.hold(size, gpu=view["gpu"])
-        person.resize(lease, size, residue_bytes=spec.footprint.residue_bytes)
 
     def disturb(self) -> None:
         chance = self.draw.random()
@@ -215,6 +194,4 @@ def test_nothing_is_lost_or_granted_twice(block: int) -> None:
     seen: collections.Counter[str] = collections.Counter()
     for seed in range(block * 3, block * 3 + 3):
         seen += live_at_random(seed, 120)[1]
-    assert all(
-        seen[kind] for kind in ("standby", "parked", "resized", "granted", "revoke_asked")
-    ), seen
+    assert all(seen[kind] for kind in ("standby", "parked", "granted", "revoke_asked")), seen

@@ -11,8 +11,8 @@ from tests.support.engine_state import state_of
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.events import OperatorAsked
-from vram_arbiter.arbiter.core.features.standby import Absence, Standby
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
+from vram_arbiter.arbiter.core.ledger import HostRam
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 
@@ -53,19 +53,19 @@ def ram(driver: CoreDriver) -> int:
 
 # -- the budget
 def test_the_budget_by_itself() -> None:
-    a, b = Absence(), Absence()
-    standby = Standby(10, {LeaseId("a"): a, LeaseId("b"): b})
-    assert standby.book(a, 6)
-    assert not standby.book(b, 5)
-    assert not standby.book(b, 0), "nothing to keep is nothing to book"
-    assert standby.book(a, 9), "instead of what it has booked"
-    b.parked_bytes, b.found = 5, True
-    assert standby.host_ram().parked_bytes == 14, "found after a restart, fitting or not"
-    assert not standby.book(b, 4)
-    a.parked_bytes = 0
-    assert standby.book(b, 5)
-    assert not b.found
-    assert standby.host_ram().parked_bytes == 5
+    a, b = LeaseId("a"), LeaseId("b")
+    ram = HostRam(10)
+    assert ram.book(a, 6)
+    assert not ram.book(b, 5)
+    assert ram.book(a, 5)
+    assert ram.book(b, 5)
+    assert not ram.book(b, 0)
+    assert ram.taken_bytes() == 10
+    ram.free(a)
+    ram.find(a, 7)
+    assert (ram.taken_bytes(), ram.found) == (12, {a})
+    assert not ram.fits(b, 4)
+    assert ram.fits(b, 3)
 
 
 def test_room_is_kept_from_the_revoke_until_it_lets_go() -> None:
@@ -318,6 +318,6 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
 def test_the_invariant_of_the_budget() -> None:
     driver = driver_with(5)
     parked(driver)
-    driver.arbiter.inspect().feature(Standby).absences[LeaseId("x")] = Absence(parked_bytes=1)
-    with pytest.raises(InvariantViolation, match="bytes are parked, the budget is"):
+    driver.arbiter.inspect().host_ram.booked[LeaseId("x")] = 1
+    with pytest.raises(InvariantViolation, match="bytes are parked, budget"):
         invariants.check(state_of(driver.arbiter))

@@ -1,0 +1,274 @@
+"""Standby and parking: leases that live on without bytes on a GPU.
+
+A lease on standby comes back by itself when there is room. A parked lease keeps its weights in
+host RAM, and comes back by itself only if it is on standby too. Coming back is a favor, never a
+claim: no holder is revoked for it, no waiter is passed by, and the lease stays away while the
+consumer that it left for is on the GPU. A holder that needs its lease now acquires or reacquires
+it, and waits in the queues like any other.
+
+`Lease.standby` follows such a lease from its first revoke to its end:
+  revoking: host RAM for its weights is booked, so that its holder can count on it (`on_revoked`)
+  verifying: `decide` said whether it parks and whether it comes back; else its RAM is free
+  parked, standby: its bytes are measured gone; it is away (`go_away`)
+  queued: its holder wants it back (`wanted`, `call_back`)
+  loading: it was granted, or came back by itself (`first_to_return`)
+  held: its weights are resident, its RAM is free
+Its ends: `dismiss` by an operator, `give_up` by its holder, `end`.
+"""
+
+from functools import partial
+
+from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.core import learning
+from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import AWAY, NONCES_MAX, Departure, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.refusals import End, Refused
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.requests.limits import check_waiters
+from vram_arbiter.arbiter.core.scheduling import admission
+from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId
+from vram_arbiter.schemas.wire.codes import Order, Why
+from vram_arbiter.schemas.wire.notes import CancelledNote, LostNote, ParkedNote, StandbyNote
+from vram_arbiter.schemas.wire.pushes import LostPush
+from vram_arbiter.schemas.wire.spec import LeaseSpec
+
+
+# -- leaving ---------------------------------------------------------------------------------------
+def can_park(core: Core, lease: Lease) -> bool:
+    """Return whether host RAM is booked for a revoked lease, or has room for another."""
+    if lease.departure.eviction is not None:
+        return lease.id in core.host_ram.booked
+    return lease.spec.park_bytes > 0 and core.host_ram.fits(lease.id, lease.spec.park_bytes)
+
+
+def on_revoked(core: Core, lease: Lease, left_for: str) -> None:
+    """Book host RAM for its weights from now on, so that the holder can count on it."""
+    lease.standby.left_for = left_for
+    parks = core.host_ram.book(lease.id, lease.spec.park_bytes)
+    if lease.spec.standby or parks:
+        # a restart must not take a release that was asked for as one that was wished for
+        core.record_lease(lease)
+
+
+def decide(core: Core, lease: Lease, *, parked: bool, exiting: bool) -> None:
+    """Decide whether a lease that is released parks, and whether it comes back by itself: only if
+    the engine revoked it, no operator. Raises Refused where host RAM has no room."""
+    count, standby = lease.spec.park_bytes, lease.standby
+    if parked and lease.id not in core.host_ram.booked and not core.host_ram.book(lease.id, count):
+        ram = core.host_ram
+        raise Refused(no.NoHostRam(count, ram.budget_bytes, ram.taken_bytes()))
+    revoked = lease.departure.eviction is not None or lease.departure.revoked_before
+    stays = lease.spec.standby and revoked and not standby.dismissed
+    standby.parks, standby.comes_back = parked, stays and not exiting
+
+
+def next_state(lease: Lease) -> LeaseState | None:
+    """Return where a released lease is, or goes after its verdict; None: it is over then."""
+    if lease.state in AWAY:
+        return lease.state
+    if lease.standby.parks:
+        return LeaseState.PARKED
+    return LeaseState.STANDBY if lease.standby.comes_back else None
+
+
+def go_away(core: Core, lease: Lease, to: LeaseState, verdict: str) -> None:
+    """Take a lease off its GPU, whose bytes are measured gone, and let it live on."""
+    gpu, request, standby = core.gpu_of(lease), lease.request, lease.standby
+    core.move(lease, to, verdict)
+    gpu.residents.remove(lease)
+    core.wake(gpu)
+    lease.departure = Departure()
+    lease.gpu = lease.observed.reported_bytes = request.id = None
+    request.gpus = tuple(gpu.info.id for gpu in admission.selected(core, lease.spec))
+    request.evicted = []
+    request.answered = True
+    request.load_peak_bytes, request.steady_bytes = learning.expected_bytes(core, lease.spec)
+    standby.since = core.now
+    core.record_lease(lease)
+    wake(core, lease)
+    note = ParkedNote if to is LeaseState.PARKED else StandbyNote
+    parked_bytes = core.host_ram.booked.get(lease.id, 0)
+    core.note(note(standby.left_for, parked_bytes, standby.comes_back), lease)
+    if standby.recalled_at is not None:
+        asked_at, standby.recalled_at = standby.recalled_at, None
+        _queue(core, lease, lease.client, None, asked_at)
+
+
+def wake(core: Core, lease: Lease) -> None:
+    """Serve the GPUs that a lease may be granted on."""
+    for gpu_id in lease.request.gpus:
+        core.wake(core.gpus[gpu_id])
+
+
+# -- ends ------------------------------------------------------------------------------------------
+def dismiss(core: Core, lease: Lease, order: Order) -> None:
+    """Do not bring back what an operator evicts.
+
+    On standby a lease ends; parked it stays until its holder asks.
+    """
+    standby = lease.standby
+    standby.comes_back, standby.recalled_at = False, None
+    if lease.state is LeaseState.STANDBY:
+        refusal = no.Lost(lease.id, Why.EVICTED, order=order)
+        assert lease.token is not None, f"{lease.id} is away and was never granted"
+        core.push(lease, LostPush(lease.id, lease.token, refusal.view()))
+        end(core, lease, LeaseState.CANCELLED, refusal)
+        return
+    standby.dismissed = lease.state is not LeaseState.PARKED
+    if lease.spec.standby or lease.state is LeaseState.PARKED:
+        core.record_lease(lease)
+
+
+def give_up(core: Core, lease: Lease, to: LeaseState, refusal: End) -> bool:
+    """End a lease that is away. One that is on its way there ends with its verdict. Return whether
+    it was either."""
+    if lease.state in AWAY:
+        end(core, lease, to, refusal)
+        return True
+    if lease.state is not LeaseState.VERIFYING:
+        return False
+    standby = lease.standby
+    leaves = standby.comes_back or standby.parks
+    standby.comes_back = standby.parks = False
+    standby.recalled_at = None
+    core.host_ram.free(lease.id)
+    return leaves
+
+
+def end(core: Core, lease: Lease, to: LeaseState, refusal: End) -> None:
+    """End a lease that is away: nothing has to be measured."""
+    core.move(lease, to, refusal.why)
+    note = LostNote if to is LeaseState.LOST else CancelledNote
+    core.note(note(refusal.why), lease)
+    core.end(lease, refusal)
+
+
+def on_away_due(core: Core, lease_id: str) -> None:
+    """A holder did not reattach after a restart."""
+    lease = core.leases[LeaseId(lease_id)]
+    end(core, lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
+
+
+# -- wanted by the holder --------------------------------------------------------------------------
+def wanted(core: Core, event: ev.AcquireRequested, known: Lease | None) -> Lease | None:
+    """Return the lease that is away and that an acquire wants back; None: there is none.
+
+    That is the one of its nonce (`known`), or the first of its process for the same model.
+    """
+    if known is not None:
+        # a restart ended its wait, if the journal knows no grant since it was asked for; a late
+        # repeat of one that waited and was granted means nothing
+        waits = known.granted_at <= known.request.arrived_at
+        waits = waits and event.nonce == known.request.nonce and known.state in AWAY
+        return known if waits else None
+    if not core.away:
+        return None
+    model = (event.spec.consumer, event.spec.model)
+    mine = core.leases_of(core.clients[event.client].process)
+    away = [lease for lease in mine if lease.state in AWAY]
+    return next((one for one in away if (one.spec.consumer, one.spec.model) == model), None)
+
+
+def call_back(
+    core: Core, lease: Lease, event: ev.AcquireRequested | ev.Reacquired, spec: LeaseSpec
+) -> None:
+    """Queue a lease that is away, as it is asked for now. Raises Refused."""
+    client, request = core.clients[event.client], lease.request
+    load_peak, steady = learning.expected_bytes(core, spec)
+    gpus = admission.places(core, spec, load_peak)
+    check_waiters(core, client, spec.priority)
+    request.load_peak_bytes, request.steady_bytes = load_peak, steady
+    if isinstance(event, ev.AcquireRequested) and event.nonce != request.nonce:
+        _rename(core, lease, event.nonce)
+        lease.spec = spec
+        core.record_lease(lease)  # still away: if a restart ends the wait, it comes back so
+    request.traceparent, request.gpus, request.uid = event.traceparent, gpus, client.uid
+    request.wait_timeout_s = event.wait_timeout_s
+    _queue(core, lease, event.client, event.request, core.now)
+    core.costs.wanted(spec.consumer, core.now)
+    core.turn.unanswered.append(lease)
+
+
+def _rename(core: Core, lease: Lease, nonce: str) -> None:
+    """Another acquire asks for a lease. The earlier ones are remembered, for their repeats."""
+    request = lease.request
+    if len(request.earlier_nonces) == NONCES_MAX:
+        core.nonces.pop((lease.process, request.earlier_nonces[0]), None)
+    request.earlier_nonces.append(request.nonce)
+    request.nonce = nonce
+    core.nonces[lease.process, nonce] = lease.id
+
+
+def _queue(
+    core: Core, lease: Lease, client: ClientId, asked: RequestId | None, asked_at: float
+) -> None:
+    """Queue a lease that is away. Without a request (`asked`) its grant is pushed."""
+    request = lease.request
+    core.move(lease, LeaseState.QUEUED, Why.WANTED)
+    core.timers.cancel(("away", lease.id))  # after a restart: its holder reattached
+    lease.attached = True
+    core.hand_to(lease, client)
+    request.id, request.answered = asked, asked is None
+    request.arrived_at, request.arrival = asked_at, core.next_arrival()
+    request.planned_gpu = None
+    core.enqueue(lease)
+
+
+# -- coming back by itself -------------------------------------------------------------------------
+def first_to_return(core: Core, gpu: Gpu) -> Lease | None:
+    """Return the lease that comes back next to a GPU for which nothing waits; None: none fits.
+
+    By priority, then in the order of their leaving. One that does not fit yet keeps its turn:
+    others pass it only where it would still fit beside them.
+    """
+    ahead: Lease | None = None
+    spare_bytes = 0
+    for lease in _by_turn(core, gpu):
+        if ahead is not None and (
+            ahead.spec.exclusive or admission.added_bytes(gpu, lease) > spare_bytes
+        ):
+            continue
+        if admission.fits(gpu, lease):
+            return lease
+        if ahead is None:
+            ahead = lease
+            passed = partial(_returned_since, lease.standby.since)
+            spare_bytes, _ = admission.spare_unplanned_bytes(gpu, lease, {}, passed)
+    return None
+
+
+def quiet_at(gpu: Gpu, lease: Lease) -> float:
+    """Return when a GPU was quiet for the lease's minimum residency, before which it does not come
+    back: between two goals a policy is away for a moment only."""
+    return max(gpu.changed_at, lease.standby.since) + lease.spec.min_residency_s
+
+
+def left_for_is_here(gpu: Gpu, lease: Lease) -> bool:
+    """Return whether the consumer that a lease left for is on a GPU."""
+    left_for = lease.standby.left_for
+    return bool(left_for) and any(
+        other.spec.consumer == left_for for other in gpu.residents.values()
+    )
+
+
+def _by_turn(core: Core, gpu: Gpu) -> list[Lease]:
+    """Return the leases that may return to a GPU, the first to do so first."""
+    found = [
+        lease
+        for lease in core.away.values()
+        if lease.standby.comes_back
+        and lease.attached
+        and gpu.info.id in lease.request.gpus
+        and lease.request.load_peak_bytes <= gpu.ledger.budget_bytes
+        and not left_for_is_here(gpu, lease)
+    ]
+    return sorted(
+        found,
+        key=lambda lease: (-lease.spec.priority, lease.standby.since, lease.request.arrival),
+    )
+
+
+def _returned_since(since: float, other: Lease) -> bool:
+    """Return whether a resident came back by itself after that moment."""
+    return other.standby.returned and other.granted_at >= since
