@@ -84,7 +84,7 @@ def is_wanted(core: Core, gpu: Gpu, eviction: Eviction) -> bool:
         case "waiter":
             return eviction.wanted_by in core.waiting
         case "pressure":
-            return gpu.pressed
+            return gpu.ledger.pressed
         case _:
             return True
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, Self
 
-from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.ledger import HostRam
 from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.learned import Costs, Footprints
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refusals, Timers
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, UseId

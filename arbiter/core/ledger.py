@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.notes import OverHolder, PressureNote
 
 NOTHING: Mapping[LeaseId, int] = {}
 
@@ -69,6 +70,7 @@ class GpuLedger:
         # bytes were seen
         self.driver_bytes = info.reserve_bytes
         self.driver_seen = False
+        self.pressed = False  # a note of pressure is out
         # kept sums: over the stowaways and what is unattributed, and over the accounts
         self.stowaway_bytes = 0
         self.charged_bytes = 0
@@ -85,6 +87,16 @@ class GpuLedger:
         pressure."""
         over = self._held_bytes + self.stowaway_bytes - self.budget_bytes
         return over if over > self._tolerance_bytes else 0
+
+    def note_pressure(self) -> PressureNote | None:
+        """Bring `pressed` up to date. Return the note of its begin or end; None: it is as it was."""
+        pressure_bytes = self.pressure_bytes()
+        if bool(pressure_bytes) == self.pressed:
+            return None
+        self.pressed = bool(pressure_bytes)
+        over = [(a.process, a.held_bytes - a.charged_bytes) for a in self.accounts.values()]
+        holders = tuple(OverHolder(p.pid, n) for p, n in over if n > self._tolerance_bytes)
+        return PressureNote(self.info.id, pressure_bytes, self.stowaway_bytes, holders)
 
     def unlisted_bytes(self, reading: MemorySampled) -> int | None:
         """Return the most that processes outside the list hold together; None: it cannot tell.

@@ -247,7 +247,6 @@ class Gpu:
     asked_at: float | None = None  # last Sample asked for, None if its answer is here
     changed_at: float = 0.0  # last grant, ready or verdict
     blocked: Block | None = None
-    pressed: bool = False  # a pressure note is out
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
 
     def in_state(self, *states: LeaseState) -> list[Lease]:

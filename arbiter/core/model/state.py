@@ -22,9 +22,9 @@ from vram_arbiter.arbiter.core.effects import (
     Reply,
     Sample,
 )
-from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.ledger import GpuLedger, HostRam
 from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
+from vram_arbiter.arbiter.core.model.learned import Costs, Footprints
 from vram_arbiter.arbiter.core.model.lease import AWAY, Eviction, Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
 from vram_arbiter.arbiter.core.settings import Settings

@@ -4,7 +4,7 @@ Sessions, connections and rates are limited before a request becomes an event (`
 """
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import learning
+from vram_arbiter.arbiter.core.model.learned import newest
 from vram_arbiter.arbiter.core.model.refusals import Limit, LimitReached, Refused, Share
 from vram_arbiter.arbiter.core.model.state import Client, Core, Refusals
 from vram_arbiter.schemas import defaults
@@ -58,7 +58,7 @@ def note_refused(core: Core, event: ev.AcquireRequested | ev.Reacquired, refusal
     many were left out.
     """
     process = core.clients[event.client].process
-    seen = learning.newest(core.refusals, process, lambda: Refusals(core.now), PROCESSES_REMEMBERED)
+    seen = newest(core.refusals, process, lambda: Refusals(core.now), PROCESSES_REMEMBERED)
     seen.noted = max(0.0, seen.noted - (core.now - seen.at))
     seen.at = core.now
     if seen.noted > AT_ONCE - 1:

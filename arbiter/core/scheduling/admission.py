@@ -76,7 +76,7 @@ def blocked(core: Core, gpu: Gpu) -> Block | None:
         return Block.UNREAD
     if gpu.residents.by_state[LeaseState.LOADING]:
         return Block.LOADING
-    return Block.PRESSURE if gpu.pressed else None
+    return Block.PRESSURE if gpu.ledger.pressed else None
 
 
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:

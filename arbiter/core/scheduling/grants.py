@@ -25,7 +25,6 @@ from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState, S
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.scheduling import admission, victims
-from vram_arbiter.arbiter.core.verification.judge import note_pressure
 from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
 from vram_arbiter.schemas.wire.notes import GrantedNote
@@ -54,14 +53,14 @@ def on_plan_due(core: Core, gpu_id: str) -> None:
 
 
 def _prepare(core: Core, gpu: Gpu) -> None:
-    if gpu.pressed or gpu.ledger.pressure_bytes():
-        note_pressure(core, gpu)
+    if (note := gpu.ledger.note_pressure()) is not None:
+        core.note(note)
     gpu.blocked = admission.blocked(core, gpu)
     eviction.take_back(core, gpu)  # 0
 
 
 def _serve(core: Core, gpu: Gpu) -> None:
-    if gpu.pressed and core.serving:  # 1
+    if gpu.ledger.pressed and core.serving:  # 1
         _relieve(core, gpu)
         return
     if gpu.blocked:  # 2

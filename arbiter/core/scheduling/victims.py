@@ -209,7 +209,7 @@ def is_best_place(core: Core, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]) ->
         if other is gpu or other.queue.head is not waiter:
             continue
         going, block = leaving(other), blocked(core, other)
-        if block is Block.LOADING and not other.pressed:
+        if block is Block.LOADING and not other.ledger.pressed:
             (load,) = other.residents.by_state[LeaseState.LOADING].values()
             load_ends_by = load.granted_at + core.settings.revoke_deadline_s
             if load_ends_by > core.now and fits(other, waiter, going):

@@ -2,7 +2,7 @@
 
 1. begin: `begin_for_lease`, `on_process_died`, `begin_again` set its clock and read at once;
 2. polls: `on_poll_due` reads again, densely at first, and declares it overdue at its deadline;
-3. readings: `on_reading` hands each to `judge`; one on target has to be confirmed by another;
+3. readings: `on_reading` takes the evidence of each and hands it to `judge`; one on target has to be confirmed by another;
 4. verdict: it is noted; a resolved one frees the charge and tells what waits for it.
 
 The bytes stay charged until then. A failed reading means unknown: it frees nothing.
@@ -15,13 +15,8 @@ from vram_arbiter.arbiter.core.ledger import bytes_of
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Verdict, Verification
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.arbiter.core.verification.judge import (
-    Judgement,
-    impossible,
-    judge,
-    others_since,
-    take,
-)
+from vram_arbiter.arbiter.core.verification.evidence import impossible, take
+from vram_arbiter.arbiter.core.verification.judge import Judgement, judge, others_since
 from vram_arbiter.schemas.defaults import VERIFY_READING_SHARE
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.notes import About, ProbeFailedNote, ProbeOkNote, VerifiedNote

@@ -1,6 +1,6 @@
 """What was measured of a model, and what of it counts for the next request."""
 
-from vram_arbiter.arbiter.core.learning import (
+from vram_arbiter.arbiter.core.model.learned import (
     HISTORY_MAX,
     MODELS_MAX,
     OOM_LOADS,
