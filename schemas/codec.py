@@ -1,9 +1,8 @@
 """Frozen dataclasses ⇄ plain maps, driven by type hints: the one codec of replies, pushes, journal
 records and event logs.
 
-Each class gets one encoder and one decoder, generated as source on first use, as the standard
-library generates `__init__`. They call those of the classes they hold by name, so a class may hold
-its own kind.
+Each class gets one table of its fields for each direction, made on first use: a row says how the
+field's value is converted, `None` where it stands for itself.
 
 Rules of the plain form:
 - A field that has its default is left out, unless its class has `WHOLE = True`; a missing field
@@ -22,7 +21,8 @@ file.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
-from threading import RLock
+from functools import cache, partial
+from operator import attrgetter
 from types import NoneType, UnionType
 from typing import Any, Literal, NewType, TypeAliasType, Union, get_args, get_origin, get_type_hints
 
@@ -39,116 +39,90 @@ class CodecError(ValueError):
 
 def to_map(value: object) -> JsonObject:
     """Return the map of a dataclass. Raises TypeError for anything else."""
-    cls = type(value)
-    encoded: JsonObject = (_ENCODERS.get(cls) or _made(_ENCODERS, cls, _write_encoder, cls))(value)
-    return encoded
+    cls: Any = type(value)
+    return _encoder(cls)(value)
 
 
 def from_map[T](cls: type[T], data: object, *, strict: bool = False) -> T:
     """Return the dataclass that a map stands for. Raises CodecError."""
-    key = (cls, strict)
-    decoded: T = (_DECODERS.get(key) or _made(_DECODERS, key, _write_decoder, cls, strict))(data)
+    any_class: Any = cls
+    decoded: T = _decoder(any_class, strict)(data)
     return decoded
 
 
 def encoders(*classes: type) -> Mapping[type, Callable[[Any], JsonObject]]:
-    """Write the encoders of dataclasses now, so that no first message waits for them."""
-    return {cls: _made(_ENCODERS, cls, _write_encoder, cls) for cls in classes}
-
-
-# -- generated source
-_ENCODERS: dict[type, _Convert] = {}
-_DECODERS: dict[tuple[type, bool], _Convert] = {}
-_NAMES: dict[object, str] = {}
-"""What is written of a class → name of its function in `_SPACE`."""
-_SPACE: JsonObject = {"MISSING": MISSING}
-"""Names that generated source refers to: its functions, and what they need."""
-_WRITING = RLock()
-
-
-def _made[K](made: dict[K, _Convert], key: K, write: Callable[..., str], *of: object) -> _Convert:
-    """Write a class's function and those that it calls; keep it once all of them are there."""
-    with _WRITING:
-        sources: list[str] = []
-        name = write(*of, sources)
-        exec("\n".join(sources), _SPACE)
-        made[key] = _SPACE[name]
-    return made[key]
-
-
-def _named(value: object) -> str:
-    """Make a value known to generated source, and return its name there."""
-    name = f"_{len(_SPACE)}"
-    _SPACE[name] = value
-    return name
+    """Make the encoders of dataclasses now, so that no first message waits for them."""
+    return {cls: _encoder(cls) for cls in classes}
 
 
 # -- values → maps
-def _write_encoder(cls: Any, sources: list[str]) -> str:
-    """Write the function that encodes a class, and those of the classes it holds. Return its
-    name."""
-    if (known := _NAMES.get(cls)) is not None:
-        return known
+type _Row = tuple[str, object, _Convert | None]
+"""Key, default (MISSING: it is always said) and conversion of one field."""
+
+
+@cache
+def _encoder(cls: Any) -> Callable[[Any], JsonObject]:
+    """Return what encodes a class. Its table is filled with its first value, so that a class may
+    hold its own kind."""
     if not is_dataclass(cls):
-        raise TypeError(f"{cls.__name__} is not a dataclass and has no plain form")
-    name = _NAMES[cls] = _named(None)
-    hints, tag = get_type_hints(cls), getattr(cls, "TAG", None)
-    always = [f"{tag[0]!r}: {tag[1]!r}"] if tag else []
-    lines: list[str] = []
+        raise TypeError(f"{cls} is not a dataclass and has no plain form")
+    names, tag = [field.name for field in fields(cls)], getattr(cls, "TAG", None)
+    always = {tag[0]: tag[1]} if tag else {}
+    values_of = attrgetter(*names, "__class__")  # of two attributes or more it makes a tuple
+    table: list[_Row] = []
+
+    def encode(value: Any) -> JsonObject:
+        encoded: JsonObject = always.copy()
+        rows = table or _fill(table, cls)
+        for (key, default, convert), item in zip(rows, values_of(value), strict=False):
+            if item is not default and (default is MISSING or item != default):
+                encoded[key] = item if convert is None else convert(item)
+        return encoded
+
+    return encode
+
+
+def _fill(table: list[_Row], cls: Any) -> list[_Row]:
+    hints = get_type_hints(cls)
     for field in fields(cls):
         part = field.metadata.get("part")
-        key, needed = part or field.name, _is_required(field) or getattr(cls, "WHOLE", False)
-        value = f"o.{field.name}" if needed else "v"
-        plain = f"{value}.{part}" if part else _encoding(hints[field.name], value, sources)
-        if needed:
-            always.append(f"{key!r}: {plain}")
-        else:
-            lines += [f"    v = o.{field.name}", f"    if {_differs(field)}: d[{key!r}] = {plain}"]
-    head = [f"def {name}(o):", f"    d = {{{', '.join(always)}}}"]
-    sources.append("\n".join([*head, *lines, "    return d"]))
-    return name
+        default: object = MISSING if getattr(cls, "WHOLE", False) else field.default
+        if default is MISSING and field.default_factory is not MISSING:
+            default = field.default_factory()
+        convert = attrgetter(part) if part else _encoding(hints[field.name])
+        table.append((part or field.name, default, convert))
+    return table
 
 
-def _differs(field: "Field[Any]") -> str:
-    default = field.default
-    if field.default_factory is not MISSING:
-        default = field.default_factory()
-    if default is None:
-        return "v is not None"
-    if isinstance(default, bool | str | tuple) and not default:
-        return "v"
-    return f"v != {_named(default)}"
-
-
-def _encoding(hint: Any, value: str, sources: list[str]) -> str:
-    """Return an expression for the plain form of `value`; `value` itself where nothing has to be
-    done."""
-    hint = _resolved(hint)
+def _encoding(hint: Any) -> _Convert | None:
+    """Return what makes the plain form of a value; None: it stands for itself."""
+    hint = cls = _resolved(hint)
     if _stands_for_itself(hint):
-        return value
+        return None
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         rest = [argument for argument in arguments if argument is not NoneType]
-        if len(rest) > 1:
-            return f"{_named(_any_plain)}({value})"
-        inner = _encoding(rest[0], value, sources)
-        return value if inner == value else f"(None if {value} is None else {inner})"
+        several = _any_plain if len(rest) > 1 else _encoding(rest[0])
+        return None if several is None else _optional(several)
     if origin is not None and issubclass(origin, Mapping):
-        inner = _encoding(arguments[1], "i", sources)
-        return value if inner == "i" else f"{{k: {inner} for k, i in {value}.items()}}"
+        each = _encoding(arguments[1])
+        return None if each is None else lambda items: {k: each(i) for k, i in items.items()}
     if origin is tuple and arguments[1:] != (Ellipsis,):
         plain = all(_stands_for_itself(_resolved(argument)) for argument in arguments)
-        return value if plain else f"{_named(_any_plain)}({value})"
+        return None if plain else _any_plain
     if origin is not None:
-        inner = _encoding(arguments[0], "i", sources)
-        if inner == "i":
-            return f"sorted({value})" if origin in (set, frozenset) else value
-        return f"[{inner} for i in {value}]"
+        inner = _encoding(arguments[0])
+        if inner is None:
+            return sorted if origin in (set, frozenset) else None
+        return lambda items: [inner(item) for item in items]
     if isinstance(hint, type) and issubclass(hint, tuple):
-        return f"list({value})"
-    exact = isinstance(hint, type) and is_dataclass(hint) and not hasattr(hint, "TAG")
-    exact = exact and not hint.__subclasses__()
-    return f"{_write_encoder(hint, sources) if exact else _named(to_map)}({value})"
+        return list
+    exact = not hasattr(cls, "TAG") and not cls.__subclasses__()
+    return _encoder(cls) if exact else to_map
+
+
+def _optional(inner: _Convert) -> _Convert:
+    return lambda value: None if value is None else inner(value)
 
 
 def _any_plain(value: Any) -> Any:
@@ -158,107 +132,108 @@ def _any_plain(value: Any) -> Any:
 
 
 # -- maps → values
-def _write_decoder(cls: Any, strict: bool, sources: list[str]) -> str:
-    """Write the function that decodes a class, and those of the classes it holds. Return its
-    name."""
-    if (known := _NAMES.get((cls, strict))) is not None:
-        return known
+@cache
+def _decoder(cls: Any, strict: bool) -> _Convert:
+    """Return what decodes a class. Its table is filled with its first value."""
+    make: Callable[..., Any] = cls
     if not is_dataclass(cls):
         raise CodecError(f"{cls} has no plain form")
-    name, own, checked = _named(None), _named(cls), _named(_checked)
-    _NAMES[cls, strict] = name
-    hints, arguments = get_type_hints(cls), []
+    table: list[tuple[str, _Convert | None, bool]] = []
+
+    def decode(data: Any) -> Any:
+        if strict or type(data) is not dict:
+            _check(cls, data, strict)
+        values = {}
+        for key, convert, required in table or _rows(table, cls, strict):
+            item = data.get(key, MISSING)
+            if item is not MISSING:
+                values[key] = item if convert is None else convert(item)
+            elif required:
+                raise _lacking(cls, data)
+        return make(**values)
+
+    return decode
+
+
+def _rows(
+    table: list[tuple[str, _Convert | None, bool]], cls: Any, strict: bool
+) -> list[tuple[str, _Convert | None, bool]]:
+    """Fill the table of a decoder: key, conversion, and whether a map must have it."""
+    hints = get_type_hints(cls)
     for field in fields(cls):
-        key = field.name
-        if _is_required(field):
-            made = _decoding(hints[key], f"d[{key!r}]", strict, sources)
-        else:
-            default = _named(field.default)
-            if field.default is MISSING:
-                default = f"{_named(field.default_factory)}()"
-            inner = _decoding(hints[key], "v", strict, sources)
-            made = f"{inner} if (v := d.get({key!r}, MISSING)) is not MISSING else {default}"
-        arguments.append(f"{key}={made}")
-    check = ["    if type(d) is not dict:", f"        {checked}({own}, d, False)"]
-    if strict:
-        check = [f"    {checked}({own}, d, True)"]
-    sources.append(
-        "\n".join([
-            f"def {name}(d):", *check,
-            "    try:", f"        return {own}({', '.join(arguments)})",
-            "    except KeyError:", f"        {_named(_check_complete)}({own}, d)", "        raise",
-        ])
-    )  # fmt: skip
-    return name
+        table.append((field.name, _decoding(hints[field.name], strict), _is_required(field)))
+    return table
 
 
-def _decoding(hint: Any, value: str, strict: bool, sources: list[str]) -> str:
-    """Return an expression for what the plain form `value` stands for; `value` itself where nothing
-    has to be done."""
+def _decoding(hint: Any, strict: bool) -> _Convert | None:
+    """Return what makes a value of its plain form; None: that stands for itself."""
     hint = _resolved(hint)
     if isinstance(hint, type) and issubclass(hint, Enum):
-        known = _named({code.value: code for code in hint})
-        return f"{_named(hint)}({value})" if strict else f"{known}.get({value}, {value})"
+        known = {code.value: code for code in hint}
+        return hint if strict else lambda value: known.get(value, value)
     if _stands_for_itself(hint):
-        return value
+        return None
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
-        return _union_decoding(arguments, value, strict, sources)
+        return _union_decoding(arguments, strict)
     if isinstance(hint, type) and issubclass(hint, tuple):
         count = len(get_type_hints(hint))
-        fits, checked = f"type({value}) is list and len({value}) == {count}", _named(_listed)
-        return f"{_named(hint)}(*({value} if {fits} else {checked}({value}, {count})))"
+        return lambda value: hint(*_listed(value, count))
     if origin is None:
-        return f"{_write_decoder(hint, strict, sources)}({value})"
-    listed = _named(_listed)
+        return _decoder(hint, strict)
     if origin is tuple and arguments[1:] != (Ellipsis,):
-        items = [_decoding(one, f"i[{n}]", strict, sources) for n, one in enumerate(arguments)]
-        return f"(lambda i: ({', '.join(items)},))({listed}({value}, {len(items)}))"
+        items = [_decoding(argument, strict) for argument in arguments]
+        return partial(_decode_items, items)
     if issubclass(origin, Mapping):
-        inner = _decoding(arguments[1], "i", strict, sources)
-        return f"{{k: {inner} for k, i in {_named(_mapped)}({value}).items()}}"
-    inner = _decoding(arguments[0], "i", strict, sources)
-    make = "tuple" if origin is Sequence else origin.__name__
-    found = f"{listed}({value})"
-    return f"{make}({found})" if inner == "i" else f"{make}([{inner} for i in {found}])"
+        inner = _decoding(arguments[1], strict) or _itself
+        return lambda value: {key: inner(item) for key, item in _mapped(value).items()}
+    inner_or_none, make = _decoding(arguments[0], strict), tuple if origin is Sequence else origin
+    if inner_or_none is None:
+        return lambda value: make(_listed(value))
+    return lambda value: make([inner_or_none(item) for item in _listed(value)])
 
 
-def _union_decoding(arguments: Sequence[Any], value: str, strict: bool, sources: list[str]) -> str:
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _decode_items(items: Sequence[_Convert | None], value: Any) -> tuple[Any, ...]:
+    """Decode a tuple of a fixed length."""
+    found = zip(items, _listed(value, len(items)), strict=True)
+    return tuple([item if convert is None else convert(item) for convert, item in found])
+
+
+def _union_decoding(arguments: Sequence[Any], strict: bool) -> _Convert | None:
     """None and plain values stand for themselves; of several dataclasses the tag decides, else the
     fields."""
     options = [_resolved(argument) for argument in arguments if argument is not NoneType]
-    classes = [option for option in options if is_dataclass(option)]
+    classes: list[Any] = [option for option in options if is_dataclass(option)]
     others = [option for option in options if option not in classes]
     if len(options) == 1 or not classes:
-        inner = _decoding(options[0], value, strict, sources)
-    else:
-        names = {cls: _write_decoder(cls, strict, sources) for cls in classes}
-        tags = {cls.TAG: name for cls, name in names.items() if hasattr(cls, "TAG")}
-        untagged = [
-            (frozenset(field.name for field in fields(cls)), name)
-            for cls, name in names.items()
-            if not hasattr(cls, "TAG")
-        ]
-        other = _decoding(others[0], "v", strict, sources) if others else "v"
-        otherwise = _named(None)
-        sources.append(f"def {otherwise}(v):\n    return {other}")
+        inner = _decoding(options[0], strict)
+        return inner if inner is None or NoneType not in arguments else _optional(inner)
+    tags = {cls.TAG: _decoder(cls, strict) for cls in classes if hasattr(cls, "TAG")}
+    untagged = [
+        (frozenset(field.name for field in fields(cls)), _decoder(cls, strict))
+        for cls in classes
+        if not hasattr(cls, "TAG")
+    ]
+    otherwise = (_decoding(others[0], strict) if others else None) or _itself
 
-        def choose(data: Any) -> Any:
-            if isinstance(data, Mapping):
-                for (key, kind), name in tags.items():
-                    if data.get(key) == kind:
-                        return _SPACE[name](data)
-                for known, name in untagged:
-                    if data.keys() <= known:
-                        return _SPACE[name](data)
-            return _SPACE[otherwise](data)
+    def choose(data: Any) -> Any:
+        if isinstance(data, Mapping):
+            for (key, kind), decode in tags.items():
+                if data.get(key) == kind:
+                    return decode(data)
+            for known, decode in untagged:
+                if data.keys() <= known:
+                    return decode(data)
+        return otherwise(data)
 
-        inner = f"{_named(choose)}({value})"
-    optional = NoneType in arguments and inner != value
-    return f"(None if {value} is None else {inner})" if optional else inner
+    return _optional(choose) if NoneType in arguments else choose
 
 
-def _checked(cls: Any, data: Any, strict: bool) -> None:
+def _check(cls: Any, data: Any, strict: bool) -> None:
     if not isinstance(data, Mapping):
         raise CodecError(f"{cls.__name__}: expected a map, got {data!r:.80}")
     known = {field.name for field in fields(cls)} | {getattr(cls, "TAG", ("",))[0]}
@@ -266,10 +241,9 @@ def _checked(cls: Any, data: Any, strict: bool) -> None:
         raise CodecError(f"{cls.__name__} has no field {', '.join(sorted(unknown))}")
 
 
-def _check_complete(cls: Any, data: JsonMap) -> None:
-    required = {field.name for field in fields(cls) if _is_required(field)}
-    if missing := required - data.keys():
-        raise CodecError(f"{cls.__name__} lacks {', '.join(sorted(missing))}") from None
+def _lacking(cls: Any, data: JsonMap) -> CodecError:
+    missing = {field.name for field in fields(cls) if _is_required(field)} - data.keys()
+    return CodecError(f"{cls.__name__} lacks {', '.join(sorted(missing))}")
 
 
 def _mapped(data: Any) -> JsonMap:
