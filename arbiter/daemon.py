@@ -118,7 +118,7 @@ class Daemon:
             notifier.ready(self._status_text())
             for serves in (
                 beat(notifier, self._inbox.pulse, self._chores(), self._status_line),
-                self._reload.serve(notifier, self._status_text),
+                self._reload.serve(notifier, self._status_line),
                 self._keep_learnt_regularly(),
             ):
                 task = self._loop.create_task(serves)
@@ -386,7 +386,8 @@ class Daemon:
 
     def _problems(self) -> list[str]:
         """What an operator should know of the daemon's own files, in words."""
-        own = (*self._journal.problems, self._history.problem, self._reload.problem)
+        reload = self._reload
+        own = (*self._journal.problems, self._history.problem, reload.problem, reload.pending)
         return [found for found in own if found]
 
     def _chores(self) -> tuple[Callable[[], None], ...]:

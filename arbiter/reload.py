@@ -62,6 +62,7 @@ class Reload:
         self._say = say
         self._asked = asyncio.Event()
         self.problem = ""
+        self.pending = ""
 
     def ask(self) -> None:
         """Reload soon. Signals that come while a reload is under way cause one more."""
@@ -86,7 +87,8 @@ class Reload:
     def _refuse(self, error: VramError) -> None:
         said = "; ".join(error.message.splitlines())[:PROBLEM_CHARS]
         self.problem = f"the changed configuration is refused, the former one is in force: {said}"
-        self._say("config_refused", {"file": str(self._file), "problem": said})
+        file = {} if self._file is None else {"file": str(self._file)}
+        self._say("config_refused", {**file, "problem": said})
 
     def _take(self, config: ArbiterConfig) -> None:
         """Apply what can be applied, and say what was not."""
@@ -97,8 +99,9 @@ class Reload:
         self._history.keep(self._config.history.max_events, self._config.history.days)
         logging.getLogger().setLevel(self._config.log.level.upper())
         self.problem = ""
-        facts = {"file": str(self._file), "changed": changed, "needs_restart": left}
-        self._say("config_reloaded", facts)
+        self.pending = f"changed keys need a restart: {', '.join(left)}" if left else ""
+        file = {} if self._file is None else {"file": str(self._file)}
+        self._say("config_reloaded", {**file, "changed": changed, "needs_restart": left})
 
 
 def changes(

@@ -49,7 +49,7 @@ def block(why: BlockView) -> str:
     names = ", ".join(why.names) + (f" and {why.more} more" if why.more else "")
     if why.code is Block.RECOVERING and not names:
         names = "holders that the journal may not name"
-    return _BLOCKS[why.code].format(why=why, names=names)
+    return _BLOCKS[why.code].format(why=why, names=names, size=gib(why.bytes or 0))
 
 
 _BLOCKS: Final[Mapping[Block, str]] = {
@@ -59,7 +59,7 @@ _BLOCKS: Final[Mapping[Block, str]] = {
     Block.UNREAD: "the GPU has not been read yet",
     Block.LOADING: "{names} is loading",
     Block.GANG: "gang {names} is loading",
-    Block.PRESSURE: "pressure: {why.bytes} bytes more than the budget are held",
+    Block.PRESSURE: "pressure: {size} more than the budget are held",
     Block.NOT_FREE: WAIT[Wait.NOT_FREE],
 }
 

@@ -14,6 +14,7 @@ from vram_arbiter.arbiter.core.model import refusals as r
 from vram_arbiter.arbiter.rpc import explained
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.sizes import format_bytes as size
 from vram_arbiter.schemas.wire import notes
 from vram_arbiter.schemas.wire.codes import RevokeCause, Why
 from vram_arbiter.schemas.wire.errors import ErrorView, Refusal
@@ -163,10 +164,10 @@ def _bad_target_state(no: r.BadTargetState) -> _Words:
 
 def _too_large(no: r.TooLarge) -> _Words:
     raised = no.needed_bytes > no.declared_bytes
-    learned = f" ({no.declared_bytes} declared, more was measured)" if raised else ""
+    learned = f" ({size(no.declared_bytes)} declared, more was measured)" if raised else ""
     return (
-        f"{no.consumer} needs {no.needed_bytes} bytes{learned}; the GPU has {no.capacity_bytes} "
-        f"less a reserve of {no.reserve_bytes}",
+        f"{no.consumer} needs {size(no.needed_bytes)}{learned}; the GPU has "
+        f"{size(no.capacity_bytes)} less a reserve of {size(no.reserve_bytes)}",
         "use a smaller model or a lower precision",
     )
 
@@ -250,14 +251,14 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
     r.Revoked: _revoked,
     r.UnknownGpu: ("there is no GPU {no.gpu!r}", "give a UUID, an index or `any`"),
     r.TooLarge: _too_large,
-    r.GrowthTooLarge: (
-        "{no.consumer} would need {no.needed_bytes} bytes; alone on its GPU it can have "
-        "{no.room_bytes}",
+    r.GrowthTooLarge: lambda no: (
+        f"{no.consumer} would need {size(no.needed_bytes)}; alone on its GPU it can have "
+        f"{size(no.room_bytes)}",
         "stay smaller",
     ),
-    r.NoHostRam: (
-        "{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} "
-        "{no.booked_bytes} are booked",
+    r.NoHostRam: lambda no: (
+        f"{size(no.needed_bytes)} of host RAM are asked for; of a budget of "
+        f"{size(no.budget_bytes)} {size(no.booked_bytes)} are booked",
         "release without parking, or raise host.park_budget_bytes",
     ),
     r.LimitReached: _limit,
@@ -280,9 +281,9 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
         "look at the daemon's log and its disk",
     ),
     r.GangMismatch: _mismatch,
-    r.GangTooLarge: (
-        "gang {no.gang}: its {no.members} members need {no.needed_bytes} bytes together, more than "
-        "the GPUs can ever hold",
+    r.GangTooLarge: lambda no: (
+        f"gang {no.gang}: its {no.members} members need {size(no.needed_bytes)} together, more "
+        "than the GPUs can ever hold",
         _AGAIN,
     ),
     r.BrokenGang: _broken_gang,
@@ -374,7 +375,7 @@ def _reason(body: notes.AnyNote, about: notes.About | None) -> str:
         case notes.ReleasedNote(why=why):
             return WHY.get(why, why)
         case notes.QueuedNote(grows=grows, more_bytes=more_bytes) if grows:
-            return f"{grows} grows by {more_bytes}"
+            return f"{grows} grows by {size(more_bytes)}"
         case notes.QueuedNote(behind=behind, position=position) if behind:
             return f"waits behind {behind} as number {position}"
         case notes.QueuedNote(wait=wait, block=block):

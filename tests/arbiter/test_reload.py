@@ -111,10 +111,15 @@ def test_a_file_takes_effect_or_is_refused_whole_and_a_replay_knows(
     event = newest_event(observer)
     assert event["changed"] == {"limits.leases_per_client_max": [2, 3]}
     assert event["needs_restart"] == {"wire.heartbeat_s": [2.0, 7.0]}
-    assert observer.ask("status")["problems"] == []
+    pending = "changed keys need a restart: wire.heartbeat_s"
+    assert observer.ask("status")["problems"] == [pending]
+    assert pending in reloadable.messages[-1], "what the reload itself tells the manager"
+    doctor = vramctl("doctor", environ=reloadable.environ).stdout
+    assert pending in doctor
     for name, (text, words) in BAD.items():
         reloaded(reloadable, text)
-        (problem,) = observer.ask("status")["problems"]
+        problem, still = observer.ask("status")["problems"]
+        assert still == pending
         assert problem.startswith("the changed configuration is refused"), name
         assert words in problem, name
         event = newest_event(observer)

@@ -135,6 +135,7 @@ def test_what_never_fits_says_the_way_out() -> None:
         "vram_insufficient",
         "use a smaller model or a lower precision",
     )
+    assert refused.message == "big needs 8 GiB; the GPU has 8 GiB less a reserve of 300 MiB"
 
 
 def test_refusals_of_operators_say_why() -> None:
@@ -250,7 +251,7 @@ def test_a_growth_waits_for_its_bytes_alone() -> None:
     )
     note = driver.notes("queued")[-1]
     assert (note["lease_id"], note["position"]) == (waiting, 1)
-    assert note["reason"] == f"{lease} grows by {2 * GIB}"
+    assert note["reason"] == f"{lease} grows by 2 GiB"
     growth = core_lease(driver, waiting)
     assert growth.spec == replace(
         core_lease(driver, lease).spec,
