@@ -85,7 +85,7 @@ class Reload:
             notifier.ready(status())
 
     def _refuse(self, error: VramError) -> None:
-        said = "; ".join(error.message.splitlines())[:PROBLEM_CHARS]
+        said = _without_quotes(error)[:PROBLEM_CHARS]
         self.problem = f"the changed configuration is refused, the former one is in force: {said}"
         file = {} if self._file is None else {"file": str(self._file)}
         self._say("config_refused", {**file, "problem": said})
@@ -102,6 +102,17 @@ class Reload:
         self.pending = f"changed keys need a restart: {', '.join(left)}" if left else ""
         file = {} if self._file is None else {"file": str(self._file)}
         self._say("config_reloaded", {**file, "changed": changed, "needs_restart": left})
+
+
+def _without_quotes(error: VramError) -> str:
+    """What is wrong with the file, for every reader of `status`: without its text, which may be
+    another file's behind a link."""
+    mistakes: list[JsonMap] = error.details.get("fields", [])
+    if not mistakes:
+        return error.message
+    file = error.details["file"]
+    lines = ", ".join(str(line) for line in sorted({one["line"] for one in mistakes}) if line)
+    return f"{file}:{lines or '1'}: see `vram-arbiter --check-config --config {file}`"
 
 
 def changes(
