@@ -310,7 +310,7 @@ _BECAUSE: Final[Mapping[Because, str]] = {
     Because.HANGING: "its unloading may hang",
     Because.LEAVING: "it is being evicted",
     Because.DENIED: "after that {step.waiter} is denied",
-    Because.WAITS_ON: "after that {step.waiter} continues to wait, and the holder's own rule applies",
+    Because.WAITS_ON: "after that {step.waiter} waits on, and the holder's own rule applies",
     Because.TIMEOUT: "when its wait timeout is over",
 }
 

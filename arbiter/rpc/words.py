@@ -106,7 +106,7 @@ _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
 }  # fmt: skip
 
 _PINNED_HINTS: Final[Mapping[r.Impractical, str]] = {
-    r.Impractical.NOT_PINNED: "its holder asked never to be evicted, and only the holder can change that",
+    r.Impractical.NOT_PINNED: "its holder asked never to be evicted, and it alone can change that",
     r.Impractical.HOLDER_LIVES: "end its program: it is pinned",
 }
 """Hints that differ for a lease that is never evicted."""

@@ -112,8 +112,8 @@ def test_a_holder_on_its_way_out() -> None:
     assert step["in_s"] == pytest.approx(d.REVOKE_DEADLINE_S, abs=0.1)
     assert (
         step["text"]
-        == "waits 30.0 s more for holder to release, after that w continues to wait, and the holder's "
-        "own rule applies"
+        == "waits 30.0 s more for holder to release, after that w waits on, and the holder's own "
+        "rule applies"
     )
     driver.advance(d.REVOKE_DEADLINE_S + 0.1)
     assert (only(driver)["action"], only(driver)["in_s"]) == ("wait", None)
