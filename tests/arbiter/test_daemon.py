@@ -138,6 +138,17 @@ def test_a_second_daemon_on_the_state_folder_is_refused(arbiter_daemon: ArbiterP
     assert f"pid {arbiter_daemon.pid}" in done.stderr
 
 
+def test_a_configuration_that_others_may_write_is_refused(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    file = arbiter.runtime / "arbiter.yaml"
+    file.write_text("log: {level: debug}\n")
+    file.chmod(0o666)
+    done = run_daemon(arbiter, "--check-config", "--config", str(file))
+    assert (done.returncode, f"{file} may be written by other users" in done.stderr) == (2, True)
+    file.chmod(0o644)
+    assert run_daemon(arbiter, "--check-config", "--config", str(file)).returncode == 0
+
+
 @pytest.mark.parametrize("second", [True, False])
 def test_a_daemon_whose_socket_and_locks_were_deleted_serves_alone(
     make_arbiter: Make, second: bool
