@@ -113,7 +113,7 @@ def effective_config(flags: argparse.Namespace, file: Path | None) -> ArbiterCon
     """Return the file's configuration with the flags over it. Raises ConfigError."""
     config = ArbiterConfig()
     if file is not None:
-        text = read_text(file, hint="--config needs a readable YAML file")
+        text = read_text(file, hint="--config needs a readable YAML file", trusted=True)
         config = load_config(text, str(file))
     values = config.model_dump()
     for section, key, value, flag in (

@@ -44,6 +44,7 @@ from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
 from vram_arbiter.arbiter.settings import budget, core_settings, router_limits, session_settings
 from vram_arbiter.schemas.config.arbiter import ArbiterConfig
+from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.folders import LockFile
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EXIT_OK = 0
+EXIT_ALREADY_RUNNING = 3
 EXIT_DEFECT = 70
 """EX_SOFTWARE: an invariant was violated or the engine raised."""
 PROBE_START_S = 30.0
@@ -79,6 +81,7 @@ class Daemon:
 
     # from the start on
     _loop: asyncio.AbstractEventLoop
+    _locks: tuple[LockFile, ...]
     _journal: Journal
     _history: History
     _gpus: tuple[GpuInfo, ...]
@@ -115,14 +118,15 @@ class Daemon:
             notifier.ready(self._status_text())
             for serves in (
                 beat(notifier, self._inbox.pulse, self._chores(), self._status_line),
-                self._reload.serve(notifier, self._status_text),
+                self._reload.serve(notifier, self._status_line),
                 self._keep_learnt_regularly(),
             ):
                 task = self._loop.create_task(serves)
                 task.add_done_callback(self._background_ended)
                 undo.callback(task.cancel)
             await self._stop.wait()
-            notifier.stopping("stopping" if self._exit_code == EXIT_OK else "the core failed")
+            failed = self._exit_code == EXIT_DEFECT
+            notifier.stopping("the core failed" if failed else "stopping")
             if self._exit_code == EXIT_OK:
                 self._keep_learnt()
             self._say(CLEAN_END, {"exit_code": self._exit_code, "leases_kept": True})
@@ -139,10 +143,10 @@ class Daemon:
         members = group_id("wire.group", config.wire.group)
         group = operators if members is None else members  # of the socket: it has one
         limits = router_limits(config, raise_limits())
-        lock = take_folders(places, config, self._environ, group, undo)  # 1
+        self._locks = take_folders(places, config, self._environ, group, undo)  # 1
         self._traced = self._open_telemetry(undo)
         boot = boot_id()
-        self._open_files(places, boot, lock, undo)
+        self._open_files(places, boot, self._locks[0], undo)
         probe = await self._open_engine(places, undo)  # 2
         sessions = session_settings(
             config,
@@ -345,9 +349,25 @@ class Daemon:
     def _failed(self, error: BaseException) -> None:
         """Nothing is decided anymore; the journal holds what was granted, and the next start
         recovers it. Without its chores the daemon would decay unseen."""
-        log.critical("stopping: %s: %s", type(error).__name__, error)
-        self._exit_code = EXIT_DEFECT
+        self._end(EXIT_DEFECT, f"{type(error).__name__}: {error}")
+
+    def _end(self, exit_code: int, why: str) -> None:
+        log.critical("stopping: %s", why)
+        self._exit_code = exit_code
         self._stop.set()
+
+    def _keep_locks(self) -> None:
+        """Where the socket and the locks were deleted, a second arbiter may grant the same memory.
+        This one then ends: holders find the other one on the socket, and reattach."""
+        for lock in self._locks:
+            try:
+                if lock.keep():
+                    log.warning("the lock file %s was deleted; locked again", lock.path)
+            except AlreadyRunning as error:
+                self._end(EXIT_ALREADY_RUNNING, f"{error}; {lock.path} was deleted")
+                return
+            except ConfigError as error:  # its folder is gone: no second one can have it either
+                log.debug("%s", error)
 
     def _say(self, kind: str, facts: JsonMap) -> None:
         """A fact of the daemon itself, in its history and its log."""
@@ -366,11 +386,17 @@ class Daemon:
 
     def _problems(self) -> list[str]:
         """What an operator should know of the daemon's own files, in words."""
-        own = (*self._journal.problems, self._history.problem, self._reload.problem)
+        reload = self._reload
+        own = (*self._journal.problems, self._history.problem, reload.problem, reload.pending)
         return [found for found in own if found]
 
     def _chores(self) -> tuple[Callable[[], None], ...]:
-        return self._sessions.sweep, self._journal.settle, self._executor.settle
+        return (
+            self._keep_locks,
+            self._sessions.sweep,
+            self._journal.settle,
+            self._executor.settle,
+        )
 
     def _picture(self) -> "Picture | None":
         """What telemetry shows of the present; None at the end."""

@@ -53,8 +53,9 @@ def take_folders(
     environ: Mapping[str, str],
     group: int | None,
     undo: contextlib.AsyncExitStack,
-) -> LockFile:
-    """Make or check the folders and lock them until `undo`. Return the socket's lock.
+) -> tuple[LockFile, LockFile]:
+    """Make or check the folders and lock them until `undo`. Return the locks of the socket and of
+    the state folder.
 
     Raises ConfigError, AlreadyRunning, and JournalUnavailable where a later try may succeed.
     """
@@ -79,4 +80,4 @@ def take_folders(
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"the state folder {places.state} cannot be made: {error}") from error
-    return socket_lock
+    return socket_lock, lock

@@ -62,6 +62,7 @@ class Reload:
         self._say = say
         self._asked = asyncio.Event()
         self.problem = ""
+        self.pending = ""
 
     def ask(self) -> None:
         """Reload soon. Signals that come while a reload is under way cause one more."""
@@ -84,9 +85,10 @@ class Reload:
             notifier.ready(status())
 
     def _refuse(self, error: VramError) -> None:
-        said = "; ".join(error.message.splitlines())[:PROBLEM_CHARS]
+        said = _without_quotes(error)[:PROBLEM_CHARS]
         self.problem = f"the changed configuration is refused, the former one is in force: {said}"
-        self._say("config_refused", {"file": str(self._file), "problem": said})
+        file = {} if self._file is None else {"file": str(self._file)}
+        self._say("config_refused", {**file, "problem": said})
 
     def _take(self, config: ArbiterConfig) -> None:
         """Apply what can be applied, and say what was not."""
@@ -97,8 +99,20 @@ class Reload:
         self._history.keep(self._config.history.max_events, self._config.history.days)
         logging.getLogger().setLevel(self._config.log.level.upper())
         self.problem = ""
-        facts = {"file": str(self._file), "changed": changed, "needs_restart": left}
-        self._say("config_reloaded", facts)
+        self.pending = f"changed keys need a restart: {', '.join(left)}" if left else ""
+        file = {} if self._file is None else {"file": str(self._file)}
+        self._say("config_reloaded", {**file, "changed": changed, "needs_restart": left})
+
+
+def _without_quotes(error: VramError) -> str:
+    """What is wrong with the file, for every reader of `status`: without its text, which may be
+    another file's behind a link."""
+    mistakes: list[JsonMap] = error.details.get("fields", [])
+    if not mistakes:
+        return error.message
+    file = error.details["file"]
+    lines = ", ".join(str(line) for line in sorted({one["line"] for one in mistakes}) if line)
+    return f"{file}:{lines or '1'}: see `vram-arbiter --check-config --config {file}`"
 
 
 def changes(

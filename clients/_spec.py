@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import BadRequest
-from vram_arbiter.schemas.sizes import parse_bytes
+from vram_arbiter.schemas.sizes import parse_bytes, parse_need
 from vram_arbiter.schemas.wire.requests import checked_spec
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -56,7 +56,7 @@ def _footprint(vram: Vram) -> Footprint:
     if isinstance(vram, Footprint):
         return vram
     try:
-        size = parse_bytes(vram)
+        size = parse_need(vram) if isinstance(vram, str) else parse_bytes(vram)
     except ValueError as error:
         raise BadRequest(str(error), hint="vram takes bytes or a text such as 5.3GB") from None
     return Footprint(

@@ -13,14 +13,18 @@ survive a fork. Every class has the methods of its async twin; a test compares t
 """
 
 import os
+import warnings
+import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
+from threading import Thread, current_thread, main_thread
 from types import TracebackType
 from typing import Any, Concatenate, Self
 
-from anyio.from_thread import BlockingPortal, start_blocking_portal
+import anyio
+from anyio.from_thread import BlockingPortal
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import records as r
@@ -48,21 +52,59 @@ class _Portal:
     def __init__(self) -> None:
         self._pid = os.getpid()
         self._portal: BlockingPortal | None = None
+        self._thread: Thread
 
     @property
     def inherited(self) -> bool:
         """Whether this process is a fork of the one that made the client."""
         return os.getpid() != self._pid
 
-    @contextmanager
-    def run(self) -> Iterator[BlockingPortal]:
-        with start_blocking_portal(name="vram-arbiter-client") as portal:
-            self._portal = portal
-            try:
-                yield portal
-            finally:
-                self._portal = None
-                portal.call(portal.stop, True)  # calls of other threads end too
+    def start(self) -> BlockingPortal:
+        """`start_blocking_portal` would wait for its thread where nothing runs any more: in a fork,
+        and at the end of a program that did not leave its block."""
+        started: Future[BlockingPortal] = Future()
+
+        async def serve() -> None:
+            async with BlockingPortal() as portal:
+                started.set_result(portal)
+                await portal.sleep_until_stopped()
+
+        self._thread = Thread(
+            target=anyio.run, args=(serve,), name="vram-arbiter-client", daemon=True
+        )
+        self._thread.start()
+        self._portal = started.result()
+        return self._portal
+
+    def leave(self, connection: AbstractContextManager[Any]) -> None:
+        """Close the connection, and end the thread."""
+        try:
+            connection.__exit__(None, None, None)
+        finally:
+            self.stop()
+
+    def stop(self) -> None:
+        if self._portal is not None:
+            portal, self._portal = self._portal, None
+            portal.call(portal.stop, True)  # calls of other threads end too
+            self._thread.join()
+
+    def dropped(self, name: str, connection: AbstractContextManager[Any]) -> None:
+        """Leave for a client that was entered, and is gone without an exit: collected in any
+        thread, or left to the end of the program."""
+        if self.inherited:
+            return
+        warnings.warn(
+            f"the client {name!r} was entered and never left; use it in a `with` block",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        if not main_thread().is_alive():
+            return  # the program ends, and its leases with it: no handler could run any more
+        if current_thread() is self._thread:  # which must not wait for itself
+            Thread(target=self.leave, args=(connection,)).start()
+        else:
+            self.leave(connection)
 
     def call[T](self, work: Callable[..., Awaitable[T]], *arguments: Any, **named: Any) -> T:
         """Run `work` in the background thread and wait for it. Ctrl-C cancels it there too."""
@@ -261,17 +303,18 @@ class Client:
             name, endpoint=endpoint, role=role, connect_timeout_s=connect_timeout_s
         )
         self._portal = _Portal()
-        self._stack = ExitStack()
+        self._connection: AbstractContextManager[Any]
+        self._dropped: weakref.finalize[Any, Any]
 
     # -- connection --------------------------------------------------------------------------------
     def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            portal = stack.enter_context(self._portal.run())
-            connection: AbstractContextManager[Any] = portal.wrap_async_context_manager(
-                self._client
-            )
-            stack.enter_context(connection)
-            self._stack = stack.pop_all()
+        self._connection = self._portal.start().wrap_async_context_manager(self._client)
+        try:
+            self._connection.__enter__()
+        except BaseException:
+            self._portal.stop()
+            raise
+        self._dropped = weakref.finalize(self, self._portal.dropped, self.name, self._connection)
         return self
 
     def __exit__(
@@ -280,8 +323,9 @@ class Client:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._dropped.detach()
         if not self._portal.inherited:
-            self._stack.__exit__(None, None, None)
+            self._portal.leave(self._connection)
 
     @property
     def name(self) -> str:

@@ -34,7 +34,7 @@ from vram_arbiter.schemas.tools import (
     QueryTaskProgress,
     StopGoal,
     ToolCall,
-    Wait,
+    WaitOn,
 )
 
 if TYPE_CHECKING:
@@ -296,7 +296,7 @@ class _Loop:
             case StopGoal() if self._acting is not None:
                 log.info("stop_goal %s", describe(decision))
                 self._call_off()
-            case Wait():
+            case WaitOn():
                 pass
             case _:
                 log.warning("the goal goes on; not taken: %s", decision)

@@ -28,7 +28,7 @@ from vram_arbiter.schemas.tools import (
     QueryTaskProgress,
     StopGoal,
     ToolCall,
-    Wait,
+    WaitOn,
     function_schema,
     function_schemas,
     parse_skill_call,
@@ -170,7 +170,7 @@ class Palette:
     # -- is a call allowed?
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
         """Return why a call is not allowed, or None."""
-        if isinstance(call, Wait | StopGoal):
+        if isinstance(call, WaitOn | StopGoal):
             return None if goal_runs else NotPermitted("no goal runs", hint=self.choice())
         if goal_runs:
             return NotPermitted(

@@ -65,10 +65,11 @@ def _encoder(cls: Any) -> Callable[[Any], JsonObject]:
     """Return what encodes a class. Its table is filled with its first value, so that a class may
     hold its own kind."""
     if not is_dataclass(cls):
-        raise TypeError(f"{cls} is not a dataclass and has no plain form")
+        raise TypeError(f"{cls.__name__} is not a dataclass and has no plain form")
     names, tag = [field.name for field in fields(cls)], getattr(cls, "TAG", None)
     always = {tag[0]: tag[1]} if tag else {}
-    values_of = attrgetter(*names, "__class__")  # of two attributes or more it makes a tuple
+    # of one attribute it would return that, of none nothing
+    values_of = attrgetter(*names, "__class__", "__class__")
     table: list[_Row] = []
 
     def encode(value: Any) -> JsonObject:

@@ -10,14 +10,16 @@ _UNITS = {
     "ki": 2**10, "kib": 2**10, "mi": 2**20, "mib": 2**20, "gi": 2**30, "gib": 2**30, "ti": 2**40,
     "tib": 2**40,
 }  # fmt: skip
+MAX_BYTES = 1 << 63
+SHOWN_CHARS = 40
 _SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([A-Za-z]*)\s*")
 
 
 def parse_bytes(text: str | int) -> int:
     """Read `8GiB`, `5.3GB`, `450MiB` or a plain count of bytes. Raises ValueError with the accepted
     forms."""
-    if isinstance(text, bool):
-        raise ValueError("a size is a number of bytes or a text such as 8GiB")
+    if isinstance(text, bool) or not isinstance(text, int | str):
+        raise ValueError(f"a size is a number of bytes or a text such as 8GiB, not {text!r}")
     if isinstance(text, int):
         if text < 0:
             raise ValueError(f"a size cannot be negative: {text}")
@@ -27,7 +29,19 @@ def parse_bytes(text: str | int) -> int:
         raise ValueError(
             f"not a size: {text!r}; write bytes or 8GiB (1024-based), 5.3GB (1000-based), 450MiB"
         )
-    return round(float(match[1]) * _UNITS[match[2].lower()])
+    size = float(match[1]) * _UNITS[match[2].lower()]
+    if size >= MAX_BYTES:
+        raise ValueError(f"no machine has so much: {text[:SHOWN_CHARS]}")
+    return round(size)
+
+
+def parse_need(text: str) -> int:
+    """Read what a person needs, `5GiB` or `5.3GB`: a bare number is rarely meant as bytes, and
+    nothing needs no lease. Raises ValueError."""
+    size = parse_bytes(text)
+    if text.strip()[-1].isdecimal() or not size:
+        raise ValueError(f"expected a size with its unit, such as 5GiB or 450MiB, got {text!r}")
+    return size
 
 
 def format_bytes(count: int) -> str:

@@ -189,7 +189,7 @@ class EmitPrompt(_Tool):
     text: Annotated[Text, Field(min_length=1)]
 
 
-class Wait(_Tool):
+class WaitOn(_Tool):
     """Let the goal that runs go on."""
 
     tool: Literal["wait"] = "wait"
@@ -209,7 +209,7 @@ ToolCall = (
     | QueryTaskProgress
     | LifecycleTransition
     | EmitPrompt
-    | Wait
+    | WaitOn
     | StopGoal
 )
 
@@ -221,7 +221,7 @@ TOOLS: dict[str, type[ToolCall]] = {
     "query_task_progress": QueryTaskProgress,
     "lifecycle_transition": LifecycleTransition,
     "emit_prompt": EmitPrompt,
-    "wait": Wait,
+    "wait": WaitOn,
     "stop_goal": StopGoal,
 }
 

@@ -8,8 +8,10 @@ twice is an error instead of the last one winning.
 """
 
 import difflib
+import os
 import re
 import reprlib
+import stat
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -105,16 +107,29 @@ def reads_as_text(value: str) -> bool:
     return bool(yaml.safe_load(value) == value)
 
 
-def read_text(path: FilePath, *, hint: str = "") -> str:
-    """Return the text of a file of at most TEXT_MAX_BYTES. Raises ConfigError that names
-    the path."""
+def read_text(path: FilePath, *, hint: str = "", trusted: bool = False) -> str:
+    """Return the text of a file of at most TEXT_MAX_BYTES. `trusted`: no other user but root can
+    have written it. Raises ConfigError that names the path."""
     try:
         with path.open("rb") as file:
+            if trusted:
+                check_owner(path, file.fileno())
             content = file.read(TEXT_MAX_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL character
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"{path} cannot be read: {reason}", hint=hint) from error
     return _text_of(content, str(path))
+
+
+def check_owner(path: FilePath, opened: int) -> None:
+    """Raises ConfigError for a file that another user but root may have written. The open file is
+    looked at: its path may name another one by now."""
+    found = os.fstat(opened)
+    if found.st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
+        raise ConfigError(
+            f"{path} may be written by other users",
+            hint=f"chown {os.geteuid()} {path} && chmod o-w {path}",
+        )
 
 
 def read_yaml(path: FilePath, *, hint: str = "") -> YamlText:

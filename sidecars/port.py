@@ -85,15 +85,24 @@ async def _copy(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> Non
 
 
 def _may_connect(writer: asyncio.StreamWriter, path: Path) -> bool:
-    """Whether the user at the other end may open the socket's file, which has mode 0660."""
-    file = path.stat()
+    """Whether the user at the other end may open the socket's file, which has mode 0660.
+
+    A client that has hung up is refused: the kernel no longer names its user, and its requests may
+    already have come. Raises OSError where it hangs up meanwhile: another user's connection may
+    have its address by then.
+    """
+    connection = writer.get_extra_info("socket")
+    file, uids = path.stat(), port_uids(connection)
+    connection.getpeername()
     refused = [
-        uid
-        for uid in port_uids(writer.get_extra_info("socket"))
+        f"uid {uid}, which may not open {path}"
+        for uid in uids
         if uid not in (ROOT, file.st_uid) and file.st_gid not in _groups_of(uid)
     ]
+    if not uids:
+        refused.append("a client that has hung up")
     if refused:
-        _log.warning("refused a connection of uid %d: it may not open %s", refused[0], path)
+        _log.warning("refused a connection of %s", refused[0])
     return not refused
 
 

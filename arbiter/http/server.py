@@ -31,6 +31,8 @@ CONNECTIONS_MAX = 48
 CONNECTIONS_PER_PEER = 16
 STREAMS_MAX = 12
 STREAMS_PER_PEER = 6
+STREAMS_OF_ROOT = 2
+"""Of STREAMS_MAX: two users would keep the operator out."""
 ACCEPTED_AT_ONCE = 8
 """Connections that are accepted in one turn of the loop."""
 HISTORY_MAX = 200
@@ -38,6 +40,7 @@ HISTORY_MAX = 200
 SEQ_MAX = 1 << 53
 
 type Peer = tuple[str, int]
+ROOT: Peer = ("", 0)
 type History = Callable[[int, int, tuple[str, ...], Callable[[HistoryReply], None]], None]
 
 
@@ -120,7 +123,11 @@ class HttpServer:
     ) -> None:
         """Answer a request: a file, the events, or a page of the history."""
         denied = self._access.check(headers)
-        path = urlsplit(target).path if target.startswith("/") else ""
+        try:
+            path = urlsplit(target).path if target.startswith("/") else ""
+        except ValueError:
+            connection.answer(problem(400, "expected a path such as /events"))
+            return
         if denied is not None:
             if denied.status == 401 and path == "/":
                 cookie = self._access.cookie_for(target)
@@ -140,7 +147,8 @@ class HttpServer:
     def _stream(self, connection: Connection, *, head: bool) -> None:
         peer = self._peers.get(connection)
         streams = Counter(its for one, its in self._peers.items() if one.streams)
-        if streams.total() >= STREAMS_MAX or (peer and streams[peer] >= STREAMS_PER_PEER):
+        most = STREAMS_MAX if peer == ROOT else STREAMS_MAX - STREAMS_OF_ROOT
+        if streams.total() >= most or (peer and streams[peer] >= STREAMS_PER_PEER):
             told = f"{streams.total()} pages are open; close some"
             connection.answer(problem(503, told))
             return

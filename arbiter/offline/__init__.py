@@ -1,1 +1,4 @@
-"""Recorded event logs, read offline: `vramctl replay` and `vramctl timeline`. The daemon imports none of it."""
+"""Recorded event logs, read offline: `vramctl replay` and `vramctl timeline`.
+
+The daemon imports none of it.
+"""

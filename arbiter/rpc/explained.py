@@ -49,7 +49,7 @@ def block(why: BlockView) -> str:
     names = ", ".join(why.names) + (f" and {why.more} more" if why.more else "")
     if why.code is Block.RECOVERING and not names:
         names = "holders that the journal may not name"
-    return _BLOCKS[why.code].format(why=why, names=names)
+    return _BLOCKS[why.code].format(why=why, names=names, size=gib(why.bytes or 0))
 
 
 _BLOCKS: Final[Mapping[Block, str]] = {
@@ -58,7 +58,7 @@ _BLOCKS: Final[Mapping[Block, str]] = {
     Block.UNREADABLE: "the GPU cannot be read: {why.problem}",
     Block.UNREAD: "the GPU has not been read yet",
     Block.LOADING: "{names} is loading",
-    Block.PRESSURE: "pressure: {why.bytes} bytes more than the budget are held",
+    Block.PRESSURE: "pressure: {size} more than the budget are held",
     Block.NOT_FREE: WAIT[Wait.NOT_FREE],
 }
 
@@ -262,7 +262,7 @@ _BECAUSE: Final[Mapping[Because, str]] = {
     Because.MEASURED_GONE: "until its bytes are measured gone",
     Because.HANGING: "its unloading may hang",
     Because.LEAVING: "it is being evicted",
-    Because.WAITS_ON: "after that {step.waiter} continues to wait",
+    Because.WAITS_ON: "after that {step.waiter} waits on",
     Because.TIMEOUT: "when its wait timeout is over",
 }
 

@@ -23,6 +23,8 @@ from vram_arbiter.schemas.wire.replies import StatusReply
 SILENT_S = 10.0
 """At a limit of sessions a connection that never held anything and has been silent for so long
 makes room."""
+NEWCOMERS = 8
+"""One in so many places is for processes that have no session yet."""
 
 
 class Decisions(Protocol):
@@ -175,25 +177,31 @@ class Registry:
         return session
 
     def _make_room(self, session: Session) -> None:
-        """A place within the shares of the process and the user, and beside the operators' reserve.
-        A session whose connection is lost, or that is silent and never held anything, leaves for
-        it.
+        """A place within the shares of the process and the user, beside the operators' reserve and,
+        for a process that has a session, beside that of the processes that have none. A session
+        whose connection is lost, or that is silent and never held anything, leaves for it.
         """
         settings, peer = self._settings, session.peer
         every, operator = settings.sessions_max, session.role == "operator"
+        count = len(self._of_process.get(peer.process, ()))
+
+        def left(places: int) -> int:
+            return places - places // NEWCOMERS if count else places
+
         self._need(
-            len(self._of_process.get(peer.process, ())), share_of(every, settings.process_share),
+            count, share_of(every, settings.process_share),
             "process_share", f"process {peer.process.pid}", session,
             lambda other: other.peer.process == peer.process,
         )  # fmt: skip
         if not operator:
             self._need(
-                self._of_user[peer.uid], share_of(every, settings.user_share),
+                self._of_user[peer.uid], left(share_of(every, settings.user_share)),
                 "user_share", f"uid {peer.uid}", session, lambda other: other.peer.uid == peer.uid,
             )  # fmt: skip
-        allowed = every if operator else every - min(settings.operator_reserve, every - 1)
-        count = len(self.sessions)
-        self._need(count, allowed, "sessions_max", "all clients", session, lambda other: True)
+        allowed = every if operator else left(every - min(settings.operator_reserve, every - 1))
+        self._need(
+            len(self.sessions), allowed, "sessions_max", "all clients", session, lambda other: True
+        )
 
     def _need(
         self,

@@ -293,7 +293,7 @@ class SessionTable:
             case w.Status():
                 reader = None if session.role == "operator" else session.peer.process
                 decisions.when_read(lambda: self._status(client, re, reader, request))
-            case w.Why(consumer=consumer):
+            case w.AskWhy(consumer=consumer):
                 decisions.when_read(lambda: self.reply(client, re, decisions.why(consumer)))
             case w.History():
                 _check_kinds(request.kinds)

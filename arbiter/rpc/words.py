@@ -14,6 +14,7 @@ from vram_arbiter.arbiter.core.model import refusals as r
 from vram_arbiter.arbiter.rpc import explained
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.sizes import format_bytes as size
 from vram_arbiter.schemas.wire import notes
 from vram_arbiter.schemas.wire.codes import RevokeCause, Why
 from vram_arbiter.schemas.wire.errors import ErrorView, Refusal
@@ -102,7 +103,7 @@ _IMPRACTICAL: Final[Mapping[r.Impractical, _Words]] = {
 }  # fmt: skip
 
 _PINNED_HINTS: Final[Mapping[r.Impractical, str]] = {
-    r.Impractical.NOT_PINNED: "its holder asked never to be evicted, and only the holder can change that",
+    r.Impractical.NOT_PINNED: "its holder asked never to be evicted, and it alone can change that",
     r.Impractical.HOLDER_LIVES: "end its program: it is pinned",
 }
 """Hints that differ for a lease that is never evicted."""
@@ -151,10 +152,10 @@ def _bad_target_state(no: r.BadTargetState) -> _Words:
 
 def _too_large(no: r.TooLarge) -> _Words:
     raised = no.needed_bytes > no.declared_bytes
-    learned = f" ({no.declared_bytes} declared, more was measured)" if raised else ""
+    learned = f" ({size(no.declared_bytes)} declared, more was measured)" if raised else ""
     return (
-        f"{no.consumer} needs {no.needed_bytes} bytes{learned}; the GPU has {no.capacity_bytes} "
-        f"less a reserve of {no.reserve_bytes}",
+        f"{no.consumer} needs {size(no.needed_bytes)}{learned}; the GPU has "
+        f"{size(no.capacity_bytes)} less a reserve of {size(no.reserve_bytes)}",
         "use a smaller model or a lower precision",
     )
 
@@ -211,9 +212,9 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
     r.Revoked: _revoked,
     r.UnknownGpu: ("there is no GPU {no.gpu!r}", "give a UUID, an index or `any`"),
     r.TooLarge: _too_large,
-    r.NoHostRam: (
-        "{no.needed_bytes} bytes of host RAM are asked for; of a budget of {no.budget_bytes} "
-        "{no.booked_bytes} are booked",
+    r.NoHostRam: lambda no: (
+        f"{size(no.needed_bytes)} of host RAM are asked for; of a budget of "
+        f"{size(no.budget_bytes)} {size(no.booked_bytes)} are booked",
         "release without parking, or raise host.park_budget_bytes",
     ),
     r.LimitReached: _limit,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
-from vram_arbiter.schemas.sizes import parse_bytes
+from vram_arbiter.schemas.sizes import parse_need
 
 
 def add_endpoint(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +46,7 @@ remark = one_line(REASON_MAX_CHARS, required=False)
 def size(written: str) -> int:
     """Argparse type: a byte size such as 5GiB."""
     try:
-        return parse_bytes(written)
+        return parse_need(written)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 

@@ -53,7 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "-c", "--consumer", action="append", default=[], help="only this consumer; repeatable"
     )
-    parser.add_argument("--kind", action="append", default=[], help="only this kind; repeatable")
+    parser.add_argument(
+        "--kind", action="append", type=kind, default=[], help="only this kind; repeatable"
+    )
     parser.add_argument(
         "-f", "--follow", action="store_true", help="then follow new events, until Ctrl-C"
     )
@@ -81,6 +83,18 @@ def since(written: str) -> float:
         return parse_since(written, time.time())
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def kind(written: str) -> str:
+    """Argparse type: a kind of event. A mistyped one would look like a history without such."""
+    from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
+
+    known = {*NOTES, *DAEMON_KINDS}
+    if written not in known:
+        from vram_arbiter.schemas.yamltext import did_you_mean
+
+        raise argparse.ArgumentTypeError(f"{written!r} is not one{did_you_mean(written, known)}")
+    return written
 
 
 AGO = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)")
@@ -130,12 +144,15 @@ class Wanted:
         return event["kind"] not in text.QUIET_KINDS.intersection(self.kinds)
 
     def fits(self, event: JsonMap) -> bool:
-        about = (event.get("consumer"), event.get("wanted_by"))
         return (
             (not self.kinds or event["kind"] in self.kinds)
-            and (not self.consumers or any(name in about for name in self.consumers))
+            and (not self.consumers or any(about(event, name) for name in self.consumers))
             and (self.since_wall_s is None or event["at_wall_s"] >= self.since_wall_s)
         )
+
+
+def about(event: JsonMap, consumer: str) -> bool:
+    return consumer in (event.get("consumer"), event.get("wanted_by"))
 
 
 def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = None) -> int:
@@ -143,6 +160,12 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 
     def shown(reply: Message) -> list[str]:
         lines = [text.event_line(event) for event in reply["events"]]
+        if len(lines) < wanted.limit:  # all that there is was looked at
+            lines += [
+                f"no such event of {name!r}: consumers of leases are in `vramctl status`"
+                for name in wanted.consumers
+                if not any(about(event, name) for event in reply["events"])
+            ]
         if folded := reply.get("folded"):
             lines.append(f"({text.plural(folded, 'quiet event')} not shown: --all)")
         return lines

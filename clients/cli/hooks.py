@@ -5,7 +5,6 @@ import asyncio
 import logging
 import os
 import signal
-import stat
 import sys
 from collections.abc import Mapping
 from contextlib import aclosing
@@ -29,7 +28,7 @@ from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.systemd import Notifier
-from vram_arbiter.schemas.yamltext import read_text
+from vram_arbiter.schemas.yamltext import check_owner, read_text
 
 log = logging.getLogger(__name__)
 
@@ -68,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
             "--config",
             type=Path,
             metavar="FILE",
-            help=f"file of the rules (default: {NAME} in CONFIGURATION_DIRECTORY, ~/.config/vram-arbiter "
-            "or /etc/vram-arbiter)",
+            help=f"file of the rules (default: {NAME} in CONFIGURATION_DIRECTORY, "
+            "~/.config/vram-arbiter or /etc/vram-arbiter)",
         )
         arguments.add_endpoint(one)
 
@@ -126,23 +125,29 @@ def state_path(environ: Mapping[str, str]) -> Path:
 
 def read_config(path: Path) -> HooksConfig:
     """Return the rules, checked as far as possible without running them. Raises ConfigError."""
-    text = read_text(path, hint="--config needs a readable YAML file")
-    found = path.stat()
-    if found.st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
-        raise ConfigError(
-            f"{path} may be written by other users, and names programs to start",
-            hint=f"chown {os.geteuid()} {path} && chmod o-w {path}",
-        )
+    text = read_text(path, hint="--config needs a readable YAML file", trusted=True)
     config = load_hooks(text, str(path))
     for hook in config.hooks:
-        if hook.command is not None and which(hook.command[0]) is None:
-            raise ConfigError(
-                f"{path}: {hook.name}: {hook.command[0]} is not a program that can be started",
-                hint="write its absolute path, and chmod +x it",
-            )
+        if hook.command is not None:
+            _check_program(hook.command[0], f"{path}: {hook.name}")
         if hook.headers_file is not None:
             webhook.read_headers(hook.headers_file)
     return config
+
+
+def _check_program(name: str, where: str) -> None:
+    """Raises ConfigError for what cannot be started, and for what other users may have written."""
+    program = which(name)
+    if program is None:
+        raise ConfigError(
+            f"{where}: {name} is not a program that can be started",
+            hint="write its absolute path, and chmod +x it",
+        )
+    opened = os.open(program, os.O_PATH | os.O_CLOEXEC)
+    try:
+        check_owner(Path(program), opened)
+    finally:
+        os.close(opened)
 
 
 def plan(config: HooksConfig) -> list[str]:

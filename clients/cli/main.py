@@ -5,6 +5,7 @@ the exit code; only the module of the command that runs is imported.
 """
 
 import argparse
+import difflib
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -146,6 +147,8 @@ def _overview(argv: Sequence[str]) -> int:
     if not argv:
         parser.print_help(sys.stderr)
         return USAGE
+    if close := difflib.get_close_matches(argv[0], COMMANDS, n=1):
+        parser.error(f"there is no command {argv[0]!r}; did you mean {close[0]}?")
     parser.parse_args(argv)
     return OK
 

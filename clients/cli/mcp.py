@@ -34,9 +34,9 @@ CALLS_MAX: Final = 4
 EVENTS_MAX: Final = 500
 
 DESCRIPTIONS = {
-    "mcp": "Serve the arbiter to agents over the Model Context Protocol, on stdin and stdout: tools "
-    "status, why and history, and with --allow the operators' actions evict, drain and resume, "
-    "which the arbiter refuses to other users. Ends with its input. Needs the extra `mcp`."
+    "mcp": "Serve the arbiter to agents over the Model Context Protocol, on stdin and stdout: "
+    "tools status, why and history, and with --allow the operators' actions evict, drain and "
+    "resume, which the arbiter refuses to other users. Ends with its input. Needs the extra `mcp`."
 }
 INSTRUCTIONS: Final = (
     "The arbiter leases the GPU memory of this machine among processes. `status` shows GPUs, "

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.net.request import Unreachable, ask
+from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.plain import Message
 
 OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
@@ -32,7 +33,7 @@ def answer(
     except Unreachable as error:
         problem = {"code": error.code, "message": str(error), "hint": error.hint, "details": {}}
         complain(problem, as_json=as_json)
-        return UNREACHABLE, {}
+        return USAGE if error.code == ConfigError.code else UNREACHABLE, {}
     if not reply.get("ok"):
         complain(reply["error"], as_json=as_json)
         return NO, {}

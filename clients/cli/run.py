@@ -92,7 +92,8 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--grace",
         type=arguments.at_least(0.0),
         metavar="SECONDS",
-        help="time from SIGTERM to SIGKILL, or for requests in progress (default: as long as it takes)",
+        help="time from SIGTERM to SIGKILL, or for requests in progress (default: as long as it "
+        "takes)",
     )
     _add_eviction(parser)
     arguments.add_endpoint(parser)
@@ -129,7 +130,7 @@ def _add_eviction(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--park",
-        type=arguments.size,
+        type=lambda written: 0 if written == "0" else arguments.size(written),
         metavar="SIZE",
         help="host RAM that the program keeps while it is away (default: as --vram for vllm and "
         "cuda-checkpoint, else 0)",

@@ -216,7 +216,7 @@ def by_hand_lines(action: str, reply: JsonMap) -> list[str]:
         return [
             f"drained by {reply['drained']}; holders keep their leases"
             if reply["drained"]
-            else "granting resumed"
+            else "grants resumed"
         ]
     lease = reply.get("lease")
     if lease is None:

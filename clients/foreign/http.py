@@ -108,7 +108,7 @@ def answer(request: Request, deadline: Deadline) -> Reply:
 
 
 def call(request: Request, deadline: Deadline, *, besides: int = 200) -> bytes:
-    """Return the body of a success: 2xx, or the status `besides`. Raises ActionFailed for another."""
+    """Return the body of a success: 2xx, or the status `besides`. Raises ActionFailed."""
     reply = answer(request, deadline)
     if not 200 <= reply.status < 300 and reply.status != besides:
         told = printable(reply.body.decode(errors="replace"))[:SHOWN_MAX_CHARS]

@@ -16,7 +16,7 @@ type OnRevoke = Literal["priority", "term", "pin"]
 class RunSpec:
     """What to run and what it needs.
 
-    `grace_s`: time from SIGTERM to SIGKILL, or for requests in progress; None waits for as long as it
+    `grace_s`: time from SIGTERM to SIGKILL, or for requests in progress; None: as long as it
     takes. `restarts`: the program is ended to make room, and started again. `action`: it is made
     to free instead, and keeps `park_bytes` of host RAM meanwhile. With neither, its end is the end.
     """

@@ -1,21 +1,33 @@
 """One run of a command, limited in time.
 
 The command leads a process group of its own. The group ends with it: processes that it left behind
-are killed, so that hooks never pile up. The leader is reaped last, so until then its pid names no
-other group.
+are killed, so that hooks never pile up; those in a session of their own are found by a variable of
+their environment. The leader is reaped last, so until then its pid names no other group. Of its
+output the beginning is logged.
 """
 
 import asyncio
 import contextlib
+import itertools
+import logging
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 from vram_arbiter.schemas.errors import ActionFailed
+from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.printable import printable
 
+log = logging.getLogger(__name__)
+
+OUTPUT_MAX_BYTES: Final = 4096
+"""Of one run; what is more is read and dropped."""
+MARK: Final = "VRAM_ARBITER_HOOK_RUN"
+ROUNDS: Final = 3
+"""A process may fork while its kin are looked for."""
+_runs = itertools.count()
 GRACE_S: Final = 5.0
 """From SIGTERM to SIGKILL."""
 
@@ -27,12 +39,24 @@ async def run_command(
     timeout_s: float,
     grace_s: float = GRACE_S,
 ) -> None:
-    """Run a command with `body` on its stdin. Its output goes to stderr.
+    """Run a command with `body` on its stdin, and log its output.
 
     Raises ActionFailed if it cannot be started, fails, or is not done in time. If the caller is
     canceled, the command is killed.
     """
-    child = _start(command, body, environ)
+    mark = f"{os.getpid()}-{next(_runs)}"
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    output = bytearray()
+    try:
+        child = _start(command, body, {**environ, MARK: mark}, writing)
+    except BaseException:
+        os.close(reading)
+        raise
+    finally:
+        os.close(writing)
+    loop = asyncio.get_running_loop()
+    loop.add_reader(reading, _read, reading, output)
     pidfd = os.pidfd_open(child.pid)
     late = False
     try:
@@ -43,7 +67,14 @@ async def run_command(
     finally:
         _signal_group(child.pid, signal.SIGKILL)
         code = child.wait()
+        _end_marked(f"{MARK}={mark}".encode())
+        loop.remove_reader(reading)
+        while _read(reading, output):
+            pass
+        os.close(reading)
         os.close(pidfd)
+        if output:
+            log.info("%s: %s", command[0], printable(output.decode(errors="replace").strip()))
     if late:
         raise ActionFailed(f"{command[0]} was not done within {timeout_s:g} s and was ended")
     if code:
@@ -52,7 +83,7 @@ async def run_command(
 
 
 def _start(
-    command: Sequence[str], body: bytes, environ: Mapping[str, str]
+    command: Sequence[str], body: bytes, environ: Mapping[str, str], output: int
 ) -> subprocess.Popen[bytes]:
     given = os.memfd_create("event")  # a pipe would block on a command that does not read
     try:
@@ -61,7 +92,8 @@ def _start(
         return subprocess.Popen(
             list(command),
             stdin=given,
-            stdout=sys.stderr.fileno(),
+            stdout=output,
+            stderr=output,
             env={**os.environ, **environ},
             start_new_session=True,
         )
@@ -69,6 +101,35 @@ def _start(
         raise ActionFailed(f"{command[0]} cannot be started: {error}") from error
     finally:
         os.close(given)
+
+
+def _read(pipe: int, output: bytearray) -> bool:
+    """Take what has come. Return False at the end, and where nothing has."""
+    try:
+        came = os.read(pipe, OUTPUT_MAX_BYTES)
+    except BlockingIOError:
+        return False
+    output += came[: OUTPUT_MAX_BYTES - len(output)]
+    return bool(came)
+
+
+def _end_marked(mark: bytes) -> None:
+    """Kill the processes of one run, in whatever session they are."""
+    for _ in range(ROUNDS):
+        for entry in procfs.PROC.iterdir():
+            if entry.name.isdecimal():
+                with contextlib.suppress(OSError):  # it has ended, or is another user's
+                    _end_if_marked(int(entry.name), mark)
+
+
+def _end_if_marked(pid: int, mark: bytes) -> None:
+    pidfd = os.pidfd_open(pid)
+    try:
+        # read after the pidfd names the process
+        if mark in (procfs.PROC / str(pid) / "environ").read_bytes().split(b"\0"):
+            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+    finally:
+        os.close(pidfd)
 
 
 async def _ended(pidfd: int, timeout_s: float) -> bool:

@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 from vram_arbiter.schemas.defaults import WIRE_VERSION
-from vram_arbiter.schemas.errors import UntrustedServer, VramError
+from vram_arbiter.schemas.errors import ConfigError, UntrustedServer, VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.msgpack_codec import pack
@@ -73,7 +73,8 @@ def ask(
                 link.send(pack(message))
             return _reply(link, where, deadline, silent)
     except VramError as error:
-        code = error.code if isinstance(error, UntrustedServer) else "arbiter_unreachable"
+        known = isinstance(error, UntrustedServer | ConfigError)
+        code = error.code if known else "arbiter_unreachable"
         raise Unreachable(error.message, error.hint, code) from error
 
 

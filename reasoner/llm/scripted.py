@@ -20,7 +20,7 @@ from vram_arbiter.schemas.tools import (
     LocateInView,
     QueryScene,
     ToolCall,
-    Wait,
+    WaitOn,
 )
 
 ATTEMPTS_MAX = 3
@@ -73,7 +73,7 @@ class ScriptedPlanner:
 
     async def decide(self, episode: Episode) -> ToolCall | Finish:
         if episode.running is not None:
-            return Wait(rationale="the script goes on when the goal has ended")
+            return WaitOn(rationale="the script goes on when the goal has ended")
         if len(episode.steps) == self._decided_after:
             return self._decision
         try:

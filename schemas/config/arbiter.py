@@ -163,7 +163,8 @@ class LimitsConfig(_Section):
     """Connections at a time, with those that have not said hello. Less where the daemon may open
     fewer files (three per connection)."""
     sessions_max: Annotated[int, Field(ge=1, le=65_536)] = d.SESSIONS_MAX
-    """Clients at a time: connections that have said hello."""
+    """Clients at a time: connections that have said hello. An eighth of these, and of a user's
+    share, is for processes that have none yet."""
     operator_reserve: Annotated[int, Field(ge=0, le=1024)] = d.OPERATOR_RESERVE
     """Of these, how many only operators get."""
     waiters_max: Annotated[int, Field(ge=1, le=1_000_000)] = d.WAITERS_MAX

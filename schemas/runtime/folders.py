@@ -125,7 +125,7 @@ class LockFile:
     """
 
     def __init__(self, path: Path, protects: str, holder: str = "an arbiter") -> None:
-        self._path = path
+        self.path = path
         self._protects = protects
         self._holder = holder
         self._fd: int | None = None
@@ -160,6 +160,19 @@ class LockFile:
             self._lock(fd)
             os.close(fd)
 
+    def keep(self) -> bool:
+        """Lock the file again where it was deleted or replaced: it keeps no second server away any
+        more. Return whether it was. Raises as `acquire`: AlreadyRunning where one is there."""
+        assert self._fd is not None, "keep before acquire"
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._fd), self.path.lstat()):
+                return False
+        lost, left = self._fd, self.left
+        self.acquire()
+        self.leave(left)
+        os.close(lost)
+        return True
+
     def release(self) -> None:
         if self._fd is not None:
             os.close(self._fd)
@@ -170,17 +183,17 @@ class LockFile:
         flags = os.O_RDWR | create | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NOCTTY
         folder: int | None = None
         try:
-            folder = _open_folder(self._path.parent)
+            folder = _open_folder(self.path.parent)
             if create:
-                _remove_foreign(self._path.name, folder)
-            fd = os.open(self._path.name, flags, 0o640, dir_fd=folder)
+                _remove_foreign(self.path.name, folder)
+            fd = os.open(self.path.name, flags, 0o640, dir_fd=folder)
         except FileNotFoundError as error:
             if not create:
                 return None
-            raise ConfigError(f"{self._path}: {error.strerror}", hint=CHOOSE) from error
+            raise ConfigError(f"{self.path}: {error.strerror}", hint=CHOOSE) from error
         except OSError as error:
             what = "is a link" if error.errno == errno.ELOOP else error.strerror
-            raise ConfigError(f"{self._path}: {what}", hint=CHOOSE) from error
+            raise ConfigError(f"{self.path}: {what}", hint=CHOOSE) from error
         finally:
             if folder is not None:
                 os.close(folder)
@@ -193,7 +206,7 @@ class LockFile:
             return fd
         os.close(fd)
         raise ConfigError(
-            f"{self._path}: not a file of this user's own (uid {found.st_uid}, {found.st_nlink} "
+            f"{self.path}: not a file of this user's own (uid {found.st_uid}, {found.st_nlink} "
             "names)",
             hint="remove it if its program does not run",
         )
@@ -207,5 +220,5 @@ class LockFile:
             raise AlreadyRunning(
                 f"{self._holder} (pid {text or 'unknown'}) already uses {self._protects}",
                 hint="stop it first, or choose another endpoint and folder",
-                details={"pid": int(text) if text.isdecimal() else None, "lock": str(self._path)},
+                details={"pid": int(text) if text.isdecimal() else None, "lock": str(self.path)},
             ) from error

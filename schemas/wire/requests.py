@@ -175,7 +175,7 @@ class Status(_Request):
     after: tuple[Literal[0, 1], Annotated[float, Field(allow_inf_nan=False)], Serial] | None = None
 
 
-class Why(_Request):
+class AskWhy(_Request):
     op: Literal["why"]
     consumer: Name
 
@@ -278,7 +278,7 @@ Request = Annotated[
     | Reattach
     | Oom
     | Status
-    | Why
+    | AskWhy
     | History
     | Subscribe
     | Evict

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -135,6 +136,48 @@ def test_a_second_daemon_on_the_state_folder_is_refused(arbiter_daemon: ArbiterP
     )
     assert done.returncode == 3
     assert f"pid {arbiter_daemon.pid}" in done.stderr
+
+
+def test_a_configuration_that_others_may_write_is_refused(make_arbiter: Make) -> None:
+    arbiter = make_arbiter()
+    file = arbiter.runtime / "arbiter.yaml"
+    file.write_text("log: {level: debug}\n")
+    file.chmod(0o666)
+    done = run_daemon(arbiter, "--check-config", "--config", str(file))
+    assert (done.returncode, f"{file} may be written by other users" in done.stderr) == (2, True)
+    file.chmod(0o644)
+    assert run_daemon(arbiter, "--check-config", "--config", str(file)).returncode == 0
+
+
+@pytest.mark.parametrize("second", [True, False])
+def test_a_daemon_whose_socket_and_locks_were_deleted_serves_alone(
+    make_arbiter: Make, second: bool
+) -> None:
+    """A second daemon served beside it, and both granted the same memory. The first ends; where
+    there is no second, none can start any more."""
+    first = make_arbiter().start({"WATCHDOG_USEC": "900000"})
+    os.kill(first.pid, signal.SIGSTOP)  # it notices nothing until the second one serves
+    for name in ("arbiter.sock", "arbiter.sock.lock", "state/lock"):
+        (first.runtime / name).unlink()
+    if not second:
+        os.kill(first.pid, signal.SIGCONT)
+        until(lambda: "state/lock was deleted; locked again" in first.log)
+        done = run_daemon(first, "--gpu", "fake:8GiB", "--state-dir", str(first.state))
+        assert done.returncode == 3
+        assert f"pid {first.pid}" in done.stderr
+        return
+    other = subprocess.Popen(first.command(), env=first.environ, stderr=subprocess.DEVNULL)
+    try:
+        until((first.runtime / "arbiter.sock").exists)
+        os.kill(first.pid, signal.SIGCONT)
+        assert first.process is not None
+        assert first.process.wait(PATIENCE_S) == 3
+        assert first.log.count(f"stopping: an arbiter (pid {other.pid}) already uses") == 1
+        with WireClient(first.endpoint) as client:
+            assert client.hello().ask("ping")["ok"], "the second one's socket stays"
+    finally:
+        other.terminate()
+        other.wait(PATIENCE_S)
 
 
 def test_the_environment_names_the_endpoint_and_the_flag_wins(make_arbiter: Make) -> None:

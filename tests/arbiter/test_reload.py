@@ -87,14 +87,15 @@ def levels(reloadable: ArbiterProcess) -> set[str]:
 
 
 BAD = {
-    "YAML": ("limits: [\n", "not valid YAML"),
-    "unknown key": ("revoke: {dedline_s: 3}\n", "did you mean deadline_s?"),
-    "out of bounds": ("limits: {leases_per_client_max: 0}\n", "greater than or equal to 1"),
+    "YAML": ("limits: [\n", "arbiter.yaml:2: see"),
+    "unknown key": ("revoke: {dedline_s: 3}\n", "arbiter.yaml:1: see"),
+    "out of bounds": ("limits: {leases_per_client_max: 0}\n", "arbiter.yaml:1: see"),
     "one of two": (
         "limits: {leases_per_client_max: 5}\nverify: {timeout_s: -1}\n",
-        "verify.timeout_s",
+        "arbiter.yaml:2: see `vram-arbiter --check-config --config",
     ),
-    "half of a write": ("limits: {leases_per_client_max: 5}\nlog:\n  lev", "log"),
+    "half of a write": ("limits: {leases_per_client_max: 5}\nlog:\n  lev", "arbiter.yaml:2"),
+    "another file": ("root:$6$secret:19000:0:99999:7:::\n", "arbiter.yaml:1"),
     "truncated": ("", "is empty"),
     "gone": (None, "arbiter.yaml"),
 }
@@ -111,12 +112,18 @@ def test_a_file_takes_effect_or_is_refused_whole_and_a_replay_knows(
     event = newest_event(observer)
     assert event["changed"] == {"limits.leases_per_client_max": [2, 3]}
     assert event["needs_restart"] == {"wire.heartbeat_s": [2.0, 7.0]}
-    assert observer.ask("status")["problems"] == []
+    pending = "changed keys need a restart: wire.heartbeat_s"
+    assert observer.ask("status")["problems"] == [pending]
+    assert pending in reloadable.messages[-1], "what the reload itself tells the manager"
+    doctor = vramctl("doctor", environ=reloadable.environ).stdout
+    assert pending in doctor
     for name, (text, words) in BAD.items():
         reloaded(reloadable, text)
-        (problem,) = observer.ask("status")["problems"]
+        problem, still = observer.ask("status")["problems"]
+        assert still == pending
         assert problem.startswith("the changed configuration is refused"), name
         assert words in problem, name
+        assert "secret" not in str(newest_event(observer)) + problem, "a link was quoted"
         event = newest_event(observer)
         assert (event["kind"], event["problem"] in problem) == ("config_refused", True), name
         assert room(reloadable) == 3, f"{name}: the former configuration is in force"

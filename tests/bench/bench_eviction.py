@@ -30,8 +30,8 @@ def run(suite: Suite) -> None:
         peers = [Peer(daemon.endpoint, name).hello() for name in ("one", "two")]
         for peer in peers:
             stack.callback(peer.close)
-        at_once = [evict(daemon, peers, 0.0) for _ in range(suite.size(200, 20))]
-        later = [evict(daemon, peers, LAG_S) for _ in range(suite.size(40, 5))]
+        at_once = [evict_all(daemon, peers, 0.0) for _ in range(suite.size(200, 20))]
+        later = [evict_all(daemon, peers, LAG_S) for _ in range(suite.size(40, 5))]
     suite.time("eviction: acquire to revoke", [asked for asked, _, _ in at_once])
     suite.time("eviction: the holder's part", [held for _, held, _ in at_once])
     suite.time(
@@ -43,7 +43,9 @@ def run(suite: Suite) -> None:
     suite.limit(name, [noticed for _, _, noticed in later], p99_max_us=10_000.0)
 
 
-def evict(daemon: ArbiterProcess, peers: list[Peer], lag_s: float) -> tuple[float, float, float]:
+def evict_all(
+    daemon: ArbiterProcess, peers: list[Peer], lag_s: float
+) -> tuple[float, float, float]:
     """(acquire → revoke, revoke → release, release or memory back → grant) in microseconds. The
     peers change places."""
     holder, waiter = peers

@@ -293,7 +293,7 @@ def _only_child(pid: int) -> int:
     return child
 
 
-def table(rows: list[Row]) -> str:
+def switch_table(rows: list[Row]) -> str:
     """Return the rows with their targets, for people."""
     lines = []
     for row in rows:
@@ -327,7 +327,7 @@ def main() -> int:
             rows += measure(family, 1 if options.quick else ROUNDS)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-    print(f"{table(rows)}\nrows are in {options.out}")
+    print(f"{switch_table(rows)}\nrows are in {options.out}")
     return 0
 
 

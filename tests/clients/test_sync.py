@@ -1,6 +1,8 @@
 """The blocking client against a real daemon: threads, callbacks, forks."""
 
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -111,6 +113,47 @@ def test_not_across_a_fork(client: Client, spec: Spec) -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     lease.ready()
     assert client.status().leases[0].state == "held"
+
+
+@pytest.mark.parametrize("how", ["kept to the end", "dropped in a function", "in a fork"])
+def test_a_client_that_is_never_left_does_not_keep_its_program(
+    arbiter_daemon: ArbiterProcess, how: str
+) -> None:
+    """The program waited for the client's thread for ever."""
+    code = f"""
+import os, sys
+from vram_arbiter import Client
+def enter():
+    client = Client("careless").__enter__()
+    client.acquire(vram="1GiB", unload=lambda: print("unloaded"))
+    return client
+kept = enter()
+if {how!r} == "dropped in a function":
+    del kept
+    with Client("other") as other:
+        assert not other.status().leases, "it was left in its place"
+if {how!r} == "in a fork":
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+print("ends")
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code],
+        env=arbiter_daemon.environ,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode == 0, done.stderr
+    expected = {
+        "kept to the end": "ends\n",
+        "dropped in a function": "unloaded\nends\n",
+        "in a fork": "ends\nends\n",
+    }
+    assert done.stdout == expected[how], done.stderr
+    assert done.stderr.count("the client 'careless' was entered and never left") == 1
+    assert "Traceback" not in done.stderr
 
 
 def test_closed_or_unreachable(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def run(daemon: ArbiterProcess, name: str, *arguments: str, by: str = sys.execut
     return done.stdout
 
 
-def kinds(daemon: ArbiterProcess, consumer: str) -> list[str]:
+def event_kinds(daemon: ArbiterProcess, consumer: str) -> list[str]:
     """Kinds of the history events of a consumer, in order."""
     with Client("test", endpoint=daemon.endpoint) as arbiter:
         events = arbiter.history().events
@@ -54,7 +54,7 @@ def test_a_consumer(arbiter_daemon: ArbiterProcess) -> None:
     assert said[0].startswith("detecting on GPU-")
     assert said[1] == "released: gone, 0 weights left"
     story = ["granted", "ready", "use_began", "use_ended", "released"]
-    assert in_order(story, kinds(arbiter_daemon, "detector"))
+    assert in_order(story, event_kinds(arbiter_daemon, "detector"))
 
 
 def test_two_models_take_turns(arbiter_daemon: ArbiterProcess) -> None:
@@ -89,7 +89,7 @@ def test_standby(arbiter_daemon: ArbiterProcess) -> None:
 def test_a_wrapped_program_runs_to_its_end(arbiter_daemon: ArbiterProcess) -> None:
     said = run(arbiter_daemon, "wrap_program.py", "5GB", "sh", "-c", "echo working")
     assert said == "working\n"
-    assert in_order(["granted", "ready", "released"], kinds(arbiter_daemon, "sh"))
+    assert in_order(["granted", "ready", "released"], event_kinds(arbiter_daemon, "sh"))
 
 
 def test_wrapping_nothing_says_how(arbiter_daemon: ArbiterProcess) -> None:
@@ -127,4 +127,4 @@ def test_a_client_in_another_language(arbiter_daemon: ArbiterProcess) -> None:
     assert said[0].startswith("granted L")
     assert said[1:] == ["working", "released"]
     story = ["granted", "ready", "use_began", "use_ended", "released"]
-    assert in_order(story, kinds(arbiter_daemon, "sorter"))
+    assert in_order(story, event_kinds(arbiter_daemon, "sorter"))

@@ -65,7 +65,7 @@ def read(data: bytes, pieces: int) -> list[Event | str]:
     return found
 
 
-def one(data: bytes) -> None:
+def feed(data: bytes) -> None:
     """One execution: greeted or not, whole and in pieces."""
     if not data:
         return
@@ -82,7 +82,7 @@ def main() -> None:
             for number, seed in enumerate(SEEDS):
                 (Path(folder) / f"seed-{number}").write_bytes(bytes((number,)) + seed)
             arguments.append(folder)
-        atheris.Setup(arguments, one)
+        atheris.Setup(arguments, feed)
         atheris.Fuzz()
 
 

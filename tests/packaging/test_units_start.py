@@ -242,7 +242,7 @@ def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> 
         lambda: "config_refused" in machine.log(ARBITER) or None, lambda: machine.log(ARBITER)
     )
     status = machine.run("vramctl", "status", "--endpoint", ENDPOINT)
-    assert "did you mean reserve_bytes?" in status, "refused, and the arbiter goes on"
+    assert "arbiter.yaml:2: see `vram-arbiter" in status, "refused, and the arbiter goes on"
     machine.run("systemctl", "restart", ARBITER, code=1)
     assert machine.show(ARBITER, "ActiveState", "ExecMainStatus") == ["failed", "2"]
     machine.run("rm", "/etc/vram-arbiter/arbiter.yaml")

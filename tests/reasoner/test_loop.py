@@ -22,7 +22,7 @@ from vram_arbiter.schemas.tools import (
     QueryScene,
     StopGoal,
     ToolCall,
-    Wait,
+    WaitOn,
 )
 
 PALETTE = Palette(
@@ -169,7 +169,7 @@ def test_a_long_talk_is_forgotten_from_its_beginning() -> None:
 
         def decide(episode: Episode) -> ToolCall | Finish:
             if episode.running:
-                return Wait()
+                return WaitOn()
             return Finish(True, "done") if episode.steps else GRAB
 
         planner = Planner(decide)
@@ -218,7 +218,7 @@ def test_whoever_speaks_all_the_time_does_not_keep_the_planner_from_deciding() -
     ("decision", "status", "reason"),
     [
         (StopGoal(), "canceled", "after the goal"),
-        (Wait(), "succeeded", "after the goal"),
+        (WaitOn(), "succeeded", "after the goal"),
         (LocateInView(query="cube"), "succeeded", "after the goal"),
         (ExecuteRskill(rskill_id="lab/grab", prompt="another"), "succeeded", "after the goal"),
         (Finish(False, "no more"), "canceled", "no more"),

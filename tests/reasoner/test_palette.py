@@ -20,7 +20,7 @@ from vram_arbiter.schemas.tools import (
     LocateInView,
     QueryScene,
     StopGoal,
-    Wait,
+    WaitOn,
 )
 
 BASE = (
@@ -224,7 +224,7 @@ def test_beside_a_goal_only_its_going_on_is_allowed() -> None:
     QueryScene(question="x"),
                  LifecycleTransition(node="detector", transition="deactivate")):  # fmt: skip
         assert isinstance(found.check(call, goal_runs=True), NotPermitted)
-    for ending in (Wait(), StopGoal()):
+    for ending in (WaitOn(), StopGoal()):
         assert found.check(ending, goal_runs=True) is None
         assert isinstance(found.check(ending), NotPermitted)
 
@@ -241,7 +241,7 @@ def test_a_refusal_names_what_is_offered_and_nothing_else() -> None:
     )
     offered = "choose from execute_rskill__lab__go, finish, query_scene"
     for call, goal_runs, hint in (
-        (Wait(), False, offered),
+        (WaitOn(), False, offered),
         (ExecuteRskill(rskill_id="lab/unknown"), False, offered),
         (ExecuteRskill(rskill_id="lab/detector"), False, offered),
         (QueryScene(question="?"), True, "choose from finish, stop_goal, wait"),

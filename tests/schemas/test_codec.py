@@ -94,3 +94,18 @@ def test_what_does_not_fit_is_named(damaged: Any, problem: str) -> None:
 def test_only_dataclasses_have_a_plain_form() -> None:
     with pytest.raises(TypeError, match="int is not a dataclass"):
         to_map(7)
+
+
+@dataclass(frozen=True, slots=True)
+class Nothing:
+    TAG: ClassVar = ("animal", "none")
+
+
+@dataclass(frozen=True, slots=True)
+class One:
+    name: str
+
+
+@pytest.mark.parametrize("value", [Nothing(), One("a")])
+def test_classes_of_no_field_and_of_one_have_a_map(value: Any) -> None:
+    assert from_map(type(value), to_map(value)) == value

@@ -54,25 +54,65 @@ def test_bytes_pass_both_ways_and_a_hang_up_too(tmp_path):
     asyncio.run(asyncio.wait_for(story(), 60))
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can connect as another user")
-def test_only_users_who_may_open_the_socket_are_let_in(tmp_path):
-    """On loopback any user of the machine could command the robot."""
-    nobody = pwd.getpwnam("nobody")
-    code = """
+AS_USER = """
 import encodings.idna, os, socket, sys
 os.setgroups([]); os.setgid(int(sys.argv[2])); os.setuid(int(sys.argv[1]))
 connection = socket.create_connection(("127.0.0.1", int(sys.argv[3])))
 try:
     connection.sendall(b"hello")
-    print(connection.recv(5))
+    if sys.argv[4] == "listen":
+        print(connection.recv(5))
 except ConnectionError:
     print(b"")
 """
 
+
+def as_nobody(port, then):
+    """A command that says hello to the port as another user, then listens or hangs up at once."""
+    nobody = pwd.getpwnam("nobody")
+    return (
+        sys.executable, "-c", AS_USER, str(nobody.pw_uid), str(nobody.pw_gid), str(port), then,
+    )  # fmt: skip
+
+
+only_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can connect as another user")
+
+
+@only_root
+def test_a_client_that_has_hung_up_is_refused(tmp_path):
+    """Any user could command a sidecar blind: `unload` was sent, and the connection closed before
+    the kernel was asked whose it was."""
+
+    async def story(path: Path):
+        served = await asyncio.start_unix_server(kept, path)
+        port = free_port()
+        async with served, on_port(port, path):
+            # the event loop stands still: the port is looked at after the client has gone
+            subprocess.run(as_nobody(port, "hang up"), check=True)
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(b"own")
+            assert await reader.read(3) == b"own", "the port serves on"
+            writer.close()
+        assert heard == [b"own"]
+
+    heard = []
+
+    async def kept(reader, writer):
+        heard.append(await reader.read(5))
+        writer.write(heard[-1])
+        writer.close()
+
+    asyncio.run(asyncio.wait_for(story(tmp_path / "s"), 60))
+
+
+@only_root
+def test_only_users_who_may_open_the_socket_are_let_in(tmp_path):
+    """On loopback any user of the machine could command the robot."""
+    nobody = pwd.getpwnam("nobody")
+
     async def heard(port):
-        argv = (str(nobody.pw_uid), str(nobody.pw_gid), str(port))
         child = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", code, *argv, stdout=subprocess.PIPE
+            *as_nobody(port, "listen"), stdout=subprocess.PIPE
         )
         out, _ = await child.communicate()
         return out.strip()

@@ -25,7 +25,7 @@ WRONG: Final = frozenset({Severity.WARNING, Severity.ERROR})
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding. `code` is stable: `CHECK.what`. `fix`: the command that fixes it."""
+    """One finding. `code` is stable: `CHECK.what`. `fix`: a command that resolves it."""
 
     WHOLE: ClassVar = True
 

@@ -35,7 +35,8 @@ _ASK: Final = (
 """The mapped files are the interpreter's libraries: a libpython lies where its builder put it."""
 _AS_A_UNIT: Final = (
     "unshare", "--mount", "sh", "-c",
-    "for hidden in $0; do test ! -d $hidden || mount -t tmpfs -o mode=0 tmpfs $hidden || exit; done;"
+    "for hidden in $0; do"
+    " test ! -d $hidden || mount -t tmpfs -o mode=0 tmpfs $hidden || exit; done;"
     ' exec setpriv --reuid=65534 --regid=65534 --clear-groups "$@"',
     " ".join(HIDDEN),
 )  # fmt: skip

@@ -7,6 +7,7 @@ Names of spans and metrics are in `names`, the calls in `spans`.
 """
 
 import atexit
+import errno
 import logging
 import os
 import socket
@@ -229,10 +230,11 @@ def _readers(
         if not port_required:
             log.info("%s", problem)
             return readers, None
+        taken = error.errno == errno.EADDRINUSE
+        why = "another program has the port" if taken else "its unit may have no network"
         raise ConfigError(
             problem,
-            hint="another program has the port; set OTEL_EXPORTER_PROMETHEUS_PORT or the "
-            "configuration",
+            hint=f"{why}; set OTEL_EXPORTER_PROMETHEUS_PORT or the configuration",
         ) from error
     ends.append(server.close)
     server.start()

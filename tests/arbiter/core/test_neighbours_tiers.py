@@ -40,6 +40,27 @@ def test_4_two_models_that_are_wanted_alike_do_not_load_all_the_time() -> None:
     assert calm <= 22, "at least half of the time they work"
 
 
+def test_4_equals_take_turns_at_safe_points() -> None:
+    """The second of two equals waited for ever. Each stays for its minimum residency at least, and
+    finishes its use."""
+    driver = CoreDriver(8 * GIB)
+    people = {name: driver.consumer(name) for name in ("a", "b")}
+    leases = {name: one.acquire(5 * GIB, min_residency_s=2.0) for name, one in people.items()}
+    for name, other in (("a", "b"), ("b", "a"), ("a", "b")):
+        person, lease = people[name], leases[name]
+        driver.until(lambda lease=lease: driver.state(lease) == "loading")
+        person.load(lease)
+        person.use_begin(lease)
+        driver.advance(1.9)
+        assert driver.state(lease) == "held"
+        driver.until(lambda lease=lease: driver.state(lease) == "revoking")
+        driver.advance(60.0)
+        assert driver.state(leases[other]) == "queued", "it is in use"
+        person.use_end(lease)
+        person.unload(lease)
+        leases[name] = person.acquire(5 * GIB, min_residency_s=2.0)
+
+
 @pytest.mark.parametrize("priority", [0, 50])
 def test_4_an_idle_holder_does_not_keep_a_gpu_for_minutes(priority: int) -> None:
     """aprender#3986: a lock held for 25 minutes at 97 % idle, six waiters. Whatever was learnt, the

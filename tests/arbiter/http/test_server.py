@@ -4,6 +4,8 @@ import contextlib
 import os
 import re
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -93,6 +95,7 @@ def test_the_files_and_their_headers(port: int) -> None:
         ("/history?" + "&".join(f"kind={n}" for n in range(200)), "GET", 400),
         ("/history?after=-5&limit=99999999", "GET", 200),
         ("http://127.0.0.1/page.js", "GET", 404),
+        ("//[", "GET", 400),
     ],
 )
 def test_what_is_not_served(port: int, path: str, method: str, status: int) -> None:
@@ -181,6 +184,39 @@ def test_open_pages_are_limited_and_idle_connections_make_room(port: int) -> Non
         assert get(port).status == 200  # the oldest connections went for it
         assert pages[0].reply.read1(1) is not None
         assert idle[0].recv(1) == b""
+
+
+AS_USER = """
+import encodings.idna, os, socket, sys
+uid, port, count = map(int, sys.argv[1:])
+os.setgroups([]); os.setgid(uid); os.setuid(uid)
+held = []
+for _ in range(count):
+    held.append(socket.create_connection(("127.0.0.1", port)))
+    held[-1].sendall(b"GET /events HTTP/1.1\\r\\nHost: localhost\\r\\n\\r\\n")
+    print(held[-1].recv(12).split()[1].decode(), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can connect as another user")
+def test_two_users_leave_open_pages_to_root(port: int) -> None:
+    """They took all of them, and no operator could open the page."""
+    with contextlib.ExitStack() as stack:
+        told = []
+        for uid, count in ((54_321, STREAMS_PER_PEER), (54_322, 5)):
+            user = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", AS_USER, str(uid), str(port), str(count)],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                )
+            )  # fmt: skip
+            assert user.stdout is not None
+            told += [user.stdout.readline().strip() for _ in range(count)]
+        assert told == ["200"] * 10 + ["503"]
+        for _ in range(2):
+            assert stack.enter_context(opened_page(port)).until("snapshot")
+        assert get(port, "/events", method="HEAD").status == 503
 
 
 def test_a_peer_that_does_not_read_its_answers_costs_no_memory(

@@ -577,9 +577,29 @@ def test_one_process_and_one_user_leave_room_for_others() -> None:
     assert [reply["ok"] for reply in codes] == [True, True, False]
     assert codes[2]["error"]["details"] == {"limit": "user_share", "value": 6}
     codes = [session_bench.hello(b"o%d" % number, peer=third) for number in range(3)]
-    assert [reply["ok"] for reply in codes] == [True, True, False]
-    assert codes[2]["error"]["details"] == {"limit": "sessions_max", "value": 8}
+    assert [reply["ok"] for reply in codes] == [True, False, False]
+    assert codes[2]["error"]["details"] == {"limit": "sessions_max", "value": 7}
     assert session_bench.hello(b"p", role="operator")["ok"], "places are kept for operators"
+
+
+def test_processes_without_a_session_have_a_reserve() -> None:
+    """Eight runaway processes of a user took all its places, and no further program of that user
+    could connect."""
+
+    def runaway(pid: int) -> Peer:
+        return Peer(ProcessKey(pid, 7), 7, 7, -1)
+
+    session_bench = make_bench(sessions_max=40, process_share=0.5, user_share=0.8)  # 32 of a user
+    hellos = [
+        session_bench.hello(b"r%d-%d" % (process, number), peer=runaway(1000 + process))
+        for number in range(20)
+        for process in range(2)
+    ]
+    refused = [reply["error"]["details"] for reply in hellos if not reply["ok"]]
+    assert refused == [{"limit": "user_share", "value": 28}] * 12
+    first = [session_bench.hello(b"n%d" % one, peer=runaway(2000 + one)) for one in range(5)]
+    assert [reply["ok"] for reply in first] == [True] * 4 + [False]
+    assert code(session_bench.hello(b"again", peer=runaway(2000))) == "limit_exceeded"
 
 
 def test_processes_that_held_something_and_left_have_a_share() -> None:

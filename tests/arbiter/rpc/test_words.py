@@ -91,7 +91,7 @@ def test_every_wait_has_words() -> None:
         (
             r.Impractical.NOT_PINNED,
             False,
-            "its holder asked never to be evicted, and only the holder can change that",
+            "its holder asked never to be evicted, and it alone can change that",
         ),
     ],
 )

@@ -56,6 +56,14 @@ def test_check_and_test_say_what_would_run(tmp_path: Path) -> None:
     open_file = vramctl(*words, environ=environ)
     assert (open_file.returncode, "may be written by other users" in open_file.stderr) == (2, True)
     assert (wrong.returncode, "/nowhere is not a program" in wrong.stderr) == (2, True)
+    config.chmod(0o600)
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o777)
+    config.write_text(f"hooks:\n  - name: a\n    on: granted\n    command: [{program}]\n")
+    planted = vramctl(*words, environ=environ)
+    assert f"{program} may be written by other users" in planted.stderr
+    assert planted.returncode == 2
 
 
 @pytest.mark.e2e

@@ -302,7 +302,7 @@ def test_a_program_that_a_user_may_change_is_not_run_by_a_unit(
 
 
 def test_the_libraries_of_an_interpreter_are_checked() -> None:
-    """Who may change a libpython changes what the units run, and it lies where its builder put it."""
+    """A libpython that another user may change is what the units run, wherever it lies."""
     _, _, *places = environment._ask(Path(sys.executable))
     assert any(".so" in place for place in places)
     loaded = sysconfig.get_config_var("INSTSONAME")

@@ -57,25 +57,37 @@ def typed(done: Finished) -> str:
         ("unpin", "x", "-r", "y" * 513),
         ("drain", "-r", " "), ("resume", "-r", "a\tb"), ("why", ""), ("why", "x\ny"),
         ("history", "-n", "0"), ("history", "--since", "yesterday"), ("replay",),
+        ("history", "--kind", "grant"), ("stauts",), ("status", "--endpoint", "tcp://127.0.0.1:1"),
+        ("run", "--vram", "5", "true"), ("run", "--vram", "0GiB", "true"),
+        ("run", "--vram", "9" * 400 + "GiB", "true"),
         ("replay", "x", "--policy", "best"),
     ],
 )  # fmt: skip
 def test_2_what_is_mistyped_is_told_before_anybody_is_asked(
     command: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """There is no daemon: who asked one would end with 3."""
+    """There is no daemon: who asked one would end with 3. Regression: `--kind bogus` ended with 1,
+    `tcp://` with 3, and a size of 400 digits in an OverflowError; `--vram 5` was five bytes."""
     environ = {k: v for k, v in os.environ.items() if not k.startswith("VRAM_ARBITER_")}
     done = vramctl(*command, environ={**environ, "VRAM_ARBITER_RUNTIME": str(tmp_path)})
     assert (done.returncode, done.stdout) == (2, "")
-    assert "usage: vramctl" in done.stderr.lower()
+    assert "usage: vramctl" in done.stderr.lower() or "tcp:// is refused" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_what_is_mistyped_is_told_with_what_was_meant() -> None:
+    for command, meant in (
+        (("stauts",), "did you mean status?"),
+        (("history", "--kind", "grant"), "did you mean granted?"),
+        (("run", "--vram", "5", "true"), "such as 5GiB or 450MiB, got '5'"),
+    ):
+        assert meant in vramctl(*command, environ=dict(os.environ)).stderr
 
 
 def test_1_for_what_cannot_be_done(
     client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    """Regression: empty reasons were journaled, and an unknown kind of event printed an empty
-    history."""
+    """Regression: empty reasons were journaled."""
     environ = arbiter_daemon.environ
     det = client.acquire(spec("det", 1))
     det.ready()
@@ -94,20 +106,15 @@ def test_1_for_what_cannot_be_done(
     assert "vramctl history" in one_line(
         vramctl("evict", ended.lease_id, "-r", "why", environ=environ)
     )
-    assert "did you mean granted?" in one_line(
-        vramctl("history", "--kind", "grant", environ=environ)
-    )
     codes = {
         command: (done.returncode, typed(done))
-        for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"),
-        ("history", "--kind", "grant"))
+        for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"))
         for done in (vramctl(*command, "--json", environ=environ),)
     }  # fmt: skip
     assert list(codes.values()) == [
         (1, "unknown_lease"),
         (1, "bad_request"),
         (1, "bad_state"),
-        (1, "bad_request"),
     ]
     nobody = vramctl("why", "nobody", environ=environ)
     assert (nobody.returncode, nobody.stdout.count("\n")) == (1, 1)
@@ -115,8 +122,10 @@ def test_1_for_what_cannot_be_done(
     assert vramctl("why", det.lease_id, environ=environ).stdout.startswith("det: "), (
         "a lease is named by its id as well"
     )
-    empty = vramctl("history", "-c", "nobody", environ=environ)
-    assert (empty.returncode, empty.stdout) == (0, ""), "nothing is an answer, and no line"
+    empty = vramctl("history", "-c", "nobody", "-c", "det", environ=environ)
+    assert empty.returncode == 0, "nothing is an answer"
+    assert empty.stdout.count("no such event of 'nobody'") == 1
+    assert "no such event of 'det'" not in empty.stdout
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root to become somebody else")

@@ -246,7 +246,7 @@ def test_an_operators_actions(client: Client, arbiter_daemon: ArbiterProcess, sp
     assert (
         "new driver" in json.loads(vramctl("status", "--json", environ=environ).stdout)["drained"]
     )
-    assert vramctl("resume", environ=environ).stdout == "granting resumed\n"
+    assert vramctl("resume", environ=environ).stdout == "grants resumed\n"
     unknown = vramctl("release-dead", "nobody", "-r", "gone", environ=environ)
     assert (unknown.returncode, "no lease or consumer" in unknown.stderr) == (1, True)
     listed = json.loads(vramctl("history", "--kind", "operator", "--json", environ=environ).stdout)[

@@ -61,6 +61,22 @@ def test_what_a_command_leaves_behind_ends_with_it(tmp_path: Path) -> None:
     until(lambda: gone(tmp_path / "pid"))
 
 
+def test_what_it_leaves_in_a_session_of_its_own_ends_too(tmp_path: Path) -> None:
+    """It was in no group that is killed, and outlived every run."""
+    left = f"setsid sh -c 'echo $$ > {tmp_path}/pid; exec sleep 600' &"
+    run(f"{left} until [ -s {tmp_path}/pid ]; do sleep 0.01; done")
+    until(lambda: gone(tmp_path / "pid"))
+
+
+def test_the_output_of_a_command_is_bounded_and_escaped(caplog: pytest.LogCaptureFixture) -> None:
+    """It went to the log as it was: without a bound, with escape sequences and forged lines."""
+    caplog.set_level("INFO", "vram_arbiter.clients.hooks.command")
+    run("printf 'one\\n\\033[2Jtwo\\n' >&2; yes | head -c 1000000")
+    (said,) = caplog.messages
+    assert said.startswith(r"sh: one\n\x1b[2Jtwo\ny\ny")
+    assert 4096 < len(said) < 8 * 4096
+
+
 def test_a_canceled_command_is_killed(tmp_path: Path) -> None:
     async def test() -> None:
         script = f"echo $$ > {tmp_path}/new; mv {tmp_path}/new {tmp_path}/pid; sleep 600"

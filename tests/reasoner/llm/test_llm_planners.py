@@ -14,7 +14,7 @@ from vram_arbiter.reasoner.llm.anthropic import AnthropicPlanner
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Step
 from vram_arbiter.schemas.errors import ConfigError, LlmError
-from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, Wait
+from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, WaitOn
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -179,7 +179,7 @@ def test_while_a_goal_runs_only_its_going_on_is_decided(
     assert any('"running"' in text for text in said)
     assert "a goal runs" in api.told(stand_in.asked[1])[-1]
     stand_in.json(api.says(("wait", "{}")))
-    assert decide(running) == Wait()
+    assert decide(running) == WaitOn()
 
 
 def test_a_skill_that_cannot_be_started_is_no_longer_offered(

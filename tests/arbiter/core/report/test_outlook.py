@@ -109,7 +109,7 @@ def test_a_holder_on_its_way_out() -> None:
     step = only(driver)
     assert step["action"] == "deadline"
     assert step["in_s"] == pytest.approx(d.REVOKE_DEADLINE_S, abs=0.1)
-    assert step["text"] == "waits 30.0 s more for holder to release, after that w continues to wait"
+    assert step["text"] == "waits 30.0 s more for holder to release, after that w waits on"
     driver.advance(d.REVOKE_DEADLINE_S + 0.1)
     assert (only(driver)["action"], only(driver)["in_s"]) == ("wait", None)
     holder.use_end(lease)

@@ -126,6 +126,7 @@ def test_what_never_fits_says_the_way_out() -> None:
         "vram_insufficient",
         "use a smaller model or a lower precision",
     )
+    assert refused.message == "big needs 8 GiB; the GPU has 8 GiB less a reserve of 300 MiB"
 
 
 def test_refusals_of_operators_say_why() -> None:

@@ -2,6 +2,7 @@
 is not asked for."""
 
 import ast
+import errno
 import importlib.util
 import os
 import socket
@@ -15,6 +16,7 @@ import pytest
 from tests.support.collector import Collector
 from tests.support.paths import ROOT
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.telemetry import scrapes
 from vram_arbiter.schemas.runtime.telemetry.plan import Plan, plan
 from vram_arbiter.schemas.runtime.telemetry.setup import Telemetry, set_up
 
@@ -285,6 +287,25 @@ def test_a_taken_port_is_named() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=f"no Prometheus endpoint on 127.0.0.1:{port}"):
             set_up("vram-arbiter", environ={}, prometheus_port=port)
+
+
+@needs_sdk
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [(errno.EADDRINUSE, "another program has"), (errno.EAFNOSUPPORT, "may have no network")],
+)
+def test_a_port_that_cannot_be_had_says_why(
+    number: int, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a unit without network it said that another program had the port."""
+
+    def refused(*arguments: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(scrapes, "ScrapeServer", refused)
+    with pytest.raises(ConfigError) as told:
+        set_up("vram-arbiter", environ={}, prometheus_port=9464)
+    assert reason in told.value.hint
 
 
 @needs_sdk
