@@ -25,7 +25,6 @@ from vram_arbiter.arbiter.core.report import status, usage, why
 from vram_arbiter.arbiter.core.report.status import Figures, PageKey
 from vram_arbiter.arbiter.core.report.usage import GpuUsage
 from vram_arbiter.arbiter.core.requests import (
-    limits,
     operators,
     recovery,
     requests,
@@ -146,7 +145,7 @@ class Arbiter:
         except Refused as refused:
             core.refuse(event.client, event.request, refused.refusal)
             if isinstance(event, ev.AcquireRequested | ev.Reacquired):
-                limits.note_refused(core, event, refused.refusal)
+                requests.note_refused(core, event, refused.refusal)
 
     def _keep_reading(self) -> None:
         """Plan the next reading of each GPU that the event touched, while a load or a client, a

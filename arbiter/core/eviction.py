@@ -17,7 +17,6 @@ withdraw revokes that nothing wants (`is_wanted`); `deny` ends a wait with an er
 serves the timer.
 """
 
-from vram_arbiter.arbiter.core import standby
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
@@ -63,7 +62,10 @@ def ask(
     if waiter is not None:
         gpu.evictions.append(eviction)
     core.move(holder, LeaseState.REVOKING, Why.REVOKED)
-    standby.on_revoked(core, holder, why.wanted_by)
+    holder.standby.left_for = why.wanted_by
+    if core.host_ram.book(holder.id, holder.spec.park_bytes) or holder.spec.standby:
+        # a restart must not take a release that was asked for as one that was wished for
+        core.record_lease(holder)
     core.want_sample(gpu, core.now)
     push_revoke(core, holder)
     asked = RevokeAskedNote(
@@ -145,7 +147,7 @@ def push_revoke(core: Core, holder: Lease, *, extra: bool = False) -> None:
             order=why.order,
             priority=None if waiter is None else waiter.spec.priority,
             uses=len(holder.uses),
-            park=standby.can_park(core, holder),
+            park=core.can_park(holder),
             traceparent=eviction.traceparent or "",
         ),
     )

@@ -7,8 +7,8 @@ consumer that it left for is on the GPU. A holder that needs its lease now acqui
 it, and waits in the queues like any other.
 
 `Lease.standby` follows such a lease from its first revoke to its end:
-  revoking: host RAM for its weights is booked, so that its holder can count on it (`on_revoked`)
-  verifying: `decide` said whether it parks and whether it comes back; else its RAM is free
+  revoking: host RAM for its weights is booked, so that its holder can count on it
+  verifying: its release decided whether it parks and whether it comes back; else its RAM is free
   parked, standby: its bytes are measured gone; it is away (`go_away`)
   queued: its holder wants it back (`wanted`, `call_back`)
   loading: it was granted, or came back by itself (`first_to_return`)
@@ -23,9 +23,8 @@ from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, NONCES_MAX, Departure, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.refusals import End, Refused
+from vram_arbiter.arbiter.core.model.refusals import End
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.arbiter.core.requests.limits import check_waiters
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId
 from vram_arbiter.schemas.wire.codes import Order, Why
@@ -35,43 +34,6 @@ from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
 # -- leaving ---------------------------------------------------------------------------------------
-def can_park(core: Core, lease: Lease) -> bool:
-    """Return whether host RAM is booked for a revoked lease, or has room for another."""
-    if lease.departure.eviction is not None:
-        return lease.id in core.host_ram.booked
-    return lease.spec.park_bytes > 0 and core.host_ram.fits(lease.id, lease.spec.park_bytes)
-
-
-def on_revoked(core: Core, lease: Lease, left_for: str) -> None:
-    """Book host RAM for its weights from now on, so that the holder can count on it."""
-    lease.standby.left_for = left_for
-    parks = core.host_ram.book(lease.id, lease.spec.park_bytes)
-    if lease.spec.standby or parks:
-        # a restart must not take a release that was asked for as one that was wished for
-        core.record_lease(lease)
-
-
-def decide(core: Core, lease: Lease, *, parked: bool, exiting: bool) -> None:
-    """Decide whether a lease that is released parks, and whether it comes back by itself: only if
-    the engine revoked it, no operator. Raises Refused where host RAM has no room."""
-    count, standby = lease.spec.park_bytes, lease.standby
-    if parked and lease.id not in core.host_ram.booked and not core.host_ram.book(lease.id, count):
-        ram = core.host_ram
-        raise Refused(no.NoHostRam(count, ram.budget_bytes, ram.taken_bytes()))
-    revoked = lease.departure.eviction is not None or lease.departure.revoked_before
-    stays = lease.spec.standby and revoked and not standby.dismissed
-    standby.parks, standby.comes_back = parked, stays and not exiting
-
-
-def next_state(lease: Lease) -> LeaseState | None:
-    """Return where a released lease is, or goes after its verdict; None: it is over then."""
-    if lease.state in AWAY:
-        return lease.state
-    if lease.standby.parks:
-        return LeaseState.PARKED
-    return LeaseState.STANDBY if lease.standby.comes_back else None
-
-
 def go_away(core: Core, lease: Lease, to: LeaseState, verdict: str) -> None:
     """Take a lease off its GPU, whose bytes are measured gone, and let it live on."""
     gpu, request, standby = core.gpu_of(lease), lease.request, lease.standby
@@ -177,7 +139,7 @@ def call_back(
     client, request = core.clients[event.client], lease.request
     load_peak, steady = learning.expected_bytes(core, spec)
     gpus = admission.places(core, spec, load_peak)
-    check_waiters(core, client, spec.priority)
+    admission.check_waiters(core, client, spec.priority)
     request.load_peak_bytes, request.steady_bytes = load_peak, steady
     if isinstance(event, ev.AcquireRequested) and event.nonce != request.nonce:
         _rename(core, lease, event.nonce)

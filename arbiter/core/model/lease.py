@@ -316,6 +316,15 @@ class Lease:
         return list(oldest.values())
 
     @property
+    def next_state(self) -> LeaseState | None:
+        """Where a released lease is, or goes after its verdict; None: it is over then."""
+        if self.state in AWAY:
+            return self.state
+        if self.standby.parks:
+            return LeaseState.PARKED
+        return LeaseState.STANDBY if self.standby.comes_back else None
+
+    @property
     def evictable(self) -> bool:
         """May it be asked to leave at all? Its holder and an operator can forbid it."""
         return self.spec.evictable and self.pinned is None

@@ -316,6 +316,13 @@ class Core:
         if to is LeaseState.HELD or (to is LeaseState.VERIFYING and not lease.standby.parks):
             self.host_ram.free(lease.id)  # its weights are on the GPU, or nowhere
 
+    def can_park(self, lease: Lease) -> bool:
+        """Return whether host RAM is booked for a revoked lease, or has room for another."""
+        if lease.departure.eviction is not None:
+            return lease.id in self.host_ram.booked
+        count = lease.spec.park_bytes
+        return count > 0 and self.host_ram.fits(lease.id, count)
+
     def enqueue(self, lease: Lease) -> None:
         """A request waits in the queue of every candidate GPU."""
         request = lease.request

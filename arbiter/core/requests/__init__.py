@@ -1,7 +1,6 @@
 """What clients, operators and the machine ask of leases. Each function checks first, then changes.
 
 - `requests`: acquire, reacquire, cancel, ready, renew, revoke_ack, unloading, release, oom.
-- `limits`: places that processes and users share.
 - `uses`: begin and end of a use.
 - `sessions`: connections, deaths, expiry, a journal that fails.
 - `operators`: evict, kill, pin, drain, release_dead.

@@ -9,21 +9,23 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, learning, standby
 from vram_arbiter.arbiter.core.learning import check_load
 from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.learned import newest
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
 from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
-from vram_arbiter.arbiter.core.model.state import Client, Core
+from vram_arbiter.arbiter.core.model.state import Client, Core, Refusals
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.report.why import ahead_of, explain
-from vram_arbiter.arbiter.core.requests.limits import check_shares, check_waiters
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 from vram_arbiter.schemas.wire.codes import Why
+from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.notes import (
     CancelledNote,
     OomNote,
     QueuedNote,
     ReadyNote,
+    RefusedNote,
     ReleasedNote,
     RevokeAckedNote,
     UnloadingNote,
@@ -38,6 +40,10 @@ from vram_arbiter.schemas.wire.replies import (
     RenewReply,
     StateReply,
 )
+
+AT_ONCE = 16
+"""Refusals of one process that are noted one by one; after that one a second."""
+PROCESSES_REMEMBERED = 1024
 
 
 # -- leases
@@ -109,9 +115,9 @@ def acquire(core: Core, event: ev.AcquireRequested) -> None:
         return
     load_peak, steady = learning.expected_bytes(core, spec)  # 3
     gpus = admission.places(core, spec, load_peak)
-    check_waiters(core, client, spec.priority)  # 4
+    admission.check_waiters(core, client, spec.priority)  # 4
     owned, most = len(core.of_client.get(client.id, ())), core.settings.leases_per_client_max
-    check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
+    admission.check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
     if core.costs.failures:  # 5
         check_load(core, spec, load_peak, gpus)
     core.enqueue(_new_lease(core, event, client, load_peak, steady, gpus))  # 6
@@ -181,7 +187,7 @@ def reacquire(core: Core, event: ev.Reacquired) -> None:
     if lease.state in AWAY:
         standby.call_back(core, lease, event, lease.spec)
         return
-    if lease.state is LeaseState.VERIFYING and standby.next_state(lease) is not None:
+    if lease.state is LeaseState.VERIFYING and lease.next_state is not None:
         lease.request.traceparent = event.traceparent
         if lease.standby.recalled_at is None:
             lease.standby.recalled_at = core.now
@@ -243,6 +249,28 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
     waited_s = core.now - lease.request.arrived_at
     why = explain(core, lease)
     eviction.deny(core, lease, no.TimedOut(lease.spec.consumer, waited_s, why))
+
+
+# -- refused at once
+def note_refused(core: Core, event: ev.AcquireRequested | ev.Reacquired, refusal: Refusal) -> None:
+    """Note that a request for bytes was refused at once, by whom it was sent, and why.
+
+    A process that asks and is refused thousands of times a second must not push everything else
+    out of the history: beyond a number at once its refusals are counted, and the next note says how
+    many were left out.
+    """
+    process = core.clients[event.client].process
+    seen = newest(core.refusals, process, lambda: Refusals(core.now), PROCESSES_REMEMBERED)
+    seen.noted = max(0.0, seen.noted - (core.now - seen.at))
+    seen.at = core.now
+    if seen.noted > AT_ONCE - 1:
+        seen.left_out += 1
+        return
+    seen.noted += 1
+    lease = None if isinstance(event, ev.AcquireRequested) else core.leases.get(event.lease)
+    consumer = event.spec.consumer if isinstance(event, ev.AcquireRequested) else ""
+    core.note(RefusedNote(process.pid, refusal, consumer, seen.left_out), lease)
+    seen.left_out = 0
 
 
 # -- holding
@@ -363,13 +391,24 @@ def release(core: Core, event: ev.ReleaseReported) -> None:
         return
     lease = own_lease(core, event)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:
-        if event.parked and (event.exiting or not lease.spec.park_bytes):
-            raise bad_state(lease, Misfit.EXITS if event.exiting else Misfit.NO_PARK_BYTES)
-        standby.decide(core, lease, parked=event.parked, exiting=event.exiting)
+        _decide_return(core, lease, event)
         why = Why.EXITS if event.exiting else Why.LET_GO
         released(core, lease, exiting=event.exiting, why=why)
-    after = standby.next_state(lease) or LeaseState.RELEASED
+    after = lease.next_state or LeaseState.RELEASED
     core.reply(event.client, event.request, ReleaseReply(lease.state, after))
+
+
+def _decide_return(core: Core, lease: Lease, event: ev.ReleaseReported) -> None:
+    """Decide whether a lease that is released parks, and whether it comes back by itself: only if
+    the engine revoked it, no operator. Raises Refused."""
+    count, ram, ahead = lease.spec.park_bytes, core.host_ram, lease.standby
+    if event.parked and (event.exiting or not count):
+        raise bad_state(lease, Misfit.EXITS if event.exiting else Misfit.NO_PARK_BYTES)
+    if event.parked and lease.id not in ram.booked and not ram.book(lease.id, count):
+        raise Refused(no.NoHostRam(count, ram.budget_bytes, ram.taken_bytes()))
+    revoked = lease.departure.eviction is not None or lease.departure.revoked_before
+    stays = lease.spec.standby and revoked and not ahead.dismissed
+    ahead.parks, ahead.comes_back = event.parked, stays and not event.exiting
 
 
 def released(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:

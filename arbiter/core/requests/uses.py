@@ -19,8 +19,8 @@ from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Us
 from vram_arbiter.arbiter.core.model.records import UserRecord
 from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
 from vram_arbiter.arbiter.core.model.state import Client, Core
-from vram_arbiter.arbiter.core.requests.limits import check_shares
 from vram_arbiter.arbiter.core.requests.requests import bad_state, lease_for, note_ended
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, UseId
 from vram_arbiter.schemas.wire.codes import Why
@@ -72,12 +72,12 @@ def _check_places(core: Core, lease: Lease, client: Client) -> None:
     others = [use for use in uses if use.process != lease.process]
     if client.process == lease.process:
         own = (Share.HOLDER, len(uses) - len(others), places)
-        check_shares("uses_per_lease_max", own, lease_id=lease.id)
+        admission.check_shares("uses_per_lease_max", own, lease_id=lease.id)
         return
     mine = sum(use.process == client.process for use in others)
     owners = [core.clients.get(use.client) for use in others]
     users = sum(owner is not None and owner.uid == client.uid for owner in owners)
-    check_shares(
+    admission.check_shares(
         "uses_per_lease_max",
         (Share.PROCESS, mine, places * settings.process_share),
         (Share.USER, users, places * settings.user_share),

@@ -1,4 +1,5 @@
-"""Admission: on which GPUs a request may ever be granted, and whether one can grant it now.
+"""Admission: whether there is a place for one more request, on which GPUs it may ever be granted,
+and whether one can grant it now.
 
 A grant passes two gates: the ledger (`fits`), and the newest reading (`measured_room_bytes`,
 `measured_need_bytes`). Changes nothing.
@@ -10,11 +11,47 @@ from vram_arbiter.arbiter.core.ledger import NOTHING
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.refusals import Refused
-from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.model.refusals import Limit, LimitReached, Refused, Share
+from vram_arbiter.arbiter.core.model.state import Client, Core
+from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.spec import LeaseSpec
+
+
+# -- places that processes and users share
+def check_waiters(core: Core, client: Client, priority: int) -> None:
+    """Refuse one waiter too many of a client, of its user or of all.
+
+    The last places are kept for requests above the default priority, of each user's share too.
+    """
+    settings, places, taken = core.settings, core.settings.waiters_max, core.waiters_of
+    mine, users = taken.get(client.process, 0), taken.get(client.uid, 0)
+    kept = 0.0 if priority > defaults.PRIORITY else settings.priority_reserve
+    check_shares(
+        "waiters_max",
+        (Share.PROCESS, mine, places * settings.process_share),
+        (Share.USER, users, places * (settings.user_share * (1 - kept))),
+        (Share.ALL, len(core.waiting), places * (1 - kept)),
+        uid=client.uid,
+    )
+
+
+def check_shares(
+    limit: Limit, *shares: tuple[Share, int, float], lease_id: str = "", uid: int | None = None
+) -> None:
+    """Refuse one place more for the first share that is used up; each has one place at least.
+
+    No process and no user can take so many places that others find none. Sessions, connections and
+    rates are limited before a request becomes an event (`rpc`).
+
+    Args:
+        shares: Whose share, places taken, places allowed.
+    """
+    for share, count, most in shares:
+        if count >= max(1, int(most)):
+            user = uid if share is Share.USER else None
+            raise Refused(LimitReached(limit, max(1, int(most)), share, count, lease_id, user))
 
 
 # -- which GPUs

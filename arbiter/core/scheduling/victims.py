@@ -15,7 +15,6 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling.admission import blocked, fits, leaving
-from vram_arbiter.arbiter.core.standby import can_park
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Block
 
@@ -150,7 +149,7 @@ def _exact(
 
     def cost(plan: Sequence[Lease]) -> tuple[int, float, int, float, list[int]]:
         return (
-            len([one for one in plan if not can_park(core, one)]),
+            len([one for one in plan if not core.can_park(one)]),
             sum(core.costs.reload_s(one.spec.consumer) for one in plan),
             sum(freed[one.id] for one in plan),
             max(one.uses.last_at for one in plan),
@@ -184,7 +183,7 @@ def _greedy(
 
     def cost(one: Lease) -> tuple[float, ...]:
         age = (one.uses.last_at, one.request.arrival)
-        return (bool(one.uses), one.spec.priority, not can_park(core, one), -freed[one.id], *age)
+        return (bool(one.uses), one.spec.priority, not core.can_park(one), -freed[one.id], *age)
 
     order = sorted(candidates, key=cost)
     size = 1 + bisect_left(range(1, len(order)), True, key=lambda n: covers(order[:n]))

@@ -315,7 +315,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     # 3. the lease
     lease = core.leases.get(lease_id)
     if lease is not None and lease.state is LeaseState.VERIFYING:
-        lives_on = standby.next_state(lease)
+        lives_on = lease.next_state
         if lives_on is not None:
             standby.go_away(core, lease, lives_on, str(judgement.verdict))
         else:
