@@ -7,6 +7,7 @@ long as the call allows, it is canceled at the runner.
 import asyncio
 import logging
 import uuid
+from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.clients.runner import Goal, RunnerClient
@@ -33,35 +34,27 @@ PROGRESS_TOLERANCE = 0.0
 BEFORE_MOTION = frozenset({"acquiring", "starting"})
 
 
+@dataclass(frozen=True, slots=True)
 class Execution:
     """`await execution(call)`: one goal, from its sending to its end."""
 
-    def __init__(
-        self,
-        runner: RunnerClient,
-        palette: Palette | None,
-        hints: Hints | None,
-        *,
-        session: str = "",
-        goal_grace_s: float = GOAL_GRACE_S,
-    ) -> None:
-        self._runner = runner
-        self._palette = palette
-        self._hints = hints
-        self._session = session
-        self._goal_grace_s = goal_grace_s
+    runner: RunnerClient
+    palette: Palette | None
+    hints: Hints | None
+    session: str = ""
+    goal_grace_s: float = GOAL_GRACE_S
 
     async def __call__(self, call: ExecuteRskill) -> Outcome:
         """Run the goal. Raises BadRequest and what its sending raises; else an outcome."""
         goal = await self._send(call)
-        limit_s = waits_s(call, self._palette, self._goal_grace_s)
+        limit_s = waits_s(call, self.palette, self.goal_grace_s)
         patience = (
             asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
         )
         waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
         hint = (
-            asyncio.create_task(self._hints.follows(call.next_rskill_id))
-            if call.next_rskill_id and self._hints is not None
+            asyncio.create_task(self.hints.follows(call.next_rskill_id))
+            if call.next_rskill_id and self.hints is not None
             else None
         )
         try:
@@ -98,13 +91,13 @@ class Execution:
         """Cancel a goal by its name if its acceptance was lost: it may run."""
         goal_id = f"goal-{uuid.uuid4().hex[:12]}"
         try:
-            return await self._runner.send_goal(
+            return await self.runner.send_goal(
                 call.rskill_id,
                 prompt=call.prompt,
                 goal_params=call.goal_params,
                 deadline_s=call.deadline_s,
                 goal_id=goal_id,
-                session=self._session,
+                session=self.session,
             )
         except (asyncio.CancelledError, RunnerUnreachable):
             await asyncio.shield(asyncio.create_task(self._cancel_unheard(goal_id)))
@@ -114,7 +107,7 @@ class Execution:
         """And its end is heard, within `CANCEL_S`."""
         try:
             async with asyncio.timeout(CANCEL_S):
-                await self._runner.ask_about(goal_id, "cancel")
+                await self.runner.ask_about(goal_id, "cancel")
                 await self._until_result(goal_id)
         except BadRequest:
             pass  # it never was accepted
@@ -126,7 +119,7 @@ class Execution:
     async def _until_result(self, goal_id: str) -> None:
         while True:
             try:
-                await self._runner.ask_about(goal_id, "result")
+                await self.runner.ask_about(goal_id, "result")
             except BadState:  # it runs
                 await asyncio.sleep(ASK_AGAIN_S)
             else:

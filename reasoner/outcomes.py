@@ -17,6 +17,7 @@ from vram_arbiter.schemas.errors import (
     FrameStale,
     GoalRejected,
     LeaseRevoking,
+    NotPermitted,
     NotResident,
     VramError,
 )
@@ -36,6 +37,8 @@ def of_error(error: VramError) -> Outcome:
                 f"the model is not resident, so nothing was looked at: {error}",
                 error.code,
             )
+        case NotPermitted():
+            return Outcome("refused", str(error), error.code)
         case FrameStale():
             return Outcome("no_frame", str(error), error.code)
         case GoalRejected():

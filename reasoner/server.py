@@ -8,12 +8,10 @@ command line.
 import asyncio
 import logging
 import os
-from typing import Any, Self
-
-from pydantic import ValidationError
+from typing import Self
 
 from vram_arbiter.clients.net.rpc_client import RpcClient
-from vram_arbiter.clients.net.server import Peer, RouterServer, reason_of
+from vram_arbiter.clients.net.server import Peer, RouterServer, parsed, reason_of, refusal
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
@@ -21,7 +19,6 @@ from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     ReasonerUnreachable,
-    UnknownOp,
     VramError,
     from_wire,
 )
@@ -34,6 +31,7 @@ from vram_arbiter.schemas.reasoner import (
     GetEpisode,
     GetTaskResult,
     ListTasks,
+    ReasonerRequest,
     ReasonerState,
     ResultReply,
     Say,
@@ -59,7 +57,7 @@ class OperatorServer:
         self._queue = queue
         self._confirmations = confirmations
         self._server = RouterServer(
-            endpoint, lambda error: _refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
+            endpoint, lambda error: refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
         )
         self._serving: asyncio.Task[None] | None = None
 
@@ -80,7 +78,7 @@ class OperatorServer:
         try:
             reply = self._answer(message)
         except VramError as error:
-            await self._server.send(peer, _refusal(request_id, error))
+            await self._server.send(peer, refusal(request_id, error))
         else:
             await self._server.send(peer, {"re": request_id, "ok": True, **reply})
 
@@ -124,31 +122,14 @@ class OperatorServer:
         }
 
 
-def _parse(message: Message) -> Any:
-    if message.get("op") not in OPS:
-        raise UnknownOp(
-            f"unknown op {str(message.get('op'))[:64]!r}",
-            hint=f"one of {', '.join(OPS)}",
-            details={"known": [*OPS]},
-        )
-    if message["op"] == "cancel":  # a cancel is never refused for a long reason
-        number = message.get("task")
-        valid = isinstance(number, int) and not isinstance(number, bool) and number > 0
-        if number is not None and not valid:  # it would end the wrong task
-            raise BadRequest("cancel: task: expected the number of a task", hint="see `tasks`")
-        return CancelEpisode(op="cancel", id=0, reason=reason_of(message), task=number)
-    try:
-        return REASONER_REQUEST.validate_python(message)
-    except ValidationError as error:
-        problems = [
-            f"{'.'.join(str(part)[:64] for part in item['loc'][1:])}: {item['msg']}"
-            for item in error.errors(include_url=False, include_input=False)
-        ]
-        raise BadRequest(f"{message['op']}: {'; '.join(problems)}") from error
-
-
-def _refusal(request_id: int | None, error: VramError) -> Message:
-    return {"re": request_id, "ok": False, "error": error.to_wire()}
+def _parse(message: Message) -> ReasonerRequest:
+    if message.get("op") != "cancel":
+        return parsed(message, REASONER_REQUEST, OPS)
+    number = message.get("task")  # a cancel is never refused for a long reason
+    valid = isinstance(number, int) and not isinstance(number, bool) and number > 0
+    if number is not None and not valid:  # it would end the wrong task
+        raise BadRequest("cancel: task: expected the number of a task", hint="see `tasks`")
+    return CancelEpisode(op="cancel", id=0, reason=reason_of(message), task=number)
 
 
 async def send(endpoint: str, request: Message, *, timeout_s: float = SEND_S) -> Message:

@@ -19,7 +19,7 @@ from vram_arbiter.reasoner.llm.scripted import ScriptedPlanner
 from vram_arbiter.reasoner.llm.transcript import Transcript
 from vram_arbiter.reasoner.loop import STEPS_MAX, THINK_MAX_S, run_episode
 from vram_arbiter.reasoner.options import LLM_PLANNERS, endpoint
-from vram_arbiter.reasoner.palette import OPERATOR, Palette, palette_of
+from vram_arbiter.reasoner.palette import OPERATOR, Palette, skills_of
 from vram_arbiter.reasoner.perception import FRAME_MAX_AGE_MS, Judge
 from vram_arbiter.reasoner.planner import Planner
 from vram_arbiter.reasoner.playbooks import Playbook
@@ -86,17 +86,19 @@ class Workplace:
             "reward": self._reward,
         }
         components = {name: client for name, client in named.items() if client is not None}
-        palette = palette_of(
-            manifests,
+        body = read_body(installed.get("body"))
+        palette = Palette(
+            skills_of(
+                manifests, body=body, allow_noncommercial=self._arguments.allow_noncommercial
+            ),
             can_locate=self._detector is not None,
             can_query=self._vlm is not None,
             can_judge=self._reward is not None,
             can_look=self._arguments.look,
-            cameras=(await self._watching.state()).get("cameras") or (),
-            allow_noncommercial=self._arguments.allow_noncommercial,
-            managed=[name for name in self._arguments.manage if name in components],
-            topics=[OPERATOR],
-            body=read_body(installed.get("body")),
+            cameras=tuple((await self._watching.state()).get("cameras") or ()),
+            managed=frozenset(name for name in self._arguments.manage if name in components),
+            topics=frozenset({OPERATOR}),
+            body=body,
         )
         if self._playbook is not None:
             palette = self._playbook.narrow(palette)
