@@ -6,6 +6,7 @@ long as the call allows, it is canceled at the runner.
 
 import asyncio
 import logging
+import math
 import uuid
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +30,6 @@ START_S = 90.0  # what the runner adds to a manifest's time of motion, to get th
 HEARD_LATE_S = 0.5
 CANCEL_S = 10.0  # for a canceled goal to end: it gives the robot back and finishes its use
 ASK_AGAIN_S = 0.2  # whether a goal has ended whose result has no listener
-PROGRESS_TOLERANCE = 0.0
 # waiting for the GPU is not a lack of progress
 BEFORE_MOTION = frozenset({"acquiring", "starting"})
 
@@ -48,28 +48,18 @@ class Execution:
         """Run the goal. Raises BadRequest and what its sending raises; else an outcome."""
         goal = await self._send(call)
         limit_s = waits_s(call, self.palette, self.goal_grace_s)
-        patience = (
-            asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
-        )
         waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
-        hint = (
-            asyncio.create_task(self.hints.follows(call.next_rskill_id))
-            if call.next_rskill_id and self.hints is not None
-            else None
-        )
+        stuck = asyncio.create_task(_stands_still(goal, call))
+        hint = asyncio.create_task(self._hint(call.next_rskill_id))
         try:
-            either: set[asyncio.Task[Any]] = {waiting} if patience is None else {waiting, patience}
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-            if not waiting.done() and patience is not None and patience.result():
-                result = await _called_off(goal)
-                if result is None or not result["success"]:
-                    return Outcome(
-                        "failed",
-                        f"no progress for {call.patience_s:g} s; {how_it_went(result)}",
-                        "no_progress",
-                    )
+            await asyncio.wait({waiting, stuck}, return_when=asyncio.FIRST_COMPLETED)
+            if waiting.done() or not stuck.result():
+                return of_result(await waiting)
+            result = await _called_off(goal)
+            if result is not None and result["success"]:
                 return of_result(result)
-            return of_result(await waiting)
+            why = f"no progress for {call.patience_s:g} s; {how_it_went(result)}"
+            return Outcome("failed", why, "no_progress")
         except TimeoutError:
             how = how_it_went(await _called_off(goal))
             return Outcome("failed", f"no result within {limit_s:.0f} s; {how}", "wait_timeout")
@@ -82,10 +72,13 @@ class Execution:
             await _called_off(goal)
             raise
         finally:
-            for task in (waiting, patience, hint):
-                if task is not None:
-                    task.cancel()
-                    task.add_done_callback(_retrieve)
+            for task in (waiting, stuck, hint):
+                task.cancel()
+                task.add_done_callback(_retrieve)
+
+    async def _hint(self, follower: str) -> None:
+        if follower and self.hints is not None:
+            await self.hints.follows(follower)
 
     async def _send(self, call: ExecuteRskill) -> Goal:
         """Cancel a goal by its name if its acceptance was lost: it may run."""
@@ -144,17 +137,14 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
 
     Preparation before the motion does not count.
     """
-    assert call.patience_s is not None, "only watched with patience"
-    tolerance = PROGRESS_TOLERANCE if call.progress_tolerance is None else call.progress_tolerance
-    best: float | None = None
+    patience_s = math.inf if call.patience_s is None else call.patience_s
+    best, deadline_s, over = -math.inf, math.inf, False
     time_s = asyncio.get_running_loop().time
     feedback = aiter(goal.feedback())
     coming = asyncio.ensure_future(anext(feedback))
-    deadline_s: float | None = None
-    over = False
     try:
         while True:
-            left_s = None if deadline_s is None else max(0.0, deadline_s - time_s())
+            left_s = max(0.0, deadline_s - time_s())
             if not (await asyncio.wait({coming}, timeout=left_s))[0]:
                 if over:
                     return True
@@ -162,10 +152,9 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
                 continue
             item = coming.result()
             coming = asyncio.ensure_future(anext(feedback))
-            if item["state"] not in BEFORE_MOTION and (
-                best is None or item["progress"] > best + tolerance
-            ):
-                best, over, deadline_s = item["progress"], False, time_s() + call.patience_s
+            grown = item["progress"] > best + (call.progress_tolerance or 0.0)
+            if item["state"] not in BEFORE_MOTION and grown:
+                best, deadline_s, over = item["progress"], time_s() + patience_s, False
     except StopAsyncIteration:
         return False
     finally:

@@ -94,9 +94,7 @@ class Places:
         return bool(seen)
 
     def _place(self, point: Point, score: float) -> Place:
-        x0, y0, yaw = self.base_pose
-        x = x0 + math.cos(yaw) * point.x - math.sin(yaw) * point.y
-        y = y0 + math.sin(yaw) * point.x + math.cos(yaw) * point.y
+        x, y = _from(self.base_pose, point.x, point.y)
         return Place(x, y, point.z, score, math.hypot(point.x, point.y))
 
     def _see(self, seen: Place, before: list[Place]) -> None:
@@ -123,12 +121,7 @@ class Places:
     def from_base(self, place: Place) -> Point:
         """Return its position relative to the base at the newest look."""
         x0, y0, yaw = self.base_pose
-        dx, dy = place.x - x0, place.y - y0
-        return Point(
-            math.cos(yaw) * dx + math.sin(yaw) * dy,
-            -math.sin(yaw) * dx + math.cos(yaw) * dy,
-            place.z,
-        )
+        return Point(*_from((0.0, 0.0, -yaw), place.x - x0, place.y - y0), place.z)
 
 
 @dataclass(slots=True)
@@ -155,18 +148,22 @@ class Search:
         """Return the next pose from which nothing was looked at; None: there is none left."""
         if not self._views:
             return None
-        x0, y0, yaw = self._views[0]
+        first = self._views[0]
         while self._given < len(VIEWPOINTS_M):
-            ahead, left = VIEWPOINTS_M[self._given]
+            pose = (*_from(first, *VIEWPOINTS_M[self._given]), first[2])
             self._given += 1
-            pose = (
-                x0 + math.cos(yaw) * ahead - math.sin(yaw) * left,
-                y0 + math.sin(yaw) * ahead + math.cos(yaw) * left,
-                yaw,
-            )
             if not any(_same_view(pose, view) for view in self._views):
                 return pose
         return None
+
+
+def _from(pose: Pose, ahead: float, left: float) -> tuple[float, float]:
+    """Return the place so far ahead of a pose and to the left of it."""
+    x, y, yaw = pose
+    return (
+        x + math.cos(yaw) * ahead - math.sin(yaw) * left,
+        y + math.sin(yaw) * ahead + math.cos(yaw) * left,
+    )
 
 
 def _near(place: Place, others: Iterable[Place]) -> bool:

@@ -93,7 +93,7 @@ class OperatorServer:
                 task = queue.submit(text)
                 return dict(SubmitReply(task=task.number, ahead=queue.ahead_of(task)))
             case ListTasks():
-                return dict(TasksReply(tasks=[task.view() for task in queue.tasks()]))
+                return dict(TasksReply(tasks=[task.view() for task in queue.tasks]))
             case GetTaskResult(task=number):
                 task = queue.find(number)
                 if task.result is None:
@@ -113,7 +113,7 @@ class OperatorServer:
     def _state(self) -> ReasonerState:
         motion = None if self._confirmations is None else self._confirmations.pending
         running = self._queue.running
-        queued = sum(task.state == "queued" for task in self._queue.tasks())
+        queued = sum(task.state == "queued" for task in self._queue.tasks)
         return {
             "task": running.text if running is not None else "",
             "pid": os.getpid(),

@@ -171,7 +171,7 @@ def _given[C: SidecarClient](kind: type[C], given: str | None, name: str) -> C |
 
 
 def _steps_max(playbook: Playbook | None) -> int:
-    return STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.max_steps)
+    return STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.contract.max_steps)
 
 
 def _think_max_s(llm: LlmConfig | None) -> float:

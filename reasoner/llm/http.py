@@ -19,7 +19,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from time import monotonic
-from typing import Any, Self
+from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
 from vram_arbiter.schemas import strictjson
@@ -60,7 +60,7 @@ def import_httpx() -> None:
 
 
 class JsonHttp:
-    """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`.
+    """`await JsonHttp(headers, timeout_s).post(url, body)`; `close` closes its connections.
 
     Redirects are not followed: the key must not reach another server. `again` is called before each
     further try of a request.
@@ -87,12 +87,6 @@ class JsonHttp:
         # its line for each request has the whole address in it, with a password or a key; our
         # errors carry the rest
         logging.getLogger("httpx").setLevel(logging.WARNING)
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.close()
 
     async def close(self) -> None:
         await self._http.aclose()
@@ -141,7 +135,7 @@ class JsonHttp:
             async with self._http.stream(
                 "POST", url, content=content, headers={"content-type": "application/json"}
             ) as response:
-                answer = await self._read(shown, response)
+                answer = await _read(shown, response)
                 status, headers = int(response.status_code), dict(response.headers)
         except httpx.TimeoutException as error:
             raise TimeoutError from error
@@ -170,16 +164,14 @@ class JsonHttp:
             raise LlmError(f"{shown} answered a JSON {type(value).__name__}, not an object")
         return value
 
-    @staticmethod
-    async def _read(url: str, response: Any) -> bytes:
-        parts: list[bytes] = []
-        size = 0
-        async for part in response.aiter_bytes():
-            size += len(part)
-            if size > ANSWER_MAX_BYTES:
-                raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
-            parts.append(part)
-        return b"".join(parts)
+
+async def _read(url: str, response: Any) -> bytes:
+    answer = bytearray()
+    async for part in response.aiter_bytes():
+        answer += part
+        if len(answer) > ANSWER_MAX_BYTES:
+            raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
+    return bytes(answer)
 
 
 def _pause_s(asked: int) -> float:
