@@ -159,22 +159,19 @@ def language_model(
     Raises ConfigError for options that only a language model can use, and what the configuration
     and the playbook raise.
     """
-    check_output("--result", arguments.result)
-    check_output("--history", arguments.history)
-    check_output("--transcript", arguments.transcript)
+    for option in ("result", "history", "transcript"):
+        check_output(f"--{option}", getattr(arguments, option))
     kind = LLM_PLANNERS.get(arguments.planner)
+    llm = None
     if kind is not None:
         llm = LlmConfig.from_environ(environ, base_url=kind.default_base_url)
         import_httpx()
-        return llm, load_playbook(arguments.playbook) if arguments.playbook else None
     playbook = load_playbook(arguments.playbook) if arguments.playbook else None
-    unused = [
-        f"{flag} is for a language model"
-        for flag, given in (("--look", arguments.look), ("--transcript", arguments.transcript))
-        if given
-    ]
-    if playbook is not None:
-        unused.insert(0, "a playbook is read by a language model")
-    if unused:
-        raise ConfigError(unused[0], hint=f"--planner {' or '.join(LLM_PLANNERS)}")
-    return None, None
+    for given, unused in (
+        (playbook, "a playbook is read by a language model"),
+        (arguments.look, "--look is for a language model"),
+        (arguments.transcript, "--transcript is for a language model"),
+    ):
+        if given and llm is None:
+            raise ConfigError(unused, hint=f"--planner {' or '.join(LLM_PLANNERS)}")
+    return llm, playbook

@@ -9,14 +9,14 @@ come from the same fields; `check` is asked again for each call.
 
 import dataclasses
 import re
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, field
 
 from vram_arbiter.reasoner.params import JsonSchema, misfits
 from vram_arbiter.schemas.body import UNKNOWN_BODY, Body
 from vram_arbiter.schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from vram_arbiter.schemas.manifest import Role, RSkillManifest
-from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
@@ -28,7 +28,6 @@ from vram_arbiter.schemas.tools import (
     StopGoal,
     ToolCall,
     Wait,
-    function_schema,
     function_schemas,
     parse_skill_call,
     parse_tool_call,
@@ -270,28 +269,13 @@ class Palette:
                 )
                 for skill in self.executable.values()
             ]
-        asked = function_schemas(name for name in _PROVIDED if name in tools)
-        for function in asked:
-            properties = function["function"]["parameters"]["properties"]
-            if self.cameras and "camera" in properties:
-                what = f"Name of the camera; without it: {self.cameras[0]}."
-                properties["camera"] = {
-                    "type": "string",
-                    "enum": [*self.cameras],
-                    "description": what,
-                }
-        offered += asked
-        for tool, parameter, allowed in (
-            (LifecycleTransition, "node", self.managed),
-            (EmitPrompt, "target_topic", self.topics),
+        for name, parameter, choices in (
+            *((name, "camera", self.cameras) for name in _PROVIDED),
+            ("lifecycle_transition", "node", sorted(self.managed)),
+            ("emit_prompt", "target_topic", sorted(self.topics)),
         ):
-            function = function_schema(tool)
-            if function["function"]["name"] in tools:
-                function["function"]["parameters"]["properties"][parameter] = {
-                    "type": "string",
-                    "enum": sorted(allowed),
-                }
-                offered.append(function)
+            if name in tools:
+                offered += [_choosing(one, parameter, choices) for one in function_schemas([name])]
         return offered
 
     def parse(self, name: str, arguments: str | JsonMap) -> ToolCall:
@@ -306,6 +290,17 @@ class Palette:
                     raise BadRequest(f"{name}: takes no goal_params", hint="leave them out")
                 return call
         return parse_tool_call(name, arguments)
+
+
+def _choosing(offer: FunctionTool, parameter: str, choices: Sequence[str]) -> FunctionTool:
+    """Let a function's parameter be one of these; of cameras the first is the default."""
+    properties = offer["function"]["parameters"]["properties"]
+    if choices and parameter in properties:
+        chosen: JsonObject = {"type": "string", "enum": [*choices]}
+        if parameter == "camera":
+            chosen["description"] = f"Name of the camera; without it: {choices[0]}."
+        properties[parameter] = chosen
+    return offer
 
 
 def skills_of(

@@ -8,7 +8,8 @@ command line.
 import asyncio
 import logging
 import os
-from typing import Self
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, parsed, reason_of, refusal
@@ -45,81 +46,70 @@ log = logging.getLogger(__name__)
 SEND_S = 5.0
 
 
-class OperatorServer:
-    """`async with OperatorServer(endpoint, queue)`: serve until the block ends.
+@asynccontextmanager
+async def operator_server(
+    endpoint: str, queue: TaskQueue, confirmations: Confirmations | None = None
+) -> AsyncIterator[None]:
+    """Serve until the block ends. Raises AlreadyRunning when another reasoner serves there."""
 
-    Raises AlreadyRunning when another reasoner serves there.
-    """
-
-    def __init__(
-        self, endpoint: str, queue: TaskQueue, confirmations: Confirmations | None = None
-    ) -> None:
-        self._queue = queue
-        self._confirmations = confirmations
-        self._server = RouterServer(
-            endpoint, lambda error: refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
-        )
-        self._serving: asyncio.Task[None] | None = None
-
-    async def __aenter__(self) -> Self:
-        await self._server.__aenter__()
-        self._serving = asyncio.create_task(self._server.serve(self._handle))
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        if self._serving is not None:
-            self._serving.cancel()
-            await asyncio.gather(self._serving, return_exceptions=True)
-        await self._server.__aexit__()
-
-    async def _handle(self, peer: Peer, message: Message) -> None:
+    async def handle(peer: Peer, message: Message) -> None:
         number = message.get("id")
         request_id = number if isinstance(number, int) else None
         try:
-            reply = self._answer(message)
+            reply = {"re": request_id, "ok": True, **_answer(message, queue, confirmations)}
         except VramError as error:
-            await self._server.send(peer, refusal(request_id, error))
-        else:
-            await self._server.send(peer, {"re": request_id, "ok": True, **reply})
+            reply = refusal(request_id, error)
+        await server.send(peer, reply)
 
-    def _answer(self, message: Message) -> Message:
-        queue = self._queue
-        match _parse(message):
-            case Say(text=text):
-                queue.say(text)
-            case CancelEpisode(reason=reason, task=number):
-                queue.cancel(number, reason or "by an operator")
-            case SubmitTask(text=text):
-                task = queue.submit(text)
-                return dict(SubmitReply(task=task.number, ahead=queue.ahead_of(task)))
-            case ListTasks():
-                return dict(TasksReply(tasks=[task.view() for task in queue.tasks]))
-            case GetTaskResult(task=number):
-                task = queue.find(number)
-                if task.result is None:
-                    raise BadState(f"task {number} is not over: {task.state}")
-                return dict(ResultReply(result=task.result))
-            case ConfirmMotion(motion=number, yes=yes, reason=reason):
-                if self._confirmations is None:
-                    raise BadState(
-                        "this reasoner asks for no confirmation",
-                        hint="start it with --require-confirmation",
-                    )
-                self._confirmations.answer(number, yes=yes, reason=reason)
-            case GetEpisode():
-                return dict(self._state())
-        return {"pid": os.getpid()}
+    async with RouterServer(
+        endpoint, lambda error: refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
+    ) as server:
+        serving = asyncio.create_task(server.serve(handle))
+        try:
+            yield
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
 
-    def _state(self) -> ReasonerState:
-        motion = None if self._confirmations is None else self._confirmations.pending
-        running = self._queue.running
-        queued = sum(task.state == "queued" for task in self._queue.tasks)
-        return {
-            "task": running.text if running is not None else "",
-            "pid": os.getpid(),
-            "motion": motion,
-            "queued": queued,
-        }
+
+def _answer(message: Message, queue: TaskQueue, confirmations: Confirmations | None) -> Message:
+    match _parse(message):
+        case Say(text=text):
+            queue.say(text)
+        case CancelEpisode(reason=reason, task=number):
+            queue.cancel(number, reason or "by an operator")
+        case SubmitTask(text=text):
+            task = queue.submit(text)
+            return dict(SubmitReply(task=task.number, ahead=queue.ahead_of(task)))
+        case ListTasks():
+            return dict(TasksReply(tasks=[task.view() for task in queue.tasks]))
+        case GetTaskResult(task=number):
+            task = queue.find(number)
+            if task.result is None:
+                raise BadState(f"task {number} is not over: {task.state}")
+            return dict(ResultReply(result=task.result))
+        case ConfirmMotion(motion=number, yes=yes, reason=reason):
+            if confirmations is None:
+                raise BadState(
+                    "this reasoner asks for no confirmation",
+                    hint="start it with --require-confirmation",
+                )
+            confirmations.answer(number, yes=yes, reason=reason)
+        case GetEpisode():
+            return dict(_state(queue, confirmations))
+    return {"pid": os.getpid()}
+
+
+def _state(queue: TaskQueue, confirmations: Confirmations | None) -> ReasonerState:
+    motion = None if confirmations is None else confirmations.pending
+    running = queue.running
+    queued = sum(task.state == "queued" for task in queue.tasks)
+    return {
+        "task": running.text if running is not None else "",
+        "pid": os.getpid(),
+        "motion": motion,
+        "queued": queued,
+    }
 
 
 def _parse(message: Message) -> ReasonerRequest:

@@ -7,7 +7,6 @@ names bytes, leases or victims: loading and unloading are between the sidecars a
 import logging
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Protocol
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -31,10 +30,6 @@ from vram_arbiter.schemas.tools import (
 )
 
 log = logging.getLogger(__name__)
-
-
-class Dispatcher(Protocol):
-    async def __call__(self, call: ToolCall) -> Outcome: ...
 
 
 @dataclass

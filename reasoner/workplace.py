@@ -18,7 +18,7 @@ from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.scripted import ScriptedPlanner
 from vram_arbiter.reasoner.llm.transcript import Transcript
 from vram_arbiter.reasoner.loop import STEPS_MAX, THINK_MAX_S, run_episode
-from vram_arbiter.reasoner.options import LLM_PLANNERS, endpoint
+from vram_arbiter.reasoner.options import LLM_PLANNERS, MANAGED, endpoint
 from vram_arbiter.reasoner.palette import OPERATOR, Palette, skills_of
 from vram_arbiter.reasoner.perception import FRAME_MAX_AGE_MS, Judge
 from vram_arbiter.reasoner.planner import Planner
@@ -64,11 +64,10 @@ class Workplace:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        for client in (self._detector, self._vlm, self._reward):
+        sidecars = (self._detector, self._vlm, self._reward)
+        for client in (*sidecars, self._runner, self._watching, self._eyes):
             if client is not None:
                 await client.close()
-        for runner in (self._runner, self._watching, self._eyes):
-            await runner.close()
         self._transcript.close()
 
     async def perform(self, task: str, inbox: Inbox) -> Result:
@@ -80,12 +79,10 @@ class Workplace:
         installed = await self._runner.skills()
         session = str(installed.get("session", ""))
         manifests = [RSkillManifest.model_validate(manifest) for manifest in installed["skills"]]
-        named: dict[str, SidecarClient | None] = {
-            "detector": self._detector,
-            "scene-vlm": self._vlm,
-            "reward": self._reward,
+        served: tuple[SidecarClient | None, ...] = (self._detector, self._vlm, self._reward)
+        components = {
+            name: client for name, client in zip(MANAGED, served, strict=True) if client is not None
         }
-        components = {name: client for name, client in named.items() if client is not None}
         body = read_body(installed.get("body"))
         palette = Palette(
             skills_of(
