@@ -36,10 +36,10 @@ class Confirmations:
             if isinstance(call, ExecuteRskill):
                 yes, reason = await self._ask(call)
                 if not yes:
-                    why = f": {reason}" if reason else ""
-                    return Outcome(
-                        "refused", f"the operator did not confirm this motion{why}", "not_permitted"
+                    why = (
+                        f"the operator did not confirm this motion{f': {reason}' if reason else ''}"
                     )
+                    return Outcome("refused", why, "not_permitted")
             return await dispatch(call)
 
         return confirmed

@@ -5,9 +5,11 @@ long as the call allows, it is canceled at the runner.
 """
 
 import asyncio
+import contextlib
 import logging
 import math
 import uuid
+from collections.abc import Coroutine
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,30 +95,21 @@ class Execution:
                 session=self.session,
             )
         except (asyncio.CancelledError, RunnerUnreachable):
-            await asyncio.shield(asyncio.create_task(self._cancel_unheard(goal_id)))
+            await _ended(goal_id, self._cancel_unheard(goal_id))
             raise
 
     async def _cancel_unheard(self, goal_id: str) -> None:
-        """And its end is heard, within `CANCEL_S`."""
-        try:
-            async with asyncio.timeout(CANCEL_S):
-                await self.runner.ask_about(goal_id, "cancel")
-                await self._until_result(goal_id)
-        except BadRequest:
-            pass  # it never was accepted
-        except (VramError, TimeoutError) as error:
-            log.error(
-                "goal %s may run: %s", goal_id, str(error) or "the runner did not say that it ended"
-            )
-
-    async def _until_result(self, goal_id: str) -> None:
-        while True:
-            try:
-                await self.runner.ask_about(goal_id, "result")
-            except BadState:  # it runs
-                await asyncio.sleep(ASK_AGAIN_S)
-            else:
-                return
+        """Cancel a goal that may have been accepted, and wait for its end."""
+        ask = self.runner.ask_about
+        with contextlib.suppress(BadRequest):  # it never was accepted
+            await ask(goal_id, "cancel")
+            while True:
+                try:
+                    await ask(goal_id, "result")
+                except BadState:  # it runs
+                    await asyncio.sleep(ASK_AGAIN_S)
+                else:
+                    return
 
 
 def waits_s(call: ExecuteRskill, palette: Palette | None, grace_s: float) -> float:
@@ -163,26 +156,32 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
 
 
 async def _called_off(goal: Goal) -> ResultPush | None:
-    """Cancel a goal and wait for its end, within `CANCEL_S`; None if the runner does not report it.
+    """Cancel a goal and wait for its end; None if the runner does not report it."""
+
+    async def end() -> ResultPush:
+        if not goal.done:
+            await goal.cancel()
+        return await goal.result()
+
+    return await _ended(goal.goal_id, end())
+
+
+async def _ended[T](goal_id: str, end: Coroutine[Any, Any, T]) -> T | None:
+    """Wait for the end of a canceled goal, within `CANCEL_S`; None if that fails.
 
     A cancellation of this task does not cut the wait short.
     """
 
-    async def end() -> ResultPush | None:
+    async def within_limit() -> T | None:
         try:
             async with asyncio.timeout(CANCEL_S):
-                if not goal.done:
-                    await goal.cancel()
-                return await goal.result()
+                return await end
         except (TimeoutError, VramError) as error:
-            log.error(
-                "goal %s may still run: %s",
-                goal.goal_id,
-                str(error) or "the runner did not say that it ended",
-            )
+            why = str(error) or "the runner did not say that it ended"
+            log.error("goal %s may still run: %s", goal_id, why)
             return None
 
-    return await asyncio.shield(asyncio.create_task(end()))
+    return await asyncio.shield(asyncio.create_task(within_limit()))
 
 
 def _retrieve(task: "asyncio.Task[Any]") -> None:

@@ -166,9 +166,8 @@ class _Loop:
                 return _NoDecision(False, f"the planner failed: {error}")
             except TimeoutError:
                 outcome = "timeout"
-                return _NoDecision(
-                    False, f"the planner failed: no decision within {self.think_max_s:g} s"
-                )
+                why = f"the planner failed: no decision within {self.think_max_s:g} s"
+                return _NoDecision(False, why)
             finally:
                 tracing.note({telemetry.ATTR_OUTCOME: outcome})
 
@@ -234,10 +233,7 @@ class _Loop:
 
     def _remember(self, call: ToolCall, outcome: Outcome) -> None:
         log.info("%s: %s%s", call.tool, outcome.status, f", {outcome.text}" if outcome.text else "")
-        labels: dict[str, str] = {
-            telemetry.ATTR_TOOL: call.tool,
-            telemetry.ATTR_OUTCOME: outcome.status,
-        }
+        labels = {telemetry.ATTR_TOOL: str(call.tool), telemetry.ATTR_OUTCOME: str(outcome.status)}
         if outcome.code and outcome.status != "canceled":
             labels[telemetry.ATTR_ERROR_TYPE] = outcome.code
         meters.count(telemetry.METRIC_TOOL_CALLS, labels)
@@ -255,9 +251,8 @@ class _Loop:
         elif isinstance(decision, Finish):
             self._finish = decision
         elif self._stuck(decision := self._with_known_follower(decision)):
-            self._finish = Finish(
-                False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}"
-            )
+            why = f"the same call {REPEATS_MAX} times in a row: {decision.tool}"
+            self._finish = Finish(False, why)
         else:
             self._begin(decision)
 
@@ -301,9 +296,8 @@ class _Loop:
             self._remember(call, refusal)
             self._end_tick(refusal.status)
             if _in_a_row(self.episode, _refused) >= REFUSALS_MAX:
-                self._finish = Finish(
-                    False, f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}"
-                )
+                why = f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}"
+                self._finish = Finish(False, why)
             return
         self._call = call
         with tracing.inside(self._tick) if self._tick is not None else contextlib.nullcontext():
@@ -316,11 +310,8 @@ class _Loop:
         if (error := self._allowed().check(call)) is not None:
             return Outcome("refused", str(error), error.code)
         if _is_look(call) and _in_a_row(self.episode, _looked) >= LOOKS_IN_A_ROW_MAX:
-            return Outcome(
-                "refused",
-                f"looked and asked {LOOKS_IN_A_ROW_MAX} times in a row: do something, or finish",
-                "limit_exceeded",
-            )
+            why = f"looked and asked {LOOKS_IN_A_ROW_MAX} times in a row: do something, or finish"
+            return Outcome("refused", why, "limit_exceeded")
         return None
 
     # -- ends

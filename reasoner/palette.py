@@ -143,13 +143,12 @@ class Palette:
     @property
     def tools(self) -> frozenset[str]:
         """Names of the tools that are there while no goal runs."""
-        names = frozenset(name for name, needs in _PROVIDED.items() if getattr(self, needs[0]))
-        for name, given in (
-            ("execute_rskill", self.executable),
-            ("lifecycle_transition", self.managed),
-            ("emit_prompt", self.topics),
-        ):
-            names |= {name} if given else set()
+        given = {name: getattr(self, needs[0]) for name, needs in _PROVIDED.items()} | {
+            "execute_rskill": self.executable,
+            "lifecycle_transition": self.managed,
+            "emit_prompt": self.topics,
+        }
+        names = frozenset(name for name, there in given.items() if there)
         return names if self.only is None else names & self.only
 
     def first(self, action: str) -> Skill:
@@ -169,11 +168,7 @@ class Palette:
 
     def without(self, benched: Set[str]) -> "Palette":
         """Return the same palette without these skills."""
-        return (
-            self
-            if benched == self.benched
-            else dataclasses.replace(self, benched=frozenset(benched))
-        )
+        return dataclasses.replace(self, benched=frozenset(benched))
 
     # -- is a call allowed?
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
@@ -195,21 +190,14 @@ class Palette:
             case LocateInView(camera=name) | QueryScene(camera=name) | Look(camera=name) if (
                 name and self.cameras and name not in self.cameras
             ):
-                return BadRequest(
-                    f"unknown camera {name}",
-                    hint=f"choose from {', '.join(self.cameras)}",
-                )
+                hint = f"choose from {', '.join(self.cameras)}"
+                return BadRequest(f"unknown camera {name}", hint=hint)
             case LifecycleTransition() if call.node not in self.managed:
-                return NotPermitted(
-                    f"{call.node} may not be managed by this reasoner",
-                    hint=f"it may manage {_list(self.managed)};"
-                    " the arbiter decides what is resident",
-                )
+                hint = f"it may manage {_list(self.managed)}; the arbiter decides what is resident"
+                return NotPermitted(f"{call.node} may not be managed by this reasoner", hint=hint)
             case EmitPrompt() if call.target_topic not in self.topics:
-                return NotPermitted(
-                    f"prompts to {call.target_topic} are not allowed",
-                    hint=f"choose from {_list(self.topics)}",
-                )
+                hint = f"choose from {_list(self.topics)}"
+                return NotPermitted(f"prompts to {call.target_topic} are not allowed", hint=hint)
             case _:
                 return None
 

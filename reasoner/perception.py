@@ -59,9 +59,8 @@ class Perception:
             ),
             answer_max_s=PLACE_MAX_S,
         )
-        return of_detections(
-            call.query, frame, detections, self._unknown_words(detector, call.query)
-        )
+        unknown = self._unknown_words(detector, call.query)
+        return of_detections(call.query, frame, detections, unknown)
 
     def _unknown_words(self, detector: DetectorClient, query: str) -> list[str]:
         """Return the words that the manifest of the served detector does not name."""
@@ -80,9 +79,8 @@ class Perception:
                 frame["data"], call.question, fresh_s=_good_for_s(frame["age_ms"])
             ),
         )
-        return Outcome(
-            "answered", answer, data={"camera": frame["camera"], "question": call.question}
-        )
+        about = {"camera": frame["camera"], "question": call.question}
+        return Outcome("answered", answer, data=about)
 
     async def show(self, call: Look) -> Outcome:
         frame = await self.runner.frame(call.camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="jpeg")

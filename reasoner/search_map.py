@@ -85,9 +85,7 @@ class Places:
         if self.joined:
             others = list(others)
             seen = [place for place in seen if not _is_other(place, others)]
-            self.known = [
-                place for place in self.known if _near(place, seen) or not _near(place, others)
-            ]
+            self.known = [one for one in self.known if _near(one, seen) or not _near(one, others)]
         before = list(self.known)
         for place in seen:
             self._see(place, before)
@@ -110,9 +108,7 @@ class Places:
 
     def best(self) -> Place | None:
         """Return the likeliest place, doubted ones last; None before anything was seen."""
-        return max(
-            self.known, key=lambda place: (not self.doubts(place), place.score), default=None
-        )
+        return max(self.known, key=lambda one: (not self.doubts(one), one.score), default=None)
 
     def doubts(self, place: Place) -> bool:
         """Return whether a place is a doubted one. Without odometry none can be told."""

@@ -98,17 +98,12 @@ class Tools:
             identity = await component.ping(timeout_s=IDENTITY_S)
             return Outcome("done", f"{call.node} serves {identity['rskill']}, {identity['state']}")
         if (goal := (await self.runner.state())["goal"]) is not None:
-            return Outcome(
-                "refused",
-                f"goal {goal} runs: nothing is loaded or unloaded beside it",
-                "bad_state",
-                {"goal": goal},
-            )
+            why = f"goal {goal} runs: nothing is loaded or unloaded beside it"
+            return Outcome("refused", why, "bad_state", {"goal": goal})
         if call.transition == "activate":
             await need_permitted(component, self.palette)
             loaded = await component.load()
-            return Outcome(
-                "done", f"{call.node} is resident" + ("" if loaded["loaded"] else " as before")
-            )
+            since = "" if loaded["loaded"] else " as before"
+            return Outcome("done", f"{call.node} is resident{since}")
         await component.unload()
         return Outcome("done", f"{call.node} leaves at its next safe point")

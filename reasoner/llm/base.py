@@ -94,13 +94,7 @@ class LlmPlanner(ABC):
         self._palette = palette
         self._system = instructions(palette, procedure)
         self._transcript = transcript or Transcript(None)
-        self._http = JsonHttp(
-            self._headers(),
-            config.timeout_s,
-            busy_s=config.busy_s,
-            pause=pause,
-            again=self.tally.tried_again,
-        )
+        self._http = JsonHttp(self._headers(), config, pause, self.tally.tried_again)
 
     async def __aenter__(self) -> Self:
         return self

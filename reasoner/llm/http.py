@@ -22,6 +22,7 @@ from time import monotonic
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
+from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.plain import JsonObject
@@ -30,7 +31,6 @@ from vram_arbiter.schemas.runtime.extras import need
 log = logging.getLogger(__name__)
 
 TRIES_MAX = 3  # of a server that fails, or a connection that breaks
-BUSY_S = 240.0  # for a busy server to find time, all pauses and refusals together
 PAUSE_S, PAUSE_MAX_S = 0.5, 30.0  # doubled each time, where the server names none
 BUSY_STATUSES = frozenset({429, 503, 529})
 FAILING_STATUSES = frozenset({408, 500, 502, 504})
@@ -60,29 +60,21 @@ def import_httpx() -> None:
 
 
 class JsonHttp:
-    """`await JsonHttp(headers, timeout_s).post(url, body)`; `close` closes its connections.
+    """`await JsonHttp(…).post(url, body)`; `close` closes its connections.
 
     Redirects are not followed: the key must not reach another server. `again` is called before each
     further try of a request.
     """
 
     def __init__(
-        self,
-        headers: Mapping[str, str],
-        timeout_s: float,
-        *,
-        busy_s: float = BUSY_S,
-        pause: Pause = asyncio.sleep,
-        again: Callable[[], None] = lambda: None,
+        self, headers: Mapping[str, str], config: LlmConfig, pause: Pause, again: Callable[[], None]
     ) -> None:
         import httpx  # only installed with the reasoner's extra
 
-        self._timeout_s = timeout_s
-        self._busy_s = busy_s
-        self._pause = pause
-        self._again = again
+        self._timeout_s, self._busy_s = config.timeout_s, config.busy_s
+        self._pause, self._again = pause, again
         self._http = httpx.AsyncClient(
-            headers=dict(headers), timeout=timeout_s, follow_redirects=False
+            headers=dict(headers), timeout=config.timeout_s, follow_redirects=False
         )
         # its line for each request has the whole address in it, with a password or a key; our
         # errors carry the rest
