@@ -32,7 +32,7 @@ type World = Callable[[ToolCall, int], Outcome]
 type Told = Outcome | Callable[[Any, int], Outcome]
 
 
-def world(look: Told = FOUND, answer: Told = YES, grab: Told = DONE, other: Told = DONE) -> World:
+def saying(look: Told = FOUND, answer: Told = YES, grab: Told = DONE, other: Told = DONE) -> World:
     """Return a world that says this of each look, question, grab and other call."""
 
     def told(call: ToolCall, before: int) -> Outcome:
@@ -68,7 +68,7 @@ def run_script(
 
 
 def test_finds_drives_corrects_grabs_and_asks() -> None:
-    result, calls = run_script(world())
+    result, calls = run_script(saying())
     assert [call.tool for call in calls] == [
         "query_scene",
         "locate_in_view",
@@ -89,7 +89,7 @@ def test_finds_drives_corrects_grabs_and_asks() -> None:
 
 
 def test_retries_at_most_three_times() -> None:
-    result, calls = run_script(world(answer=NO))
+    result, calls = run_script(saying(answer=NO))
     assert result["status"] == "failure"
     assert result["attempts"] == 3
     assert not result["vlm_confirmed"]
@@ -98,7 +98,7 @@ def test_retries_at_most_three_times() -> None:
 
 
 def test_looks_around_when_not_seen_and_gives_up_without_grabbing() -> None:
-    result, calls = run_script(world(Outcome("not_seen", ""), NO))
+    result, calls = run_script(saying(Outcome("not_seen", ""), NO))
     turns = [call.goal_params["turn_rad"] for call in calls if isinstance(call, ExecuteRskill)]
     assert turns == [0.35, -0.70, 0.35]
     assert result["attempts"] == 0
@@ -110,7 +110,7 @@ def test_evicted_is_not_absent() -> None:
     makes the robot turn away.
     """
     evicted = Outcome("evicted", "not resident", "evicted")
-    result, calls = run_script(world(lambda _, before: evicted if before == 0 else FOUND))
+    result, calls = run_script(saying(lambda _, before: evicted if before == 0 else FOUND))
     assert [call.tool for call in calls][1:4] == [
         "locate_in_view",
         "locate_in_view",
@@ -121,14 +121,14 @@ def test_evicted_is_not_absent() -> None:
 
 
 def test_a_detector_that_cannot_look_makes_nobody_turn_away() -> None:
-    result, calls = run_script(world(Outcome("error", "CUDA out of memory", "oom")))
+    result, calls = run_script(saying(Outcome("error", "CUDA out of memory", "oom")))
     assert not any(isinstance(call, ExecuteRskill) for call in calls)
     assert result["reason"] == "could not look for the red cube: CUDA out of memory"
 
 
 def test_a_failed_drive_or_grab_is_a_retry_with_its_reason() -> None:
     failed = Outcome("failed", "CUDA out of memory (simulated)", "oom")
-    result, calls = run_script(world(answer=NO, grab=failed))
+    result, calls = run_script(saying(answer=NO, grab=failed))
     assert result["status"] == "failure"
     assert result["attempts"] == 3
     assert "out of memory" in result["reason"]
@@ -141,7 +141,7 @@ def test_a_grab_that_says_it_failed_and_holds_the_thing_is_a_success() -> None:
     the next one dropped it.
     """
 
-    result, _ = run_script(world(grab=Outcome("failed", "the time is over", "deadline")))
+    result, _ = run_script(saying(grab=Outcome("failed", "the time is over", "deadline")))
     assert (result["status"], result["attempts"]) == ("success", 1)
     assert result["vlm_confirmed"]
 
@@ -171,7 +171,7 @@ def test_an_answer_that_contradicts_itself_is_asked_after(
         asks = call.question == "What is the gripper holding?"
         return Outcome("answered", holding if asks else answer)
 
-    result, _ = run_script(world(answer=told))
+    result, _ = run_script(saying(answer=told))
     assert (result["status"], result["attempts"]) == (status, attempts)
     if answer.startswith("Yes") and status == "success":
         assert result["vlm_confirmed"]
@@ -230,7 +230,7 @@ def sees(base_pose: list[float] | None, *things: tuple[float, float, float]) -> 
 
 
 def looks_of(*looks: Outcome) -> World:
-    return world(lambda _, before: looks[min(before, len(looks) - 1)])
+    return saying(lambda _, before: looks[min(before, len(looks) - 1)])
 
 
 def drives(calls: list[ToolCall]) -> list[tuple[float, float]]:
@@ -279,7 +279,7 @@ PLACE = Skill("lab/put-down", "ros_action", "put down", ("place",))
 def grabs_and_places(answer: Outcome) -> list[str]:
     """Which arm skills follow each other when the scene VLM always says this."""
 
-    _, calls = run_script(world(answer=answer), Palette((NAVIGATE, GRAB, PLACE, DETECTOR)))
+    _, calls = run_script(saying(answer=answer), Palette((NAVIGATE, GRAB, PLACE, DETECTOR)))
     return [
         call.rskill_id
         for call in calls
@@ -319,7 +319,7 @@ def hears(*answers: str, palette: Palette = PALETTE) -> tuple[Result, list[ToolC
     def told(_: QueryScene, before: int) -> Outcome:
         return Outcome("answered", answers[min(before, len(answers) - 1)])
 
-    return run_script(world(answer=told), palette, hand=answers[0])
+    return run_script(saying(answer=told), palette, hand=answers[0])
 
 
 def test_a_target_that_is_held_already_is_confirmed_and_nothing_moves() -> None:
@@ -635,11 +635,11 @@ def test_an_unknown_word_is_said_before_the_robot_drives() -> None:
     said = dataclasses.replace(PALETTE, topics=frozenset({OPERATOR}))
 
     nothing = Outcome("not_seen", "", data=unknown)
-    result, calls = run_script(world(nothing, DONE), said)
+    result, calls = run_script(saying(nothing, DONE), said)
     assert "does not know cube" in result["reason"]
     assert [call.tool for call in calls] == ["query_scene", "locate_in_view", "emit_prompt"]
     something = Outcome("found", "", data=dict(FOUND.data) | unknown)
-    result, calls = run_script(world(something), said)
+    result, calls = run_script(saying(something), said)
     tools = [call.tool for call in calls]
     assert tools.count("emit_prompt") == 1
     assert tools.index("emit_prompt") < tools.index("execute_rskill")
