@@ -3,8 +3,8 @@ vram-sidecar]`.
 
 FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail,
 `slow_prepare` or `slow_load` makes it last; a module `endless.py` is imported. The query tells
-`run`: `hold NAME` waits until the file NAME appears there, `fail` raises; anything else is echoed. `query` is answered
-with what stands behind the picture's first eight bytes.
+`run`: `hold NAME` waits until the file NAME appears there, `fail` raises; anything else is
+echoed. `query` is answered with what stands behind the picture's first eight bytes.
 """
 
 import functools
