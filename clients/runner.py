@@ -1,6 +1,8 @@
 """Client of the runner: goals with feedback and result, frames, state. Speaks `schemas.goals`;
 knows no robot and no GPU."""
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import logging
@@ -8,7 +10,7 @@ import os
 import uuid
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, Self, cast
+from typing import TYPE_CHECKING, Literal, Self, cast
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.estop import Stopped, stop
@@ -20,9 +22,11 @@ from vram_arbiter.schemas.errors import (
     RunnerUnreachable,
     from_wire,
 )
-from vram_arbiter.schemas.goals import FeedbackPush, FrameReply, ResultPush
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
+
+if TYPE_CHECKING:
+    from vram_arbiter.schemas.goals import FeedbackPush, FrameReply, ResultPush
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +46,7 @@ Verdict = Literal["success", "failure", "discard"]
 class Goal:
     """An accepted goal. Its result comes exactly once and stays."""
 
-    def __init__(self, client: "RunnerClient", goal_id: str) -> None:
+    def __init__(self, client: RunnerClient, goal_id: str) -> None:
         self.goal_id = goal_id
         self._client = client
         self._feedback: asyncio.Queue[FeedbackPush | None] = asyncio.Queue()
@@ -190,7 +194,7 @@ class RunnerClient:
         except BadState:
             return  # it runs; the error of a runner that forgot the goal is the caller's
         if reply.get("status") in ENDED:
-            self._end(cast(ResultPush, reply))
+            self._end(cast("ResultPush", reply))
 
     async def ask_about(self, goal_id: str, op: str) -> Message:
         """Ask the runner that accepted the goal: another one that starts does not know it.
@@ -219,7 +223,7 @@ class RunnerClient:
     ) -> FrameReply:
         """Latest frame ("" takes the first camera). Raises FrameStale when none is young enough."""
         fields = {"camera": camera, "max_age_ms": max_age_ms, "encoding": encoding}
-        return cast(FrameReply, await self.call("frame", fields))
+        return cast("FrameReply", await self.call("frame", fields))
 
     async def state(self) -> Message:
         return await self.call("state")
@@ -302,9 +306,9 @@ class RunnerClient:
         match message["push"]:
             case "feedback":
                 if goal := self._goals.get(message["goal_id"]):
-                    goal.fed(cast(FeedbackPush, message))
+                    goal.fed(cast("FeedbackPush", message))
             case "result":
-                self._end(cast(ResultPush, message))
+                self._end(cast("ResultPush", message))
 
     def _dropped(self) -> None:
         self._drop.set()

@@ -14,7 +14,7 @@ import os
 import signal
 import sys
 from collections.abc import Awaitable, Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.json_lines import JsonLines
@@ -26,7 +26,7 @@ from vram_arbiter.reasoner.options import (
     parser,
 )
 from vram_arbiter.reasoner.results import nothing_done
-from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.reasoner.server import operator_server, send
 from vram_arbiter.reasoner.service import serve
 from vram_arbiter.reasoner.task_queue import Task, TaskQueue
 from vram_arbiter.reasoner.workplace import Workplace
@@ -183,16 +183,10 @@ async def _work(
         asyncio.get_running_loop().add_signal_handler(number, stop, number)
     at = endpoint(arguments.listen, "reasoner")
     with contextlib.suppress(asyncio.CancelledError):
-        async with workplace, OperatorServer(at, queue, confirmations):
-            with terminal_answers(confirmations):
+        async with workplace, operator_server(at, queue, confirmations):
+            with nullcontext() if confirmations is None else confirmations.on_terminal(sys.stdin):
                 await perform(workplace)
     return " and ".join(heard)
-
-
-def terminal_answers(confirmations: Confirmations | None) -> AbstractContextManager[None]:
-    if confirmations is None or sys.stdin is None:  # a program may be started without it
-        return nullcontext()
-    return confirmations.on_terminal(sys.stdin)
 
 
 if __name__ == "__main__":

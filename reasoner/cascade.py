@@ -108,13 +108,8 @@ def conversation(episode: Episode, palette: Palette) -> list[Turn]:
     if episode.running is None:
         return turns + _notes(notes, len(episode.steps))
     number = len(episode.steps)
-    turns.append(_called(number, episode.running, palette))
-    turns.append(
-        Answered(
-            _id(number),
-            json.dumps({"status": "running", "meaning": "the goal runs; it is not over"}),
-        )
-    )
+    runs = json.dumps({"status": "running", "meaning": "the goal runs; it is not over"})
+    turns += [_called(number, episode.running, palette), Answered(_id(number), runs)]
     return turns + _notes(notes, number)
 
 

@@ -36,10 +36,10 @@ class Confirmations:
             if isinstance(call, ExecuteRskill):
                 yes, reason = await self._ask(call)
                 if not yes:
-                    why = f": {reason}" if reason else ""
-                    return Outcome(
-                        "refused", f"the operator did not confirm this motion{why}", "not_permitted"
+                    why = (
+                        f"the operator did not confirm this motion{f': {reason}' if reason else ''}"
                     )
+                    return Outcome("refused", why, "not_permitted")
             return await dispatch(call)
 
         return confirmed
@@ -73,11 +73,11 @@ class Confirmations:
             self._answer.set_result((yes, reason))
 
     @contextlib.contextmanager
-    def on_terminal(self, terminal: IO[str]) -> Iterator[None]:
+    def on_terminal(self, terminal: IO[str] | None) -> Iterator[None]:
         """Within the block a line of the terminal answers the motion that waits; no terminal, no
-        answers.
+        answers. A program may be started without standard input.
         """
-        if not terminal.isatty():
+        if terminal is None or not terminal.isatty():
             yield
             return
         loop = asyncio.get_running_loop()

@@ -5,8 +5,12 @@ long as the call allows, it is canceled at the runner.
 """
 
 import asyncio
+import contextlib
 import logging
+import math
 import uuid
+from collections.abc import Coroutine
+from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.clients.runner import Goal, RunnerClient
@@ -28,55 +32,36 @@ START_S = 90.0  # what the runner adds to a manifest's time of motion, to get th
 HEARD_LATE_S = 0.5
 CANCEL_S = 10.0  # for a canceled goal to end: it gives the robot back and finishes its use
 ASK_AGAIN_S = 0.2  # whether a goal has ended whose result has no listener
-PROGRESS_TOLERANCE = 0.0
 # waiting for the GPU is not a lack of progress
 BEFORE_MOTION = frozenset({"acquiring", "starting"})
 
 
+@dataclass(frozen=True, slots=True)
 class Execution:
     """`await execution(call)`: one goal, from its sending to its end."""
 
-    def __init__(
-        self,
-        runner: RunnerClient,
-        palette: Palette | None,
-        hints: Hints | None,
-        *,
-        session: str = "",
-        goal_grace_s: float = GOAL_GRACE_S,
-    ) -> None:
-        self._runner = runner
-        self._palette = palette
-        self._hints = hints
-        self._session = session
-        self._goal_grace_s = goal_grace_s
+    runner: RunnerClient
+    palette: Palette | None
+    hints: Hints | None
+    session: str = ""
+    goal_grace_s: float = GOAL_GRACE_S
 
     async def __call__(self, call: ExecuteRskill) -> Outcome:
         """Run the goal. Raises BadRequest and what its sending raises; else an outcome."""
         goal = await self._send(call)
-        limit_s = waits_s(call, self._palette, self._goal_grace_s)
-        patience = (
-            asyncio.create_task(_stands_still(goal, call)) if call.patience_s is not None else None
-        )
+        limit_s = waits_s(call, self.palette, self.goal_grace_s)
         waiting = asyncio.create_task(goal.result(timeout_s=limit_s))
-        hint = (
-            asyncio.create_task(self._hints.follows(call.next_rskill_id))
-            if call.next_rskill_id and self._hints is not None
-            else None
-        )
+        stuck = asyncio.create_task(_stands_still(goal, call))
+        hint = asyncio.create_task(self._hint(call.next_rskill_id))
         try:
-            either: set[asyncio.Task[Any]] = {waiting} if patience is None else {waiting, patience}
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-            if not waiting.done() and patience is not None and patience.result():
-                result = await _called_off(goal)
-                if result is None or not result["success"]:
-                    return Outcome(
-                        "failed",
-                        f"no progress for {call.patience_s:g} s; {how_it_went(result)}",
-                        "no_progress",
-                    )
+            await asyncio.wait({waiting, stuck}, return_when=asyncio.FIRST_COMPLETED)
+            if waiting.done() or not stuck.result():
+                return of_result(await waiting)
+            result = await _called_off(goal)
+            if result is not None and result["success"]:
                 return of_result(result)
-            return of_result(await waiting)
+            why = f"no progress for {call.patience_s:g} s; {how_it_went(result)}"
+            return Outcome("failed", why, "no_progress")
         except TimeoutError:
             how = how_it_went(await _called_off(goal))
             return Outcome("failed", f"no result within {limit_s:.0f} s; {how}", "wait_timeout")
@@ -89,48 +74,42 @@ class Execution:
             await _called_off(goal)
             raise
         finally:
-            for task in (waiting, patience, hint):
-                if task is not None:
-                    task.cancel()
-                    task.add_done_callback(_retrieve)
+            for task in (waiting, stuck, hint):
+                task.cancel()
+                task.add_done_callback(_retrieve)
+
+    async def _hint(self, follower: str) -> None:
+        if follower and self.hints is not None:
+            await self.hints.follows(follower)
 
     async def _send(self, call: ExecuteRskill) -> Goal:
         """Cancel a goal by its name if its acceptance was lost: it may run."""
         goal_id = f"goal-{uuid.uuid4().hex[:12]}"
         try:
-            return await self._runner.send_goal(
+            return await self.runner.send_goal(
                 call.rskill_id,
                 prompt=call.prompt,
                 goal_params=call.goal_params,
                 deadline_s=call.deadline_s,
                 goal_id=goal_id,
-                session=self._session,
+                session=self.session,
             )
         except (asyncio.CancelledError, RunnerUnreachable):
-            await asyncio.shield(asyncio.create_task(self._cancel_unheard(goal_id)))
+            await _ended(goal_id, self._cancel_unheard(goal_id))
             raise
 
     async def _cancel_unheard(self, goal_id: str) -> None:
-        """And its end is heard, within `CANCEL_S`."""
-        try:
-            async with asyncio.timeout(CANCEL_S):
-                await self._runner.ask_about(goal_id, "cancel")
-                await self._until_result(goal_id)
-        except BadRequest:
-            pass  # it never was accepted
-        except (VramError, TimeoutError) as error:
-            log.error(
-                "goal %s may run: %s", goal_id, str(error) or "the runner did not say that it ended"
-            )
-
-    async def _until_result(self, goal_id: str) -> None:
-        while True:
-            try:
-                await self._runner.ask_about(goal_id, "result")
-            except BadState:  # it runs
-                await asyncio.sleep(ASK_AGAIN_S)
-            else:
-                return
+        """Cancel a goal that may have been accepted, and wait for its end."""
+        ask = self.runner.ask_about
+        with contextlib.suppress(BadRequest):  # it never was accepted
+            await ask(goal_id, "cancel")
+            while True:
+                try:
+                    await ask(goal_id, "result")
+                except BadState:  # it runs
+                    await asyncio.sleep(ASK_AGAIN_S)
+                else:
+                    return
 
 
 def waits_s(call: ExecuteRskill, palette: Palette | None, grace_s: float) -> float:
@@ -151,17 +130,14 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
 
     Preparation before the motion does not count.
     """
-    assert call.patience_s is not None, "only watched with patience"
-    tolerance = PROGRESS_TOLERANCE if call.progress_tolerance is None else call.progress_tolerance
-    best: float | None = None
+    patience_s = math.inf if call.patience_s is None else call.patience_s
+    best, deadline_s, over = -math.inf, math.inf, False
     time_s = asyncio.get_running_loop().time
     feedback = aiter(goal.feedback())
     coming = asyncio.ensure_future(anext(feedback))
-    deadline_s: float | None = None
-    over = False
     try:
         while True:
-            left_s = None if deadline_s is None else max(0.0, deadline_s - time_s())
+            left_s = max(0.0, deadline_s - time_s())
             if not (await asyncio.wait({coming}, timeout=left_s))[0]:
                 if over:
                     return True
@@ -169,10 +145,9 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
                 continue
             item = coming.result()
             coming = asyncio.ensure_future(anext(feedback))
-            if item["state"] not in BEFORE_MOTION and (
-                best is None or item["progress"] > best + tolerance
-            ):
-                best, over, deadline_s = item["progress"], False, time_s() + call.patience_s
+            grown = item["progress"] > best + (call.progress_tolerance or 0.0)
+            if item["state"] not in BEFORE_MOTION and grown:
+                best, deadline_s, over = item["progress"], time_s() + patience_s, False
     except StopAsyncIteration:
         return False
     finally:
@@ -181,26 +156,32 @@ async def _stands_still(goal: Goal, call: ExecuteRskill) -> bool:
 
 
 async def _called_off(goal: Goal) -> ResultPush | None:
-    """Cancel a goal and wait for its end, within `CANCEL_S`; None if the runner does not report it.
+    """Cancel a goal and wait for its end; None if the runner does not report it."""
+
+    async def end() -> ResultPush:
+        if not goal.done:
+            await goal.cancel()
+        return await goal.result()
+
+    return await _ended(goal.goal_id, end())
+
+
+async def _ended[T](goal_id: str, end: Coroutine[Any, Any, T]) -> T | None:
+    """Wait for the end of a canceled goal, within `CANCEL_S`; None if that fails.
 
     A cancellation of this task does not cut the wait short.
     """
 
-    async def end() -> ResultPush | None:
+    async def within_limit() -> T | None:
         try:
             async with asyncio.timeout(CANCEL_S):
-                if not goal.done:
-                    await goal.cancel()
-                return await goal.result()
+                return await end
         except (TimeoutError, VramError) as error:
-            log.error(
-                "goal %s may still run: %s",
-                goal.goal_id,
-                str(error) or "the runner did not say that it ended",
-            )
+            why = str(error) or "the runner did not say that it ended"
+            log.error("goal %s may still run: %s", goal_id, why)
             return None
 
-    return await asyncio.shield(asyncio.create_task(end()))
+    return await asyncio.shield(asyncio.create_task(within_limit()))
 
 
 def _retrieve(task: "asyncio.Task[Any]") -> None:

@@ -41,17 +41,15 @@ class Inbox:
     """One reader, any number of writers on the reader's event loop."""
 
     def __init__(self) -> None:
-        self._urgent: list[Message] = []
-        self._words: list[Said] = []
+        self._messages: list[Message] = []
         self._there = asyncio.Event()
 
     def put(self, message: Message) -> None:
-        if isinstance(message, Said):
-            if len(self._words) >= WORDS_MAX:
-                log.warning("an operator's words were pushed out: %s", self._words.pop(0).text)
-            self._words.append(message)
-        else:
-            self._urgent.append(message)
+        words = [one for one in self._messages if isinstance(one, Said)]
+        if isinstance(message, Said) and len(words) >= WORDS_MAX:
+            log.warning("an operator's words were pushed out: %s", words[0].text)
+            self._messages.remove(words[0])
+        self._messages.append(message)
         self._there.set()
 
     async def wait(self) -> None:
@@ -60,7 +58,6 @@ class Inbox:
 
     def take(self) -> list[Message]:
         """Take everything, cancels and dangers first."""
-        taken = [*self._urgent, *self._words]
-        self._urgent, self._words = [], []
+        taken, self._messages = self._messages, []
         self._there.clear()
-        return taken
+        return sorted(taken, key=lambda message: isinstance(message, Said))

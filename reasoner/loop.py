@@ -15,6 +15,8 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
@@ -87,38 +89,31 @@ async def run_episode(
     return result_of(loop.episode, finish, palette.manipulation, stopped=stopped)
 
 
+@dataclass
 class _Loop:
-    def __init__(
-        self,
-        episode: Episode,
-        planner: Planner,
-        palette: Palette,
-        dispatch: Dispatch,
-        inbox: Inbox,
-        steps_max: int,
-        think_max_s: float,
-    ) -> None:
-        self.episode = episode
-        self._planner = planner
-        self._palette = palette
-        self._dispatch = dispatch
-        self._inbox = inbox
-        self._steps_max = steps_max
-        self._think_max_s = think_max_s
-        self._thinking: asyncio.Task[ToolCall | Finish] | None = None
-        self._acting: asyncio.Task[Outcome] | None = None
-        self._call: ToolCall | None = None  # what `_acting` does
-        self._news = False  # said while a goal runs: the planner is to be asked
-        self._superseded = 0
-        self._finish: Finish | None = None
-        self._tick: Span | None = None
+    episode: Episode
+    planner: Planner
+    palette: Palette
+    dispatch: Dispatch
+    inbox: Inbox
+    steps_max: int
+    think_max_s: float
+    _thinking: asyncio.Task[ToolCall | Finish] | None = None
+    _acting: asyncio.Task[Outcome] | None = None
+    _call: ToolCall | None = None
+    """What `_acting` does."""
+    _news: bool = False
+    """Said while a goal runs: the planner is to be asked."""
+    _superseded: int = 0
+    _finish: Finish | None = None
+    _tick: "Span | None" = None
 
     async def run(self) -> Finish:
         """1. Ask the planner if it is due.
 
         2. Wait for the first event. 3. Take all events, urgent ones first.
         """
-        message = asyncio.create_task(self._inbox.wait())
+        message = asyncio.create_task(self.inbox.wait())
         try:
             while self._ask():
                 waited = {
@@ -127,7 +122,7 @@ class _Loop:
                 await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
                 if message.done():
                     self._take_messages()
-                    message = asyncio.create_task(self._inbox.wait())
+                    message = asyncio.create_task(self.inbox.wait())
                 if self._acting is not None and self._acting.done():
                     self._take_outcome()
                 if self._thinking is not None and self._thinking.done():
@@ -147,8 +142,8 @@ class _Loop:
             return False
         if self._thinking is not None or (self._acting is not None and not self._news):
             return True
-        if self._acting is None and len(self.episode.steps) >= self._steps_max:
-            self._finish = Finish(False, f"gave up after {self._steps_max} steps")
+        if self._acting is None and len(self.episode.steps) >= self.steps_max:
+            self._finish = Finish(False, f"gave up after {self.steps_max} steps")
             return False
         self._news = False
         self.episode.running = self._call
@@ -162,8 +157,8 @@ class _Loop:
         outcome = "superseded"
         with tracing.span(telemetry.SPAN_PLAN):
             try:
-                async with asyncio.timeout(self._think_max_s):
-                    decision = await self._planner.decide(self.episode)
+                async with asyncio.timeout(self.think_max_s):
+                    decision = await self.planner.decide(self.episode)
                 outcome = "finish" if isinstance(decision, Finish) else decision.tool
                 return decision
             except VramError as error:
@@ -171,9 +166,8 @@ class _Loop:
                 return _NoDecision(False, f"the planner failed: {error}")
             except TimeoutError:
                 outcome = "timeout"
-                return _NoDecision(
-                    False, f"the planner failed: no decision within {self._think_max_s:g} s"
-                )
+                why = f"the planner failed: no decision within {self.think_max_s:g} s"
+                return _NoDecision(False, why)
             finally:
                 tracing.note({telemetry.ATTR_OUTCOME: outcome})
 
@@ -184,7 +178,7 @@ class _Loop:
         status = "canceled"
         with tracing.span(telemetry.SPAN_TOOL, attributes=attributes):
             try:
-                outcome = await self._dispatch(call)
+                outcome = await self.dispatch(call)
                 status = outcome.status
                 return outcome
             finally:
@@ -198,7 +192,7 @@ class _Loop:
 
     # -- 3
     def _take_messages(self) -> None:
-        for item in self._inbox.take():
+        for item in self.inbox.take():
             match item:
                 case Cancel():
                     self._end(Finish(False, f"canceled: {item.reason}"))
@@ -228,11 +222,7 @@ class _Loop:
     def _take_outcome(self) -> None:
         assert self._acting is not None, "only called when it is done"
         assert self._call is not None, "a decision to act has a call"
-        outcome = (
-            Outcome("canceled", "called off", "cancelled")
-            if self._acting.cancelled()
-            else self._acting.result()
-        )
+        outcome = _outcome_of(self._acting)
         self._remember(self._call, outcome)
         self._acting = self._call = None
         self._end_tick(outcome.status)
@@ -243,10 +233,7 @@ class _Loop:
 
     def _remember(self, call: ToolCall, outcome: Outcome) -> None:
         log.info("%s: %s%s", call.tool, outcome.status, f", {outcome.text}" if outcome.text else "")
-        labels: dict[str, str] = {
-            telemetry.ATTR_TOOL: call.tool,
-            telemetry.ATTR_OUTCOME: outcome.status,
-        }
+        labels = {telemetry.ATTR_TOOL: str(call.tool), telemetry.ATTR_OUTCOME: str(outcome.status)}
         if outcome.code and outcome.status != "canceled":
             labels[telemetry.ATTR_ERROR_TYPE] = outcome.code
         meters.count(telemetry.METRIC_TOOL_CALLS, labels)
@@ -263,12 +250,14 @@ class _Loop:
             self._decided_beside(decision)
         elif isinstance(decision, Finish):
             self._finish = decision
-        elif _stuck(self.episode, decision := self._with_known_follower(decision)):
-            self._finish = Finish(
-                False, f"the same call {REPEATS_MAX} times in a row: {decision.tool}"
-            )
+        elif self._stuck(decision := self._with_known_follower(decision)):
+            why = f"the same call {REPEATS_MAX} times in a row: {decision.tool}"
+            self._finish = Finish(False, why)
         else:
             self._begin(decision)
+
+    def _stuck(self, call: ToolCall) -> bool:
+        return _in_a_row(self.episode, lambda step: step.call == call) >= REPEATS_MAX
 
     def _with_known_follower(self, call: ToolCall) -> ToolCall:
         """Return the call, without `next_rskill_id` where no such skill can follow.
@@ -306,27 +295,23 @@ class _Loop:
         if (refusal := self._refusal(call)) is not None:
             self._remember(call, refusal)
             self._end_tick(refusal.status)
-            if _refused_in_a_row(self.episode) >= REFUSALS_MAX:
-                self._finish = Finish(
-                    False, f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}"
-                )
+            if _in_a_row(self.episode, _refused) >= REFUSALS_MAX:
+                why = f"{REFUSALS_MAX} calls in a row were refused: {refusal.text}"
+                self._finish = Finish(False, why)
             return
         self._call = call
         with tracing.inside(self._tick) if self._tick is not None else contextlib.nullcontext():
             self._acting = asyncio.create_task(self._act(call), name=call.tool)
 
     def _allowed(self) -> Palette:
-        return self._palette.without(benched(self.episode.steps))
+        return self.palette.without(benched(self.episode.steps))
 
     def _refusal(self, call: ToolCall) -> Outcome | None:
         if (error := self._allowed().check(call)) is not None:
             return Outcome("refused", str(error), error.code)
-        if _is_look(call) and _looks_in_a_row(self.episode) >= LOOKS_IN_A_ROW_MAX:
-            return Outcome(
-                "refused",
-                f"looked and asked {LOOKS_IN_A_ROW_MAX} times in a row: do something, or finish",
-                "limit_exceeded",
-            )
+        if _is_look(call) and _in_a_row(self.episode, _looked) >= LOOKS_IN_A_ROW_MAX:
+            why = f"looked and asked {LOOKS_IN_A_ROW_MAX} times in a row: do something, or finish"
+            return Outcome("refused", why, "limit_exceeded")
         return None
 
     # -- ends
@@ -348,14 +333,18 @@ class _Loop:
             return
         self._call_off()
         await asyncio.wait({self._acting}, timeout=STOP_MAX_S)
-        if not self._acting.done():
+        if self._acting.done():
+            self._remember(self._call, _outcome_of(self._acting))
+        else:
             log.error(
                 "%s did not end within %.0f s of its cancellation", self._call.tool, STOP_MAX_S
             )
-        elif self._acting.cancelled():
-            self._remember(self._call, Outcome("canceled", "called off", "cancelled"))
-        else:
-            self._remember(self._call, self._acting.result())
+
+
+def _outcome_of(acting: "asyncio.Task[Outcome]") -> Outcome:
+    if acting.cancelled():
+        return Outcome("canceled", "called off", "cancelled")
+    return acting.result()
 
 
 def _look_away(task: "asyncio.Task[Any]") -> None:
@@ -364,27 +353,21 @@ def _look_away(task: "asyncio.Task[Any]") -> None:
         log.warning("a decision that was not waited for failed: %r", error)
 
 
-def _stuck(episode: Episode, call: ToolCall) -> bool:
-    recent = episode.steps[-REPEATS_MAX:]
-    return len(recent) == REPEATS_MAX and all(step.call == call for step in recent)
+def _in_a_row(episode: Episode, such: Callable[[Step], bool]) -> int:
+    """Return how many of the newest steps are such."""
+    return sum(1 for _ in takewhile(such, reversed(episode.steps)))
 
 
-def _refused_in_a_row(episode: Episode) -> int:
-    return next(
-        (n for n, step in enumerate(reversed(episode.steps)) if step.outcome.status != "refused"),
-        len(episode.steps),
-    )
+def _refused(step: Step) -> bool:
+    return step.outcome.status == "refused"
+
+
+def _looked(step: Step) -> bool:
+    return _is_look(step.call)
 
 
 def _is_look(call: ToolCall) -> bool:
     return isinstance(call, LocateInView | QueryScene | Look | QueryTaskProgress)
-
-
-def _looks_in_a_row(episode: Episode) -> int:
-    return next(
-        (n for n, step in enumerate(reversed(episode.steps)) if not _is_look(step.call)),
-        len(episode.steps),
-    )
 
 
 def describe(call: ToolCall) -> str:

@@ -22,6 +22,46 @@ from vram_arbiter.schemas.runtime.version import add_version
 LLM_PLANNERS: dict[str, type[LlmPlanner]] = {"openai": OpenAiPlanner, "anthropic": AnthropicPlanner}
 MANAGED = ("detector", "scene-vlm", "reward")
 TASK_MAX_CHARS = 4000  # with what a planner says around it, a tool's text
+ONE_OF_TEXTS = (  # one of these, or of the switches below, is given
+    ("--task", "TASK", 'what to do, e.g. "grab the red cube"'),
+    ("--say", "TEXT", "send a message to the planner of a running reasoner, and exit"),
+    ("--cancel", "REASON", "end the task of a running reasoner and its goal, and exit"),
+    ("--submit", "TASK", "queue a task at a serving reasoner, and exit"),
+    ("--deny", "REASON", "refuse the waiting motion of a running reasoner, and exit"),
+)
+ONE_OF_SWITCHES = (
+    ("--tasks", "list the tasks of a serving reasoner, as lines of JSON, and exit"),
+    ("--confirm", "confirm the waiting motion of a running reasoner, and exit"),
+)
+SWITCHES = (
+    (
+        "--require-confirmation",
+        "the operator confirms each motion: y on this terminal, or --confirm elsewhere",
+    ),
+    ("--look", "let the planner see the cameras' pictures: for language models that read images"),
+    (LICENSE_FLAG, LICENSE_HELP),
+)
+FILES = (
+    (
+        "--transcript",
+        "FILE",
+        "append a language model's requests, answers and rejected answers, as lines of JSON",
+    ),
+    ("--playbook", "RSKILL.YAML", "the procedure that a language model follows"),
+    ("--result", "FILE", "write the result as JSON into this file"),
+    (
+        "--history",
+        "FILE",
+        "with serve: append each finished task and its result, as lines of JSON",
+    ),
+)
+ENDPOINTS = (
+    ("--listen", "socket for operators (default: ipc://RUNTIME/reasoner.sock)"),
+    ("--runner", "the runner (default: ipc://RUNTIME/runner.sock)"),
+    ("--arbiter", 'the arbiter, which is told what model follows; "none": it is not told'),
+    ("--detector", 'the detector sidecar; "none": there is none'),
+    ("--scene-vlm", 'the scene-VLM sidecar; "none": there is none'),
+)
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
@@ -33,22 +73,12 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     add_version(parser)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
-        "command",
-        nargs="?",
-        choices=("serve",),
-        help="serve tasks in sequence, from --submit",
+        "command", nargs="?", choices=("serve",), help="serve tasks in sequence, from --submit"
     )
-    what.add_argument("--task", help='what to do, e.g. "grab the red cube"')
-    what.add_argument(
-        "--say",
-        metavar="TEXT",
-        help="send a message to the planner of a running reasoner, and exit",
-    )
-    what.add_argument(
-        "--cancel",
-        metavar="REASON",
-        help="end the task of a running reasoner and its goal, and exit",
-    )
+    for flag, metavar, text in ONE_OF_TEXTS:
+        what.add_argument(flag, metavar=metavar, help=text)
+    for flag, text in ONE_OF_SWITCHES:
+        what.add_argument(flag, action="store_true", help=text)
     parser.add_argument(
         "--number",
         type=int,
@@ -62,78 +92,12 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         help="openai, anthropic: VRAM_REASONER_LLM_{BASE_URL,MODEL,API_KEY,TIMEOUT_S,MAX_TOKENS,"
         "BUSY_S} configure them",
     )
-    what.add_argument(
-        "--submit", metavar="TASK", help="queue a task at a serving reasoner, and exit"
-    )
-    what.add_argument(
-        "--tasks",
-        action="store_true",
-        help="list the tasks of a serving reasoner, as lines of JSON, and exit",
-    )
-    what.add_argument(
-        "--confirm",
-        action="store_true",
-        help="confirm the waiting motion of a running reasoner, and exit",
-    )
-    what.add_argument(
-        "--deny",
-        metavar="REASON",
-        help="refuse the waiting motion of a running reasoner, and exit",
-    )
-    parser.add_argument(
-        "--require-confirmation",
-        action="store_true",
-        help="the operator confirms each motion: y on this terminal, or --confirm elsewhere",
-    )
-    parser.add_argument(
-        "--look",
-        action="store_true",
-        help="let the planner see the cameras' pictures: for language models that read images",
-    )
-    parser.add_argument(
-        "--transcript",
-        type=Path,
-        metavar="FILE",
-        help="append a language model's requests, answers and rejected answers, as lines of JSON",
-    )
-    parser.add_argument(
-        "--playbook",
-        type=Path,
-        metavar="RSKILL.YAML",
-        help="the procedure that a language model follows",
-    )
-    parser.add_argument(
-        "--manage",
-        action="append",
-        default=[],
-        choices=MANAGED,
-        help="a sidecar that the planner may load and unload (repeatable;"
-        " default: none, the arbiter decides)",
-    )
-    parser.add_argument(
-        LICENSE_FLAG,
-        action="store_true",
-        help=LICENSE_HELP,
-    )
-    parser.add_argument(
-        "--listen", help="socket for operators (default: ipc://RUNTIME/reasoner.sock)"
-    )
-    parser.add_argument(
-        "--runner", help="endpoint of the runner (default: ipc://RUNTIME/runner.sock)"
-    )
-    parser.add_argument(
-        "--arbiter",
-        help='endpoint of the arbiter, which is told what model follows; "none": it is not told',
-    )
-    parser.add_argument(
-        "--detector", help='endpoint of the detector sidecar; "none": there is none'
-    )
-    parser.add_argument(
-        "--scene-vlm", help='endpoint of the scene-VLM sidecar; "none": there is none'
-    )
-    parser.add_argument(
-        "--log-format", choices=logs.FORMS, default="human", help="json: one object a line"
-    )
+    for flag, text in SWITCHES:
+        parser.add_argument(flag, action="store_true", help=text)
+    for flag, metavar, text in FILES:
+        parser.add_argument(flag, type=Path, metavar=metavar, help=text)
+    for flag, text in ENDPOINTS:
+        parser.add_argument(flag, metavar="ENDPOINT", help=text)
     parser.add_argument(
         "--reward",
         nargs="?",
@@ -145,12 +109,16 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--reward-camera", default="wrist", help="camera of the reward model (default: %(default)s)"
     )
-    parser.add_argument("--result", type=Path, help="write the result as JSON into this file")
     parser.add_argument(
-        "--history",
-        type=Path,
-        metavar="FILE",
-        help="with serve: append each finished task and its result, as lines of JSON",
+        "--manage",
+        action="append",
+        default=[],
+        choices=MANAGED,
+        help="a sidecar that the planner may load and unload (repeatable;"
+        " default: none, the arbiter decides)",
+    )
+    parser.add_argument(
+        "--log-format", choices=logs.FORMS, default="human", help="json: one object a line"
     )
     return parser
 
@@ -191,22 +159,19 @@ def language_model(
     Raises ConfigError for options that only a language model can use, and what the configuration
     and the playbook raise.
     """
-    check_output("--result", arguments.result)
-    check_output("--history", arguments.history)
-    check_output("--transcript", arguments.transcript)
+    for option in ("result", "history", "transcript"):
+        check_output(f"--{option}", getattr(arguments, option))
     kind = LLM_PLANNERS.get(arguments.planner)
+    llm = None
     if kind is not None:
         llm = LlmConfig.from_environ(environ, base_url=kind.default_base_url)
         import_httpx()
-        return llm, load_playbook(arguments.playbook) if arguments.playbook else None
     playbook = load_playbook(arguments.playbook) if arguments.playbook else None
-    unused = [
-        f"{flag} is for a language model"
-        for flag, given in (("--look", arguments.look), ("--transcript", arguments.transcript))
-        if given
-    ]
-    if playbook is not None:
-        unused.insert(0, "a playbook is read by a language model")
-    if unused:
-        raise ConfigError(unused[0], hint=f"--planner {' or '.join(LLM_PLANNERS)}")
-    return None, None
+    for given, unused in (
+        (playbook, "a playbook is read by a language model"),
+        (arguments.look, "--look is for a language model"),
+        (arguments.transcript, "--transcript is for a language model"),
+    ):
+        if given and llm is None:
+            raise ConfigError(unused, hint=f"--planner {' or '.join(LLM_PLANNERS)}")
+    return llm, playbook

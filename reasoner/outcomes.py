@@ -17,6 +17,7 @@ from vram_arbiter.schemas.errors import (
     FrameStale,
     GoalRejected,
     LeaseRevoking,
+    NotPermitted,
     NotResident,
     VramError,
 )
@@ -31,11 +32,10 @@ def of_error(error: VramError) -> Outcome:
     """Return the outcome of a call that ended with an error."""
     match error:
         case Evicted() | NotResident() | LeaseRevoking():
-            return Outcome(
-                "evicted",
-                f"the model is not resident, so nothing was looked at: {error}",
-                error.code,
-            )
+            why = f"the model is not resident, so nothing was looked at: {error}"
+            return Outcome("evicted", why, error.code)
+        case NotPermitted():
+            return Outcome("refused", str(error), error.code)
         case FrameStale():
             return Outcome("no_frame", str(error), error.code)
         case GoalRejected():
@@ -63,11 +63,9 @@ def how_it_went(result: ResultPush | None) -> str:
         return (
             "the goal was called off, but the runner has not said that it ended: it may still run"
         )
-    return (
-        f"the goal was {result['message'] or 'canceled'}"
-        if result["status"] == "canceled"
-        else f"it ended by then: {result['status']}"
-    )
+    if result["status"] == "canceled":
+        return f"the goal was {result['message'] or 'canceled'}"
+    return f"it ended by then: {result['status']}"
 
 
 def of_detections(
@@ -85,25 +83,17 @@ def of_detections(
         where["unknown_words"] = [*unknown_words]
         unnamed = f"; the detector's manifest does not name {', '.join(unknown_words)}"
     if not detections:
-        return Outcome(
-            "not_seen", f"{query} is not in view of {frame['camera']}{unnamed}", data=where
-        )
-    best, *others = sorted(detections, key=lambda detection: -detection.score)
-    data: JsonObject = where | {
-        "box": list(best.box),
-        "score": best.score,
-        "label": best.label,
-    }
+        absent = f"{query} is not in view of {frame['camera']}{unnamed}"
+        return Outcome("not_seen", absent, data=where)
+    ranked = sorted(detections, key=lambda detection: -detection.score)
+    best = ranked[0]
+    data = where | {"box": list(best.box), "score": best.score, "label": best.label}
     point = point_on_plane(frame, best.box)
     if point is None:
-        return Outcome(
-            "error",
-            f"{query} is seen, but the camera cannot say where it stands",
-            "frame_stale",
-            data,
-        )
+        why = f"{query} is seen, but the camera cannot say where it stands"
+        return Outcome("error", why, "frame_stale", data)
     data["point_base_m"] = point
-    data["seen"] = seen = _things(frame, [best, *others])
+    data["seen"] = seen = _things(frame, ranked)
     places = [
         "({:.3f}, {:.3f}, {:.3f}) m from the base, score {:.2f}".format(
             *one["point_base_m"], one["score"]

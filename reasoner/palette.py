@@ -9,14 +9,14 @@ come from the same fields; `check` is asked again for each call.
 
 import dataclasses
 import re
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, field
 
 from vram_arbiter.reasoner.params import JsonSchema, misfits
 from vram_arbiter.schemas.body import UNKNOWN_BODY, Body
 from vram_arbiter.schemas.errors import BadRequest, CallerError, NotPermitted, UnknownSkill
 from vram_arbiter.schemas.manifest import Role, RSkillManifest
-from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
@@ -25,11 +25,9 @@ from vram_arbiter.schemas.tools import (
     LocateInView,
     Look,
     QueryScene,
-    QueryTaskProgress,
     StopGoal,
     ToolCall,
     WaitOn,
-    function_schema,
     function_schemas,
     parse_skill_call,
     parse_tool_call,
@@ -41,12 +39,25 @@ EXECUTABLE_KINDS = frozenset({"vla", "ros_action", "ros_service"})
 # they have a model and read words; the others have their goal in its parameters
 PROMPTED_KINDS = frozenset({"vla"})
 WHILE_A_GOAL_RUNS = frozenset({"wait", "stop_goal"})
-ASKED = ("locate_in_view", "query_scene", "look", "query_task_progress")
 OPERATOR = "/operator"
 OPEN = "open-vocabulary"  # in `objects` of a manifest: any word
 ARTICLES = frozenset({"a", "an", "the"})
 
 FINISH = "finish"  # how a language model ends a task: offered always, and no tool of the robot's
+_PROVIDED = {  # tool → what says that it is there, why it is not, and what would provide it
+    "locate_in_view": ("can_locate", "no detector is provided", "start the detector sidecar"),
+    "query_scene": ("can_query", "no scene VLM is provided", "start the scene-VLM sidecar"),
+    "look": (
+        "can_look",
+        "no pictures are shown to this planner",
+        "start the reasoner with --look",
+    ),
+    "query_task_progress": (
+        "can_judge",
+        "no reward model is provided",
+        "start the reward sidecar, and the reasoner with --reward",
+    ),
+}
 _ASKED_THROUGH = {
     "detector": "locate_in_view",
     "vlm": "query_scene",
@@ -132,16 +143,12 @@ class Palette:
     @property
     def tools(self) -> frozenset[str]:
         """Names of the tools that are there while no goal runs."""
-        there = {
-            "execute_rskill": bool(self.executable),
-            "locate_in_view": self.can_locate,
-            "query_scene": self.can_query,
-            "look": self.can_look,
-            "query_task_progress": self.can_judge,
-            "lifecycle_transition": bool(self.managed),
-            "emit_prompt": bool(self.topics),
+        given = {name: getattr(self, needs[0]) for name, needs in _PROVIDED.items()} | {
+            "execute_rskill": self.executable,
+            "lifecycle_transition": self.managed,
+            "emit_prompt": self.topics,
         }
-        names = frozenset(name for name, given in there.items() if given)
+        names = frozenset(name for name, there in given.items() if there)
         return names if self.only is None else names & self.only
 
     def first(self, action: str) -> Skill:
@@ -161,11 +168,7 @@ class Palette:
 
     def without(self, benched: Set[str]) -> "Palette":
         """Return the same palette without these skills."""
-        return (
-            self
-            if benched == self.benched
-            else dataclasses.replace(self, benched=frozenset(benched))
-        )
+        return dataclasses.replace(self, benched=frozenset(benched))
 
     # -- is a call allowed?
     def check(self, call: ToolCall, *, goal_runs: bool = False) -> CallerError | None:
@@ -178,55 +181,33 @@ class Palette:
             )
         if self.only is not None and call.tool not in self.only:
             return NotPermitted(f"{call.tool} is not a tool of this playbook", hint=self.choice())
+        if call.tool in _PROVIDED and call.tool not in self.tools:
+            _, why, hint = _PROVIDED[call.tool]
+            return NotPermitted(why, hint=hint)
         match call:
             case ExecuteRskill():
                 return self._check_skill(call)
-            case LocateInView() if not self.can_locate:
-                return NotPermitted("no detector is provided", hint="start the detector sidecar")
-            case QueryScene() if not self.can_query:
-                return NotPermitted("no scene VLM is provided", hint="start the scene-VLM sidecar")
-            case Look() if not self.can_look:
-                return NotPermitted(
-                    "no pictures are shown to this planner", hint="start the reasoner with --look"
-                )
-            case LocateInView() | QueryScene() | Look() if self._no_camera(call.camera):
-                return BadRequest(
-                    f"unknown camera {call.camera}",
-                    hint=f"choose from {', '.join(self.cameras)}",
-                )
-            case QueryTaskProgress() if not self.can_judge:
-                return NotPermitted(
-                    "no reward model is provided",
-                    hint="start the reward sidecar, and the reasoner with --reward",
-                )
+            case LocateInView(camera=name) | QueryScene(camera=name) | Look(camera=name) if (
+                name and self.cameras and name not in self.cameras
+            ):
+                hint = f"choose from {', '.join(self.cameras)}"
+                return BadRequest(f"unknown camera {name}", hint=hint)
             case LifecycleTransition() if call.node not in self.managed:
-                return NotPermitted(
-                    f"{call.node} may not be managed by this reasoner",
-                    hint=f"it may manage {_list(self.managed)};"
-                    " the arbiter decides what is resident",
-                )
+                hint = f"it may manage {_list(self.managed)}; the arbiter decides what is resident"
+                return NotPermitted(f"{call.node} may not be managed by this reasoner", hint=hint)
             case EmitPrompt() if call.target_topic not in self.topics:
-                return NotPermitted(
-                    f"prompts to {call.target_topic} are not allowed",
-                    hint=f"choose from {_list(self.topics)}",
-                )
+                hint = f"choose from {_list(self.topics)}"
+                return NotPermitted(f"prompts to {call.target_topic} are not allowed", hint=hint)
             case _:
                 return None
-
-    def _no_camera(self, name: str) -> bool:
-        return bool(name and self.cameras) and name not in self.cameras
 
     def _check_skill(self, call: ExecuteRskill) -> CallerError | None:
         skill = self.executable.get(call.rskill_id)
         if skill is not None:
-            wrong = (
-                misfits(call.goal_params, skill.goal_params_schema) if call.goal_params_json else []
-            )
-            return (
-                BadRequest(f"{skill.id}: {'; '.join(wrong[:8])}", hint="see its parameters")
-                if wrong
-                else None
-            )
+            given = call.goal_params_json
+            if wrong := misfits(call.goal_params, skill.goal_params_schema) if given else []:
+                return BadRequest(f"{skill.id}: {'; '.join(wrong[:8])}", hint="see its parameters")
+            return None
         known = next((known for known in self.skills if known.id == call.rskill_id), None)
         if known is None:
             return UnknownSkill(f"unknown skill {call.rskill_id}", hint=self.choice())
@@ -276,28 +257,13 @@ class Palette:
                 )
                 for skill in self.executable.values()
             ]
-        asked = function_schemas(name for name in ASKED if name in tools)
-        for function in asked:
-            properties = function["function"]["parameters"]["properties"]
-            if self.cameras and "camera" in properties:
-                what = f"Name of the camera; without it: {self.cameras[0]}."
-                properties["camera"] = {
-                    "type": "string",
-                    "enum": [*self.cameras],
-                    "description": what,
-                }
-        offered += asked
-        for tool, parameter, allowed in (
-            (LifecycleTransition, "node", self.managed),
-            (EmitPrompt, "target_topic", self.topics),
+        for name, parameter, choices in (
+            *((name, "camera", self.cameras) for name in _PROVIDED),
+            ("lifecycle_transition", "node", sorted(self.managed)),
+            ("emit_prompt", "target_topic", sorted(self.topics)),
         ):
-            function = function_schema(tool)
-            if function["function"]["name"] in tools:
-                function["function"]["parameters"]["properties"][parameter] = {
-                    "type": "string",
-                    "enum": sorted(allowed),
-                }
-                offered.append(function)
+            if name in tools:
+                offered += [_choosing(one, parameter, choices) for one in function_schemas([name])]
         return offered
 
     def parse(self, name: str, arguments: str | JsonMap) -> ToolCall:
@@ -314,50 +280,42 @@ class Palette:
         return parse_tool_call(name, arguments)
 
 
-def palette_of(
+def _choosing(offer: FunctionTool, parameter: str, choices: Sequence[str]) -> FunctionTool:
+    """Let a function's parameter be one of these; of cameras the first is the default."""
+    properties = offer["function"]["parameters"]["properties"]
+    if choices and parameter in properties:
+        chosen: JsonObject = {"type": "string", "enum": [*choices]}
+        if parameter == "camera":
+            chosen["description"] = f"Name of the camera; without it: {choices[0]}."
+        properties[parameter] = chosen
+    return offer
+
+
+def skills_of(
     manifests: Iterable[RSkillManifest],
     *,
-    can_locate: bool,
-    can_query: bool,
-    can_judge: bool = False,
-    can_look: bool = False,
-    cameras: Iterable[str] = (),
     allow_noncommercial: bool = False,
-    managed: Iterable[str] = (),
-    topics: Iterable[str] = (),
     body: Body = UNKNOWN_BODY,
-) -> Palette:
-    """Return the palette of installed manifests.
+) -> tuple[Skill, ...]:
+    """Return the skills of installed manifests, by name: read from folders in another order they
+    are the same prompt.
 
     Templates, models that do not fit the robot's `body` and, unless allowed, those whose license
     forbids commercial use are listed but barred. A robot without a described body gets what fits
     any body.
     """
-    skills = (
-        tuple(  # by name: the same skills read from folders in another order are the same prompt
-            Skill(
-                manifest.name,
-                str(manifest.kind),
-                manifest.description.strip(),
-                tuple(str(action) for action in manifest.actions),
-                manifest.goal_params_schema,
-                _barred(manifest, allow_noncommercial) or body.misfit(manifest),
-                manifest.latency_budget.max_execution_s or 0.0,
-                _vocabulary(manifest),
-            )
-            for manifest in sorted(manifests, key=lambda manifest: manifest.name)
+    return tuple(
+        Skill(
+            manifest.name,
+            str(manifest.kind),
+            manifest.description.strip(),
+            tuple(str(action) for action in manifest.actions),
+            manifest.goal_params_schema,
+            _barred(manifest, allow_noncommercial) or body.misfit(manifest),
+            manifest.latency_budget.max_execution_s or 0.0,
+            _vocabulary(manifest),
         )
-    )
-    return Palette(
-        skills,
-        can_locate=can_locate,
-        can_query=can_query,
-        can_judge=can_judge,
-        can_look=can_look,
-        cameras=tuple(cameras),
-        body=body,
-        managed=frozenset(managed),
-        topics=frozenset(topics),
+        for manifest in sorted(manifests, key=lambda manifest: manifest.name)
     )
 
 

@@ -37,9 +37,12 @@ def misfits(value: Any, schema: Any, path: str = "goal_params") -> list[str]:
     if isinstance(value, dict):
         return _object(value, schema, path)
     if isinstance(value, list):
-        return _array(value, schema, path)
+        wrong = _outside(len(value), schema, ("minItems", "maxItems"), "have {} items", path)
+        for index, item in enumerate(value):
+            wrong += misfits(item, schema.get("items"), f"{path}[{index}]")
+        return wrong
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return _number(value, schema, path)
+        return _outside(value, schema, ("minimum", "maximum"), "be {}", path)
     return []
 
 
@@ -55,9 +58,8 @@ def _is(value: Any, kind: Any) -> bool:
 
 
 def _object(value: dict[str, Any], schema: JsonSchema, path: str) -> list[str]:
-    known = schema.get("properties")
+    known, required = schema.get("properties"), schema.get("required")
     known = known if isinstance(known, Mapping) else {}
-    required = schema.get("required")
     wrong = [
         f"{path}.{name}: is required"
         for name in (required if isinstance(required, list) else [])
@@ -71,20 +73,13 @@ def _object(value: dict[str, Any], schema: JsonSchema, path: str) -> list[str]:
     return wrong
 
 
-def _array(value: list[Any], schema: JsonSchema, path: str) -> list[str]:
-    wrong = []
-    if isinstance(least := schema.get("minItems"), int) and len(value) < least:
-        wrong.append(f"{path}: must have at least {least} items")
-    if isinstance(most := schema.get("maxItems"), int) and len(value) > most:
-        wrong.append(f"{path}: must have at most {most} items")
-    for index, item in enumerate(value):
-        wrong += misfits(item, schema.get("items"), f"{path}[{index}]")
-    return wrong
-
-
-def _number(value: float, schema: JsonSchema, path: str) -> list[str]:
-    if isinstance(low := schema.get("minimum"), int | float) and value < low:
-        return [f"{path}: must be at least {low}"]
-    if isinstance(high := schema.get("maximum"), int | float) and value > high:
-        return [f"{path}: must be at most {high}"]
+def _outside(
+    size: float, schema: JsonSchema, words: tuple[str, str], told: str, path: str
+) -> list[str]:
+    """Return why a size is not within the two bounds that `words` name."""
+    least, most = (schema.get(word) for word in words)
+    if isinstance(least, int | float) and size < least:
+        return [f"{path}: must {told.format(f'at least {least}')}"]
+    if isinstance(most, int | float) and size > most:
+        return [f"{path}: must {told.format(f'at most {most}')}"]
     return []

@@ -14,7 +14,7 @@ from vram_arbiter.reasoner.history import Past, Taken
 from vram_arbiter.reasoner.outcomes import of_detections, of_judgement
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Outcome
-from vram_arbiter.schemas.errors import FrameStale
+from vram_arbiter.schemas.errors import FrameStale, NotPermitted
 from vram_arbiter.schemas.goals import FrameReply
 from vram_arbiter.schemas.tools import LocateInView, Look, QueryScene, QueryTaskProgress
 
@@ -38,68 +38,52 @@ class Judge:
     task: str
 
 
+@dataclass(frozen=True, slots=True)
 class Perception:
-    """`locate`, `query`, `show` and `progress`; a model that is not there refuses."""
+    """`locate`, `query`, `show` and `progress`. Raises NotPermitted for a model that is not there,
+    or that the palette bars."""
 
-    def __init__(
-        self,
-        runner: RunnerClient,
-        detector: DetectorClient | None,
-        scene_vlm: SceneVlmClient | None,
-        judge: Judge | None,
-        palette: Palette | None,
-    ) -> None:
-        self._runner = runner
-        self._detector = detector
-        self._scene_vlm = scene_vlm
-        self._judge = judge
-        self._palette = palette
+    runner: RunnerClient
+    detector: DetectorClient | None
+    scene_vlm: SceneVlmClient | None
+    judge: Judge | None
+    palette: Palette | None
 
     async def locate(self, call: LocateInView) -> Outcome:
-        if self._detector is None:
-            return Outcome("refused", "no detector is provided", "not_permitted")
-        if (refusal := await not_permitted(self._detector, self._palette)) is not None:
-            return refusal
-        detector = self._detector
-        frame, detections = await _look(
+        detector = _provided(self.detector, "detector")
+        frame, detections = await self._ask(
+            detector,
             lambda: self._frame(call.camera),
             lambda frame: detector.detect(
                 frame["data"], call.query, fresh_s=_good_for_s(frame["age_ms"])
             ),
             answer_max_s=PLACE_MAX_S,
         )
-        if (refusal := await not_permitted(self._detector, self._palette)) is not None:
-            return refusal  # it was replaced meanwhile
         unknown = self._unknown_words(detector, call.query)
         return of_detections(call.query, frame, detections, unknown)
 
     def _unknown_words(self, detector: DetectorClient, query: str) -> list[str]:
         """Return the words that the manifest of the served detector does not name."""
-        served = str(detector.identity.get("rskill", "")) if detector.identity else ""
-        skills = self._palette.skills if self._palette is not None else ()
-        known = next((skill for skill in skills if skill.id == served), None)
-        return [] if known is None else known.unknown_words(query)
+        served = detector.identity["rskill"] if detector.identity else ""
+        skills = self.palette.skills if self.palette is not None else ()
+        return [
+            word for skill in skills if skill.id == served for word in skill.unknown_words(query)
+        ]
 
     async def query(self, call: QueryScene) -> Outcome:
-        if self._scene_vlm is None:
-            return Outcome("refused", "no scene VLM is provided", "not_permitted")
-        if (refusal := await not_permitted(self._scene_vlm, self._palette)) is not None:
-            return refusal
-        vlm = self._scene_vlm
-        frame, answer = await _look(
+        vlm = _provided(self.scene_vlm, "scene VLM")
+        frame, answer = await self._ask(
+            vlm,
             lambda: self._frame(call.camera),
             lambda frame: vlm.query(
                 frame["data"], call.question, fresh_s=_good_for_s(frame["age_ms"])
             ),
         )
-        if (refusal := await not_permitted(self._scene_vlm, self._palette)) is not None:
-            return refusal
-        return Outcome(
-            "answered", answer, data={"camera": frame["camera"], "question": call.question}
-        )
+        about = {"camera": frame["camera"], "question": call.question}
+        return Outcome("answered", answer, data=about)
 
     async def show(self, call: Look) -> Outcome:
-        frame = await self._runner.frame(call.camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="jpeg")
+        frame = await self.runner.frame(call.camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="jpeg")
         age_s = frame["age_ms"] / 1e3
         text = f"{frame['camera']}, {frame['width']} × {frame['height']}, {age_s:.1f} s old"
         return Outcome("shown", text, data={"camera": frame["camera"]}, picture=frame["data"])
@@ -108,48 +92,63 @@ class Perception:
         """Judge by what the camera showed within the window, up to now: no picture now is no
         evidence.
         """
-        if self._judge is None:
-            return Outcome("refused", "no reward model is provided", "not_permitted")
-        reward, past = self._judge.reward, self._judge.past
-        if (refusal := await not_permitted(reward, self._palette)) is not None:
-            return refusal
-        task = call.task or self._judge.task
+        judge = _provided(self.judge, "reward model")
+        reward, task = judge.reward, call.task or judge.task
 
         async def shown_now() -> list[Taken]:
-            newest = await past.look()
-            return past.since(newest.at_s - call.window_s)
+            newest = await judge.past.look()
+            return judge.past.since(newest.at_s - call.window_s)
 
-        shown, judged = await _look(
+        shown, judged = await self._ask(
+            reward,
             shown_now,
             lambda shown: reward.score(
                 [taken.image for taken in shown], task, fresh_s=_good_for_s(shown[-1].age_s * 1e3)
             ),
         )
-        if (refusal := await not_permitted(reward, self._palette)) is not None:
-            return refusal
         return of_judgement(task, shown, judged)
 
     async def _frame(self, camera: str) -> FrameReply:
-        return await self._runner.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png")
+        return await self.runner.frame(camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="png")
+
+    async def _ask[P, A](
+        self,
+        sidecar: SidecarClient,
+        take: Callable[[], Awaitable[P]],
+        ask: Callable[[P], Awaitable[A]],
+        *,
+        answer_max_s: float = math.inf,
+    ) -> tuple[P, A]:
+        """Look with a sidecar that the palette permits, also after it: it may have been replaced
+        meanwhile."""
+        await need_permitted(sidecar, self.palette)
+        found = await _look(take, ask, answer_max_s)
+        await need_permitted(sidecar, self.palette)
+        return found
 
 
-async def not_permitted(sidecar: SidecarClient, palette: Palette | None) -> Outcome | None:
-    """Return why the palette bars the served model, if it does.
+def _provided[T](given: T | None, what: str) -> T:
+    if given is None:
+        raise NotPermitted(f"no {what} is provided")
+    return given
+
+
+async def need_permitted(sidecar: SidecarClient, palette: Palette | None) -> None:
+    """Raise NotPermitted where the palette bars the served model.
 
     Asked until the sidecar has answered.
     """
     if palette is None:
-        return None
+        return
     identity = sidecar.identity or await sidecar.ping(timeout_s=IDENTITY_S)
-    error = palette.permits(str(identity.get("rskill", "")))
-    return None if error is None else Outcome("refused", str(error), error.code)
+    if (error := palette.permits(str(identity.get("rskill", "")))) is not None:
+        raise error
 
 
 async def _look[P, A](
     take: Callable[[], Awaitable[P]],
     ask: Callable[[P], Awaitable[A]],
-    *,
-    answer_max_s: float = math.inf,
+    answer_max_s: float,
 ) -> tuple[P, A]:
     """Return a picture and a model's answer about it.
 

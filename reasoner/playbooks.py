@@ -12,6 +12,7 @@ from pathlib import Path
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid
 from vram_arbiter.schemas.manifest import Kind, ManifestError, load_manifest
+from vram_arbiter.schemas.manifest.contracts import PlaybookContract
 from vram_arbiter.schemas.tools import TOOLS
 
 BODY_MAX_BYTES = 16 * 1024
@@ -20,19 +21,21 @@ BODY_MAX_BYTES = 16 * 1024
 @dataclass(frozen=True, slots=True)
 class Playbook:
     name: str
-    trigger: str
+    contract: PlaybookContract
     body: str
-    tools: frozenset[str]
-    done_predicate: str
-    max_steps: int
+
+    @property
+    def tools(self) -> frozenset[str]:
+        return frozenset(self.contract.composes_tools)
 
     @property
     def procedure(self) -> str:
         """What a planner reads."""
         return (
-            f"Follow this procedure ({self.name}; it is for: {self.trigger}).\n\n"
+            f"Follow this procedure ({self.name}; it is for: {self.contract.trigger}).\n\n"
             f"{self.body.strip()}\n\n"
-            f"It is done when: {self.done_predicate}. You have {self.max_steps} steps."
+            f"It is done when: {self.contract.done_predicate}. "
+            f"You have {self.contract.max_steps} steps."
         )
 
     def narrow(self, palette: Palette) -> Palette:
@@ -69,14 +72,7 @@ def load_playbook(file: Path) -> Playbook:
             f"{file}: composes_tools: unknown tool {unknown[0]}",
             hint=f"choose from {', '.join(TOOLS)}",
         )
-    return Playbook(
-        manifest.name,
-        contract.trigger,
-        _body(file, contract.body_uri),
-        frozenset(contract.composes_tools),
-        contract.done_predicate,
-        contract.max_steps,
-    )
+    return Playbook(manifest.name, contract, _body(file, contract.body_uri))
 
 
 def _body(file: Path, uri: str) -> str:

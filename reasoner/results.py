@@ -7,17 +7,7 @@ from vram_arbiter.schemas.tools import QueryScene
 
 def nothing_done(task: str, reason: str) -> Result:
     """Return the result of a task that ended without an episode, or broke one off."""
-    return {
-        "task": task,
-        "status": "failure",
-        "reason": reason,
-        "stopped": False,
-        "attempts": 0,
-        "vlm_confirmed": False,
-        "vlm_answers": [],
-        "steps": [],
-        "notes": [],
-    }
+    return result_of(Episode(task), Finish(False, reason), frozenset(), stopped=False)
 
 
 def result_of(

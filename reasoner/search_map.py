@@ -85,18 +85,14 @@ class Places:
         if self.joined:
             others = list(others)
             seen = [place for place in seen if not _is_other(place, others)]
-            self.known = [
-                place for place in self.known if _near(place, seen) or not _near(place, others)
-            ]
+            self.known = [one for one in self.known if _near(one, seen) or not _near(one, others)]
         before = list(self.known)
         for place in seen:
             self._see(place, before)
         return bool(seen)
 
     def _place(self, point: Point, score: float) -> Place:
-        x0, y0, yaw = self.base_pose
-        x = x0 + math.cos(yaw) * point.x - math.sin(yaw) * point.y
-        y = y0 + math.sin(yaw) * point.x + math.cos(yaw) * point.y
+        x, y = _from(self.base_pose, point.x, point.y)
         return Place(x, y, point.z, score, math.hypot(point.x, point.y))
 
     def _see(self, seen: Place, before: list[Place]) -> None:
@@ -112,9 +108,7 @@ class Places:
 
     def best(self) -> Place | None:
         """Return the likeliest place, doubted ones last; None before anything was seen."""
-        return max(
-            self.known, key=lambda place: (not self.doubts(place), place.score), default=None
-        )
+        return max(self.known, key=lambda one: (not self.doubts(one), one.score), default=None)
 
     def doubts(self, place: Place) -> bool:
         """Return whether a place is a doubted one. Without odometry none can be told."""
@@ -123,12 +117,7 @@ class Places:
     def from_base(self, place: Place) -> Point:
         """Return its position relative to the base at the newest look."""
         x0, y0, yaw = self.base_pose
-        dx, dy = place.x - x0, place.y - y0
-        return Point(
-            math.cos(yaw) * dx + math.sin(yaw) * dy,
-            -math.sin(yaw) * dx + math.cos(yaw) * dy,
-            place.z,
-        )
+        return Point(*_from((0.0, 0.0, -yaw), place.x - x0, place.y - y0), place.z)
 
 
 @dataclass(slots=True)
@@ -155,18 +144,22 @@ class Search:
         """Return the next pose from which nothing was looked at; None: there is none left."""
         if not self._views:
             return None
-        x0, y0, yaw = self._views[0]
+        first = self._views[0]
         while self._given < len(VIEWPOINTS_M):
-            ahead, left = VIEWPOINTS_M[self._given]
+            pose = (*_from(first, *VIEWPOINTS_M[self._given]), first[2])
             self._given += 1
-            pose = (
-                x0 + math.cos(yaw) * ahead - math.sin(yaw) * left,
-                y0 + math.sin(yaw) * ahead + math.cos(yaw) * left,
-                yaw,
-            )
             if not any(_same_view(pose, view) for view in self._views):
                 return pose
         return None
+
+
+def _from(pose: Pose, ahead: float, left: float) -> tuple[float, float]:
+    """Return the place so far ahead of a pose and to the left of it."""
+    x, y, yaw = pose
+    return (
+        x + math.cos(yaw) * ahead - math.sin(yaw) * left,
+        y + math.sin(yaw) * ahead + math.cos(yaw) * left,
+    )
 
 
 def _near(place: Place, others: Iterable[Place]) -> bool:

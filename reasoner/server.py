@@ -8,12 +8,11 @@ command line.
 import asyncio
 import logging
 import os
-from typing import Any, Self
-
-from pydantic import ValidationError
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 from vram_arbiter.clients.net.rpc_client import RpcClient
-from vram_arbiter.clients.net.server import Peer, RouterServer, reason_of
+from vram_arbiter.clients.net.server import Peer, RouterServer, parsed, reason_of, refusal
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
@@ -21,7 +20,6 @@ from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     ReasonerUnreachable,
-    UnknownOp,
     VramError,
     from_wire,
 )
@@ -34,6 +32,7 @@ from vram_arbiter.schemas.reasoner import (
     GetEpisode,
     GetTaskResult,
     ListTasks,
+    ReasonerRequest,
     ReasonerState,
     ResultReply,
     Say,
@@ -47,108 +46,80 @@ log = logging.getLogger(__name__)
 SEND_S = 5.0
 
 
-class OperatorServer:
-    """`async with OperatorServer(endpoint, queue)`: serve until the block ends.
+@asynccontextmanager
+async def operator_server(
+    endpoint: str, queue: TaskQueue, confirmations: Confirmations | None = None
+) -> AsyncIterator[None]:
+    """Serve until the block ends. Raises AlreadyRunning when another reasoner serves there."""
 
-    Raises AlreadyRunning when another reasoner serves there.
-    """
-
-    def __init__(
-        self, endpoint: str, queue: TaskQueue, confirmations: Confirmations | None = None
-    ) -> None:
-        self._queue = queue
-        self._confirmations = confirmations
-        self._server = RouterServer(
-            endpoint, lambda error: _refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
-        )
-        self._serving: asyncio.Task[None] | None = None
-
-    async def __aenter__(self) -> Self:
-        await self._server.__aenter__()
-        self._serving = asyncio.create_task(self._server.serve(self._handle))
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        if self._serving is not None:
-            self._serving.cancel()
-            await asyncio.gather(self._serving, return_exceptions=True)
-        await self._server.__aexit__()
-
-    async def _handle(self, peer: Peer, message: Message) -> None:
+    async def handle(peer: Peer, message: Message) -> None:
         number = message.get("id")
         request_id = number if isinstance(number, int) else None
         try:
-            reply = self._answer(message)
+            reply = {"re": request_id, "ok": True, **_answer(message, queue, confirmations)}
         except VramError as error:
-            await self._server.send(peer, _refusal(request_id, error))
-        else:
-            await self._server.send(peer, {"re": request_id, "ok": True, **reply})
+            reply = refusal(request_id, error)
+        await server.send(peer, reply)
 
-    def _answer(self, message: Message) -> Message:
-        queue = self._queue
-        match _parse(message):
-            case Say(text=text):
-                queue.say(text)
-            case CancelEpisode(reason=reason, task=number):
-                queue.cancel(number, reason or "by an operator")
-            case SubmitTask(text=text):
-                task = queue.submit(text)
-                return dict(SubmitReply(task=task.number, ahead=queue.ahead_of(task)))
-            case ListTasks():
-                return dict(TasksReply(tasks=[task.view() for task in queue.tasks()]))
-            case GetTaskResult(task=number):
-                task = queue.find(number)
-                if task.result is None:
-                    raise BadState(f"task {number} is not over: {task.state}")
-                return dict(ResultReply(result=task.result))
-            case ConfirmMotion(motion=number, yes=yes, reason=reason):
-                if self._confirmations is None:
-                    raise BadState(
-                        "this reasoner asks for no confirmation",
-                        hint="start it with --require-confirmation",
-                    )
-                self._confirmations.answer(number, yes=yes, reason=reason)
-            case GetEpisode():
-                return dict(self._state())
-        return {"pid": os.getpid()}
-
-    def _state(self) -> ReasonerState:
-        motion = None if self._confirmations is None else self._confirmations.pending
-        running = self._queue.running
-        queued = sum(task.state == "queued" for task in self._queue.tasks())
-        return {
-            "task": running.text if running is not None else "",
-            "pid": os.getpid(),
-            "motion": motion,
-            "queued": queued,
-        }
+    async with RouterServer(
+        endpoint, lambda error: refusal(None, error), message_max_bytes=MESSAGE_MAX_BYTES
+    ) as server:
+        serving = asyncio.create_task(server.serve(handle))
+        try:
+            yield
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
 
 
-def _parse(message: Message) -> Any:
-    if message.get("op") not in OPS:
-        raise UnknownOp(
-            f"unknown op {str(message.get('op'))[:64]!r}",
-            hint=f"one of {', '.join(OPS)}",
-            details={"known": [*OPS]},
-        )
-    if message["op"] == "cancel":  # a cancel is never refused for a long reason
-        number = message.get("task")
-        valid = isinstance(number, int) and not isinstance(number, bool) and number > 0
-        if number is not None and not valid:  # it would end the wrong task
-            raise BadRequest("cancel: task: expected the number of a task", hint="see `tasks`")
-        return CancelEpisode(op="cancel", id=0, reason=reason_of(message), task=number)
-    try:
-        return REASONER_REQUEST.validate_python(message)
-    except ValidationError as error:
-        problems = [
-            f"{'.'.join(str(part)[:64] for part in item['loc'][1:])}: {item['msg']}"
-            for item in error.errors(include_url=False, include_input=False)
-        ]
-        raise BadRequest(f"{message['op']}: {'; '.join(problems)}") from error
+def _answer(message: Message, queue: TaskQueue, confirmations: Confirmations | None) -> Message:
+    match _parse(message):
+        case Say(text=text):
+            queue.say(text)
+        case CancelEpisode(reason=reason, task=number):
+            queue.cancel(number, reason or "by an operator")
+        case SubmitTask(text=text):
+            task = queue.submit(text)
+            return dict(SubmitReply(task=task.number, ahead=queue.ahead_of(task)))
+        case ListTasks():
+            return dict(TasksReply(tasks=[task.view() for task in queue.tasks]))
+        case GetTaskResult(task=number):
+            task = queue.find(number)
+            if task.result is None:
+                raise BadState(f"task {number} is not over: {task.state}")
+            return dict(ResultReply(result=task.result))
+        case ConfirmMotion(motion=number, yes=yes, reason=reason):
+            if confirmations is None:
+                raise BadState(
+                    "this reasoner asks for no confirmation",
+                    hint="start it with --require-confirmation",
+                )
+            confirmations.answer(number, yes=yes, reason=reason)
+        case GetEpisode():
+            return dict(_state(queue, confirmations))
+    return {"pid": os.getpid()}
 
 
-def _refusal(request_id: int | None, error: VramError) -> Message:
-    return {"re": request_id, "ok": False, "error": error.to_wire()}
+def _state(queue: TaskQueue, confirmations: Confirmations | None) -> ReasonerState:
+    motion = None if confirmations is None else confirmations.pending
+    running = queue.running
+    queued = sum(task.state == "queued" for task in queue.tasks)
+    return {
+        "task": running.text if running is not None else "",
+        "pid": os.getpid(),
+        "motion": motion,
+        "queued": queued,
+    }
+
+
+def _parse(message: Message) -> ReasonerRequest:
+    if message.get("op") != "cancel":
+        return parsed(message, REASONER_REQUEST, OPS)
+    number = message.get("task")  # a cancel is never refused for a long reason
+    valid = isinstance(number, int) and not isinstance(number, bool) and number > 0
+    if number is not None and not valid:  # it would end the wrong task
+        raise BadRequest("cancel: task: expected the number of a task", hint="see `tasks`")
+    return CancelEpisode(op="cancel", id=0, reason=reason_of(message), task=number)
 
 
 async def send(endpoint: str, request: Message, *, timeout_s: float = SEND_S) -> Message:

@@ -3,6 +3,7 @@ as history. No sockets; one event loop.
 """
 
 import asyncio
+import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -59,13 +60,12 @@ class TaskQueue:
     ) -> None:
         self._check = check
         self._ended = ended
-        self._waiting: list[Task] = []
-        self._over: list[Task] = []
-        self._numbers = 0
+        self._numbers = itertools.count(1)
+        self.tasks: list[Task] = []
+        """All that are known, the oldest first."""
         self._changed = asyncio.Event()
         self._stopped = False
         self.serves = True
-        self.running: Task | None = None
 
     @classmethod
     def of_one(cls, text: str) -> Self:
@@ -75,6 +75,13 @@ class TaskQueue:
         queue.serves = False
         return queue
 
+    @property
+    def running(self) -> Task | None:
+        return next(iter(self._in("running")), None)
+
+    def _in(self, state: TaskState) -> list[Task]:
+        return [task for task in self.tasks if task.state == state]
+
     # -- what a client may do
     def submit(self, text: str) -> Task:
         """Raises BadState for a reasoner that takes no tasks, LimitExceeded for a full queue."""
@@ -82,21 +89,20 @@ class TaskQueue:
             why = "ends" if self._stopped else "runs one task"
             raise BadState(f"this reasoner {why}", hint="start one by `vram-reasoner serve`")
         self._check(text)
-        if len(self._waiting) >= QUEUED_MAX:
+        if len(self._in("queued")) >= QUEUED_MAX:
             raise LimitExceeded(
                 f"{QUEUED_MAX} tasks wait already",
                 hint="cancel one, or submit this one later",
                 details={"limit": QUEUED_MAX},
             )
-        self._numbers += 1
-        task = Task(self._numbers, text, _now())
-        self._waiting.append(task)
+        task = Task(next(self._numbers), text, _now())
+        self.tasks.append(task)
         self._changed.set()
         return task
 
     def ahead_of(self, task: Task) -> int:
         """Return how many tasks come before this one."""
-        return self._waiting.index(task) + (self.running is not None)
+        return self._in("queued").index(task) + (self.running is not None)
 
     def say(self, text: str) -> None:
         """Pass words to the running task's planner. Raises BadState when none runs."""
@@ -109,46 +115,38 @@ class TaskQueue:
 
         Raises BadState for one that is over, or when none runs, and BadRequest for an unknown one.
         """
-        if number is None:
-            if self.running is None:
-                raise BadState("no task runs", hint="name the task that waits by its number")
-            task = self.running
-        else:
-            task = self.find(number)
-        if task is self.running:
+        task = self.running if number is None else self.find(number)
+        if task is None:
+            raise BadState("no task runs", hint="name the task that waits by its number")
+        if task.state == "running":
             task.canceled = True
             task.inbox.put(Cancel(reason))
-        elif task in self._waiting:
+        elif task.state == "queued":
             self._drop(task, f"canceled: {reason}")
         else:
             raise BadState(f"task {number} is over: {task.state}")
 
     def find(self, number: int) -> Task:
         """Raises BadRequest for a number that is not known, or not any more."""
-        found = next((task for task in self.tasks() if task.number == number), None)
+        found = next((task for task in self.tasks if task.number == number), None)
         if found is None:
             raise BadRequest(
                 f"unknown task {number}", hint=f"the last {HISTORY_MAX} that ended are kept"
             )
         return found
 
-    def tasks(self) -> list[Task]:
-        """Return all that are known, the oldest first."""
-        running = [] if self.running is None else [self.running]
-        return sorted([*self._over, *running, *self._waiting], key=lambda task: task.number)
-
     # -- what the server of the queue does
     async def next(self) -> Task | None:
         """Wait for a task and begin it; None: the queue was stopped."""
         while not self._stopped:
-            if self._waiting:
+            if self._in("queued"):
                 return self._begin()
             self._changed.clear()
             await self._changed.wait()
         return None
 
     def _begin(self) -> Task:
-        self.running = task = self._waiting.pop(0)
+        task = self._in("queued")[0]
         task.state, task.started_at = "running", _now()
         return task
 
@@ -157,8 +155,8 @@ class TaskQueue:
 
         One that a danger ended takes those that wait with it: an operator has to submit them again.
         """
-        assert self.running is not None, "only a running task has a result"
-        task, self.running = self.running, None
+        task = self.running
+        assert task is not None, "only a running task has a result"
         self._close(task, result, "canceled" if task.canceled else result["status"])
         if result["stopped"]:
             self._drop_all(f"canceled: task {task.number} was {result['reason']}")
@@ -172,11 +170,10 @@ class TaskQueue:
             self.cancel(None, reason)
 
     def _drop_all(self, reason: str) -> None:
-        for task in list(self._waiting):
+        for task in self._in("queued"):
             self._drop(task, reason)
 
     def _drop(self, task: Task, reason: str) -> None:
-        self._waiting.remove(task)
         self._close(task, nothing_done(task.text, reason), "canceled")
 
     def _close(self, task: Task, result: Result, state: TaskState) -> None:
@@ -184,8 +181,9 @@ class TaskQueue:
             state = "success"  # it was faster than the cancel
         task.state, task.ended_at, task.result = state, _now(), result
         log.info("task %d: %s: %s", task.number, state, result["reason"])
-        self._over.append(task)
-        del self._over[:-HISTORY_MAX]
+        over = [task for task in self.tasks if task.ended_at is not None]
+        if len(over) > HISTORY_MAX:
+            self.tasks.remove(over[0])
         self._ended(task)
 
 

@@ -6,7 +6,7 @@ names bytes, leases or victims: loading and unloading are between the sidecars a
 
 import logging
 from collections.abc import Mapping
-from typing import Protocol
+from dataclasses import KW_ONLY, dataclass, field
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -15,9 +15,9 @@ from vram_arbiter.reasoner.execution import GOAL_GRACE_S, Execution
 from vram_arbiter.reasoner.hints import Hints
 from vram_arbiter.reasoner.outcomes import of_error
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.perception import IDENTITY_S, Judge, Perception, not_permitted
+from vram_arbiter.reasoner.perception import IDENTITY_S, Judge, Perception, need_permitted
 from vram_arbiter.reasoner.planner import Outcome
-from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.errors import NotPermitted, VramError
 from vram_arbiter.schemas.tools import (
     EmitPrompt,
     ExecuteRskill,
@@ -32,10 +32,7 @@ from vram_arbiter.schemas.tools import (
 log = logging.getLogger(__name__)
 
 
-class Dispatcher(Protocol):
-    async def __call__(self, call: ToolCall) -> Outcome: ...
-
-
+@dataclass
 class Tools:
     """Dispatch to a runner, a detector, a scene VLM and a reward model, started on demand.
 
@@ -43,25 +40,23 @@ class Tools:
     palette allows it. `session` is the runner's when the task began: another one gets no goal.
     """
 
-    def __init__(
-        self,
-        runner: RunnerClient,
-        detector: DetectorClient | None,
-        scene_vlm: SceneVlmClient | None,
-        *,
-        judge: Judge | None = None,
-        palette: Palette | None = None,
-        components: Mapping[str, SidecarClient] | None = None,
-        hints: Hints | None = None,
-        session: str = "",
-        goal_grace_s: float = GOAL_GRACE_S,
-    ) -> None:
-        self._runner = runner
-        self._palette = palette
-        self._components = dict(components or {})
-        self._perception = Perception(runner, detector, scene_vlm, judge, palette)
+    runner: RunnerClient
+    detector: DetectorClient | None
+    scene_vlm: SceneVlmClient | None
+    _: KW_ONLY
+    judge: Judge | None = None
+    palette: Palette | None = None
+    components: Mapping[str, SidecarClient] = field(default_factory=dict)
+    hints: Hints | None = None
+    session: str = ""
+    goal_grace_s: float = GOAL_GRACE_S
+
+    def __post_init__(self) -> None:
+        self._perception = Perception(
+            self.runner, self.detector, self.scene_vlm, self.judge, self.palette
+        )
         self._execution = Execution(
-            runner, palette, hints, session=session, goal_grace_s=goal_grace_s
+            self.runner, self.palette, self.hints, self.session, self.goal_grace_s
         )
 
     async def __call__(self, call: ToolCall) -> Outcome:
@@ -86,7 +81,7 @@ class Tools:
                     log.warning("to %s: %s", call.target_topic, call.text)
                     return Outcome("done", f"said to {call.target_topic}")
                 case _:
-                    return Outcome("refused", f"{call.tool} is not provided here", "not_permitted")
+                    raise NotPermitted(f"{call.tool} is not provided here")
         except VramError as error:
             return of_error(error)
 
@@ -96,25 +91,19 @@ class Tools:
         Never beside a goal: the state is read just before, and a goal that begins in between has
         its lease in use, which the arbiter protects.
         """
-        component = self._components.get(call.node)
+        component = self.components.get(call.node)
         if component is None:
-            return Outcome("refused", f"no component {call.node} to manage", "not_permitted")
+            raise NotPermitted(f"no component {call.node} to manage")
         if call.transition == "configure":
             identity = await component.ping(timeout_s=IDENTITY_S)
             return Outcome("done", f"{call.node} serves {identity['rskill']}, {identity['state']}")
-        if (goal := (await self._runner.state())["goal"]) is not None:
-            return Outcome(
-                "refused",
-                f"goal {goal} runs: nothing is loaded or unloaded beside it",
-                "bad_state",
-                {"goal": goal},
-            )
+        if (goal := (await self.runner.state())["goal"]) is not None:
+            why = f"goal {goal} runs: nothing is loaded or unloaded beside it"
+            return Outcome("refused", why, "bad_state", {"goal": goal})
         if call.transition == "activate":
-            if (refusal := await not_permitted(component, self._palette)) is not None:
-                return refusal
+            await need_permitted(component, self.palette)
             loaded = await component.load()
-            return Outcome(
-                "done", f"{call.node} is resident" + ("" if loaded["loaded"] else " as before")
-            )
+            since = "" if loaded["loaded"] else " as before"
+            return Outcome("done", f"{call.node} is resident{since}")
         await component.unload()
         return Outcome("done", f"{call.node} leaves at its next safe point")

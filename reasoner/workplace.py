@@ -18,8 +18,8 @@ from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.scripted import ScriptedPlanner
 from vram_arbiter.reasoner.llm.transcript import Transcript
 from vram_arbiter.reasoner.loop import STEPS_MAX, THINK_MAX_S, run_episode
-from vram_arbiter.reasoner.options import LLM_PLANNERS, endpoint
-from vram_arbiter.reasoner.palette import OPERATOR, Palette, palette_of
+from vram_arbiter.reasoner.options import LLM_PLANNERS, MANAGED, endpoint
+from vram_arbiter.reasoner.palette import OPERATOR, Palette, skills_of
 from vram_arbiter.reasoner.perception import FRAME_MAX_AGE_MS, Judge
 from vram_arbiter.reasoner.planner import Planner
 from vram_arbiter.reasoner.playbooks import Playbook
@@ -64,11 +64,10 @@ class Workplace:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        for client in (self._detector, self._vlm, self._reward):
+        sidecars = (self._detector, self._vlm, self._reward)
+        for client in (*sidecars, self._runner, self._watching, self._eyes):
             if client is not None:
                 await client.close()
-        for runner in (self._runner, self._watching, self._eyes):
-            await runner.close()
         self._transcript.close()
 
     async def perform(self, task: str, inbox: Inbox) -> Result:
@@ -80,23 +79,23 @@ class Workplace:
         installed = await self._runner.skills()
         session = str(installed.get("session", ""))
         manifests = [RSkillManifest.model_validate(manifest) for manifest in installed["skills"]]
-        named: dict[str, SidecarClient | None] = {
-            "detector": self._detector,
-            "scene-vlm": self._vlm,
-            "reward": self._reward,
+        served: tuple[SidecarClient | None, ...] = (self._detector, self._vlm, self._reward)
+        components = {
+            name: client for name, client in zip(MANAGED, served, strict=True) if client is not None
         }
-        components = {name: client for name, client in named.items() if client is not None}
-        palette = palette_of(
-            manifests,
+        body = read_body(installed.get("body"))
+        palette = Palette(
+            skills_of(
+                manifests, body=body, allow_noncommercial=self._arguments.allow_noncommercial
+            ),
             can_locate=self._detector is not None,
             can_query=self._vlm is not None,
             can_judge=self._reward is not None,
             can_look=self._arguments.look,
-            cameras=(await self._watching.state()).get("cameras") or (),
-            allow_noncommercial=self._arguments.allow_noncommercial,
-            managed=[name for name in self._arguments.manage if name in components],
-            topics=[OPERATOR],
-            body=read_body(installed.get("body")),
+            cameras=tuple((await self._watching.state()).get("cameras") or ()),
+            managed=frozenset(name for name in self._arguments.manage if name in components),
+            topics=frozenset({OPERATOR}),
+            body=body,
         )
         if self._playbook is not None:
             palette = self._playbook.narrow(palette)
@@ -169,7 +168,7 @@ def _given[C: SidecarClient](kind: type[C], given: str | None, name: str) -> C |
 
 
 def _steps_max(playbook: Playbook | None) -> int:
-    return STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.max_steps)
+    return STEPS_MAX if playbook is None else min(STEPS_MAX, playbook.contract.max_steps)
 
 
 def _think_max_s(llm: LlmConfig | None) -> float:

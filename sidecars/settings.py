@@ -21,7 +21,8 @@ from vram_arbiter.schemas.yamltext import read_yaml
 from vram_arbiter.sidecars.weights import Weights, resolve, with_processors
 
 NICE_VARIABLE = "VRAM_ARBITER_SIDECAR_NICE"
-"""Tells the server of imports its nice value (`preload`)."""
+HOST_VARIABLE = "VRAM_ARBITER_SIDECAR_HOST"
+"""Tell the server of imports its nice value and the pid of its host (`preload`)."""
 NICE = 5  # a third of the cores' time beside one ordinary program, all of it on idle cores
 WAIT_TIMEOUT_S = 120.0  # wait for the lease of a request without a time limit of its own
 # limit of work in the model; the field's clients wait as long for an answer

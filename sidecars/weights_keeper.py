@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Final, Protocol
 
@@ -24,7 +25,7 @@ from vram_arbiter.sidecars import model_main
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.model_main import THREADS_VARIABLE
 from vram_arbiter.sidecars.model_process import Channel, Model, ModelProcess, how_ended
-from vram_arbiter.sidecars.settings import NICE_VARIABLE, Settings
+from vram_arbiter.sidecars.settings import HOST_VARIABLE, NICE_VARIABLE, Settings
 
 ENVIRONMENT: Final = {
     "PYTORCH_NVML_BASED_CUDA_CHECK": "1",  # asking for GPUs initializes no CUDA before the fork
@@ -161,6 +162,7 @@ class ModelProcesses:
             os.environ.setdefault(name, value)
         os.environ[THREADS_VARIABLE] = "1"  # of the server and the keeper, whatever is set here
         os.environ[NICE_VARIABLE] = str(self._settings.nice)
+        os.environ[HOST_VARIABLE] = str(os.getpid())
         self._context.set_forkserver_preload(["vram_arbiter.sidecars.preload", *modules])
 
     async def prepare(self) -> None:
@@ -222,6 +224,8 @@ class ModelProcesses:
             daemon=True,
         )
         try:
+            # from this thread: the server ends with the thread that started it (`preload`)
+            forkserver.ensure_running()
             await _in_a_thread(partial(self._fork, process))
             streams = await asyncio.open_connection(sock=ours)
         except BaseException:

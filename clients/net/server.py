@@ -11,13 +11,21 @@ import asyncio
 import contextlib
 import logging
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
+from pydantic import TypeAdapter, ValidationError
+
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
-from vram_arbiter.schemas.errors import LimitExceeded, MessageTooLarge, VramError
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    LimitExceeded,
+    MessageTooLarge,
+    UnknownOp,
+    VramError,
+)
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.connection import Bounds, Connection
 from vram_arbiter.schemas.runtime.endpoints import socket_path
@@ -264,6 +272,33 @@ class RouterServer:
             waiting.size_bytes -= size
             if not waiting.count:
                 self._waiting.pop(peer.uid, None)
+
+
+def parsed[T](message: Message, adapter: TypeAdapter[T], ops: Sequence[str]) -> T:
+    """Return the request that a message holds.
+
+    Raises UnknownOp (details.known), or BadRequest (details.fields) with each wrong field.
+    """
+    if message.get("op") not in ops:
+        raise UnknownOp(
+            f"unknown op {str(message.get('op'))[:64]!r}",
+            hint=f"one of {', '.join(ops)}",
+            details={"known": [*ops]},
+        )
+    try:
+        return adapter.validate_python(message)
+    except ValidationError as error:
+        fields = [
+            {"path": ".".join(str(part)[:64] for part in item["loc"][1:]), "problem": item["msg"]}
+            for item in error.errors(include_url=False, include_input=False)
+        ]
+        text = "; ".join(f"{item['path']}: {item['problem']}" for item in fields)
+        raise BadRequest(f"{message['op']}: {text}", details={"fields": fields}) from error
+
+
+def refusal(request_id: int | None, error: VramError) -> Message:
+    """Return the reply to a request that failed."""
+    return {"re": request_id, "ok": False, "error": error.to_wire()}
 
 
 def reason_of(message: Message) -> str:

@@ -7,6 +7,7 @@ the decision has failed.
 """
 
 import asyncio
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -93,13 +94,7 @@ class LlmPlanner(ABC):
         self._palette = palette
         self._system = instructions(palette, procedure)
         self._transcript = transcript or Transcript(None)
-        self._http = JsonHttp(
-            self._headers(),
-            config.timeout_s,
-            busy_s=config.busy_s,
-            pause=pause,
-            again=self.tally.tried_again,
-        )
+        self._http = JsonHttp(self._headers(), config, pause, self.tally.tried_again)
 
     async def __aenter__(self) -> Self:
         return self
@@ -227,10 +222,7 @@ def _told_back(call_id: str, call: Call, problem: str) -> list[Turn]:
         arguments = read_arguments(call.name, call.arguments)
     except BadRequest:
         arguments = {"unreadable": str(call.arguments)[:500]}
-    name = "".join(
-        letter if letter.isascii() and (letter.isalnum() or letter in "_-") else "_"
-        for letter in call.name
-    )
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", call.name)
     return [
         Called(call_id, name[:64] or "unnamed", arguments),
         Answered(call_id, f"{problem} {NUDGE}", is_error=True),

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Self
 from urllib.parse import urlsplit
 
-from vram_arbiter.reasoner.llm.http import BUSY_S
 from vram_arbiter.schemas.errors import ConfigError
 
 TIMEOUT_S = 60.0
+BUSY_S = 240.0  # for a busy server to find time, all pauses and refusals together
 MAX_TOKENS = 4096  # a model that thinks first needs a thousand for that
 PREFIX = "VRAM_REASONER_LLM_"
 

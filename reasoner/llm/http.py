@@ -19,9 +19,10 @@ from collections.abc import Awaitable, Callable, Mapping
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from time import monotonic
-from typing import Any, Self
+from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
+from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.plain import JsonObject
@@ -30,7 +31,6 @@ from vram_arbiter.schemas.runtime.extras import need
 log = logging.getLogger(__name__)
 
 TRIES_MAX = 3  # of a server that fails, or a connection that breaks
-BUSY_S = 240.0  # for a busy server to find time, all pauses and refusals together
 PAUSE_S, PAUSE_MAX_S = 0.5, 30.0  # doubled each time, where the server names none
 BUSY_STATUSES = frozenset({429, 503, 529})
 FAILING_STATUSES = frozenset({408, 500, 502, 504})
@@ -60,39 +60,25 @@ def import_httpx() -> None:
 
 
 class JsonHttp:
-    """`async with JsonHttp(headers, timeout_s) as http: await http.post(url, body)`.
+    """`await JsonHttp(…).post(url, body)`; `close` closes its connections.
 
     Redirects are not followed: the key must not reach another server. `again` is called before each
     further try of a request.
     """
 
     def __init__(
-        self,
-        headers: Mapping[str, str],
-        timeout_s: float,
-        *,
-        busy_s: float = BUSY_S,
-        pause: Pause = asyncio.sleep,
-        again: Callable[[], None] = lambda: None,
+        self, headers: Mapping[str, str], config: LlmConfig, pause: Pause, again: Callable[[], None]
     ) -> None:
         import httpx  # only installed with the reasoner's extra
 
-        self._timeout_s = timeout_s
-        self._busy_s = busy_s
-        self._pause = pause
-        self._again = again
+        self._timeout_s, self._busy_s = config.timeout_s, config.busy_s
+        self._pause, self._again = pause, again
         self._http = httpx.AsyncClient(
-            headers=dict(headers), timeout=timeout_s, follow_redirects=False
+            headers=dict(headers), timeout=config.timeout_s, follow_redirects=False
         )
         # its line for each request has the whole address in it, with a password or a key; our
         # errors carry the rest
         logging.getLogger("httpx").setLevel(logging.WARNING)
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.close()
 
     async def close(self) -> None:
         await self._http.aclose()
@@ -141,7 +127,7 @@ class JsonHttp:
             async with self._http.stream(
                 "POST", url, content=content, headers={"content-type": "application/json"}
             ) as response:
-                answer = await self._read(shown, response)
+                answer = await _read(shown, response)
                 status, headers = int(response.status_code), dict(response.headers)
         except httpx.TimeoutException as error:
             raise TimeoutError from error
@@ -170,16 +156,14 @@ class JsonHttp:
             raise LlmError(f"{shown} answered a JSON {type(value).__name__}, not an object")
         return value
 
-    @staticmethod
-    async def _read(url: str, response: Any) -> bytes:
-        parts: list[bytes] = []
-        size = 0
-        async for part in response.aiter_bytes():
-            size += len(part)
-            if size > ANSWER_MAX_BYTES:
-                raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
-            parts.append(part)
-        return b"".join(parts)
+
+async def _read(url: str, response: Any) -> bytes:
+    answer = bytearray()
+    async for part in response.aiter_bytes():
+        answer += part
+        if len(answer) > ANSWER_MAX_BYTES:
+            raise LlmError(f"{url} answered more than {ANSWER_MAX_BYTES} bytes")
+    return bytes(answer)
 
 
 def _pause_s(asked: int) -> float:

@@ -5,9 +5,9 @@ One span `chat MODEL` a request, below `reasoner.plan`, with every try of the re
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from time import monotonic
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 from urllib.parse import urlsplit
 
 from vram_arbiter.reasoner.llm.config import LlmConfig
@@ -38,26 +38,19 @@ class Tally:
         self.failed += 1
 
     def as_result(self, model: str) -> LlmUsage:
-        return {
-            "model": model,
-            "requests": self.requests,
-            "failed": self.failed,
-            "rejected": self.rejected,
-            "input_tokens": self.input_tokens,
-            "output_tokens": self.output_tokens,
-        }
+        return cast(LlmUsage, {"model": model, **asdict(self)})
 
 
+@dataclass(frozen=True, slots=True)
 class Chat:
     """One request while it is measured."""
 
-    def __init__(self, tally: Tally, labels: dict[str, str]) -> None:
-        self._tally = tally
-        self._labels = labels
+    tally: Tally
+    labels: dict[str, str]
 
     def answered(self, answer: "Answer") -> None:
-        self._tally.input_tokens += answer.input_tokens
-        self._tally.output_tokens += answer.output_tokens
+        self.tally.input_tokens += answer.input_tokens
+        self.tally.output_tokens += answer.output_tokens
         noted: dict[str, str | int] = {
             telemetry.ATTR_INPUT_TOKENS: answer.input_tokens,
             telemetry.ATTR_OUTPUT_TOKENS: answer.output_tokens,
@@ -68,7 +61,7 @@ class Chat:
         if answer.finish_reason:
             tracing.note_texts(telemetry.ATTR_FINISH_REASONS, [answer.finish_reason])
         for kind, tokens in (("input", answer.input_tokens), ("output", answer.output_tokens)):
-            labels = self._labels | {telemetry.ATTR_TOKEN_TYPE: kind}
+            labels = self.labels | {telemetry.ATTR_TOKEN_TYPE: kind}
             meters.measure(telemetry.GEN_AI_TOKENS, tokens, labels)
 
 

@@ -15,32 +15,29 @@ from vram_arbiter.schemas.reasoner import TranscriptLine
 PICTURE_MIN_CHARS = 1024  # a shorter text does not hold a picture
 
 
-class Transcript:
+class Transcript(JsonLines):
     """Lines are appended to the file until it is closed. None: nothing is written.
 
     Raises ConfigError for a file that cannot be written.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._lines = JsonLines(path, "--transcript")
-
-    def close(self) -> None:
-        self._lines.close()
+        super().__init__(path, "--transcript")
 
     def answered(self, request: JsonObject, answer: JsonObject) -> None:
-        self._add(TranscriptLine(kind="answered", request=request, answer=answer, at=_now()))
+        self._tell(TranscriptLine(kind="answered", request=request, answer=answer, at=_now()))
 
     def failed(self, request: JsonObject, problem: str) -> None:
         """The server gave no answer of its API."""
-        self._add(TranscriptLine(kind="failed", request=request, problem=problem, at=_now()))
+        self._tell(TranscriptLine(kind="failed", request=request, problem=problem, at=_now()))
 
     def rejected(self, problem: str) -> None:
         """The answer before was not taken: the model is told why and asked again."""
-        self._add(TranscriptLine(kind="rejected", problem=problem, at=_now()))
+        self._tell(TranscriptLine(kind="rejected", problem=problem, at=_now()))
 
-    def _add(self, line: TranscriptLine) -> None:
+    def _tell(self, line: TranscriptLine) -> None:
         shown = line.model_copy(update={"request": without_pictures(line.request)})
-        self._lines.add(shown, without_none=True)
+        self.add(shown, without_none=True)
 
 
 def without_pictures(value: object) -> object:

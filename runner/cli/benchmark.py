@@ -24,13 +24,11 @@ from vram_arbiter.runner.cli.common import (
     connect_arbiter,
     default_skills,
     install_signals,
-    not_negative_int,
-    positive,
-    positive_int,
     sidecars_given,
     unlicensed,
     warm_up,
 )
+from vram_arbiter.runner.cli.numbers import not_negative_int, positive, positive_int
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import ModelFamily

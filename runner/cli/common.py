@@ -15,6 +15,7 @@ from typing import Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
+from vram_arbiter.runner.cli.numbers import positive, share
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
@@ -24,46 +25,6 @@ from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, Kind, RSki
 log = logging.getLogger("runner")
 
 AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
-
-
-def positive(text: str) -> float:
-    """Parse a positive number of seconds."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
-
-
-def positive_int(text: str) -> int:
-    """Parse a positive count."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return value
-
-
-def not_negative_int(text: str) -> int:
-    """Parse a count that may be 0."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
-    return value
-
-
-def share(text: str) -> float:
-    """Parse a number from 0 to 1."""
-    value = float(text)
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Parse a number of 0 or more."""
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
-    return value
 
 
 def add_trace_flag(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from typing import Literal
 
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note
-from vram_arbiter.runner.cli.common import positive
+from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.schemas.errors import ConfigError
 
 ENCODINGS: dict[str, Literal["jpeg", "png"]] = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}

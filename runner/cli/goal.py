@@ -7,11 +7,14 @@ import asyncio
 import json
 import signal
 from collections.abc import AsyncIterator
+from typing import TYPE_CHECKING
 
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note, show_json
-from vram_arbiter.runner.cli.common import positive, positive_int
-from vram_arbiter.schemas.goals import FeedbackPush
+from vram_arbiter.runner.cli.numbers import positive, positive_int
 from vram_arbiter.schemas.plain import JsonMap
+
+if TYPE_CHECKING:
+    from vram_arbiter.schemas.goals import FeedbackPush
 
 
 def add_parser(

@@ -24,13 +24,12 @@ from vram_arbiter.runner.cli.common import (
     connect_arbiter,
     default_skills,
     install_signals,
-    not_negative,
-    positive_int,
     sidecars_given,
     unlicensed,
     warm_up,
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
+from vram_arbiter.runner.cli.numbers import not_negative, positive_int
 from vram_arbiter.runner.cli.recording import (
     Recording,
     add_push_flags,

@@ -15,9 +15,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
-from pydantic import ValidationError
-
-from vram_arbiter.clients.net.server import Peer, RouterServer
+from vram_arbiter.clients.net.server import Peer, RouterServer, parsed, refusal
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals import frames
@@ -27,7 +25,6 @@ from vram_arbiter.runner.recording.recorder import Marked, Verdict
 from vram_arbiter.runner.safety.estop import OBEY_S, EstopServer
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
-    BadRequest,
     BadState,
     EstopRequested,
     GoalRejected,
@@ -147,7 +144,7 @@ class GoalServer:
             server = await stack.enter_async_context(
                 RouterServer(
                     self._endpoint,
-                    lambda error: _refusal(None, error),
+                    lambda error: refusal(None, error),
                     message_max_bytes=MESSAGE_MAX_BYTES,
                     work_share=WORK_SHARE,
                 )
@@ -193,14 +190,14 @@ class GoalServer:
     async def _handle(self, peer: Peer, message: Message) -> None:
         request_id = message.get("id") if isinstance(message.get("id"), int) else None
         try:
-            reply = await self._answer(peer, _parse(message))
+            reply = await self._answer(peer, parsed(message, RUNNER_REQUEST, OPS))
         except VramError as error:
-            await self._send(peer, _refusal(request_id, error))
+            await self._send(peer, refusal(request_id, error))
         except Exception as error:
             log.exception("request failed")
             await self._send(
                 peer,
-                _refusal(
+                refusal(
                     request_id,
                     InternalError(f"{type(error).__name__}: {error}", hint="see the log"),
                 ),
@@ -331,28 +328,6 @@ class GoalServer:
     async def _send(self, peer: Peer, message: Message) -> None:
         if self._server is not None:
             await self._server.send(peer, message)
-
-
-def _parse(message: Message) -> Any:
-    if message.get("op") not in OPS:
-        raise UnknownOp(
-            f"unknown op {str(message.get('op'))[:64]!r}",
-            hint=f"one of {', '.join(OPS)}",
-            details={"known": [*OPS]},
-        )
-    try:
-        return RUNNER_REQUEST.validate_python(message)
-    except ValidationError as error:
-        fields = [
-            {"path": ".".join(str(part)[:64] for part in item["loc"][1:]), "problem": item["msg"]}
-            for item in error.errors(include_url=False, include_input=False)
-        ]
-        text = "; ".join(f"{item['path']}: {item['problem']}" for item in fields)
-        raise BadRequest(f"{message['op']}: {text}", details={"fields": fields}) from error
-
-
-def _refusal(request_id: int | None, error: VramError) -> Message:
-    return {"re": request_id, "ok": False, "error": error.to_wire()}
 
 
 def _text(key: object) -> str | None:

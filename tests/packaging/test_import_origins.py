@@ -124,3 +124,59 @@ importlib.import_module("vram_arbiter.{package}.__main__")
 print(json.dumps([heavy for heavy in {HEAVY!r} if heavy in sys.modules]))
 """
     assert json.loads(in_a_fresh_interpreter(code, tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["goal", "test/skill", "--wait", "0.01"],
+        ["state", "--wait", "0.01"],
+        ["frame", "--wait", "0.01", "--out", "frame.jpg"],
+        ["reset", "--wait", "0.01"],
+        ["mark", "success", "--wait", "0.01"],
+        ["estop", "--endpoint", "ipc:///nowhere/runner.sock"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_command_that_asks_a_runner_imports_no_runner(command: list[str], tmp_path: Path) -> None:
+    """Regression: `mark` took 2 s of a core, most of it for manifests and models of robots."""
+    code = f"""
+import json, sys
+from vram_arbiter.runner.__main__ import main
+assert main({command!r}) == 1
+parts = ("runner.control", "runner.robots", "runner.sim", "schemas.manifest", "schemas.config")
+unwanted = {(*HEAVY, "pydantic", "yaml", "opentelemetry")!r}
+print(json.dumps([
+    *(name for name in unwanted if name in sys.modules),
+    *(part for part in parts if f"vram_arbiter.{{part}}" in sys.modules),
+]))
+"""
+    assert json.loads(in_a_fresh_interpreter(code, tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "code"),
+    [
+        ("runner", ["deploy", "--config", "so101-twin", "--dry-run"], 0),
+        ("sidecars", ["--rskill", "owlv2-base", "--name", "eye", "--device", "none", "--check"], 2),
+    ],
+)
+def test_a_check_imports_no_library_of_models_that_it_does_not_compare(
+    program: str, arguments: list[str], code: int, tmp_path: Path
+) -> None:
+    """A robot of lerobot is made by lerobot, and weights that are here are compared with their
+    model: only those checks import torch, which takes seconds of a core."""
+    source = f"""
+import json, os, sys
+os.environ.update(VRAM_ARBITER_RUNTIME={str(tmp_path)!r}, HF_HUB_CACHE={str(tmp_path)!r})
+from vram_arbiter.{program}.__main__ import main
+output, sys.stdout = sys.stdout, sys.stderr
+try:
+    ended = main({arguments!r})
+except SystemExit as end:
+    ended = end.code
+assert ended == {code}, ended
+print(json.dumps([name for name in ("torch", "lerobot", "transformers") if name in sys.modules]),
+      file=output)
+"""
+    assert json.loads(in_a_fresh_interpreter(source, tmp_path)) == []

@@ -16,7 +16,7 @@ from vram_arbiter.reasoner.inbox import Cancel
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
-from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.reasoner.server import operator_server, send
 from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.schemas.errors import BadState
 from vram_arbiter.schemas.reasoner import Result
@@ -54,7 +54,7 @@ class Story:
         return motion
 
     async def play(self, operator: Callable[[], Any]) -> Result:
-        async with OperatorServer(self.endpoint, self.queue, self.confirmations):
+        async with operator_server(self.endpoint, self.queue, self.confirmations):
             dispatch = self.confirmations.before(self.dispatch)
             episode = asyncio.create_task(
                 run_episode("x", TwoGrabs(), PALETTE, dispatch, inbox=self.inbox)
@@ -129,7 +129,7 @@ def test_a_reasoner_without_the_flag_takes_no_confirmation(tmp_path: Path) -> No
     endpoint = f"ipc://{tmp_path}/reasoner.sock"
 
     async def story() -> None:
-        async with OperatorServer(endpoint, TaskQueue.of_one("x")):
+        async with operator_server(endpoint, TaskQueue.of_one("x")):
             assert (await send(endpoint, {"op": "state"}))["motion"] is None
             with pytest.raises(BadState, match="asks for no confirmation"):
                 await send(endpoint, {"op": "confirm", "motion": 1, "yes": True})

@@ -11,7 +11,7 @@ from vram_arbiter.reasoner.inbox import Cancel, Inbox, Said
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
-from vram_arbiter.reasoner.server import OperatorServer, send
+from vram_arbiter.reasoner.server import operator_server, send
 from vram_arbiter.reasoner.task_queue import TaskQueue
 from vram_arbiter.schemas.errors import AlreadyRunning, BadRequest, ReasonerUnreachable, UnknownOp
 from vram_arbiter.schemas.tools import ToolCall
@@ -28,7 +28,7 @@ def test_words_and_a_cancel_reach_the_inbox(tmp_path: Path) -> None:
 
     async def story() -> list[Any]:
         queue, inbox = one_task("tidy up")
-        async with OperatorServer(endpoint, queue):
+        async with operator_server(endpoint, queue):
             await send(endpoint, {"op": "say", "text": "mind the cat"})
             await send(endpoint, {"op": "cancel"})
             assert (await send(endpoint, {"op": "state"}))["task"] == "tidy up"
@@ -43,7 +43,7 @@ def test_what_is_no_request_is_refused_and_the_server_lives(tmp_path: Path) -> N
 
     async def story() -> list[Any]:
         queue, inbox = one_task("x")
-        async with OperatorServer(endpoint, queue):
+        async with operator_server(endpoint, queue):
             for wrong, error in (
                 ({"op": "execute"}, UnknownOp),
                 ({"op": "say"}, BadRequest),
@@ -54,7 +54,7 @@ def test_what_is_no_request_is_refused_and_the_server_lives(tmp_path: Path) -> N
                     await send(endpoint, wrong)
             await send(endpoint, {"op": "ping"})
             with pytest.raises(AlreadyRunning):
-                async with OperatorServer(endpoint, queue):
+                async with operator_server(endpoint, queue):
                     pass
         with pytest.raises(ReasonerUnreachable):
             await send(endpoint, {"op": "ping"}, timeout_s=0.1)
@@ -76,7 +76,7 @@ def test_a_cancel_over_the_socket_ends_an_episode_whose_planner_hangs(tmp_path: 
 
     async def story() -> str:
         queue, inbox = one_task("x")
-        async with OperatorServer(endpoint, queue):
+        async with operator_server(endpoint, queue):
             episode = asyncio.create_task(
                 run_episode("x", Hanging(), Palette(()), dispatch, inbox=inbox)
             )
@@ -92,7 +92,7 @@ def test_a_cancel_is_not_refused_for_its_words(tmp_path: Path) -> None:
 
     async def story() -> list[Any]:
         queue, inbox = one_task("tidy up")
-        async with OperatorServer(endpoint, queue):
+        async with operator_server(endpoint, queue):
             await send(
                 endpoint, {"op": "cancel", "reason": "the cat\n" * 1000, "by": "a newer client"}
             )

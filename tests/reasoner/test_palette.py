@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vram_arbiter.reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, palette_of
-from vram_arbiter.schemas.body import Body
+from vram_arbiter.reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, skills_of
+from vram_arbiter.schemas.body import UNKNOWN_BODY, Body
 from vram_arbiter.schemas.errors import BadRequest, NotPermitted, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, parse_manifest
 from vram_arbiter.schemas.tools import (
@@ -59,8 +59,14 @@ def manifest_of(
     return parse_manifest(head + BASE + BY_KIND[kind])
 
 
-def palette(*manifests: RSkillManifest, **options: Any) -> Palette:
-    return palette_of(manifests, **{"can_locate": True, "can_query": True, **options})
+def palette(
+    *manifests: RSkillManifest,
+    body: Body = UNKNOWN_BODY,
+    allow_noncommercial: bool = False,
+    **options: Any,
+) -> Palette:
+    skills = skills_of(manifests, body=body, allow_noncommercial=allow_noncommercial)
+    return Palette(skills, body=body, **options)
 
 
 @pytest.mark.parametrize("kind", [str(kind) for kind in Kind])
@@ -199,7 +205,10 @@ def test_a_template_is_never_executed() -> None:
 
 def test_lifecycle_only_for_nodes_on_the_list() -> None:
     """The defect of the field: any node could be switched, the safety kernel too."""
-    nobody, some = palette(manifest_of("vla")), palette(manifest_of("vla"), managed=["detector"])
+    nobody, some = (
+        palette(manifest_of("vla")),
+        palette(manifest_of("vla"), managed=frozenset({"detector"})),
+    )
     call = LifecycleTransition(node="detector", transition="activate")
     assert isinstance(nobody.check(call), NotPermitted)
     assert "lifecycle_transition" not in {
@@ -213,13 +222,13 @@ def test_lifecycle_only_for_nodes_on_the_list() -> None:
 
 
 def test_prompts_go_only_where_somebody_listens() -> None:
-    found = palette(manifest_of("vla"), topics=[OPERATOR])
+    found = palette(manifest_of("vla"), topics=frozenset({OPERATOR}))
     assert found.check(EmitPrompt(target_topic="/operator", text="hello")) is None
     assert isinstance(found.check(EmitPrompt(target_topic="/cmd_vel", text="go")), NotPermitted)
 
 
 def test_beside_a_goal_only_its_going_on_is_allowed() -> None:
-    found = palette(manifest_of("vla"), managed=["detector"])
+    found = palette(manifest_of("vla"), managed=frozenset({"detector"}))
     for call in (ExecuteRskill(rskill_id="lab/vla"), LocateInView(query="x"),
     QueryScene(question="x"),
                  LifecycleTransition(node="detector", transition="deactivate")):  # fmt: skip
@@ -234,10 +243,8 @@ def test_a_refusal_names_what_is_offered_and_nothing_else() -> None:
     the skills without their tools, and never `finish`; a detector was said to be asked through a
     tool that was not there.
     """
-    palette = palette_of(
-        [manifest_of("ros_action", name="lab/go"), manifest_of("detector")],
-        can_locate=False,
-        can_query=True,
+    found = palette(
+        manifest_of("ros_action", name="lab/go"), manifest_of("detector"), can_locate=False
     )
     offered = "choose from execute_rskill__lab__go, finish, query_scene"
     for call, goal_runs, hint in (
@@ -246,7 +253,7 @@ def test_a_refusal_names_what_is_offered_and_nothing_else() -> None:
         (ExecuteRskill(rskill_id="lab/detector"), False, offered),
         (QueryScene(question="?"), True, "choose from finish, stop_goal, wait"),
     ):
-        refusal = palette.check(call, goal_runs=goal_runs)
+        refusal = found.check(call, goal_runs=goal_runs)
         assert refusal is not None
         assert refusal.hint == hint
         assert "locate_in_view" not in str(refusal)

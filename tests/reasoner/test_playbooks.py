@@ -38,7 +38,7 @@ def test_a_playbook_tells_how_and_narrows_what(tmp_path: Path) -> None:
     playbook = load_playbook(playbook_file(tmp_path))
     assert "Turn left first." in playbook.procedure
     assert "It is done when: it is in view. You have 4 steps." in playbook.procedure
-    assert playbook.max_steps == 4
+    assert playbook.contract.max_steps == 4
     narrow = playbook.narrow(PALETTE)
     assert {function["function"]["name"] for function in narrow.functions()} == {
         "execute_rskill__lab__go",

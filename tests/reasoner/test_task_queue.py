@@ -17,7 +17,7 @@ def success(task: Task) -> Result:
 
 
 def states(queue: TaskQueue) -> list[tuple[int, str]]:
-    return [(task.number, task.state) for task in queue.tasks()]
+    return [(task.number, task.state) for task in queue.tasks]
 
 
 def test_tasks_begin_in_their_order_and_a_waiter_hears_of_the_next() -> None:
@@ -112,7 +112,7 @@ def test_queue_and_history_have_limits_and_a_task_is_checked_first() -> None:
             task = await queue.next()
             assert task is not None
             queue.end(success(task))
-        assert len(queue.tasks()) == HISTORY_MAX
+        assert len(queue.tasks) == HISTORY_MAX
         with pytest.raises(BadRequest, match="the last 64"):
             queue.find(1)
         for _ in range(QUEUED_MAX):

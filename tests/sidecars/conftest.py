@@ -86,7 +86,8 @@ class Box:
         self.environ = environ
         self.sidecars = []
 
-    def spawn(self, name, *flags, footprint="1GB,1GB,100MB", device=None):
+    def spawn(self, name, *flags, footprint="1GB,1GB,100MB", device=None, start=start):
+        """`start`: by default a program whose imports are made already."""
         folder = self.runtime / f"{name}-model"
         folder.mkdir(exist_ok=True)
         (folder / "rskill.yaml").write_text(MANIFEST.format(name=name))

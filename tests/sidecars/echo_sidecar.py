@@ -2,9 +2,9 @@
 vram-sidecar]`.
 
 FOLDER tells it what to do: a file `fail_prepare` or `fail_load` makes that step fail,
-`slow_prepare` or `slow_load` makes it last. The query tells `run`: `hold NAME`
-waits until the file NAME appears there, `fail` raises; anything else is echoed. `query` is answered
-with what stands behind the picture's first eight bytes.
+`slow_prepare` or `slow_load` makes it last; a module `endless.py` is imported. The query tells
+`run`: `hold NAME` waits until the file NAME appears there, `fail` raises; anything else is
+echoed. `query` is answered with what stands behind the picture's first eight bytes.
 """
 
 import functools
@@ -19,11 +19,11 @@ from vram_arbiter.sidecars.__main__ import main as serve
 
 class EchoAdapter:
     kind = "detector"
-    modules = ()
     ops = frozenset({"detect", "query", "get_action", "reset"})
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self.modules = ("endless",) if (folder / "endless.py").exists() else ()
         self._model: str | None = None
 
     def _fail(self, step: str) -> None:

@@ -1,13 +1,17 @@
 """A sidecar without its arbiter: told to do without, started before it, or attacked."""
 
+import contextlib
 import json
+import os
+import select
 import shutil
+import signal
 import subprocess
 import sys
 
 import pytest
 
-from tests.support.paths import SUPPORT
+from tests.support.paths import ROOT, SUPPORT
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 
@@ -112,6 +116,36 @@ def test_without_its_simulated_gpu_it_tells_those_that_wait(kind, flags, request
             "start the arbiter with --gpu fake:8GiB",
         )
     assert sidecar.process.wait(PATIENCE_S) == 1
+
+
+def started_anew(_, arguments, environ, output, errors):
+    """Start the sidecar with a server of imports of its own."""
+    echo = [sys.executable, str(ROOT / "tests/sidecars/echo_sidecar.py"), *arguments]
+    return subprocess.Popen(echo, env=environ, stdout=output, stderr=errors)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_its_end_in_the_middle_of_imports_ends_their_server(lone_box, how):
+    """Regression: that server saw the end of its host once all was imported, up to 25 s later."""
+    folder = lone_box.runtime / "eye-model"
+    folder.mkdir()
+    (folder / "endless.py").write_text(
+        "import os, pathlib, threading\n"
+        "pathlib.Path(__file__).with_name('importing').symlink_to(str(os.getpid()))\n"
+        "threading.Event().wait()\n"
+    )
+    lone_box.environ["PYTHONPATH"] += f":{folder}"
+    eye = lone_box.start("eye", "--no-arbiter", device="none", start=started_anew)
+    until((folder / "importing").is_symlink)
+    server = os.pidfd_open(int(os.readlink(folder / "importing")))
+    try:
+        eye.process.send_signal(how)
+        assert eye.process.wait(PATIENCE_S) in (0, -how)
+        assert select.select([server], [], [], PATIENCE_S)[0]
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(server, signal.SIGKILL)
+        os.close(server)
 
 
 def test_its_end_in_the_middle_of_a_load_is_in_order(lone_box):

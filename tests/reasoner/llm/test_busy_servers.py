@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from tests.support.llm_apis import PALETTE
-from vram_arbiter.reasoner.llm.config import LlmConfig
-from vram_arbiter.reasoner.llm.http import BUSY_S, PAUSE_MAX_S, TRIES_MAX, retry_after_s
+from vram_arbiter.reasoner.llm.config import BUSY_S, LlmConfig
+from vram_arbiter.reasoner.llm.http import PAUSE_MAX_S, TRIES_MAX, retry_after_s
 from vram_arbiter.reasoner.planner import Episode
 from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.tools import LocateInView

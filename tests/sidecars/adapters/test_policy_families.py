@@ -442,6 +442,7 @@ def change(folder: Path, pattern: str, change: Callable[[dict[str, Any]], dict[s
 
 STATISTICS: dict[str, tuple[str, Callable[[Any, Any], dict[str, Any]], str]] = {
     "missing": ("act", lambda name, _: {name: None}, "no std"),
+    "no mean": ("act", lambda name, _: {name.replace(".std", ".mean"): None}, "no mean"),
     "too long": ("act", lambda name, x: {name: x.repeat(2)}, r"std has shape \(12,\), not \(6,\)"),
     "broadcast": ("act", lambda name, x: {name: x[:1]}, r"std has shape \(1,\), not \(6,\)"),
     "a number": ("act", lambda name, x: {name: x[0].clone()}, r"std has shape \(\), not"),
