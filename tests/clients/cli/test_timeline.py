@@ -303,7 +303,7 @@ def test_the_lines_show_each_consumer_from_left_to_right(printed: Story) -> None
     assert shown[1].startswith("GPU 0 Simulated GPU")
     assert shown[1].endswith("of 8 GiB")
     by_name = {line[: chart.NAME_CHARS].strip(): line[chart.NAME_CHARS + 2 :] for line in shown}
-    assert re.fullmatch("▒?█+", by_name["encoder"])
+    assert re.fullmatch(" *▒?█+", by_name["encoder"])
     assert re.fullmatch(" *▒?█*▼+", by_name["detector"])
     assert re.fullmatch(" *·*▒+", by_name["grab"])
     assert len(by_name["encoder"]) == chart.CELLS, "it is held to the end"
