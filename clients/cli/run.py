@@ -24,7 +24,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.http import METHODS, HttpAction, Request, checked_url
-from vram_arbiter.clients.foreign.program import adopt_orphans
+from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram, adopt_orphans
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
@@ -218,12 +218,10 @@ def _json(args: argparse.Namespace, option: str) -> str:
 
 async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     """Return the program's exit code. Raises the typed error of a lease that was not granted,
-    ArbiterUnreachable, CheckpointUnsupported, ConfigError."""
+    ArbiterUnreachable, CheckpointUnsupported, ConfigError; with a record also CalibrationFailed."""
     program = shutil.which(spec.command[0])
     if program is None:
-        code, problem = _why_not(spec.command[0])
-        say(f"{spec.command[0]}: {problem}")
-        return code
+        return _not_started(spec)
     if spec.action is not None:
         spec.action.check()
     if spec.comes_back:
@@ -237,13 +235,43 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
             check_gpus(spec.gpu, status.gpus)
         supervisor = Supervisor(spec, client, program)
         await supervisor.acquire()
-        with Forwarding(supervisor.asked_to_end) as signals:
-            try:
-                await supervisor.start(signals)
-            except OSError as error:
-                say(f"{program}: {error.strerror}")
-                return NOT_STARTED
-            code = await supervisor.until_ended()
+        try:
+            if spec.record is not None:
+                await spec.record.begin()
+            with Forwarding(supervisor.asked_to_end) as signals:
+                try:
+                    await supervisor.start(signals)
+                except OSError as error:
+                    say(f"{program}: {error.strerror}")
+                    return NOT_STARTED
+                code = await supervisor.until_ended()
+            if spec.record is not None:
+                supervisor.check_undisturbed()
+                await spec.record.end()
+        finally:
+            await supervisor.lease.release(exiting=True)
+    return code if code >= 0 else 128 - code
+
+
+async def run_alone(spec: RunSpec) -> int:
+    """Run a program without a lease, for its record alone. Returns its exit code."""
+    path = shutil.which(spec.command[0])
+    if path is None:
+        return _not_started(spec)
+    assert spec.record is not None, "nothing else is done without a lease"
+    await spec.record.begin()
+    environ = {**os.environ, **spec.environ}
+    program = await ForeignProgram.start(path, spec.command[1:], environ, STDERR)
+    with Forwarding(lambda number: None) as signals:
+        signals.to(program)
+        try:
+            async with asyncio.timeout(spec.limit_s):
+                code = await program.wait()
+        except TimeoutError:
+            await program.end(spec.grace_s)
+            code = 0
+        await program.end_orphans()
+    await spec.record.end()
     return code if code >= 0 else 128 - code
 
 
@@ -256,8 +284,9 @@ def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
         )
 
 
-def _why_not(command: str) -> tuple[int, str]:
-    """The exit code and the reason for a command that is not an executable file."""
+def _not_started(spec: RunSpec) -> int:
+    """Say why a command is not an executable file. Returns the exit code."""
+    command = spec.command[0]
     folders = [""] if os.sep in command else os.environ.get("PATH", os.defpath).split(os.pathsep)
     found = [
         path
@@ -265,5 +294,7 @@ def _why_not(command: str) -> tuple[int, str]:
         if command and os.path.exists(path := os.path.join(folder, command))
     ]
     if not found:
-        return NOT_FOUND, "not found"
-    return NOT_STARTED, "is a directory" if os.path.isdir(found[0]) else "permission denied"
+        say(f"{command}: not found")
+        return NOT_FOUND
+    say(f"{command}: {'is a directory' if os.path.isdir(found[0]) else 'permission denied'}")
+    return NOT_STARTED
