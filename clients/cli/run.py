@@ -235,21 +235,13 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
             check_gpus(spec.gpu, status.gpus)
         supervisor = Supervisor(spec, client, program)
         await supervisor.acquire()
-        try:
-            if spec.record is not None:
-                await spec.record.begin()
-            with Forwarding(supervisor.asked_to_end) as signals:
-                try:
-                    await supervisor.start(signals)
-                except OSError as error:
-                    say(f"{program}: {error.strerror}")
-                    return NOT_STARTED
-                code = await supervisor.until_ended()
-            if spec.record is not None:
-                supervisor.check_undisturbed()
-                await spec.record.end()
-        finally:
-            await supervisor.lease.release(exiting=True)
+        with Forwarding(supervisor.asked_to_end) as signals:
+            try:
+                await supervisor.start(signals)
+            except OSError as error:
+                say(f"{program}: {error.strerror}")
+                return NOT_STARTED
+            code = await supervisor.until_ended()
     return code if code >= 0 else 128 - code
 
 

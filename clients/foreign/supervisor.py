@@ -73,13 +73,20 @@ class Supervisor:
         self._lease = await self._acquire(self._spec.wait_timeout_s)
 
     async def start(self, signals: Forwards) -> None:
-        """Start the program. Raises OSError."""
+        """Start the program. Raises OSError, and what its record raises, with the lease
+        released."""
         self._signals = signals
-        await self._start()
+        try:
+            if self._spec.record is not None:
+                await self._spec.record.begin()
+            await self._start()
+        except (OSError, VramError):
+            await self.lease.release()
+            raise
 
     async def until_ended(self) -> int:
-        """Keep the program and its lease together. Return the program's exit code; the caller
-        releases the lease."""
+        """Keep the program and its lease together. Return the program's exit code. Raises what its
+        record raises."""
         self._spawn(self._follow())
         self._spawn(self._watch())
         if self._spec.limit_s is not None:
@@ -92,10 +99,16 @@ class Supervisor:
             await self._program.end(self._grace_s)  # where it has not ended itself
             if self._spec.comes_back:
                 await self._program.end_orphans()
-        say(self.peak.text())
+        try:
+            if self._spec.record is not None:
+                self._check_undisturbed()
+                await self._spec.record.end()
+        finally:
+            say(self.peak.text())
+            await self.lease.release(exiting=True)
         return code
 
-    def check_undisturbed(self) -> None:
+    def _check_undisturbed(self) -> None:
         """Raises CalibrationFailed where the program did not have its lease until it ended."""
         if self._ending or self.lease.state == "gone":
             raise CalibrationFailed(

@@ -180,7 +180,6 @@ USER_UNIT = {
     "/home/op/.config/systemd/user/vram-arbiter.service": UNIT,
     "/home/op/.config/systemd/user/default.target.wants/vram-arbiter.service": "",
 }
-SERVED = {"/proc/net/tcp": f"{TCP} 0: 0100007F:24F8 00000000:0000 0A 0:0 0:0 0 1000 0 9 1\n"}
 PCI = "/sys/bus/pci/devices/0000:01:00.0"
 GONE: Mapping[str, str | None] = {"/proc/driver/nvidia/version": None}
 NOT_FOUND = field(
@@ -336,16 +335,6 @@ CASES = [
         {"/proc/meminfo": "MemAvailable: 16777216 kB\nSwapTotal: 0 kB\n"},
     ),
     Case("ports.arbiters", "kill 800", SECOND),
-    Case(
-        "ports.taken",
-        "sed -i 's/\\b9464\\b/9465/' /etc/vram-arbiter/arbiter.yaml && sudo systemctl restart",
-        {"/etc/vram-arbiter/arbiter.yaml": "telemetry:\n  prometheus_port: 9464\n", **SERVED},
-    ),
-    Case(
-        "ports.taken",
-        "vram-arbiter --http 127.0.0.1:9465",
-        {f"/proc/{PID}/cmdline": "vram-arbiter\0--http\x00127.0.0.1:9464\0", **SERVED},
-    ),
     Case(
         "units.missing",
         "vramctl install",
