@@ -22,8 +22,7 @@ from typing import Any
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.clients.sidecar.spawn import SpawnSpec
-from vram_arbiter.schemas.errors import ConfigError, VramError
+from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable, VramError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 from vram_arbiter.schemas.manifest.vocabulary import Modality
 from vram_arbiter.schemas.plain import Message
@@ -78,24 +77,39 @@ def check(manifest: RSkillManifest, pictures: Path | None) -> None:
 
 
 async def run(plan: Plan) -> dict[str, float]:
-    """Return the marks. Raises the sidecar's typed errors."""
-    manifest, marks = load_manifest(Path(plan.rskill)), {"requests": float(plan.requests)}
+    """Return the marks. Raises the sidecar's typed errors, SidecarUnavailable where it ends."""
     with tempfile.TemporaryDirectory(prefix="vc") as folder:
         endpoint = f"ipc://{folder}/calibrate.sock"
-        spawn = SpawnSpec([*plan.sidecar, "--endpoint", endpoint], log=Path(folder) / "log")
-        client = CLIENTS[manifest.kind](endpoint, spawn=spawn, timeout_s=LOAD_S)
+        process = await asyncio.create_subprocess_exec(*plan.sidecar, "--endpoint", endpoint)
+        working = asyncio.create_task(_work(plan, endpoint))
+        try:
+            ended = asyncio.create_task(process.wait())
+            await asyncio.wait({working, ended}, return_when=asyncio.FIRST_COMPLETED)
+            if not working.done():
+                raise SidecarUnavailable(f"the sidecar ended with exit code {process.returncode}")
+            return working.result()
+        finally:
+            working.cancel()
+            if process.returncode is None:
+                process.terminate()
+            await process.wait()
+
+
+async def _work(plan: Plan, endpoint: str) -> dict[str, float]:
+    manifest, marks = load_manifest(Path(plan.rskill)), {"requests": float(plan.requests)}
+    kind = CLIENTS[manifest.kind]
+    async with kind(endpoint, timeout_s=LOAD_S, connect_timeout_s=LOAD_S) as client:
         ask = asking(client, manifest, plan)
-        async with client:
-            await client.load()
-            await asyncio.sleep(plan.rest_s)
-            marks["asked"] = time.monotonic()
-            for _ in range(plan.requests):
-                await ask()
-            await asyncio.sleep(0.1)  # a reading after the last answer
-            marks["answered"] = time.monotonic()
-            await client.unload()
-            await asyncio.sleep(plan.rest_s)
-            marks["unloaded"] = time.monotonic()
+        await client.load()
+        await asyncio.sleep(plan.rest_s)
+        marks["asked"] = time.monotonic()
+        for _ in range(plan.requests):
+            await ask()
+        await asyncio.sleep(0.1)  # a reading after the last answer
+        marks["answered"] = time.monotonic()
+        await client.unload()
+        await asyncio.sleep(plan.rest_s)
+        marks["unloaded"] = time.monotonic()
     return marks
 
 

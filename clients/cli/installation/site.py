@@ -4,7 +4,6 @@ Paths of the other modules are those of the installed machine; only `Site.at` kn
 """
 
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,6 @@ before, and those that have members."""
 LINKS_MAX = 40
 LINK = "-> "
 """Begins the text of a link; its target follows."""
-_NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +142,6 @@ class Site:
     def record(self) -> Path:
         """The file that says what was installed."""
         return self.layout.settings / "installed.json"
-
-
-def check_name(name: str, what: str) -> str:
-    """Return a group's name. Raises ConfigError for one that no unit could hold."""
-    if not _NAME.fullmatch(name):
-        raise ConfigError(f"expected the name of a {what}, got {name!r}")
-    return name
 
 
 def is_tegra(site: Site) -> bool:
