@@ -27,9 +27,9 @@ from vram_arbiter.clients.cli import run as runs
 from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.foreign.run_spec import RunSpec
-from vram_arbiter.clients.net.request import Unreachable, ask
+from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
-from vram_arbiter.schemas.errors import ArbiterUnreachable, CalibrationFailed, ConfigError
+from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, load_manifest
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
@@ -220,13 +220,9 @@ async def _measure(args: argparse.Namespace, record: Record, command: list[str],
 
 
 def _room(gpu: Gpu, endpoint: str | None) -> int:
-    """Return the bytes that a lease alone on the GPU can have now. Raises ConfigError."""
-    try:
-        status = ask("status", {}, endpoint)
-    except Unreachable as error:
-        hint = "start it, or use --no-arbiter where none runs"
-        raise ArbiterUnreachable(str(error), hint=hint) from error
-    for view in status.get("gpus", ()):
+    """Return the bytes that a lease alone on the GPU can have now. Raises ConfigError,
+    ArbiterUnreachable."""
+    for view in ask("status", {}, endpoint).get("gpus", ()):
         if view["gpu"] == gpu.uuid:
             kept = sum(process["residue_bytes"] or 0 for process in view["processes"])
             taken = view["reserve_bytes"] + view["stowaway_bytes"] + kept

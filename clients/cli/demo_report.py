@@ -147,5 +147,5 @@ def draw_timeline(
             reader.event(event)
             ends.append(event["at_wall_s"])
     for at_s in story.refused_at_s:
-        reader.mark(Mark(at_s + wall_offset_s, "oom", "out of memory", gpu))
+        reader.marks.append(Mark(at_s + wall_offset_s, "oom", "out of memory", gpu))
     write(path, reader.story(max(ends)), title)

@@ -35,8 +35,8 @@ from vram_arbiter.clients.cli.installation.site import (
     layout_of_user,
 )
 from vram_arbiter.clients.cli.replies import NO, OK
-from vram_arbiter.clients.net.request import Unreachable, ask
-from vram_arbiter.schemas.errors import ConfigError, InstallFailed
+from vram_arbiter.clients.net.request import ask
+from vram_arbiter.schemas.errors import ConfigError, InstallFailed, VramError
 from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME, arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.version import version
@@ -254,7 +254,7 @@ def _stops(site: Site, record: Record) -> list[Step]:
         endpoint = arbiter_endpoint(os.environ, os.getuid())
     try:
         leases = ask("status", {}, endpoint).get("leases", ()) if found else ()
-    except Unreachable:
+    except VramError:
         leases = ()
     held = ", ".join(lease["consumer"] for lease in leases if lease["charge_bytes"])
     told = [f"these hold a lease, and unload without an arbiter: {held}"] if held else []

@@ -22,7 +22,7 @@ def socket(m: Machine) -> Iterator[Finding]:
     problem = m.arbiter.problem
     if problem is None:
         return
-    said = str(problem)
+    said = problem.message
     if problem.code == "untrusted_server":
         found = m.stat(path)
         uid = "" if found is None else str(found.st_uid)

@@ -20,7 +20,7 @@ from typing import Final
 from vram_arbiter.clients.cli.doctor.findings import CouldNotLook
 from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.codec import CodecError, from_map
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
@@ -55,7 +55,7 @@ class Arbiter:
     server: str = ""  # its version
     pid: int | None = None  # 0: of another pid namespace
     uid: int | None = None
-    problem: request.Unreachable | None = None
+    problem: VramError | None = None
     refusal: ErrorView | None = None
 
 
@@ -228,7 +228,7 @@ def ask_arbiter(endpoint: str) -> Arbiter:
         events = request.ask("history", {"after": after, "limit": EVENTS}, endpoint)
         told, name = from_map(HistoryReply, events), from_map(PingReply, ping)
         return Arbiter(from_map(StatusReply, status), told.events, name.server, pid, uid)
-    except request.Unreachable as error:
+    except VramError as error:
         return Arbiter(problem=error)
     except (CodecError, KeyError) as error:
         view = ErrorView("internal", f"its answer is not understood: {error}", "", {})

@@ -18,10 +18,9 @@ from vram_arbiter.clients.cli.offline import EVENT_LOG
 from vram_arbiter.clients.cli.status import all_pages
 from vram_arbiter.clients.cli.timeline.reader import Reader
 from vram_arbiter.clients.cli.timeline.story import Story
-from vram_arbiter.clients.net.request import Unreachable
 from vram_arbiter.schemas.codec import from_map
 from vram_arbiter.schemas.defaults import RESERVE_BYTES
-from vram_arbiter.schemas.errors import ArbiterUnreachable, OperatorError, from_wire
+from vram_arbiter.schemas.errors import OperatorError, from_wire
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import LeaseView
@@ -65,13 +64,6 @@ class Range:
 def from_history(wanted: Range, endpoint: str | None) -> Story:
     """Read the history of a running daemon. Raises EmptyTimeline, ArbiterUnreachable, and what the
     arbiter refuses."""
-    try:
-        return _from_history(wanted, endpoint)
-    except Unreachable as error:
-        raise ArbiterUnreachable(str(error), hint=error.hint) from error
-
-
-def _from_history(wanted: Range, endpoint: str | None) -> Story:
     begin = wanted.begin_s(time.time(), 0.0)
     last_seq = int(_checked(history.page(NEVER, 1, (), endpoint))["last_seq"])
     start = history.first_since(begin, last_seq, endpoint)

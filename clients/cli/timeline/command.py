@@ -70,7 +70,10 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         problem = f"{out} cannot be written: {error.strerror}"
         raise ConfigError(problem, hint="name a file in a folder that you can write") from error
-    print(_summary(story, out))
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(story.begin_s))
+    leases, evictions = plural(len(story.leases), "lease"), plural(len(story.evictions), "eviction")
+    lasted_s = story.end_s - story.begin_s
+    print(f"{out}: {lasted_s:.1f} s from {began}, {leases}, {evictions}")
     return OK
 
 
@@ -84,11 +87,3 @@ def write(out: Path, story: Story, title: str = "") -> None:
     from vram_arbiter.clients.cli.timeline.png import write as write_png
 
     write_png(out, story, title)
-
-
-def _summary(story: Story, out: Path) -> str:
-    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(story.begin_s))
-    return (
-        f"{out}: {story.end_s - story.begin_s:.1f} s from {began}, "
-        f"{plural(len(story.leases), 'lease')}, {plural(len(story.evictions), 'eviction')}"
-    )

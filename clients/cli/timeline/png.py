@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from vram_arbiter.clients.cli.timeline.story import GpuStory, LeaseStory, Mark, Story
+from vram_arbiter.clients.cli.timeline.story import GpuStory, LeaseStory, Story
 from vram_arbiter.clients.cli.timeline.trace import steps_of
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.runtime.extras import need
@@ -24,9 +24,6 @@ _PAINTS: Final = {
     "revoke": "#e8a0bf", "quiesce": "#c86fa0", "unload": "#8f4fa8", "verify": "#4b3f8f",
     "standby": "#d6d6d6", "parked": "#b9c6d6",
 }  # fmt: skip
-_LOUD: Final = frozenset(
-    {"oom", "denied", "lost", "expired", "signalled", "probe_failed", "stowaway"}
-)
 _RED: Final = "#c00000"
 
 
@@ -143,18 +140,13 @@ def _lanes(axes: Any, story: Story, rows: Sequence[_Row]) -> None:
             paints = [_PAINTS[span.name if spans is states else "in use"] for span in spans]
             ranges = [(span.begin_s - story.begin_s, span.end_s - span.begin_s) for span in spans]
             axes.broken_barh(ranges, (bottom, height), facecolors=paints, edgecolors=paints, lw=0.4)
-    _moments(axes, story.begin_s, story.marks)
+    for mark in story.marks:
+        axes.vlines(mark.at_s - story.begin_s, -1.3, -0.7, color="#1c1c1e", lw=1.5)
     axes.set_yticks([-1, *range(len(rows))], ["moments", *(name for name, _ in rows)])
     axes.set_ylim(len(rows) - 0.4, -1.6)
     for name, paint in _PAINTS.items():
         axes.bar(0.0, 0.0, color=paint, label=name)
     axes.figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=10)
-
-
-def _moments(axes: Any, begin_s: float, marks: Sequence[Mark]) -> None:
-    for mark in marks:
-        color = _RED if mark.kind in _LOUD else "#1c1c1e"
-        axes.vlines(mark.at_s - begin_s, -1.3, -0.7, color=color, lw=1.5)
 
 
 def _short(text: str) -> str:

@@ -21,44 +21,23 @@ from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.views import LeaseView
 
 _NEXT = {
-    "queued": "queued",
-    "granted": "loading",
-    "ready": "held",
-    "revoke_asked": "revoke",
-    "revoke_acked": "quiesce",
-    "revoke_withdrawn": "held",
-    "unloading": "unload",
-    "released": "verify",
-    "standby": "standby",
-    "parked": "parked",
-}
+    "queued": "queued", "granted": "loading", "ready": "held", "revoke_asked": "revoke",
+    "revoke_acked": "quiesce", "revoke_withdrawn": "held", "unloading": "unload",
+    "released": "verify", "standby": "standby", "parked": "parked",
+}  # fmt: skip
 """State after an event of this kind."""
 _BEFORE = {
-    "ready": "loading",
-    "revoke_acked": "revoke",
-    "revoke_withdrawn": "revoke",
-    "verified": "verify",
-    "oom": "loading",
-    "denied": "queued",
-    "cancelled": "queued",
-}
+    "ready": "loading", "revoke_acked": "revoke", "revoke_withdrawn": "revoke",
+    "verified": "verify", "oom": "loading", "denied": "queued", "cancelled": "queued",
+}  # fmt: skip
 """State before an event, for a lease whose beginning is not known; `held` before the others."""
 _OF_VIEW = {"revoking": "revoke", "unloading": "unload", "verifying": "verify"}
 _ENDS = frozenset({"denied", "cancelled"})
 _LOSSES = frozenset({"lost", "expired"})
 MARKED = _LOSSES | {
-    "oom",
-    "denied",
-    "deadline_passed",
-    "signalled",
-    "stowaway",
-    "probe_failed",
-    "started",
-    "stopped",
-    "operator",
-    "resumed",
-    "journal_failed",
-}
+    "oom", "denied", "deadline_passed", "signalled", "stowaway", "probe_failed", "started",
+    "stopped", "operator", "resumed", "journal_failed",
+}  # fmt: skip
 """Kinds of events that are drawn as a moment."""
 
 
@@ -85,16 +64,12 @@ class Reader:
         self._evictions: list[Eviction] = []
         self._gpus: dict[str, GpuStory] = {}
         self._pressed: dict[str, tuple[float, str]] = {}
-        self._marks: list[Mark] = []
+        self.marks: list[Mark] = []
 
     # -- in
     def gpu(self, gpu: str, title: str = "", capacity: int = 0, reserve: int = 0) -> GpuStory:
         """Return a GPU, which is added at first sight."""
         return self._gpus.setdefault(gpu, GpuStory(gpu, title or gpu, capacity, reserve))
-
-    def mark(self, mark: Mark) -> None:
-        """Add a moment that no event tells."""
-        self._marks.append(mark)
 
     def snapshot(self, at_s: float, leases: Iterable[LeaseView]) -> None:
         """Add the leases as they are at a moment. One that is not among them is over."""
@@ -123,12 +98,10 @@ class Reader:
             text = str(event.get("reason") or event.get("action") or "")
             who = str(event.get("consumer") or event.get("name") or event.get("action") or "")
             told = f"{kind.replace('_', ' ')} {who}".strip() + (f": {text}" if text else "")
-            self._marks.append(Mark(at_s, kind, told, event.get("gpu")))
+            self.marks.append(Mark(at_s, kind, told, event.get("gpu")))
         if kind == "pressure":
             self._pressure(at_s, event)
-        elif kind == "switch":
-            self._sizes_of_evicted(event)
-        elif event.get("lease_id") and kind != "operator":
+        elif event.get("lease_id") and kind not in ("operator", "switch"):
             self._of_lease(self._known(at_s, kind, event), at_s, kind, event)
 
     # -- one lease
@@ -220,16 +193,6 @@ class Reader:
             if kind == "revoke_withdrawn" or event.get("resolved"):
                 eviction.end_s, lease.eviction = at_s, None
 
-    def _sizes_of_evicted(self, event: JsonMap) -> None:
-        """A switch names the charges of the leases that left for it: of those whose grant is not
-        known."""
-        for gone in event.get("evicted", ()):
-            known = self._leases.get(str(gone.get("lease_id")))
-            charges = [] if known is None else known.story.charges
-            if known is not None and charges and not any(count for _, count in charges):
-                begin = known.story.states[0].begin_s if known.story.states else 0.0
-                charges.insert(0, (begin, int(gone.get("charge_bytes") or 0)))
-
     def _pressure(self, at_s: float, event: JsonMap) -> None:
         gpu, over = str(event.get("gpu")), int(event.get("pressure_bytes") or 0)
         began = self._pressed.pop(gpu, None)
@@ -257,7 +220,7 @@ class Reader:
             tuple(self._gpus.values()),
             tuple(lease.story for lease in self._leases.values()),
             tuple(self._evictions),
-            tuple(self._marks),
+            tuple(self.marks),
             tuple(notices),
         )
         begin = self._begin_s if begin_s is None else begin_s

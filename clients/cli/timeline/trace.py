@@ -45,7 +45,6 @@ class _Maker:
         titles |= {self._pids[gpu.gpu]: gpu.title for gpu in self._story.gpus}
         for pid, title in titles.items():
             yield self._event("M", "process_name", 0, pid, 0, args={"name": printable(title)})
-            yield self._event("M", "process_sort_index", 0, pid, 0, args={"sort_index": pid})
         for (pid, name), tid in self._tids.items():
             yield self._event("M", "thread_name", 0, pid, tid, args={"name": name})
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from vram_arbiter.clients.cli.doctor.machine import Arbiter, Clocks, Import, Machine, Nvml
-from vram_arbiter.clients.net.request import Unreachable
 from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.errors import ArbiterUnreachable, UntrustedServer
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import StatusReply
@@ -61,7 +61,7 @@ STATUS = StatusReply(
     1, "serving", 5.0, (GPU,), (), Totals(0, 0), 2, HostRamView(8 * GIB, 0), "", ()
 )
 EVENTS = tuple({"seq": n, "kind": "granted", "at_wall_s": 1.9e9 + n} for n in range(3))
-SILENT = Unreachable("no arbiter answers", "look")
+SILENT = ArbiterUnreachable("no arbiter answers", hint="look")
 
 
 def lay(root: Path, files: Mapping[str, str | None]) -> None:
@@ -243,7 +243,7 @@ CASES = [
     Case(
         "socket.untrusted",
         "VRAM_ARBITER_SERVER_USERS",
-        change=arbiter_of(problem=Unreachable("served by uid 5", "", "untrusted_server")),
+        change=arbiter_of(problem=UntrustedServer("served by uid 5")),
     ),
     Case("socket.elsewhere", "ipc:///run/vram-arbiter/arbiter.sock", change=elsewhere),
     Case("socket.missing", "systemctl start vram-arbiter", {SOCKET: None}, silent),

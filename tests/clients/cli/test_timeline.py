@@ -250,7 +250,7 @@ def rules_of_trace(printed: Mapping[str, Any]) -> list[str]:
                 if one["s"] not in ("g", "p", "t"):
                     broken.append(f"scope: {one}")
             case "M":
-                if one["name"] not in ("process_name", "process_sort_index", "thread_name"):
+                if one["name"] not in ("process_name", "thread_name"):
                     broken.append(f"metadata: {one}")
             case _:
                 broken.append(f"phase: {one}")
