@@ -1,5 +1,5 @@
-"""The program that `vramctl calibrate MANIFEST` measures: it loads the manifest's model in a sidecar
-of its own, asks it, unloads it and ends it.
+"""The program that `vramctl calibrate MANIFEST` measures: it loads the manifest's model in a
+sidecar of its own, asks it, unloads it and ends it.
 
 `python -m vram_arbiter.clients.calibration.model PLAN`: a `Plan` as JSON. It writes marks, each the
 monotonic time at which a phase ended, to the file that the plan names, and rests before them.

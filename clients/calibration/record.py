@@ -71,7 +71,8 @@ class Record:
     _thread: threading.Thread | None = None
 
     async def begin(self) -> None:
-        """Measure an empty context, and start the readings. Raises CalibrationFailed, ProbeFailed."""
+        """Measure an empty context, and start the readings. Raises CalibrationFailed,
+        ProbeFailed."""
         adopt_orphans()  # a process stays below this one when its parent ends
         self.series.append((time.monotonic(), 0))
         self._thread = threading.Thread(target=self._run, name="readings", daemon=True)
@@ -147,8 +148,9 @@ class Record:
             still = rested and max(rested) - min(rested) <= REST_BYTES
             if late and still and time.monotonic() - since_s >= self.rest_s:
                 return late[0]
+        patience_s = self.rest_s + self.limit_s
         raise CalibrationFailed(
-            f"bytes on {self.gpu.name} did not come to rest within {self.rest_s + self.limit_s:.0f} s",
+            f"bytes on {self.gpu.name} did not come to rest within {patience_s:.0f} s",
             hint="end other programs on it: where the driver lists no bytes by process, they count",
         )
 

@@ -1,5 +1,5 @@
-"""`vramctl demo --quick`: a real arbiter, a simulated GPU of 8 GiB, and three stand-in programs that
-take turns on it (`demo_stand_in`). Needs the base install only.
+"""`vramctl demo --quick`: a real arbiter, a simulated GPU of 8 GiB, and three stand-in programs
+that take turns on it (`demo_stand_in`). Needs the base install only.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""A stand-in of `vramctl demo --quick`: `python -m vram_arbiter.clients.cli.demo_stand_in NAME SIZE`.
+"""A stand-in of `vramctl demo --quick`, started with its name and the size of its model.
 
 It allocates on the simulated GPU what its model would take, and frees it when it is revoked.
 """

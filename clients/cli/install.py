@@ -15,7 +15,7 @@ from typing import Final
 
 from vram_arbiter.clients.cli.installation.contents import SYSUSERS, TMPFILES, wanted
 from vram_arbiter.clients.cli.installation.environment import check_environment
-from vram_arbiter.clients.cli.installation.files import Files, Record, Step, load
+from vram_arbiter.clients.cli.installation.files import Files, Installed, Step, load
 from vram_arbiter.clients.cli.installation.machine import (
     account_removals,
     check_systemd,
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _install(args: argparse.Namespace, site: Site, before: Record | None) -> int:
+def _install(args: argparse.Namespace, site: Site, before: Installed | None) -> int:
     prefix = args.prefix or Path(sys.prefix)
     if not _PLAIN.fullmatch(str(prefix)) or ".." in prefix.parts:
         raise ConfigError(
@@ -120,7 +120,7 @@ def _install(args: argparse.Namespace, site: Site, before: Record | None) -> int
         )
     if site.live:
         check_environment(prefix, system=site.layout.system)
-    record = before.model_copy(deep=True) if before else Record()
+    record = before.model_copy(deep=True) if before else Installed()
     record.group = _checked(args.group or record.group, "group")
     record.version, record.prefix = version(), prefix
     operators = [_checked(name, "user") for name in args.operators.split(",") if name]
@@ -169,7 +169,7 @@ def _check_rights(what: str, *, system: bool) -> None:
 
 
 # -- plans
-def installation(site: Site, record: Record) -> list[Step]:
+def installation(site: Site, record: Installed) -> list[Step]:
     """Return the steps of an installation; they keep `record` up to date."""
     layout = site.layout
     texts = wanted(site, record.prefix, record.group, record.operators)
@@ -205,7 +205,7 @@ def installation(site: Site, record: Record) -> list[Step]:
     return [*steps, Step("start", f"{ARBITER}, now and at every boot", perform=start)]
 
 
-def removal(site: Site, record: Record, *, purge: bool) -> list[Step]:
+def removal(site: Site, record: Installed, *, purge: bool) -> list[Step]:
     """Return the steps of a removal. `purge`: state, settings, users and changed files too."""
     files, layout = Files(site, record), site.layout
     steps = _stops(site, record) if site.live else []
@@ -241,7 +241,7 @@ def _running(*argv: str) -> Step:
     return Step("run", " ".join(argv), perform=partial(command, *argv))
 
 
-def _stops(site: Site, record: Record) -> list[Step]:
+def _stops(site: Site, record: Installed) -> list[Step]:
     """Stop what runs, the arbiter last."""
     layout = site.layout
     names = (ARBITER, *CLIENTS) if layout.system else OF_USER

@@ -13,7 +13,7 @@ from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 type OnRevoke = Literal["priority", "term", "pin"]
 
 
-class Record(Protocol):
+class Recorder(Protocol):
     """Keeps a program's bytes while it runs (`clients.calibration.record`)."""
 
     async def begin(self) -> None: ...
@@ -46,7 +46,7 @@ class RunSpec:
     park_bytes: int = 0
     environ: Mapping[str, str] = field(default_factory=dict)
     limit_s: float | None = None
-    record: Record | None = None
+    record: Recorder | None = None
 
     @property
     def consumer(self) -> str:

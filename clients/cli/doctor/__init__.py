@@ -56,8 +56,8 @@ CHECKS: Final[Checks] = (
     ("ports", leftovers.arbiters, "no second arbiter of real GPUs"),
     ("units", installation.units, "the unit is enabled, and its program exists"),
 )
-"""First part of the findings' codes, check, and what is said where it finds nothing; in the order of
-the report."""
+"""First part of the findings' codes, check, and what is said where it finds nothing; in the order
+of the report."""
 
 _WIDTH: Final = 22
 

@@ -25,7 +25,7 @@ QUIET: Final = ("same", "gone", "keep")
 """Words of steps after which the machine is as before; a new text beside a file is no change."""
 
 
-class Record(BaseModel):
+class Installed(BaseModel):
     """The file `installed.json`: what was put on the machine."""
 
     model_config = ConfigDict(extra="forbid")
@@ -59,7 +59,7 @@ class Step:
         return self.perform is not None and self.verb not in QUIET
 
 
-def load(site: Site) -> Record | None:
+def load(site: Site) -> Installed | None:
     """Return the record of the last installation, None without one.
 
     Raises ConfigError for a file that this version did not write, or that another user could have.
@@ -70,7 +70,7 @@ def load(site: Site) -> Record | None:
             problem = writable_by_others(os.fstat(file.fileno())) if os.getuid() == 0 else ""
             if problem:
                 raise ConfigError(f"{path} {problem}; it says what root removes", hint="check it")
-            return Record.model_validate_json(file.read())
+            return Installed.model_validate_json(file.read())
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -89,7 +89,7 @@ class Files:
     """Steps for the files of one installation; they keep `record` up to date."""
 
     site: Site
-    record: Record
+    record: Installed
 
     def install(self, wanted: Mapping[Path, str]) -> list[Step]:
         """Return the steps that bring the machine's files to what is wanted."""

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
-from vram_arbiter.clients.cli.installation.files import Record, Step
+from vram_arbiter.clients.cli.installation.files import Installed, Step
 from vram_arbiter.clients.cli.installation.site import DEVICE_GROUPS
 from vram_arbiter.schemas.errors import ConfigError, InstallFailed
 
@@ -78,7 +78,7 @@ def exists(kind: str, name: str) -> bool:
     return True
 
 
-def account_removals(record: Record) -> list[Step]:
+def account_removals(record: Installed) -> list[Step]:
     """Return the steps that remove what systemd-sysusers made; a group of devices that has got
     members stays."""
     steps = []

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 from vram_arbiter.clients.cli.timeline.story import (
     AWAY,
-    Eviction,
     GpuStory,
     LeaseStory,
+    Leaving,
     Mark,
     Span,
     Story,
@@ -50,7 +50,7 @@ class _Open:
     since_s: float
     note: str = ""
     running: dict[str, tuple[float, str]] = field(default_factory=dict)
-    eviction: Eviction | None = None
+    eviction: Leaving | None = None
     ended: bool = False
 
 
@@ -61,7 +61,7 @@ class Reader:
         self._begin_s = begin_s
         self._last_s = begin_s
         self._leases: dict[str, _Open] = {}
-        self._evictions: list[Eviction] = []
+        self._evictions: list[Leaving] = []
         self._gpus: dict[str, GpuStory] = {}
         self._pressed: dict[str, tuple[float, str]] = {}
         self.marks: list[Mark] = []
@@ -185,7 +185,7 @@ class Reader:
         told, eviction = lease.story, lease.eviction
         if kind == "revoke_asked":
             by, reason = str(event.get("wanted_by") or ""), str(event.get("reason") or "")
-            made = Eviction(told.lease_id, told.consumer, told.gpu, by, reason, at_s)
+            made = Leaving(told.lease_id, told.consumer, told.gpu, by, reason, at_s)
             self._evictions.append(made)
             lease.eviction = made
         elif eviction is not None and kind in ("revoke_withdrawn", "verified"):

@@ -33,7 +33,7 @@ class Mark:
 
 
 @dataclass(slots=True)
-class Eviction:
+class Leaving:
     """A lease that was revoked. `end_s` None: it is still leaving."""
 
     lease_id: str
@@ -80,7 +80,7 @@ class Story:
     end_s: float
     gpus: tuple[GpuStory, ...]
     leases: tuple[LeaseStory, ...]
-    evictions: tuple[Eviction, ...]
+    evictions: tuple[Leaving, ...]
     marks: tuple[Mark, ...]
     notices: tuple[str, ...] = ()
 

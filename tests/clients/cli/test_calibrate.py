@@ -382,11 +382,22 @@ async def test_bytes_of_the_tree_are_its_own_also_when_a_parent_has_ended(
     gpu: Gpu, seen: Path
 ) -> None:
     record = Record(gpu, **QUICK)
-    program = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {PROGRAM!r}, *sys.argv[1:]])"
-    assert await recorded(record, sys.executable, "-c", f"{program}.wait()", str(seen)) == 0
+    assert await recorded(record, sys.executable, "-c", ADOPTED, PROGRAM, str(seen)) == 0
     found = record.figures({})
     assert found is not None
     assert found.load_peak == 1500 * MIB
+
+
+ADOPTED = """
+import os, subprocess, sys
+
+begin = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', *sys.argv[1:]], close_fds=0)"
+ended, alive = os.pipe()
+subprocess.run([sys.executable, "-c", begin, *sys.argv[1:]], pass_fds=[alive])
+os.close(alive)
+os.read(ended, 1)
+"""
+"""Its child starts a program and ends; it ends with that program."""
 
 
 @pytest.mark.e2e
