@@ -78,35 +78,6 @@ class YamlText:
         return 0
 
 
-@dataclass(frozen=True, slots=True)
-class BlockMap:
-    """Place of a map in a text: the offsets of its values, and the column of its keys."""
-
-    values: Mapping[str, tuple[int, int]]
-    column: int
-
-
-def top_keys(text: str) -> list[str]:
-    """Return the keys of a document that `parse_yaml` has taken for a map."""
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    return [] if root is None else [key.value for key, _ in root.value]
-
-
-def block_map(text: str, key: str) -> BlockMap | None:
-    """Return where the map under a top-level key stands; None unless it has lines of its own."""
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    node = {at.value: value for at, value in ([] if root is None else root.value)}.get(key)
-    if not isinstance(node, yaml.MappingNode) or node.flow_style or not node.value:
-        return None
-    values = {at.value: (value.start_mark.index, value.end_mark.index) for at, value in node.value}
-    return BlockMap(values, node.value[0][0].start_mark.column)
-
-
-def reads_as_text(value: str) -> bool:
-    """Return whether a text without quotes is read as that text."""
-    return bool(yaml.safe_load(value) == value)
-
-
 def read_text(path: FilePath, *, hint: str = "", trusted: bool = False) -> str:
     """Return the text of a file of at most TEXT_MAX_BYTES. `trusted`: no other user but root can
     have written it. Raises ConfigError that names the path."""

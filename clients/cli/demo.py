@@ -75,6 +75,12 @@ class Watch:
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="no robot: three stand-in programs take turns on a simulated GPU, in 20 s at most and "
+        "with the base install; no other option applies",
+    )
+    parser.add_argument(
         "--seed",
         type=arguments.count(0, SEED_MAX),
         default=0,
@@ -120,6 +126,13 @@ def run(args: argparse.Namespace) -> int:
 
     With the arbiter: completed without an out-of-memory. Without: an out-of-memory.
     """
+    if args.quick:
+        from vram_arbiter.clients.cli import demo_quick
+
+        options = ("seed", "arbiter", "gpu", "http", "out")
+        if any(getattr(args, name) != args.parser.get_default(name) for name in options):
+            args.parser.error("--quick takes no other option")
+        return demo_quick.run()
     if args.gpu != "nvml" and not args.gpu.startswith("fake:"):
         args.parser.error(f"--gpu: expected nvml or fake:SIZE, got {args.gpu!r}")
     arbiter = args.arbiter == "on"

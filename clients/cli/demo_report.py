@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vram_arbiter.clients.cli.timeline.command import write
 from vram_arbiter.clients.cli.timeline.reader import Reader
-from vram_arbiter.clients.cli.timeline.story import Mark, within
+from vram_arbiter.clients.cli.timeline.story import Mark
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 SPLIT = ("wait_ms", "drain_ms", "unload_ms", "verify_ms", "load_ms", "total_ms")
@@ -136,7 +136,7 @@ def draw_timeline(
     begin_s = start_s + wall_offset_s
     gpu = next((str(event["gpu"]) for event in events if event.get("gpu")), "GPU")
     reader = Reader(begin_s)
-    held = reader.gpu(gpu, "GPU", capacity_bytes, 0).held
+    held = reader.gpu(gpu, "GPU", capacity_bytes).held
     ends = [begin_s + 1.0]
     for point in sorted(story.points, key=lambda point: point.at_s):
         at_s = point.at_s + wall_offset_s
@@ -147,6 +147,5 @@ def draw_timeline(
             reader.event(event)
             ends.append(event["at_wall_s"])
     for at_s in story.refused_at_s:
-        reader.mark(Mark(at_s + wall_offset_s, "oom", "out of memory", gpu))
-    story_told = reader.story(max(ends))
-    write(path, within(story_told, story_told.first_s, story_told.end_s), title)
+        reader.marks.append(Mark(at_s + wall_offset_s, "oom", "out of memory", gpu))
+    write(path, reader.story(max(ends)), title)

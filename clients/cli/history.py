@@ -187,7 +187,7 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 
 def collect(wanted: Wanted, endpoint: str | None) -> Message:
     """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises
-    `Unreachable`."""
+    ArbiterUnreachable."""
     reply = page(NEVER, 1, (), endpoint)
     if not reply.get("ok"):
         return reply
@@ -225,7 +225,7 @@ def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
 
 
 def page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
-    """Ask for the events after a number. Raises `Unreachable`."""
+    """Ask for the events after a number. Raises ArbiterUnreachable."""
     return request.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)}, endpoint)
 
 

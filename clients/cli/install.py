@@ -1,29 +1,43 @@
-"""`vramctl install` and `vramctl uninstall`: show the plan, ask, perform it."""
+"""`vramctl install` and `vramctl uninstall`: show the plan, ask, perform it.
+
+Files are written here; systemd-sysusers makes the users, systemd-tmpfiles the folders.
+"""
 
 import argparse
 import os
+import re
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Final
 
-from vram_arbiter.clients.cli.installation.contents import wanted
-from vram_arbiter.clients.cli.installation.environment import check_environment, check_prefix
-from vram_arbiter.clients.cli.installation.install import Installation, check_rights
-from vram_arbiter.clients.cli.installation.machine import Services
-from vram_arbiter.clients.cli.installation.record import Record, load
-from vram_arbiter.clients.cli.installation.removal import Removal
+from vram_arbiter.clients.cli.installation.contents import SYSUSERS, TMPFILES, wanted
+from vram_arbiter.clients.cli.installation.environment import check_environment
+from vram_arbiter.clients.cli.installation.files import Files, Installed, Step, load
+from vram_arbiter.clients.cli.installation.machine import (
+    account_removals,
+    check_systemd,
+    command,
+    exists,
+    known_units,
+    missing_accounts,
+    systemctl,
+)
 from vram_arbiter.clients.cli.installation.site import (
     ARBITER,
+    CLIENTS,
     GROUP,
+    OF_USER,
     SYSTEM,
     Site,
-    check_name,
     layout_of_user,
-    user_home,
 )
-from vram_arbiter.clients.cli.installation.steps import Files, Step, store
 from vram_arbiter.clients.cli.replies import NO, OK
-from vram_arbiter.schemas.errors import ConfigError, InstallFailed
+from vram_arbiter.clients.net.request import ask
+from vram_arbiter.schemas.errors import ConfigError, InstallFailed, VramError
+from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME, arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.version import version
 
@@ -35,73 +49,88 @@ DESCRIPTIONS = {
     "uninstall": "Remove what `vramctl install` put on this machine, after showing the plan. Files "
     "that were changed by hand stay, and so do state, settings and users, unless --purge.",
 }
+NO_START: Final = (
+    "see `journalctl -u vram-arbiter -n 20`; without a GPU write "
+    'ARBITER_OPTIONS="--gpu fake:8GiB" into /etc/vram-arbiter/arbiter.env; then install again'
+)
+RUNTIME: Final = Path("/run/vram-arbiter")
+_NAME: Final = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+_PLAIN: Final = re.compile(r"/[A-Za-z0-9._+/-]*")
+"""What a unit file holds as it is."""
 
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    add = parser.add_argument
     if command == "install":
-        parser.add_argument(
-            "--prefix",
-            metavar="DIR",
-            type=Path,
+        add(
+            "--prefix", metavar="DIR", type=Path,
             help="environment whose programs the units start (default: the one of this vramctl)",
-        )
-        parser.add_argument(
+        )  # fmt: skip
+        add(
             "--group",
             help=f"group that may connect and hold leases (default: {GROUP}, or that of the last "
             "installation)",
         )
-        parser.add_argument(
-            "--operators",
-            metavar="USERS",
-            default="",
+        add(
+            "--operators", metavar="USERS", default="",
             help="users who may evict, pin and drain: alice,bob",
-        )
+        )  # fmt: skip
     else:
-        parser.add_argument(
-            "--purge",
-            action="store_true",
+        add(
+            "--purge", action="store_true",
             help="also remove state, caches, settings, users, and files that were changed by hand",
-        )
-    parser.add_argument(
-        "--user-units", action="store_true", help="the calling user's systemd; needs no root"
-    )
-    parser.add_argument(
-        "--root",
-        metavar="DIR",
-        type=Path,
-        default=Path("/"),
+        )  # fmt: skip
+    add("--user-units", action="store_true", help="the calling user's systemd; needs no root")
+    add(
+        "--root", metavar="DIR", type=Path, default=Path("/"),
         help="write files only, below this folder: for an image or a package",
-    )
-    parser.add_argument("--dry-run", action="store_true", help="show the plan and exit")
-    parser.add_argument("--yes", action="store_true", help="do not ask")
+    )  # fmt: skip
+    add("--dry-run", action="store_true", help="show the plan and exit")
+    add("--yes", action="store_true", help="do not ask")
 
 
 def run(args: argparse.Namespace) -> int:
-    layout = layout_of_user(os.environ, user_home(os.environ)) if args.user_units else SYSTEM
+    layout = layout_of_user(os.environ) if args.user_units else SYSTEM
     site = Site(layout, args.root.absolute())
-    if not args.dry_run:
-        check_rights(site, what=args.command_name)
     if site.live:
-        Services(layout.system).check()
+        if not args.dry_run:
+            _check_rights(args.command_name, system=layout.system)
+        check_systemd(system=layout.system)
     before = load(site)
-    if args.command_name == "uninstall":
-        return _uninstall(args, site, before)
-    return _install(args, site, before)
+    if args.command_name == "install":
+        return _install(args, site, before)
+    if before is None:
+        print(f"nothing is installed: there is no {site.at(site.record)}")
+        return OK
+    steps = removal(site, before, purge=args.purge)
+    if (code := _confirm(args, steps)) is not None:
+        return code
+    _perform(steps)
+    kept = "" if args.purge else f"; `{before.prefix}/bin/vramctl uninstall --purge` removes state"
+    print(f"next: the programs stay in {before.prefix}{kept}")
+    return OK
 
 
-def _install(args: argparse.Namespace, site: Site, before: Record | None) -> int:
+def _install(args: argparse.Namespace, site: Site, before: Installed | None) -> int:
     prefix = args.prefix or Path(sys.prefix)
-    check_prefix(prefix)
+    if not _PLAIN.fullmatch(str(prefix)) or ".." in prefix.parts:
+        raise ConfigError(
+            f"expected an absolute path of letters, digits and ._+- for --prefix, got '{prefix}'",
+            hint="a unit file gives other characters a meaning",
+        )
     if site.live:
         check_environment(prefix, system=site.layout.system)
-    record = before.model_copy(deep=True) if before else Record()
-    record.group = check_name(args.group or record.group, "group")
+    record = before.model_copy(deep=True) if before else Installed()
+    record.group = _checked(args.group or record.group, "group")
     record.version, record.prefix = version(), prefix
-    operators = tuple(check_name(name, "user") for name in args.operators.split(",") if name)
+    operators = [_checked(name, "user") for name in args.operators.split(",") if name]
     if operators and not (site.layout.system and site.live):
         raise ConfigError("--operators needs the machine's units", hint="leave it out")
-    installation = Installation(site, record, wanted(site, prefix, record.group), operators)
-    steps = installation.steps()
+    for name in operators:
+        if not exists("user", name):
+            raise ConfigError(f"--operators names {name!r}, which is not a user of this machine")
+    record.operators = list(dict.fromkeys([*record.operators, *operators]))
+    steps = installation(site, record)
     what = "this machine" if site.layout.system else "this user"
     print(f"vram-arbiter {version()} from {prefix} for {what if site.live else site.root}:")
     changing = any(step.changes for step in steps)
@@ -111,27 +140,150 @@ def _install(args: argparse.Namespace, site: Site, before: Record | None) -> int
         _perform(steps)
     finally:
         if record != before:
-            store(Files(site, record))
-    upgraded = changing and before is not None and ARBITER in before.enabled
-    if upgraded and site.live and Services(site.layout.system).is_active(ARBITER):
+            Files(site, record).store()
+    if site.live and changing and before is not None and before.started:
         user = "" if site.layout.system else "--user "
         print(f"next: systemctl {user}restart vram-arbiter (holders keep their leases)")
     return OK
 
 
-def _uninstall(args: argparse.Namespace, site: Site, before: Record | None) -> int:
-    if before is None:
-        print(f"nothing is installed: there is no {site.at(site.record)}")
-        return OK
-    steps = Removal(site, before, args.purge).steps()
-    if (code := _confirm(args, steps)) is not None:
-        return code
-    _perform(steps)
-    kept = "" if args.purge else f"; `{before.prefix}/bin/vramctl uninstall --purge` removes state"
-    print(f"next: the programs stay in {before.prefix}{kept}")
-    return OK
+def _checked(name: str, what: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"expected the name of a {what}, got {name!r}")
+    return name
 
 
+def _check_rights(what: str, *, system: bool) -> None:
+    """Raises ConfigError where the calling user cannot change what belongs to the installation."""
+    if system and os.getuid() != 0:
+        raise ConfigError(
+            f"`vramctl {what}` of the machine's units needs root",
+            hint=f"run it with sudo, or `vramctl {what} --user-units` for an arbiter of your own; "
+            "--dry-run shows the plan to anyone",
+        )
+    if not system and os.getuid() == 0:
+        raise ConfigError(
+            "--user-units as root: root's arbiter is the machine's",
+            hint="run it without sudo, or leave --user-units out",
+        )
+
+
+# -- plans
+def installation(site: Site, record: Installed) -> list[Step]:
+    """Return the steps of an installation; they keep `record` up to date."""
+    layout = site.layout
+    texts = wanted(site, record.prefix, record.group, record.operators)
+    steps = Files(site, record).install(texts)
+    if not site.live:
+        return steps
+    changed = [step.what for step in steps if step.changes]
+    if layout.system:
+        missing = missing_accounts(texts[SYSUSERS])
+
+        def create() -> None:
+            record.accounts += missing
+            command("systemd-sysusers", str(SYSUSERS))
+
+        says = ", ".join(["users and groups", *(f"{kind} {name}" for kind, name in missing)])
+        new = bool(missing) or str(SYSUSERS) in changed
+        steps.append(Step("create" if new else "same", says, perform=create if new else None))
+        if not RUNTIME.is_dir():
+            steps.append(_running("systemd-tmpfiles", "--create", str(TMPFILES)))
+    if any(what.startswith(str(layout.units)) for what in changed):
+        steps.append(_running(*systemctl("daemon-reload", system=layout.system)))
+
+    def start() -> None:
+        try:
+            command(*systemctl("enable", "--now", ARBITER, system=layout.system))
+        except InstallFailed as error:
+            said = f"{ARBITER} does not start: {error.message}"
+            raise InstallFailed(said, hint=NO_START) from error
+        record.started = True
+
+    if record.started:  # once; afterwards its state is the operator's choice
+        return [*steps, Step("same", ARBITER)]
+    return [*steps, Step("start", f"{ARBITER}, now and at every boot", perform=start)]
+
+
+def removal(site: Site, record: Installed, *, purge: bool) -> list[Step]:
+    """Return the steps of a removal. `purge`: state, settings, users and changed files too."""
+    files, layout = Files(site, record), site.layout
+    steps = _stops(site, record) if site.live else []
+    steps += files.remove(purge=purge)
+    units = site.folder(layout.units)
+    for path in sorted(units.glob("vram-*.service.d/*")):  # of `systemctl edit`
+        drop_in = layout.units / path.relative_to(units)
+        if drop_in not in record.files:
+            steps.append(Step("keep", f"{drop_in}: not installed by vramctl"))
+    if site.live and any(step.changes for step in steps):
+        steps.append(_running(*systemctl("daemon-reload", system=layout.system)))
+    if purge:
+        steps += _trees(site, layout.state)
+        # after the state: a folder must not belong to a user id that is given away again
+        steps += account_removals(record) if site.live else []
+        # last, with the record: what failed can be tried again
+        steps += _trees(site, [layout.settings])
+
+    def end() -> None:
+        record.started = False
+        if keeps:
+            files.store()
+        else:
+            site.at(site.record).unlink(missing_ok=True)
+        files.remove_folders()
+
+    keeps = not purge and bool(record.accounts or record.operators)
+    what = f"{site.record}, for --purge" if keeps else str(site.record)
+    return [*steps, Step("same" if keeps else "remove", what, perform=end)]
+
+
+def _running(*argv: str) -> Step:
+    return Step("run", " ".join(argv), perform=partial(command, *argv))
+
+
+def _stops(site: Site, record: Installed) -> list[Step]:
+    """Stop what runs, the arbiter last."""
+    layout = site.layout
+    names = (ARBITER, *CLIENTS) if layout.system else OF_USER
+    mine = [name.replace("@.", "@*.") for name in names if layout.units / name in record.files]
+    if not mine:
+        return []
+    found = known_units(mine, layout.units, system=layout.system)
+    endpoint = f"{IPC}{SYSTEM_RUNTIME}/arbiter.sock"
+    if not layout.system:
+        endpoint = arbiter_endpoint(os.environ, os.getuid())
+    try:
+        leases = ask("status", {}, endpoint).get("leases", ()) if found else ()
+    except VramError:
+        leases = ()
+    held = ", ".join(lease["consumer"] for lease in leases if lease["charge_bytes"])
+    told = [f"these hold a lease, and unload without an arbiter: {held}"] if held else []
+    return [
+        Step(
+            "stop", unit, told if unit == ARBITER else (),
+            partial(command, *systemctl("disable", "--now", unit, system=layout.system)),
+        )
+        for unit in sorted(found, key=lambda unit: unit == ARBITER)
+    ]  # fmt: skip
+
+
+def _trees(site: Site, paths: Iterable[Path]) -> list[Step]:
+    return [
+        Step("remove", f"{path}, with all that is in it", perform=partial(_clear, site.at(path)))
+        for path in paths
+        if site.at(path).exists()
+    ]
+
+
+def _clear(place: Path) -> None:
+    """Remove a folder with all that is in it; a link is removed, not what it leads to."""
+    if place.is_symlink():
+        place.unlink()
+    else:
+        shutil.rmtree(place)
+
+
+# -- performing
 def _confirm(args: argparse.Namespace, steps: Sequence[Step]) -> int | None:
     """Show the plan and ask. Returns the exit code if it is not to be performed.
 
@@ -165,10 +317,9 @@ def _confirm(args: argparse.Namespace, steps: Sequence[Step]) -> int | None:
 
 def _perform(steps: Sequence[Step]) -> None:
     for step in steps:
-        if step.perform is None:
-            continue
         try:
-            step.perform()
+            if step.perform is not None:
+                step.perform()
         except OSError as error:
             raise InstallFailed(
                 f"{step.what}: {error.strerror}", hint="fix it, then run the command again"

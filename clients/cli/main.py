@@ -56,7 +56,7 @@ COMMANDS: Mapping[str, Command] = {
     "why": Command("why", "explain why a consumer is not running", traced=False),
     "history": Command("history", "list grants, evictions and verdicts with their reasons"),
     "timeline": Command(
-        "timeline.command", "draw GPU memory over time as .png, .html or a Perfetto trace"
+        "timeline.command", "draw GPU memory over time, also as .png or a Perfetto trace"
     ),
     "top": Command("top.command", "show everything live on a full screen, with operator keys"),
     "evict": Command("operators", "revoke a lease; a use in flight finishes first"),

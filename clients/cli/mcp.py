@@ -15,9 +15,9 @@ from pydantic import ValidationError
 
 from vram_arbiter.clients.cli import arguments, history, status, text
 from vram_arbiter.clients.cli.replies import ENVELOPE, OK
-from vram_arbiter.clients.net.request import Unreachable, ask
+from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
-from vram_arbiter.schemas.errors import BadRequest, InternalError, UnknownOp
+from vram_arbiter.schemas.errors import BadRequest, InternalError, UnknownOp, VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.version import version
@@ -116,8 +116,8 @@ def server(endpoint: str | None, allow: Sequence[Action]) -> "MCPServer":
         """Ask in a thread. Raises ToolError."""
         try:
             reply = await to_thread.run_sync(question, abandon_on_cancel=True, limiter=limiter)
-        except Unreachable as error:
-            raise ToolError(f"{error.code}: {error} ({error.hint})") from error
+        except VramError as error:
+            raise ToolError(f"{error.code}: {error}") from error
         if not reply.get("ok"):
             raise ToolError(refusal(reply["error"]))
         body = {key: value for key, value in reply.items() if key not in ENVELOPE}

@@ -5,8 +5,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 from vram_arbiter.clients.cli import text
-from vram_arbiter.clients.net.request import Unreachable, ask
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.plain import Message
 
 OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
@@ -24,16 +23,11 @@ def answer(
     hidden: frozenset[str] = ENVELOPE,
     question: Callable[..., Message] = ask,
 ) -> tuple[int, Message]:
-    """Ask and print. Returns the exit code and the reply.
+    """Ask and print. Returns the exit code and the reply. Raises what the question raises.
 
     `--json` prints the reply of `schemas.wire` without the fields in `hidden`.
     """
-    try:
-        reply = question(op, fields, endpoint)
-    except Unreachable as error:
-        problem = {"code": error.code, "message": str(error), "hint": error.hint, "details": {}}
-        complain(problem, as_json=as_json)
-        return USAGE if error.code == ConfigError.code else UNREACHABLE, {}
+    reply = question(op, fields, endpoint)
     if not reply.get("ok"):
         complain(reply["error"], as_json=as_json)
         return NO, {}

@@ -24,7 +24,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.http import METHODS, HttpAction, Request, checked_url
-from vram_arbiter.clients.foreign.program import adopt_orphans
+from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram, adopt_orphans
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
@@ -219,12 +219,10 @@ def _json(args: argparse.Namespace, option: str) -> str:
 
 async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     """Return the program's exit code. Raises the typed error of a lease that was not granted,
-    ArbiterUnreachable, CheckpointUnsupported, ConfigError."""
+    ArbiterUnreachable, CheckpointUnsupported, ConfigError; with a record also CalibrationFailed."""
     program = shutil.which(spec.command[0])
     if program is None:
-        code, problem = _why_not(spec.command[0])
-        say(f"{spec.command[0]}: {problem}")
-        return code
+        return _not_started(spec)
     if spec.action is not None:
         spec.action.check()
     if spec.comes_back:
@@ -248,6 +246,28 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     return code if code >= 0 else 128 - code
 
 
+async def run_alone(spec: RunSpec) -> int:
+    """Run a program without a lease, for its record alone. Returns its exit code."""
+    path = shutil.which(spec.command[0])
+    if path is None:
+        return _not_started(spec)
+    assert spec.record is not None, "nothing else is done without a lease"
+    await spec.record.begin()
+    environ = {**os.environ, **spec.environ}
+    program = await ForeignProgram.start(path, spec.command[1:], environ, STDERR)
+    with Forwarding(lambda number: None) as signals:
+        signals.to(program)
+        try:
+            async with asyncio.timeout(spec.limit_s):
+                code = await program.wait()
+        except TimeoutError:
+            await program.end(spec.grace_s)
+            code = 0
+        await program.end_orphans()
+    await spec.record.end()
+    return code if code >= 0 else 128 - code
+
+
 def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
     """Raises ConfigError where a program that lives on could be granted another GPU later."""
     if wanted == "any" and len(gpus) > 1:
@@ -257,8 +277,9 @@ def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
         )
 
 
-def _why_not(command: str) -> tuple[int, str]:
-    """The exit code and the reason for a command that is not an executable file."""
+def _not_started(spec: RunSpec) -> int:
+    """Say why a command is not an executable file. Returns the exit code."""
+    command = spec.command[0]
     folders = [""] if os.sep in command else os.environ.get("PATH", os.defpath).split(os.pathsep)
     found = [
         path
@@ -266,5 +287,7 @@ def _why_not(command: str) -> tuple[int, str]:
         if command and os.path.exists(path := os.path.join(folder, command))
     ]
     if not found:
-        return NOT_FOUND, "not found"
-    return NOT_STARTED, "is a directory" if os.path.isdir(found[0]) else "permission denied"
+        say(f"{command}: not found")
+        return NOT_FOUND
+    say(f"{command}: {'is a directory' if os.path.isdir(found[0]) else 'permission denied'}")
+    return NOT_STARTED

@@ -17,6 +17,8 @@ from vram_arbiter.schemas.runtime import procfs
 
 ORPHAN_GRACE_S: Final = 5.0
 """From SIGTERM to SIGKILL for processes that outlive the program itself."""
+STDERR: Final = 2
+"""The descriptor, also where `sys.stderr` is another file."""
 ORPHAN_POLL_S: Final = 0.05
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_CHILD_SUBREAPER: Final = 36
@@ -44,8 +46,11 @@ class ForeignProgram:
         self._others = others  # children of this process that are not the program's
 
     @classmethod
-    async def start(cls, path: str, arguments: Sequence[str], environ: Mapping[str, str]) -> Self:
-        """Start it. Raises OSError where it cannot be executed."""
+    async def start(
+        cls, path: str, arguments: Sequence[str], environ: Mapping[str, str], out: int | None = None
+    ) -> Self:
+        """Start it; what it prints goes to the descriptor `out` if one is given. Raises OSError
+        where it cannot be executed."""
         others = frozenset(_children().get(os.getpid(), ()))
         parent = os.getpid()
 
@@ -56,7 +61,7 @@ class ForeignProgram:
                 os._exit(128 + signal.SIGKILL)
 
         child = await asyncio.create_subprocess_exec(
-            path, *arguments, env=environ, preexec_fn=prepare
+            path, *arguments, env=environ, preexec_fn=prepare, stdout=out
         )
         return cls(child, others)
 
@@ -151,7 +156,7 @@ def _send(pid: int, number: signal.Signals) -> None:
     except ProcessLookupError:
         return
     try:
-        if _is_below(pid, os.getpid()):  # asked after the pidfd names the process
+        if is_below(pid, os.getpid()):  # asked after the pidfd names the process
             signal.pidfd_send_signal(pidfd, number)
     except ProcessLookupError:
         pass
@@ -159,7 +164,8 @@ def _send(pid: int, number: signal.Signals) -> None:
         os.close(pidfd)
 
 
-def _is_below(pid: int, ancestor: int) -> bool:
+def is_below(pid: int, ancestor: int) -> bool:
+    """Return whether a process is another one, or descends from it."""
     while pid > 1 and pid != ancestor:
         stat = procfs.read_stat(pid)
         pid = 0 if stat is None else stat.parent_pid

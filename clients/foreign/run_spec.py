@@ -1,8 +1,9 @@
 """What `vramctl run` is told of a program, and the lease that it means."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, RESIDUE_BYTES
@@ -12,6 +13,14 @@ from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 type OnRevoke = Literal["priority", "term", "pin"]
 
 
+class Recorder(Protocol):
+    """Keeps a program's bytes while it runs (`clients.calibration.record`)."""
+
+    async def begin(self) -> None: ...
+
+    async def end(self) -> None: ...
+
+
 @dataclass(frozen=True, slots=True)
 class RunSpec:
     """What to run and what it needs.
@@ -19,6 +28,8 @@ class RunSpec:
     `grace_s`: time from SIGTERM to SIGKILL, or for requests in progress; None: as long as it
     takes. `restarts`: the program is ended to make room, and started again. `action`: it is made
     to free instead, and keeps `park_bytes` of host RAM meanwhile. With neither, its end is the end.
+    `limit_s`: the program is ended after this time, which is no failure. `record`: the program's
+    bytes are recorded, and what it prints goes to stderr.
     """
 
     command: list[str]
@@ -33,6 +44,9 @@ class RunSpec:
     restarts: bool = False
     action: Action | None = None
     park_bytes: int = 0
+    environ: Mapping[str, str] = field(default_factory=dict)
+    limit_s: float | None = None
+    record: Recorder | None = None
 
     @property
     def consumer(self) -> str:

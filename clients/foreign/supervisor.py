@@ -23,11 +23,11 @@ from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.peak import Peak
-from vram_arbiter.clients.foreign.program import ForeignProgram
+from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram
 from vram_arbiter.clients.foreign.run_spec import RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.errors import CalibrationFailed, VramError
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -73,18 +73,24 @@ class Supervisor:
         self._lease = await self._acquire(self._spec.wait_timeout_s)
 
     async def start(self, signals: Forwards) -> None:
-        """Start the program. Raises OSError, with the lease released."""
+        """Start the program. Raises OSError, and what its record raises, with the lease
+        released."""
         self._signals = signals
         try:
+            if self._spec.record is not None:
+                await self._spec.record.begin()
             await self._start()
-        except OSError:
+        except (OSError, VramError):
             await self.lease.release()
             raise
 
     async def until_ended(self) -> int:
-        """Keep the program and its lease together. Return the program's exit code."""
+        """Keep the program and its lease together. Return the program's exit code. Raises what its
+        record raises."""
         self._spawn(self._follow())
         self._spawn(self._watch())
+        if self._spec.limit_s is not None:
+            self._spawn(self._expire(self._spec.limit_s))
         code = await self._over
         for task in self._tasks:
             task.cancel()
@@ -93,9 +99,22 @@ class Supervisor:
             await self._program.end(self._grace_s)  # where it has not ended itself
             if self._spec.comes_back:
                 await self._program.end_orphans()
-        say(self.peak.text())
-        await self.lease.release(exiting=True)
+        try:
+            if self._spec.record is not None:
+                self._check_undisturbed()
+                await self._spec.record.end()
+        finally:
+            say(self.peak.text())
+            await self.lease.release(exiting=True)
         return code
+
+    def _check_undisturbed(self) -> None:
+        """Raises CalibrationFailed where the program did not have its lease until it ended."""
+        if self._ending or self.lease.state == "gone":
+            raise CalibrationFailed(
+                f"the GPU is needed: {self._reason}",
+                hint="nothing was written; calibrate again while the robot is idle",
+            )
 
     def asked_to_end(self, number: signal.Signals) -> None:
         """Take a signal that asks the program to end: it is not started again, and not resumed."""
@@ -122,9 +141,9 @@ class Supervisor:
 
     # -- the program
     async def _start(self) -> None:
-        self._program = await ForeignProgram.start(
-            self._path, self._spec.command[1:], _environ(self.lease)
-        )
+        environ = {**_environ(self.lease), **self._spec.environ}
+        out = None if self._spec.record is None else STDERR
+        self._program = await ForeignProgram.start(self._path, self._spec.command[1:], environ, out)
         assert self._signals is not None
         self._signals.to(self._program)
         self._spawn(self._until_exit(self._program))
@@ -145,6 +164,15 @@ class Supervisor:
             say(f"it did not end within {self._spec.grace_s:g} s and was killed")
         if program.stopping and (count := await program.end_orphans()):
             say(f"ended {count} of its processes that outlived it")
+
+    async def _expire(self, limit_s: float) -> None:
+        await asyncio.sleep(limit_s)
+        assert self._program is not None
+        self._program.stopping = True
+        say(f"ending it after {limit_s:g} s")
+        await self._program.end(self._spec.grace_s)
+        await self._program.end_orphans()
+        self._finish(0)
 
     async def _end_suspended(self, program: ForeignProgram) -> None:
         grace_s = self._grace_s

@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 from vram_arbiter.schemas.defaults import WIRE_VERSION
-from vram_arbiter.schemas.errors import ConfigError, UntrustedServer, VramError
+from vram_arbiter.schemas.errors import ArbiterUnreachable
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.msgpack_codec import pack
@@ -31,16 +31,6 @@ HANGS = (
 )
 
 
-class Unreachable(Exception):
-    """No arbiter answers that may be believed; the text says where, `hint` what to do, `code` is
-    that of the typed error."""
-
-    def __init__(self, message: str, hint: str, code: str = "arbiter_unreachable") -> None:
-        super().__init__(message)
-        self.hint = hint
-        self.code = code
-
-
 def ask(
     op: str,
     fields: JsonMap,
@@ -48,7 +38,10 @@ def ask(
     timeout_s: float = TIMEOUT_S,
     role: str = "observer",
 ) -> Message:
-    """Hello, then one request. Returns its reply, error replies too. Raises Unreachable."""
+    """Hello, then one request. Returns its reply, error replies too.
+
+    Raises ArbiterUnreachable, UntrustedServer, and ConfigError for an endpoint that is not one.
+    """
     import zmq
 
     deadline = time.monotonic() + timeout_s
@@ -60,28 +53,27 @@ def ask(
         "instance": f"vramctl-{os.getpid()}",
         "role": role,
     }
-    try:
-        where = endpoint or arbiter_endpoint(os.environ, os.getuid())
-        silent = Unreachable(f"no arbiter answers at {where} within {timeout_s:g} s", HANGS)
-        if where.startswith("ipc:///") and not os.path.exists(where.removeprefix("ipc://")):
-            _look(where)
-        with (
-            zmq.Context() as context,
-            contextlib.closing(_link(context, where, deadline, silent)) as link,
-        ):
-            for message in (hello, {"op": op, "id": 2, **fields}):
-                link.send(pack(message))
-            return _reply(link, where, deadline, silent)
-    except VramError as error:
-        known = isinstance(error, UntrustedServer | ConfigError)
-        code = error.code if known else "arbiter_unreachable"
-        raise Unreachable(error.message, error.hint, code) from error
+    where = endpoint or arbiter_endpoint(os.environ, os.getuid())
+    late = f"no arbiter answers at {where} within {timeout_s:g} s"
+    silent = ArbiterUnreachable(late, hint=HANGS)
+    if where.startswith("ipc:///") and not os.path.exists(where.removeprefix("ipc://")):
+        _look(where)
+    with (
+        zmq.Context() as context,
+        contextlib.closing(_link(context, where, deadline, silent)) as link,
+    ):
+        for message in (hello, {"op": op, "id": 2, **fields}):
+            link.send(pack(message))
+        return _reply(link, where, deadline, silent)
 
 
 def _link(
-    context: "zmq.Context[zmq.Socket[bytes]]", where: str, deadline: float, silent: Unreachable
+    context: "zmq.Context[zmq.Socket[bytes]]",
+    where: str,
+    deadline: float,
+    silent: ArbiterUnreachable,
 ) -> "Link":
-    """A link to an arbiter that may be believed. Raises Unreachable, UntrustedServer,
+    """A link to an arbiter that may be believed. Raises ArbiterUnreachable, UntrustedServer,
     ConfigError."""
     from vram_arbiter.clients.net.link import Link
 
@@ -100,8 +92,8 @@ def _link(
         time.sleep(RETRY_S)
 
 
-def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Message:
-    """The reply to the request, or the refusal of the hello. Raises Unreachable,
+def _reply(link: "Link", where: str, deadline: float, silent: ArbiterUnreachable) -> Message:
+    """The reply to the request, or the refusal of the hello. Raises ArbiterUnreachable,
     UntrustedServer."""
     import msgpack
     import zmq
@@ -121,13 +113,14 @@ def _reply(link: "Link", where: str, deadline: float, silent: Unreachable) -> Me
                 return reply
         if ended:
             _look(where)
-            raise Unreachable(f"the arbiter at {where} hung up", "try again, or look at its log")
+            told = f"the arbiter at {where} hung up"
+            raise ArbiterUnreachable(told, hint="try again, or look at its log")
     raise silent
 
 
 def _look(where: str) -> None:
-    """Raise Unreachable if the kernel knows at once why no arbiter answers."""
+    """Raise ArbiterUnreachable if the kernel knows at once why no arbiter answers."""
     from vram_arbiter.clients.net.diagnose import obstacle
 
     if found := obstacle(where):
-        raise Unreachable(*found)
+        raise ArbiterUnreachable(found[0], hint=found[1])

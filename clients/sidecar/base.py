@@ -1,9 +1,7 @@
-"""Talk to one sidecar: lazy connection, replies matched by id, typed errors, a child of its own
-where no sidecar serves.
+"""Talk to one sidecar: lazy connection, replies matched by id, typed errors.
 
-Rules. The first call connects; a socket that timed out or was hung up on is replaced before the
-next call; a child of ours that died is started again by the next call; a sidecar that another
-program started is used and left running. No failure here reads as an answer: *evicted* or
+Rules. The first call connects, and waits for a sidecar that is starting; a socket that timed out or
+was hung up on is replaced before the next call. No failure here reads as an answer: *evicted* or
 *unavailable* is never "not found". It knows nothing of images or actions.
 
 The server may be one of the field, with a REP socket. The `ping` that begins each connection finds
@@ -12,22 +10,18 @@ one of the other kind. It gets one request at a time, in the shapes of `clients.
 """
 
 import asyncio
-import contextlib
 from collections.abc import Sequence
 from time import monotonic
 from typing import Any, ClassVar, Self, cast
 
 from vram_arbiter.clients._protocol import traces
-from vram_arbiter.clients.net.link import somebody_listens
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.clients.sidecar import field
-from vram_arbiter.clients.sidecar.spawn import Child, SpawnSpec
 from vram_arbiter.schemas.errors import (
     BadRequest,
     FrameStale,
     ModelError,
     SidecarUnavailable,
-    VramError,
     from_wire,
 )
 from vram_arbiter.schemas.plain import JsonMap
@@ -36,16 +30,13 @@ from vram_arbiter.schemas.sidecar import LoadResult, PingResult
 CALL_TIMEOUT_S = 180.0  # a cold load of a large model; the field's clients wait as long
 CONNECT_TIMEOUT_S = 10.0  # for a sidecar that another program starts
 PROBE_S = 1.0  # one ping
-REBIRTH_S = 0.2  # between a broken connection and the kernel's word on its process
-SHUTDOWN_S = 5.0  # from the op's answer to the exit
 
 
 class SidecarClient:
     """Base of the sidecars' clients. `family` says how requests are tagged: `op` (perception) or
     `endpoint` (policy).
 
-    `spawn` starts the sidecar when none answers at `endpoint`. Several calls may be under way. One
-    loop, one process.
+    Several calls may be under way. One loop, one process.
     """
 
     family: ClassVar[field.Family] = "op"
@@ -54,16 +45,12 @@ class SidecarClient:
         self,
         endpoint: str,
         *,
-        spawn: SpawnSpec | None = None,
         timeout_s: float = CALL_TIMEOUT_S,
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self.endpoint = endpoint
-        self.child: Child | None = None
-        """The process that we started, if we did."""
         self.identity: PingResult | None = None
         """The last answer to `ping`."""
-        self._spawn = spawn
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
         self._rpc = RpcClient(endpoint, program="sidecar", lost=self._lost, enveloped=True)
@@ -138,8 +125,8 @@ class SidecarClient:
         timeout_s: float | None = None,
         fresh_s: float | None = None,
     ) -> Any:
-        """One request, connecting and starting the sidecar first where needed. It carries the
-        present span, if there is one.
+        """One request, connecting first where needed. It carries the present span, if there is
+        one.
 
         `fresh_s`: from now on, what was sent has to be looked at within so long; else FrameStale.
         Raises the type of the reply's code (Evicted, NotResident, Loading, OutOfMemory, ModelError,
@@ -160,109 +147,23 @@ class SidecarClient:
         return await self._exchange(op, message, limit_s)
 
     async def close(self) -> None:
-        """End the child that we started (shutdown, SIGTERM, SIGKILL); leave an adopted one alone.
-        Idempotent."""
-        async with self._connecting:
-            child, self.child = self.child, None
-            try:
-                if child is not None:
-                    serves = self._rpc.proven and child.alive
-                    if serves:
-                        with contextlib.suppress(VramError):
-                            await self.shutdown()
-                    await child.end(SHUTDOWN_S if serves else 0.0)
-            finally:
-                self._drop("the client was closed")
+        """Leave the sidecar as it is. Idempotent."""
+        self._drop("the client was closed")
 
     # -- steps: connection
     async def _ensure(self) -> None:
-        """1. Proven already, child alive. 2. A sidecar answers: adopt it. 3. Start a child, or wait
-        for another program's start."""
+        """Connect, unless the server that answered last still holds the connection."""
         async with self._connecting:
-            if self.child is not None and not self._rpc.proven:
-                await self.child.wait(REBIRTH_S)  # it may have hung up because it is dying
-            if self.child is not None and not self.child.alive:
-                self._drop("the sidecar ended")
-                await self._bury()
-            if self._rpc.proven:  # 1
+            if self._rpc.proven:
                 return
-            if self._spawn is not None:
-                if self._somebody_listens() and await self._answers():  # 2
-                    return
-                await self._boot(self._spawn)  # 3
-            elif not await self._answers(self._connect_timeout_s):
+            try:
+                await self.ping(timeout_s=self._connect_timeout_s)
+            except SidecarUnavailable as error:
                 raise SidecarUnavailable(
                     f"no sidecar answers at {self.endpoint} within {self._connect_timeout_s:g} s",
-                    hint="start it with `vram-sidecar`, or give this client a spawn spec",
+                    hint="start it with `vram-sidecar`",
                     details={"endpoint": self.endpoint},
-                )
-
-    def _somebody_listens(self) -> bool:
-        return somebody_listens(self.endpoint)
-
-    async def _answers(self, timeout_s: float = PROBE_S) -> bool:
-        try:
-            await self.ping(timeout_s=timeout_s)
-        except SidecarUnavailable:
-            return False
-        return True
-
-    async def _boot(self, spec: SpawnSpec) -> None:
-        """Start it and wait for its first answer or its end, whichever comes first. A child of ours
-        that lives and is silent is waited for: it still boots, or is dying, and then it is
-        replaced.
-        """
-        if self.child is not None and not self.child.alive:
-            await self._bury()
-        started = self.child is None
-        child = self.child = self.child or Child(spec)
-        exited = asyncio.create_task(child.exited.wait())
-        answered: asyncio.Task[bool] | None = None
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + spec.boot_timeout_s
-        try:
-            while loop.time() < deadline:
-                answered = asyncio.create_task(self._answers(deadline - loop.time()))
-                await asyncio.wait({exited, answered}, return_when=asyncio.FIRST_COMPLETED)
-                if answered.done() and answered.result():
-                    if self.identity and self.identity.get("pid", child.pid) != child.pid:
-                        await self._bury()  # another program was faster: use its sidecar, end ours
-                    return
-                answered.cancel()
-                if await child.wait(REBIRTH_S):
-                    if started:
-                        await self._bury_or_raise()
-                    else:
-                        await self._bury()
-                        self._drop("the sidecar ended")
-                        await self._boot(spec)
-                    return
-            raise SidecarUnavailable(
-                f"the sidecar did not answer within {spec.boot_timeout_s:g} s of its start",
-                hint="see its log",
-                details={"exit_code": None, "log": child.log_tail(), "argv": list(spec.argv)},
-            )
-        finally:
-            exited.cancel()
-            if answered is not None:
-                answered.cancel()
-
-    async def _bury_or_raise(self) -> None:
-        """Our child ended at once: if another process serves the endpoint by now, that is why, and
-        good enough."""
-        assert self.child is not None
-        failure = self.child.failure()
-        await self._bury()
-        self._drop("the sidecar ended")
-        if not await self._answers(
-            self._connect_timeout_s if self._somebody_listens() else PROBE_S
-        ):
-            raise failure
-
-    async def _bury(self) -> None:
-        child, self.child = self.child, None
-        if child is not None:
-            await child.end(0.0)
+                ) from error
 
     # -- steps: one exchange
     async def _ask_field(

@@ -17,7 +17,7 @@ from tests.support.process import ArbiterProcess
 from tests.support.processes import children, server_of_imports
 from tests.support.waiting import until
 from tests.support.wire import WireClient
-from vram_arbiter.clients.calibration.gpu import FakeGpu, Gpu, NvmlGpu
+from vram_arbiter.clients.calibration.gpu import Gpu, open_gpu
 from vram_arbiter.schemas.errors import VramError
 
 MIB, GIB = 2**20, 2**30
@@ -47,7 +47,7 @@ NF4 = "{dtype: int4, extra: {compute_dtype: float32, min_params_to_quantize: 0, 
 def without_cuda() -> str | None:
     """Return why no CUDA program can run here; None: one can."""
     try:
-        NvmlGpu(0)
+        open_gpu("cuda")
     except VramError as error:
         return error.message
     os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # no context in this process
@@ -191,9 +191,9 @@ def kind(request: pytest.FixtureRequest) -> str:
 def machine(kind: str, make_arbiter: Callable[..., ArbiterProcess]) -> Iterator[Machine]:
     if kind == "fake":
         arbiter = make_arbiter().start()
-        made = Machine(kind, arbiter, FakeGpu(arbiter.gpu_folder), 32 * MIB)
+        made = Machine(kind, arbiter, open_gpu(f"fake:{arbiter.gpu_folder}"), 32 * MIB)
     else:
-        made = Machine(kind, make_arbiter(gpu="nvml").start(), NvmlGpu(0), 512 * MIB)
+        made = Machine(kind, make_arbiter(gpu="nvml").start(), open_gpu("cuda"), 512 * MIB)
     yield made
     made.close()
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from tests.gpu.conftest import without_cuda
-from vram_arbiter.clients.calibration.gpu import NvmlGpu
+from vram_arbiter.clients.calibration.gpu import open_gpu
 from vram_arbiter.schemas.errors import OutOfMemory
 
 pytestmark = [pytest.mark.gpu, pytest.mark.heavy]
@@ -65,8 +65,8 @@ def test_cuda_is_limited_to_the_granted_gpu() -> None:
     """The last GPU is not the one that CUDA takes by itself, where there are several."""
     import pynvml
 
-    NvmlGpu(0)
-    environ = {**os.environ, "TEST_UUID": NvmlGpu(pynvml.nvmlDeviceGetCount() - 1).uuid}
+    open_gpu("cuda")
+    environ = {**os.environ, "TEST_UUID": open_gpu(f"cuda:{pynvml.nvmlDeviceGetCount() - 1}").uuid}
     environ.pop("CUDA_VISIBLE_DEVICES", None)
     done = subprocess.run(
         [sys.executable, "-c", BIND], env=environ, capture_output=True, text=True, timeout=120

@@ -1,22 +1,16 @@
 """A sidecar of the tests, in a process of its own: the op family on `clients.net.server`, without
 any model. Not a test module.
 
-Usage: server_process.py ENDPOINT [crash | silent | slow]. `crash` prints and exits with 3, `silent`
-never serves.
+Usage: server_process.py ENDPOINT.
 """
 
 import asyncio
 import os
 import sys
-import time
 from typing import Any
 
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.schemas.errors import CODES, VramError
-
-DYING_S = 1.5
-"""A process that held gigabytes of a GPU hangs up long before the kernel says that it has
-ended."""
 
 
 def failure(error: VramError) -> dict[str, Any]:
@@ -29,12 +23,7 @@ def failure(error: VramError) -> dict[str, Any]:
     }
 
 
-async def main(endpoint: str, mode: str) -> None:
-    if mode == "crash":
-        print("cannot find the weights")
-        raise SystemExit(3)
-    if mode == "silent":
-        await asyncio.Event().wait()
+async def main(endpoint: str) -> None:
     stopped = asyncio.Event()
 
     async with RouterServer(endpoint, failure) as server:
@@ -48,12 +37,6 @@ async def main(endpoint: str, mode: str) -> None:
                 case "detect" if message["query"] in CODES:
                     reply = failure(CODES[message["query"]]("as asked", hint="h", details={"n": 1}))
                 case "detect" if message["query"] == "die":
-                    os._exit(9)
-                case "detect" if message["query"] == "die slowly":
-                    os.closerange(
-                        3, 1024
-                    )  # as the kernel does, before it says that a process has ended
-                    time.sleep(DYING_S)
                     os._exit(9)
                 case "detect" if message["query"] == "hang":
                     return
@@ -89,4 +72,4 @@ async def main(endpoint: str, mode: str) -> None:
         serving.cancel()
 
 
-asyncio.run(main(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else ""))
+asyncio.run(main(sys.argv[1]))

@@ -5,7 +5,6 @@ import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,10 +17,9 @@ from vram_arbiter.clients.cli.doctor import (
     driver,
     health,
     installation,
-    orphans,
-    ports,
+    leftovers,
 )
-from vram_arbiter.clients.cli.doctor.findings import WRONG, Check, Report, Severity, examine
+from vram_arbiter.clients.cli.doctor.findings import WRONG, Checks, Report, Severity, examine
 from vram_arbiter.clients.cli.doctor.machine import ask_nvml, this_installation, this_machine
 from vram_arbiter.clients.cli.replies import NO, OK, UNREACHABLE
 from vram_arbiter.schemas.codec import to_map
@@ -36,30 +34,30 @@ DESCRIPTIONS = {
     "one, 3 if the arbiter cannot be reached."
 }
 
-CHECKS: Final[Sequence[tuple[str, Check]]] = (
-    ("installation", installation.origins),
-    ("driver", driver.driver),
-    ("devices", driver.devices),
-    ("suspend", driver.suspend),
-    ("socket", access.socket),
-    ("permissions", access.permissions),
-    ("operators", access.operators),
-    ("versions", installation.versions),
-    ("daemon", health.daemon),
-    ("probe", health.probe),
-    ("stowaways", health.stowaways),
-    ("orphans", orphans.sockets),
-    ("files", orphans.files),
-    ("clocks", clocks.wall),
-    ("clocks", clocks.monotonic),
-    ("cgroup", cgroup.memory),
-    ("oom", cgroup.out_of_memory),
-    ("parked", cgroup.parked),
-    ("ports", ports.arbiters),
-    ("ports", ports.ports),
-    ("units", installation.units),
+CHECKS: Final[Checks] = (
+    ("installation", installation.origins, ""),
+    ("driver", driver.driver, ""),
+    ("devices", driver.devices, "the device nodes may be opened"),
+    ("suspend", driver.suspend, "no suspend loses GPU memory"),
+    ("socket", access.socket, "an arbiter answers"),
+    ("permissions", access.permissions, "the socket is open to its group alone"),
+    ("operators", access.operators, "this user may evict, pin and drain"),
+    ("versions", installation.versions, "client and daemon are of one version"),
+    ("daemon", health.daemon, ""),
+    ("probe", health.probe, ""),
+    ("stowaways", health.stowaways, "every GPU process has a lease"),
+    ("orphans", leftovers.sockets, "every socket beside the arbiter's is served"),
+    ("files", leftovers.files, "no journal or history was set aside"),
+    ("clocks", clocks.wall, "the wall clock did not go back"),
+    ("clocks", clocks.monotonic, "no suspend since the start"),
+    ("cgroup", cgroup.memory, "no memory limit affects the daemon"),
+    ("oom", cgroup.out_of_memory, "the daemon is neither first to be killed nor swapped out"),
+    ("parked", cgroup.parked, "parked weights fit into host RAM"),
+    ("ports", leftovers.arbiters, "no second arbiter of real GPUs"),
+    ("units", installation.units, "the unit is enabled, and its program exists"),
 )
-"""Checks with the first part of their findings' codes, in the order of the report."""
+"""First part of the findings' codes, check, and what is said where it finds nothing; in the order
+of the report."""
 
 _WIDTH: Final = 22
 

@@ -4,15 +4,8 @@ import os
 import stat
 from collections.abc import Iterator
 
-from vram_arbiter.clients.cli.doctor.findings import (
-    CouldNotLook,
-    Finding,
-    error,
-    note,
-    ok,
-    warning,
-)
-from vram_arbiter.clients.cli.doctor.machine import Machine, is_listening
+from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, error, note, warning
+from vram_arbiter.clients.cli.doctor.machine import Machine, unix_sockets
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.endpoints import EXAMPLE, SYSTEM_RUNTIME, socket_path
 
@@ -28,27 +21,23 @@ def socket(m: Machine) -> Iterator[Finding]:
         return
     problem = m.arbiter.problem
     if problem is None:
-        yield ok("socket.answers", f"an arbiter answers at {m.endpoint}")
         return
+    said = problem.message
     if problem.code == "untrusted_server":
         found = m.stat(path)
         uid = "" if found is None else str(found.st_uid)
-        yield error("socket.untrusted", str(problem), f"export VRAM_ARBITER_SERVER_USERS={uid}")
-        return
-    if path != SYSTEM_SOCKET and is_listening(m, SYSTEM_SOCKET):
-        yield error(
-            "socket.elsewhere",
-            f"no arbiter at {m.endpoint}, and the system's arbiter listens at {SYSTEM_SOCKET}",
-            f"export VRAM_ARBITER_ENDPOINT={EXAMPLE}",
-        )
+        yield error("socket.untrusted", said, f"export VRAM_ARBITER_SERVER_USERS={uid}")
+    elif path != SYSTEM_SOCKET and unix_sockets(m).get(SYSTEM_SOCKET):
+        what = f"no arbiter at {m.endpoint}, and the system's arbiter listens at {SYSTEM_SOCKET}"
+        yield error("socket.elsewhere", what, f"export VRAM_ARBITER_ENDPOINT={EXAMPLE}")
     elif (closed := _closed(m, path)) is not None:
-        yield error("socket.closed", str(problem), _join(m, closed))
+        yield error("socket.closed", said, _join(m, closed))
     elif not m.exists(path):
-        yield error("socket.missing", str(problem), m.service("start"))
-    elif not is_listening(m, path):
-        yield error("socket.dead", str(problem), m.service("start"))
+        yield error("socket.missing", said, m.service("start"))
+    elif not unix_sockets(m).get(path):
+        yield error("socket.dead", said, m.service("start"))
     else:
-        yield error("socket.silent", str(problem), m.service("restart"))
+        yield error("socket.silent", said, m.service("restart"))
 
 
 def permissions(m: Machine) -> Iterator[Finding]:
@@ -58,11 +47,8 @@ def permissions(m: Machine) -> Iterator[Finding]:
     if (closed := _closed(m, path)) is not None:
         group = m.group_name(closed.st_gid)
         if name in m.group_members(group):
-            yield error(
-                "permissions.session",
-                f"{name} is a member of {group}, but this session began before that",
-                f"newgrp {group}",
-            )
+            what = f"{name} is a member of {group}, but this session began before that"
+            yield error("permissions.session", what, f"newgrp {group}")
         else:
             yield error("permissions.group", f"{name} may not use {path}", _join(m, closed))
         return
@@ -70,49 +56,30 @@ def permissions(m: Machine) -> Iterator[Finding]:
     above = m.stat(folder)
     if found is None or above is None:
         raise CouldNotLook(f"{path} is not there")
-    clean = True
     if found.st_mode & stat.S_IWOTH:
-        clean = False
-        yield warning(
-            "permissions.socket",
-            f"{path} has mode {stat.S_IMODE(found.st_mode):04o}: every user may take leases",
-            f"{m.sudo}chmod 0660 {path}",
-        )
+        what = f"{path} has mode {stat.S_IMODE(found.st_mode):04o}: every user may take leases"
+        yield warning("permissions.socket", what, f"{m.sudo}chmod 0660 {path}")
     writable = above.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     if above.st_mode & stat.S_IWOTH or (writable and not above.st_mode & stat.S_ISVTX):
-        clean = False
-        yield warning(
-            "permissions.folder",
-            f"{folder} has mode {stat.S_IMODE(above.st_mode):04o}: others may replace its sockets",
-            f"{m.sudo}chmod 1770 {folder}",
-        )
+        bits = stat.S_IMODE(above.st_mode)
+        what = f"{folder} has mode {bits:04o}: others may replace its sockets"
+        yield warning("permissions.folder", what, f"{m.sudo}chmod 1770 {folder}")
     if m.arbiter.uid == 0 and m.is_system:
-        clean = False
         yield warning(
             "permissions.root",
             "the daemon runs as root; its unit runs it as vram-arbiter without any capability",
             f"{m.sudo}kill {m.arbiter.pid} && {m.sudo}systemctl start vram-arbiter",
         )
-    if clean:
-        owner, group = m.user_name(found.st_uid), m.group_name(found.st_gid)
-        mode = stat.S_IMODE(found.st_mode)
-        yield ok("permissions.sound", f"{path}: {owner}:{group}, mode {mode:04o}")
 
 
 def operators(m: Machine) -> Iterator[Finding]:
     """Whether this user may act by hand. Most users need not."""
-    if not m.is_system or m.uid in (0, m.arbiter.uid):
-        yield ok("operators.may", f"{m.user_name(m.uid)} may evict, pin and drain")
-        return
     name = m.user_name(m.uid)
-    if name in m.group_members("vram-operators"):
-        yield ok("operators.may", f"{name} may evict, pin and drain (vram-operators)")
-    else:
-        yield note(
-            "operators.may-not",
-            f"{name} may look and lease, not evict, pin or drain",
-            f"{m.sudo}usermod --append --groups vram-operators {name}",
-        )
+    others = m.is_system and m.uid not in (0, m.arbiter.uid)
+    if others and name not in m.group_members("vram-operators"):
+        what = f"{name} may look and lease, not evict, pin or drain"
+        join = f"{m.sudo}usermod --append --groups vram-operators {name}"
+        yield note("operators.may-not", what, join)
 
 
 def _closed(m: Machine, path: str) -> os.stat_result | None:

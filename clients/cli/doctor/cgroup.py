@@ -3,14 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from vram_arbiter.clients.cli.doctor.findings import (
-    CouldNotLook,
-    Finding,
-    error,
-    note,
-    ok,
-    warning,
-)
+from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, error, note, warning
 from vram_arbiter.clients.cli.doctor.health import status_of
 from vram_arbiter.clients.cli.doctor.machine import Machine
 from vram_arbiter.schemas.defaults import MIB
@@ -25,80 +18,59 @@ UNIT_SCORE: Final = -500
 
 def memory(m: Machine) -> Iterator[Finding]:
     """No cgroup above the daemon limits it to less than it needs, or killed for it."""
-    line = next(
-        (one for one in m.daemon_file("cgroup").splitlines() if one.startswith("0::")), None
+    lines = m.daemon_file("cgroup").splitlines()
+    group = next(
+        (one.removeprefix("0::").rstrip("/") for one in lines if one.startswith("0::")), ""
     )
-    if line is None or not m.exists("/sys/fs/cgroup/cgroup.controllers"):
+    if not m.exists("/sys/fs/cgroup/cgroup.controllers"):
         raise CouldNotLook("this machine has no cgroup v2")
-    group = line.removeprefix("0::").rstrip("/")
-    clean = True
     while group:
-        place = f"/sys/fs/cgroup{group}"
-        unit = group.rpartition("/")[2]
-        for name in ("memory.max", "memory.high"):
+        place, unit = f"/sys/fs/cgroup{group}", group.rpartition("/")[2]
+        lift = f"{m.sudo}systemctl set-property {unit}"
+        for name, key in (("memory.max", "MemoryMax"), ("memory.high", "MemoryHigh")):
             limit = (m.text(f"{place}/{name}") or "max").strip()
             if limit != "max" and int(limit) < LIMIT_MIN_BYTES:
-                clean = False
-                key = "MemoryMax" if name == "memory.max" else "MemoryHigh"
-                yield warning(
-                    "cgroup.limit",
-                    f"{name} of {group} is {format_bytes(int(limit))}, the daemon may need 140 MiB",
-                    f"{m.sudo}systemctl set-property {unit} {key}=infinity",
-                )
+                size = format_bytes(int(limit))
+                what = f"{name} of {group} is {size}, the daemon may need 140 MiB"
+                yield warning("cgroup.limit", what, f"{lift} {key}=infinity")
         kills = _field(m.text(f"{place}/memory.events"), "oom_kill")
         if kills and unit.startswith("vram-arbiter"):
-            clean = False
-            yield error(
-                "cgroup.killed",
-                f"the kernel killed {kills} processes of {group} for want of memory",
-                f"{m.sudo}systemctl set-property {unit} MemoryMax=infinity",
-            )
+            what = f"the kernel killed {kills} processes of {group} for want of memory"
+            yield error("cgroup.killed", what, f"{lift} MemoryMax=infinity")
         group = group.rpartition("/")[0]
-    if clean:
-        yield ok("cgroup.limit", "no memory limit affects the daemon")
 
 
 def out_of_memory(m: Machine) -> Iterator[Finding]:
     """The daemon is not the first to be killed, and is not swapped out."""
     score = int(m.daemon_file("oom_score_adj"))
-    pid, clean = m.arbiter.pid, True
     if score > 0 or (score > UNIT_SCORE and m.is_system):
-        clean = False
         yield warning(
             "oom.score",
             f"oom_score_adj of the daemon is {score}: when host memory runs out it ends before "
             "programs that it knows",
-            f"echo {UNIT_SCORE} | {m.sudo}tee /proc/{pid}/oom_score_adj",
+            f"echo {UNIT_SCORE} | {m.sudo}tee /proc/{m.arbiter.pid}/oom_score_adj",
         )
     swapped = _field(m.daemon_file("status"), "VmSwap:") * 1024
     if swapped >= SWAPPED_MIN_BYTES:
-        clean = False
-        yield warning(
-            "oom.swapped",
-            f"{format_bytes(swapped)} of the daemon are swapped out: decisions wait for the disk",
-            f"{m.sudo}systemctl set-property vram-arbiter MemorySwapMax=0 && "
-            f"{m.service('restart')}",
-        )
-    if clean:
-        yield ok("oom.score", f"oom_score_adj of the daemon is {score}, nothing is swapped out")
+        keep = f"{m.sudo}systemctl set-property vram-arbiter MemorySwapMax=0"
+        what = f"{format_bytes(swapped)} of the daemon are swapped out: decisions wait for the disk"
+        yield warning("oom.swapped", what, f"{keep} && {m.service('restart')}")
 
 
 def parked(m: Machine) -> Iterator[Finding]:
     """Parked weights fit into host RAM."""
-    ram = status_of(m).host_ram
-    info = m.text("/proc/meminfo")
+    ram, info = status_of(m).host_ram, m.text("/proc/meminfo")
     if info is None:
         raise CouldNotLook("/proc/meminfo is not there")
     available = _field(info, "MemAvailable:") * 1024
-    swap = _field(info, "SwapTotal:") * 1024
-    more = ram.budget_bytes - ram.parked_bytes
-    budget, free = format_bytes(ram.budget_bytes), format_bytes(available)
-    if more > available + _field(info, "SwapFree:") * 1024:
+    free, swap = format_bytes(available), _field(info, "SwapTotal:")
+    if ram.budget_bytes - ram.parked_bytes > available + _field(info, "SwapFree:") * 1024:
         without = "" if swap else ", and there is no swap"
         yield warning(
             "parked.budget",
-            f"parked weights may take {budget}, {format_bytes(ram.parked_bytes)} are taken, and "
-            f"{free} of host RAM are available{without}",
+            f"parked weights may take {format_bytes(ram.budget_bytes)}, "
+            f"{format_bytes(ram.parked_bytes)} are taken, and {free} of host RAM are available"
+            f"{without}",
             f"printf 'host:\\n  park_budget_bytes: {available // 2}\\n' | "
             f"{m.sudo}tee -a /etc/vram-arbiter/arbiter.yaml && {m.service('restart')}",
         )
@@ -109,8 +81,6 @@ def parked(m: Machine) -> Iterator[Finding]:
             f"{m.sudo}fallocate -l 4G /swapfile && {m.sudo}chmod 600 /swapfile && "
             f"{m.sudo}mkswap /swapfile && {m.sudo}swapon /swapfile",
         )
-    else:
-        yield ok("parked.budget", f"parked weights may take {budget}, {free} are available")
 
 
 def _field(text: str | None, name: str) -> int:

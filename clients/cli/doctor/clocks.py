@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from itertools import pairwise
 from typing import Final
 
-from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, note, ok, warning
+from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, note, warning
 from vram_arbiter.clients.cli.doctor.machine import Machine
 from vram_arbiter.clients.cli.text import duration
 
@@ -23,35 +24,22 @@ def wall(m: Machine) -> Iterator[Finding]:
         return
     if m.arbiter.status is None:
         raise CouldNotLook("jumps of the wall clock show in the history, and no arbiter answers")
-    before, jumps = None, []
-    for event in m.arbiter.history:
-        if before is not None and event["at_wall_s"] < before["at_wall_s"] - JUMP_S:
-            jumps.append((before, event))
-        before = event
-    if jumps:
-        before, after = jumps[-1]
+    now = {"seq": "the present", "at_wall_s": m.clocks.wall}
+    for before, after in pairwise([*m.arbiter.history, now]):
         back = before["at_wall_s"] - after["at_wall_s"]
-        yield warning(
-            "clocks.jumped",
-            f"the wall clock went back by {duration(back)} between the events {before['seq']} and "
-            f"{after['seq']}: times of the history before that are wrong",
-            fix,
-        )
-    elif before is not None and before["at_wall_s"] > m.clocks.wall + JUMP_S:
-        ahead = before["at_wall_s"] - m.clocks.wall
-        yield warning(
-            "clocks.jumped",
-            f"the newest event is {duration(ahead)} in the future: the wall clock went back",
-            fix,
-        )
-    else:
-        yield ok("clocks.wall", f"no jump of the wall clock in {len(m.arbiter.history)} events")
+        if back > JUMP_S:
+            yield warning(
+                "clocks.jumped",
+                f"the wall clock went back by {duration(back)} between the events {before['seq']} "
+                f"and {after['seq']}: times of the history before that are wrong",
+                fix,
+            )
 
 
 def monotonic(m: Machine) -> Iterator[Finding]:
     """Programs and daemon count the same seconds."""
-    offsets = m.text("/proc/self/timens_offsets") or ""
-    moved = [line.split()[0] for line in offsets.splitlines() if any(_nonzero(line))]
+    offsets = (m.text("/proc/self/timens_offsets") or "").splitlines()
+    moved = [line.split()[0] for line in offsets if set(line.split()[1:]) - {"0", "-0"}]
     if moved:
         yield warning(
             "clocks.namespace",
@@ -62,14 +50,5 @@ def monotonic(m: Machine) -> Iterator[Finding]:
         return
     slept = m.clocks.boottime - m.clocks.monotonic
     if slept > SLEPT_S:
-        yield note(
-            "clocks.slept",
-            f"the machine slept for {duration(slept)} since it was started; no TTL ran meanwhile",
-            "vramctl history --kind resumed",
-        )
-    else:
-        yield ok("clocks.monotonic", "boottime and monotonic agree: no suspend since the start")
-
-
-def _nonzero(line: str) -> list[bool]:
-    return [word.lstrip("-") != "0" for word in line.split()[1:]]
+        what = f"the machine slept for {duration(slept)} since its start; no TTL ran meanwhile"
+        yield note("clocks.slept", what, "vramctl history --kind resumed")

@@ -50,6 +50,8 @@ class CouldNotLook(Exception):
 
 
 type Check = Callable[["Machine"], Iterator[Finding]]
+type Checks = Sequence[tuple[str, Check, str]]
+"""(first part of the codes, check, what is said where it finds nothing)"""
 
 
 def ok(code: str, found: str) -> Finding:
@@ -68,12 +70,12 @@ def error(code: str, found: str, fix: str) -> Finding:
     return Finding(code, Severity.ERROR, found, fix)
 
 
-def examine(machine: "Machine", checks: Sequence[tuple[str, Check]]) -> tuple[Finding, ...]:
+def examine(machine: "Machine", checks: Checks) -> tuple[Finding, ...]:
     """Run the checks. One that cannot be done leaves a finding that says why, never nothing."""
     found: list[Finding] = []
-    for name, check in checks:
+    for name, check, sound in checks:
         try:
-            found += check(machine)
+            found += list(check(machine)) or [ok(f"{name}.sound", sound)]
         except CouldNotLook as why:
             found.append(Finding(f"{name}.unknown", Severity.UNKNOWN, f"could not look: {why}"))
     return tuple(found)

@@ -1,7 +1,6 @@
 """Checks of what the arbiter says: its files, grants, GPUs, processes without a lease."""
 
 from collections.abc import Iterator
-from typing import Final
 
 from vram_arbiter.clients.cli.doctor.findings import (
     CouldNotLook,
@@ -14,12 +13,6 @@ from vram_arbiter.clients.cli.doctor.findings import (
 from vram_arbiter.clients.cli.doctor.machine import Machine
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.views import GpuView
-
-READS: Final = {
-    "unified": "memory shared with the CPU, read from /proc/meminfo",
-    "fake": "a simulated GPU",
-}
 
 
 def status_of(m: Machine) -> StatusReply:
@@ -49,39 +42,30 @@ def probe(m: Machine) -> Iterator[Finding]:
     if not gpus:
         yield error("probe.none", "the arbiter leases no GPU", "nvidia-smi")
     for gpu in gpus:
-        yield _gpu(m, gpu)
-
-
-def _gpu(m: Machine, gpu: GpuView) -> Finding:
-    name, blocked = f"gpu {gpu.index} {gpu.name}", gpu.blocked
-    if gpu.measured_used_bytes is None:
-        why = "" if blocked is None else f" ({blocked.text})"
-        what = f"{name}: its probe does not answer, nothing is granted{why}"
-        return error("probe.unreadable", what, "nvidia-smi")
-    if gpu.pressure_bytes:
-        over = format_bytes(gpu.pressure_bytes)
-        return error(
-            "probe.pressure",
-            f"{name}: {over} more are held than were granted",
-            "vramctl history --kind pressure --kind stowaway --kind drift",
-        )
-    if blocked is not None:
-        return note("probe.blocked", f"{name}: no grants now: {blocked.text}", "vramctl status")
-    return ok("probe.reads", f"{name}: its probe answers ({READS.get(gpu.source, gpu.source)})")
+        name, blocked = f"gpu {gpu.index} {gpu.name}", gpu.blocked
+        if gpu.measured_used_bytes is None:
+            why = "" if blocked is None else f" ({blocked.text})"
+            what = f"{name}: its probe does not answer, nothing is granted{why}"
+            yield error("probe.unreadable", what, "nvidia-smi")
+        elif gpu.pressure_bytes:
+            what = f"{name}: {format_bytes(gpu.pressure_bytes)} more are held than were granted"
+            kinds = "--kind pressure --kind stowaway --kind drift"
+            yield error("probe.pressure", what, f"vramctl history {kinds}")
+        elif blocked is not None:
+            what = f"{name}: no grants now: {blocked.text}"
+            yield note("probe.blocked", what, "vramctl status")
+        else:
+            yield ok("probe.reads", f"{name}: its probe answers (source {gpu.source})")
 
 
 def stowaways(m: Machine) -> Iterator[Finding]:
     """Every process with bytes on a GPU has a lease."""
-    found = [one for gpu in status_of(m).gpus for one in gpu.processes if one.stowaway]
-    for one in found:
+    for one in (one for gpu in status_of(m).gpus for one in gpu.processes if one.stowaway):
         size = "unknown bytes" if one.used_bytes is None else format_bytes(one.used_bytes)
-        words = [word for word in m.command_line(one.pid) if word]
         vram = size.replace(" ", "") if one.used_bytes else "SIZE"
-        again = " ".join(words) if words else one.name
+        again = " ".join(word for word in m.command_line(one.pid) if word) or one.name
         yield warning(
             "stowaways.process",
             f"pid {one.pid} {one.name} holds {size} without a lease",
             f"kill {one.pid}; vramctl run --vram {vram} -- {again}",
         )
-    if not found:
-        yield ok("stowaways.none", "every GPU process has a lease")

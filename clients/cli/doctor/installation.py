@@ -22,27 +22,18 @@ def origins(m: Machine) -> Iterator[Finding]:
     """One copy of the package is on the path, and the programs on PATH belong to it."""
     installed = m.installed
     yield ok("installation.origin", f"{installed.package} ({installed.version})")
-    if installed.strays:
-        yield error(
-            "installation.mixed",
-            f"modules come from two copies of the package, also from {installed.strays[0]}",
-            _remove(installed.strays[0], installed.bin),
-        )
+    for stray in installed.strays[:1]:
+        what = f"modules come from two copies of the package, also from {stray}"
+        yield error("installation.mixed", what, _remove(stray, installed.bin))
     for copy in installed.copies:
         if os.path.realpath(copy) != os.path.realpath(installed.package):
-            yield note(
-                "installation.shadowed",
-                f"another copy is on the path of this Python, but is not used: {copy}",
-                _remove(copy, installed.bin),
-            )
+            what = f"another copy is on the path of this Python, but is not used: {copy}"
+            yield note("installation.shadowed", what, _remove(copy, installed.bin))
     for name, place in installed.programs.items():
         own = os.path.realpath(f"{installed.bin}/{name}")
         if place != own and os.path.exists(own):
-            yield warning(
-                "installation.path",
-                f"`{name}` on PATH is {place}, this installation has {own}",
-                f"{m.sudo}ln -sf {own} /usr/local/bin/{name}",
-            )
+            what = f"`{name}` on PATH is {place}, this installation has {own}"
+            yield warning("installation.path", what, f"{m.sudo}ln -sf {own} /usr/local/bin/{name}")
 
 
 def _remove(copy: str, bin: str) -> str:
@@ -54,53 +45,36 @@ def _remove(copy: str, bin: str) -> str:
 
 def versions(m: Machine) -> Iterator[Finding]:
     """Client and daemon are of one version."""
-    if m.arbiter.refusal is not None and m.arbiter.refusal.code == "version_mismatch":
-        yield error("versions.wire", m.arbiter.refusal.message, m.service("restart"))
+    refusal, own = m.arbiter.refusal, m.installed.version
+    if refusal is not None and refusal.code == "version_mismatch":
+        yield error("versions.wire", refusal.message, m.service("restart"))
     elif m.arbiter.status is None:
         raise CouldNotLook("no arbiter answers")
-    elif (daemon := m.arbiter.server.rpartition(" ")[2]) != m.installed.version:
-        yield warning(
-            "versions.differ",
-            f"the daemon runs {daemon or 'an unknown version'}, this program is "
-            f"{m.installed.version}",
-            m.service("restart"),
-        )
-    else:
-        yield ok("versions.same", f"client and daemon are {daemon}")
+    elif (daemon := m.arbiter.server.rpartition(" ")[2]) != own:
+        what = f"the daemon runs {daemon or 'an unknown version'}, this program is {own}"
+        yield warning("versions.differ", what, m.service("restart"))
 
 
 def units(m: Machine) -> Iterator[Finding]:
     """The arbiter's unit is installed, enabled, and starts a program that exists."""
     if not m.exists("/run/systemd/system"):
         raise CouldNotLook("systemd does not run here")
-    system = _unit(m, SYSTEM_FOLDERS)
-    user = _unit(m, user_folders(m.environ))
+    system, user = _unit(m, SYSTEM_FOLDERS), _unit(m, user_folders(m.environ))
     if system is None and user is None:
-        yield note(
-            "units.missing",
-            "no unit vram-arbiter.service: the arbiter does not start with the machine",
-            f"{m.sudo}vramctl install",
-        )
+        what = "no unit vram-arbiter.service: the arbiter does not start with the machine"
+        yield note("units.missing", what, f"{m.sudo}vramctl install")
         return
     enabled = _enabled(m, "/etc/systemd/system")
     user_enabled = any(_enabled(m, folder) for folder in user_folders(m.environ))
-    found = list(_of_unit(m, system, "system")) if system else []
-    found += _of_unit(m, user, "user") if user and user_enabled else []
     if enabled and user_enabled:
-        fix = "systemctl --user disable --now vram-arbiter"
-        yield warning(
-            "units.both", "the system's and a user's unit are enabled: two arbiters of one GPU", fix
-        )
+        what = "the system's and a user's unit are enabled: two arbiters of one GPU"
+        yield warning("units.both", what, "systemctl --user disable --now vram-arbiter")
     elif not enabled and not user_enabled:
         command = f"{m.sudo}systemctl" if system else "systemctl --user"
-        yield warning(
-            "units.disabled",
-            f"{system or user} is not enabled: the arbiter does not start with the machine",
-            f"{command} enable --now vram-arbiter",
-        )
-    elif not found:
-        yield ok("units.enabled", f"{system if enabled else user} is enabled")
-    yield from found
+        what = f"{system or user} is not enabled: the arbiter does not start with the machine"
+        yield warning("units.disabled", what, f"{command} enable --now vram-arbiter")
+    yield from _of_unit(m, system, "system") if system else ()
+    yield from _of_unit(m, user, "user") if user and user_enabled else ()
 
 
 def _unit(m: Machine, folders: tuple[str, ...]) -> str | None:
@@ -113,7 +87,7 @@ def _enabled(m: Machine, folder: str) -> bool:
 
 
 def _of_unit(m: Machine, path: str, kind: str) -> Iterator[Finding]:
-    if m.exists(path) and os.path.realpath(m.path(path)) == "/dev/null":
+    if os.path.realpath(m.path(path)) == "/dev/null":
         flag = "--user " if kind == "user" else ""
         yield error(f"units.masked-{kind}", f"{path} is masked", f"systemctl {flag}unmask {UNIT}")
         return

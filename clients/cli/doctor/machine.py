@@ -20,7 +20,7 @@ from typing import Final
 from vram_arbiter.clients.cli.doctor.findings import CouldNotLook
 from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.codec import CodecError, from_map
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
@@ -55,7 +55,7 @@ class Arbiter:
     server: str = ""  # its version
     pid: int | None = None  # 0: of another pid namespace
     uid: int | None = None
-    problem: request.Unreachable | None = None
+    problem: VramError | None = None
     refusal: ErrorView | None = None
 
 
@@ -105,39 +105,26 @@ class Machine:
 
     def text(self, name: str) -> str | None:
         """Return a file's text; None where there is none. Raises CouldNotLook."""
-        try:
-            return self.path(name).read_text(errors="replace")
-        except (FileNotFoundError, NotADirectoryError, ProcessLookupError):
-            return None
-        except OSError as error:
-            raise CouldNotLook(f"{name}: {error.strerror}") from error
+        return self._looked(name, lambda place: place.read_text(errors="replace"))
 
     def exists(self, name: str) -> bool:
         """Whether there is such a file, also a link that leads nowhere. Raises CouldNotLook."""
-        try:
-            os.lstat(self.path(name))
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        except OSError as error:
-            raise CouldNotLook(f"{name}: {error.strerror}") from error
-        return True
+        return self._looked(name, os.lstat) is not None
 
     def names(self, folder: str) -> list[str]:
         """Return the names in a folder, sorted; none where there is no folder. Raises
         CouldNotLook."""
-        try:
-            return sorted(os.listdir(self.path(folder)))
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        except OSError as error:
-            raise CouldNotLook(f"{folder}: {error.strerror}") from error
+        return sorted(self._looked(folder, os.listdir) or ())
 
     def stat(self, name: str) -> os.stat_result | None:
         """Return what the file system says of a file; None where there is none. Raises
         CouldNotLook."""
+        return self._looked(name, os.stat)
+
+    def _looked[T](self, name: str, look: Callable[[Path], T]) -> T | None:
         try:
-            return os.stat(self.path(name))
-        except (FileNotFoundError, NotADirectoryError):
+            return look(self.path(name))
+        except (FileNotFoundError, NotADirectoryError, ProcessLookupError):
             return None
         except OSError as error:
             raise CouldNotLook(f"{name}: {error.strerror}") from error
@@ -220,9 +207,9 @@ def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
             time.clock_gettime(time.CLOCK_MONOTONIC),
             time.clock_gettime(time.CLOCK_BOOTTIME),
         ),
-        group_name=_group_name,
-        group_members=_group_members,
-        user_name=_user_name,
+        group_name=lambda gid: _found(lambda key: grp.getgrgid(key).gr_name, gid, str(gid)),
+        group_members=lambda name: _found(lambda key: grp.getgrnam(key).gr_mem, name, []),
+        user_name=lambda uid: _found(lambda key: pwd.getpwuid(key).pw_name, uid, str(uid)),
     )
 
 
@@ -232,23 +219,20 @@ def ask_arbiter(endpoint: str) -> Arbiter:
         status = request.ask("status", {}, endpoint)
         pid, uid = _listener(endpoint)
         if not status.get("ok"):
-            return Arbiter(pid=pid, uid=uid, refusal=_error(status))
+            error = status["error"]
+            view = ErrorView(error["code"], error["message"], error.get("hint", ""), {})
+            return Arbiter(pid=pid, uid=uid, refusal=view)
         ping = request.ask("ping", {}, endpoint)
         last = request.ask("history", {"after": 1 << 62, "limit": 1}, endpoint)
         after = max(0, int(last.get("last_seq", 0)) - EVENTS)
         events = request.ask("history", {"after": after, "limit": EVENTS}, endpoint)
         told, name = from_map(HistoryReply, events), from_map(PingReply, ping)
         return Arbiter(from_map(StatusReply, status), told.events, name.server, pid, uid)
-    except request.Unreachable as error:
+    except VramError as error:
         return Arbiter(problem=error)
     except (CodecError, KeyError) as error:
         view = ErrorView("internal", f"its answer is not understood: {error}", "", {})
         return Arbiter(refusal=view)
-
-
-def _error(reply: JsonMap) -> ErrorView:
-    error = reply["error"]
-    return ErrorView(error["code"], error["message"], error.get("hint", ""), {})
 
 
 def _listener(endpoint: str) -> tuple[int | None, int | None]:
@@ -313,11 +297,6 @@ def ask_nvml() -> Nvml:
     return Nvml(version, gpus)
 
 
-def is_listening(machine: Machine, path: str) -> bool:
-    """Whether a process listens on a unix socket. Raises CouldNotLook."""
-    return unix_sockets(machine).get(path, False)
-
-
 def unix_sockets(machine: Machine) -> Mapping[str, bool]:
     """Return the paths of bound unix sockets by the kernel's table, and which of them listen.
     Raises CouldNotLook."""
@@ -335,22 +314,9 @@ def unix_sockets(machine: Machine) -> Mapping[str, bool]:
 _LISTENS: Final = 0x10000  # __SO_ACCEPTCON, linux/net.h
 
 
-def _group_name(gid: int) -> str:
+def _found[K, T](look: Callable[[K], T], key: K, otherwise: T) -> T:
+    """Return what the account database says; `otherwise` where it knows no such name or number."""
     try:
-        return grp.getgrgid(gid).gr_name
+        return look(key)
     except KeyError:
-        return str(gid)
-
-
-def _group_members(name: str) -> Sequence[str]:
-    try:
-        return tuple(grp.getgrnam(name).gr_mem)
-    except KeyError:
-        return ()
-
-
-def _user_name(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return str(uid)
+        return otherwise

@@ -4,8 +4,7 @@ links to the programs, and shell completions. It reads shipped files and compare
 
 import re
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import vram_arbiter
@@ -14,39 +13,37 @@ from vram_arbiter.clients.cli.installation.site import (
     ARBITER,
     CLIENTS,
     GROUP,
+    LINK,
     OF_USER,
+    OPERATORS,
     PROGRAMS,
     Site,
     is_tegra,
     tegra_devices,
 )
 
+SYSUSERS = Path("/etc/sysusers.d/vram-arbiter.conf")
+TMPFILES = Path("/etc/tmpfiles.d/vram-arbiter.conf")
 SHIPPED = Path(vram_arbiter.__file__).parent / "configs"
 _PREFIX = "/opt/vram-arbiter"  # of the shipped files
 _ON_GPU = ("vram-arbiter.service", "vram-sidecar@.service", "vram-runner@.service")
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """The files and links of an installation, by their paths on the installed machine."""
-
-    files: dict[Path, str]
-    links: dict[Path, str]
-
-
-def wanted(site: Site, prefix: Path, group: str) -> Contents:
-    """Return what belongs on the machine."""
+def wanted(site: Site, prefix: Path, group: str, operators: Sequence[str] = ()) -> dict[Path, str]:
+    """Return the texts of the files and links that belong on the machine, by their paths there."""
     files = _files_of_system(site) if site.layout.system else _files_of_user(site)
     files = {path: _adapted(text, prefix, group) for path, text in files.items()}
+    for name in operators:  # a socket has one group, and only its members connect
+        files[SYSUSERS] += f"m {name} {group}\nm {name} {OPERATORS}\n"
     settings, shared = site.layout.settings, site.layout.shared
     for name in ("arbiter.yaml", "hooks.yaml"):
         files[settings / f"{name}.example"] = _example(name, prefix)
     for place, text in completions().items():
         files[shared / place] = text
-    links = {}
     if prefix / "bin" != site.layout.programs:
-        links = {site.layout.programs / name: str(prefix / "bin" / name) for name in PROGRAMS}
-    return Contents(files, links)
+        for name in PROGRAMS:
+            files[site.layout.programs / name] = f"{LINK}{prefix}/bin/{name}"
+    return files
 
 
 def _files_of_system(site: Site) -> dict[Path, str]:
@@ -54,12 +51,8 @@ def _files_of_system(site: Site) -> dict[Path, str]:
     files = {units / name: _read(f"systemd/system/{name}") for name in (ARBITER, *CLIENTS)}
     for path in sorted((SHIPPED / f"systemd/system/{ARBITER}.d").iterdir()):
         files[units / f"{ARBITER}.d" / path.name] = path.read_text(encoding="utf-8")
-    for folder, name in (
-        ("sysusers.d", "vram-arbiter.conf"),
-        ("tmpfiles.d", "vram-arbiter.conf"),
-        ("profile.d", "vram-arbiter.sh"),
-    ):
-        files[Path("/etc") / folder / name] = _read(f"systemd/{folder}/{name}")
+    for path in (SYSUSERS, TMPFILES, Path("/etc/profile.d/vram-arbiter.sh")):
+        files[path] = _read(f"systemd/{path.relative_to('/etc')}")
     if is_tegra(site):
         text = tegra_drop_in(_read("systemd/tegra.conf"), tegra_devices(site))
         files |= {units / f"{name}.d" / "tegra.conf": text for name in _ON_GPU}

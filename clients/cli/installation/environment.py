@@ -10,11 +10,11 @@ import os
 import re
 import stat
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from vram_arbiter.clients.cli.installation.site import LINKS_MAX, PROGRAMS
+from vram_arbiter.clients.cli.installation.site import PROGRAMS
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.version import version
 
@@ -24,7 +24,6 @@ ELSEWHERE: Final = (
     "make the environment elsewhere, with a Python elsewhere: "
     "UV_PYTHON_INSTALL_DIR=/opt/python uv python install 3.12"
 )
-_PLAIN: Final = re.compile(r"/[A-Za-z0-9._+/-]*")
 _START_S: Final = 60.0
 _ASK: Final = (
     "import json, sys, vram_arbiter\n"
@@ -43,15 +42,6 @@ _AS_A_UNIT: Final = (
 """What root can read says little of a unit, which has another user, and these folders hidden."""
 
 
-def check_prefix(prefix: Path) -> None:
-    """Raises ConfigError for a path that a unit file cannot hold as it is."""
-    if not _PLAIN.fullmatch(str(prefix)) or ".." in prefix.parts:
-        raise ConfigError(
-            f"expected an absolute path of letters, digits and ._+- for --prefix, got '{prefix}'",
-            hint="a unit file gives other characters a meaning",
-        )
-
-
 def check_environment(prefix: Path, *, system: bool) -> None:
     """Check the environment that the units will run. Raises ConfigError."""
     programs = [prefix / "bin" / name for name in PROGRAMS]
@@ -61,29 +51,23 @@ def check_environment(prefix: Path, *, system: bool) -> None:
                 f"not found: {program}",
                 hint="install the product there first, or name its environment with --prefix",
             )
-    python = _interpreter(programs[0])
-    if system:
-        for program in (*programs, python):
-            check_path(program)
+    first_line = re.match(rb"#!(/\S+)\s*\n", programs[0].read_bytes())
+    if first_line is None:
+        raise ConfigError(
+            f"{programs[0]} is not a program of pip's", hint="install the product again"
+        )
+    python = Path(os.fsdecode(first_line[1]))
+    for program in (*programs, python) if system else ():
+        check_path(program)
     found, *places = _ask(python, _AS_A_UNIT if system else ())
-    if system:
-        for path in places:
-            if os.path.exists(path):
-                check_path(Path(path))
+    for place in places if system else ():
+        if os.path.exists(place):
+            check_path(Path(place))
     if found != version():
         raise ConfigError(
             f"{prefix} has version {found}, this is version {version()}",
             hint=f"run {prefix}/bin/vramctl install",
         )
-
-
-def _interpreter(program: Path) -> Path:
-    """Return the interpreter that a program names in its first line. Raises ConfigError."""
-    with program.open("rb") as file:
-        found = re.match(rb"#!(/\S+)\s*$", file.readline())
-    if found is None:
-        raise ConfigError(f"{program} is not a program of pip's", hint="install the product again")
-    return Path(os.fsdecode(found[1]))
 
 
 def _ask(python: Path, through: Sequence[str] = ()) -> list[str]:
@@ -97,21 +81,25 @@ def _ask(python: Path, through: Sequence[str] = ()) -> list[str]:
         return _ask(python)  # a container, where units get no folders of their own either
     if done.returncode:
         said = done.stderr.strip().rpartition("\n")[2] or f"exit code {done.returncode}"
-        if through:
-            raise ConfigError(
-                f"a unit cannot run the product by {python}: {said}",
-                hint="every user has to be able to read the environment, its Python and libpython; "
-                + ELSEWHERE,
-            )
-        raise ConfigError(f"{python} cannot run the product: {said}", hint="install it there again")
+        who = "a unit" if through else "this user"
+        raise ConfigError(
+            f"{who} cannot run the product by {python}: {said}",
+            hint="every user has to be able to read the environment, its Python and libpython; "
+            + ELSEWHERE,
+        )
     answer: list[str] = json.loads(done.stdout)
     return answer
 
 
 def check_path(path: Path) -> None:
     """Check a program or folder of the system's units, every folder above it and every link on the
-    way. Raises ConfigError."""
-    for step, found in _steps(path):
+    way, as the kernel walks them. Raises ConfigError."""
+    try:
+        path.resolve(strict=True)
+    except (OSError, RuntimeError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    for step in (*reversed(path.parents), path):
+        found = step.lstat()
         if any(step.is_relative_to(hidden) for hidden in HIDDEN):
             raise ConfigError(f"the system's units cannot read {step}", hint=ELSEWHERE)
         if problem := writable_by_others(found):
@@ -119,6 +107,9 @@ def check_path(path: Path) -> None:
                 f"{step} {problem}: this user could change what the units run",
                 hint=f"let it belong to root: chown root:root {step}; chmod go-w {step}",
             )
+        if stat.S_ISLNK(found.st_mode):
+            check_path(step.parent / os.readlink(step) / path.relative_to(step))
+            return
 
 
 def writable_by_others(found: os.stat_result) -> str:
@@ -132,23 +123,3 @@ def writable_by_others(found: os.stat_result) -> str:
     if found.st_mode & stat.S_IWGRP and found.st_gid != 0:
         return f"may be written by group {found.st_gid}"
     return ""
-
-
-def _steps(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
-    """Yield the components of a path as the kernel walks them. Raises ConfigError."""
-    links = 0
-    while True:
-        for step in (*reversed(path.parents), path):
-            try:
-                found = step.lstat()
-            except OSError as error:
-                raise ConfigError(f"{step}: {error.strerror}") from error
-            yield step, found
-            if stat.S_ISLNK(found.st_mode):
-                links += 1
-                if links > LINKS_MAX:
-                    raise ConfigError(f"{step}: too many links")
-                path = step.parent / os.readlink(step) / path.relative_to(step)
-                break
-        else:
-            return

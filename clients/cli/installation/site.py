@@ -4,7 +4,6 @@ Paths of the other modules are those of the installed machine; only `Site.at` kn
 """
 
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +26,8 @@ DEVICE_GROUPS = ("video", "render", "dialout")
 """Groups of the snippet that other programs use as well: a removal leaves those that were there
 before, and those that have members."""
 LINKS_MAX = 40
-_NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+LINK = "-> "
+"""Begins the text of a link; its target follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,22 +49,25 @@ SYSTEM = Layout(
     settings=Path("/etc/vram-arbiter"),
     programs=Path("/usr/local/bin"),
     shared=Path("/usr/local/share"),
-    state=(
-        Path("/var/lib/vram-arbiter"),
-        Path("/var/lib/vram-runner"),
-        Path("/var/lib/vram-reasoner"),
-        Path("/var/lib/vram-hooks"),
-        Path("/var/lib/private/vram-hooks"),  # where that leads: its user exists while it runs
-        Path("/var/cache/vram-sidecar"),
-        Path("/var/cache/vram-runner"),
-        Path("/run/vram-arbiter"),
+    state=tuple(
+        Path(folder)
+        for folder in (
+            *(f"/var/lib/vram-{name}" for name in ("arbiter", "runner", "reasoner", "hooks")),
+            "/var/lib/private/vram-hooks",  # where that leads: its user exists while it runs
+            "/var/cache/vram-sidecar",
+            "/var/cache/vram-runner",
+            "/run/vram-arbiter",
+        )
     ),
     system=True,
 )
 
 
-def layout_of_user(environ: Mapping[str, str], home: Path) -> Layout:
-    """Return the folders of one user (XDG base directories)."""
+def layout_of_user(environ: Mapping[str, str]) -> Layout:
+    """Return the folders of the calling user (XDG base directories). Raises ConfigError."""
+    home = Path(environ.get("HOME", ""))
+    if not home.is_absolute():
+        raise ConfigError("no home folder: HOME is not set", hint="set it, or log in")
 
     def folder(variable: str, otherwise: str) -> Path:
         value = environ.get(variable, "")
@@ -121,6 +124,15 @@ class Site:
         """Return where a folder of the installed machine is on this one, also through a link."""
         return self.at(path / "_").parent
 
+    def read(self, path: Path) -> str | None:
+        """Return the text of a file, or of a link; None for nothing, empty for anything else."""
+        place = self.at(path)
+        if place.is_symlink():
+            return f"{LINK}{os.readlink(place)}"
+        if place.is_file():
+            return place.read_text(encoding="utf-8", errors="surrogateescape")
+        return "" if place.exists() else None
+
     @property
     def live(self) -> bool:
         """Whether the services of this machine are meant."""
@@ -130,13 +142,6 @@ class Site:
     def record(self) -> Path:
         """The file that says what was installed."""
         return self.layout.settings / "installed.json"
-
-
-def check_name(name: str, what: str) -> str:
-    """Return a group's name. Raises ConfigError for one that no unit could hold."""
-    if not _NAME.fullmatch(name):
-        raise ConfigError(f"expected the name of a {what}, got {name!r}")
-    return name
 
 
 def is_tegra(site: Site) -> bool:
@@ -160,11 +165,3 @@ def tegra_devices(site: Site) -> list[str]:
     patterns = ("nvmap", "nvsciipc", "nvhost-*", "host1x-*", "nvgpu/*/*")
     found = {path for pattern in patterns for path in devices.glob(pattern) if not path.is_dir()}
     return sorted(str(Path("/dev") / path.relative_to(devices)) for path in found)
-
-
-def user_home(environ: Mapping[str, str]) -> Path:
-    """Return the home folder of the calling user. Raises ConfigError."""
-    home = environ.get("HOME", "")
-    if not os.path.isabs(home):
-        raise ConfigError("no home folder: HOME is not set", hint="set it, or log in")
-    return Path(home)

@@ -17,19 +17,16 @@ from vram_arbiter.clients.cli.history import NEVER
 from vram_arbiter.clients.cli.offline import EVENT_LOG
 from vram_arbiter.clients.cli.status import all_pages
 from vram_arbiter.clients.cli.timeline.reader import Reader
-from vram_arbiter.clients.cli.timeline.story import Story, within
-from vram_arbiter.clients.net.request import Unreachable
+from vram_arbiter.clients.cli.timeline.story import Story
 from vram_arbiter.schemas.codec import from_map
 from vram_arbiter.schemas.defaults import RESERVE_BYTES
-from vram_arbiter.schemas.errors import ArbiterUnreachable, OperatorError, from_wire
+from vram_arbiter.schemas.errors import OperatorError, from_wire
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import LeaseView
 
-SIZES = ("granted", "ready", "verified", "released", "standby", "parked", "queued")
+SIZES = ("granted", "ready")
 """Kinds of events that tell the bytes and the GPU of a lease; of earlier times no others count."""
-BACK = 8
-"""By this factor the look back grows until every lease's beginning is found."""
 
 
 class EmptyTimeline(OperatorError):
@@ -67,13 +64,6 @@ class Range:
 def from_history(wanted: Range, endpoint: str | None) -> Story:
     """Read the history of a running daemon. Raises EmptyTimeline, ArbiterUnreachable, and what the
     arbiter refuses."""
-    try:
-        return _from_history(wanted, endpoint)
-    except Unreachable as error:
-        raise ArbiterUnreachable(str(error), hint=error.hint) from error
-
-
-def _from_history(wanted: Range, endpoint: str | None) -> Story:
     begin = wanted.begin_s(time.time(), 0.0)
     last_seq = int(_checked(history.page(NEVER, 1, (), endpoint))["last_seq"])
     start = history.first_since(begin, last_seq, endpoint)
@@ -90,14 +80,13 @@ def _from_history(wanted: Range, endpoint: str | None) -> Story:
     reader = Reader(begin)
     for gpu in status.gpus:
         title = f"GPU {gpu.index} {gpu.name}"
-        reader.gpu(gpu.gpu, title, gpu.capacity_bytes, gpu.reserve_bytes)
+        drawn = reader.gpu(gpu.gpu, title, gpu.capacity_bytes, gpu.reserve_bytes)
         if gpu.measured_used_bytes is not None:
-            reader.reading(end - (gpu.sample_age_s or 0.0), gpu.gpu, gpu.measured_used_bytes)
+            drawn.measured.append((end - (gpu.sample_age_s or 0.0), gpu.measured_used_bytes))
     for event in [*earlier, *events]:
         reader.event(event)
     reader.snapshot(end, status.leases)
-    story = reader.story(end, status.problems)
-    return within(story, max(begin, story.first_s), end)
+    return reader.story(end, status.problems)
 
 
 def _earlier(
@@ -112,16 +101,10 @@ def _earlier(
     told = {one["lease_id"] for one in events if one.get("lease_id")}
     unknown = (told | {lease.lease_id for lease in leases}) - begun
     first = int(events[0]["seq"]) if events else last_seq + 1
-    back, found = history.PAGE, list[JsonMap]()
-    while unknown and first > 1:
-        after = max(0, first - 1 - back)
-        found = [
-            one for one in _events(after, first, SIZES, endpoint) if one.get("lease_id") in unknown
-        ]
-        if not after or unknown <= {one["lease_id"] for one in found if one["kind"] == "granted"}:
-            break
-        back *= BACK
-    return [one for one in found if one["at_wall_s"] <= begin_s]
+    if not unknown or first <= 1:
+        return []
+    found = _events(0, first, SIZES, endpoint)
+    return [one for one in found if one["lease_id"] in unknown and one["at_wall_s"] <= begin_s]
 
 
 def _events(
@@ -191,10 +174,13 @@ def story_of(told: JsonMap, wanted: Range) -> Story:
         )
     reader = Reader(told["begin_wall_s"])
     for gpu in told["gpus"]:
-        title = f"GPU {gpu['index']} {gpu['name']}"
-        reader.gpu(gpu["id"], title, gpu["capacity_bytes"], gpu.get("reserve_bytes", RESERVE_BYTES))
+        title, reserve = (
+            f"GPU {gpu['index']} {gpu['name']}",
+            gpu.get("reserve_bytes", RESERVE_BYTES),
+        )
+        reader.gpu(gpu["id"], title, gpu["capacity_bytes"], reserve)
     for at_s, name, used in told["readings"]:
-        reader.reading(at_s, name, used)
+        reader.gpu(name).measured.append((at_s, used))
     feed = [(one["at_wall_s"], 1, one) for one in events]
     feed += [(one["at_wall_s"], 0, one) for one in told["snapshots"]]
     for at_s, is_event, one in sorted(feed, key=lambda entry: entry[:2]):
@@ -202,4 +188,4 @@ def story_of(told: JsonMap, wanted: Range) -> Story:
             reader.event(one)
         else:
             reader.snapshot(at_s, [from_map(LeaseView, lease) for lease in one["leases"]])
-    return within(reader.story(end, told["notices"]), begin, end)
+    return reader.story(end, told["notices"], begin)

@@ -1,4 +1,4 @@
-"""`vramctl timeline`: GPU memory over time as a picture, a page or a trace."""
+"""`vramctl timeline`: GPU memory over time on the terminal, as a picture or as a trace."""
 
 import argparse
 import json
@@ -8,24 +8,24 @@ from pathlib import Path
 from vram_arbiter.clients.cli import arguments, history
 from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.cli.text import plural
-from vram_arbiter.clients.cli.timeline import collect
+from vram_arbiter.clients.cli.timeline import chart, collect
 from vram_arbiter.clients.cli.timeline.collect import Range
 from vram_arbiter.clients.cli.timeline.story import Story
 from vram_arbiter.schemas.errors import ConfigError
 
 DESCRIPTIONS = {
     "timeline": "Draw GPU bytes by consumer over time, with leases, waits, uses, evictions with "
-    "their phases and pressure: as .png, as .html, or as .json that loads in Perfetto and "
+    "their phases and pressure: on the terminal, as .png, or as .json that loads in Perfetto and "
     "chrome://tracing. From the daemon's history, or offline from an event log."
 }
 DEFAULT_LAST_S = 900.0
-SUFFIXES = (".png", ".html", ".json")
+SUFFIXES = (".png", ".json")
 
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="FILE.{png,html,json}",
-        help="file to write; its suffix decides the format",
+        "-o", "--out", type=Path, metavar="FILE.{png,json}",
+        help="file to write; its suffix decides the format (default: lines on the terminal)",
     )  # fmt: skip
     parser.add_argument(
         "--event-log", type=Path, metavar="LOG",
@@ -53,25 +53,27 @@ def last(written: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Draw. Raises ConfigError for a file that cannot be written, and what reading raises."""
-    out: Path = args.out
-    if out.suffix not in SUFFIXES:
+    out: Path | None = args.out
+    if out is not None and out.suffix not in SUFFIXES:
         args.parser.error(f"--out: expected a file that ends in {', '.join(SUFFIXES)}, got {out}")
-    if out.suffix == ".png":
-        from vram_arbiter.schemas.runtime.extras import need
-
-        need("a timeline as .png (.html and .json need no package)", "matplotlib", extra="runner")
     if args.event_log is not None:
         story = collect.from_log(args.event_log, Range(args.since_wall_s, args.last_s))
     else:
         neither = args.since_wall_s is None and args.last_s is None
         wanted = Range(args.since_wall_s, DEFAULT_LAST_S if neither else args.last_s)
         story = collect.from_history(wanted, args.endpoint)
+    if out is None:
+        print("\n".join(chart.lines(story)))
+        return OK
     try:
         write(out, story)
     except OSError as error:
         problem = f"{out} cannot be written: {error.strerror}"
         raise ConfigError(problem, hint="name a file in a folder that you can write") from error
-    print(_summary(story, out))
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(story.begin_s))
+    leases, evictions = plural(len(story.leases), "lease"), plural(len(story.evictions), "eviction")
+    lasted_s = story.end_s - story.begin_s
+    print(f"{out}: {lasted_s:.1f} s from {began}, {leases}, {evictions}")
     return OK
 
 
@@ -82,22 +84,6 @@ def write(out: Path, story: Story, title: str = "") -> None:
 
         out.write_text(json.dumps(trace(story)) + "\n")
         return
-    from vram_arbiter.clients.cli.timeline.layout import draw
+    from vram_arbiter.clients.cli.timeline.png import write as write_png
 
-    picture = draw(story, title)
-    if out.suffix == ".png":
-        from vram_arbiter.clients.cli.timeline.png import write as write_png
-
-        write_png(out, picture)
-    else:
-        from vram_arbiter.clients.cli.timeline.svg import page
-
-        out.write_text(page(story, picture), encoding="utf-8")
-
-
-def _summary(story: Story, out: Path) -> str:
-    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(story.begin_s))
-    return (
-        f"{out}: {story.end_s - story.begin_s:.1f} s from {began}, "
-        f"{plural(len(story.leases), 'lease')}, {plural(len(story.evictions), 'eviction')}"
-    )
+    write_png(out, story, title)

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from vram_arbiter.clients.cli.timeline.story import (
-    EvictionStory,
+    AWAY,
     GpuStory,
     LeaseStory,
+    Leaving,
     Mark,
     Span,
     Story,
@@ -19,60 +20,25 @@ from vram_arbiter.clients.cli.timeline.story import (
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.views import LeaseView
 
-RESIDENT = frozenset({"loading", "held", "revoking", "unloading", "verifying"})
-"""States in which a lease has bytes on a GPU."""
 _NEXT = {
-    "queued": "queued",
-    "granted": "loading",
-    "ready": "held",
-    "revoke_asked": "revoking",
-    "revoke_withdrawn": "held",
-    "unloading": "unloading",
-    "released": "verifying",
-    "standby": "standby",
-    "parked": "parked",
-}
+    "queued": "queued", "granted": "loading", "ready": "held", "revoke_asked": "revoke",
+    "revoke_acked": "quiesce", "revoke_withdrawn": "held", "unloading": "unload",
+    "released": "verify", "standby": "standby", "parked": "parked",
+}  # fmt: skip
 """State after an event of this kind."""
 _BEFORE = {
-    "ready": "loading",
-    "revoke_asked": "held",
-    "revoke_acked": "revoking",
-    "revoke_withdrawn": "revoking",
-    "use_began": "held",
-    "use_ended": "held",
-    "unloading": "held",
-    "verified": "verifying",
-    "oom": "loading",
-    "drift": "held",
-}
-"""State before an event, for a lease whose beginning is not known."""
+    "ready": "loading", "revoke_acked": "revoke", "revoke_withdrawn": "revoke",
+    "verified": "verify", "oom": "loading", "denied": "queued", "cancelled": "queued",
+}  # fmt: skip
+"""State before an event, for a lease whose beginning is not known; `held` before the others."""
+_OF_VIEW = {"revoking": "revoke", "unloading": "unload", "verifying": "verify"}
 _ENDS = frozenset({"denied", "cancelled"})
 _LOSSES = frozenset({"lost", "expired"})
-MARKED = frozenset(
-    {
-        "oom",
-        "denied",
-        "lost",
-        "expired",
-        "deadline_passed",
-        "signalled",
-        "stowaway",
-        "probe_failed",
-        "started",
-        "stopped",
-        "operator",
-        "resumed",
-        "journal_failed",
-    }
-)
+MARKED = _LOSSES | {
+    "oom", "denied", "deadline_passed", "signalled", "stowaway", "probe_failed", "started",
+    "stopped", "operator", "resumed", "journal_failed",
+}  # fmt: skip
 """Kinds of events that are drawn as a moment."""
-
-
-def _state_before(kind: str, event: JsonMap) -> str:
-    """Return the state of a lease before the first event that is known of it."""
-    if kind in _ENDS:
-        return "queued"
-    return str(event.get("was") or _BEFORE.get(kind, "held"))
 
 
 @dataclass(slots=True)
@@ -84,6 +50,7 @@ class _Open:
     since_s: float
     note: str = ""
     running: dict[str, tuple[float, str]] = field(default_factory=dict)
+    eviction: Leaving | None = None
     ended: bool = False
 
 
@@ -94,45 +61,29 @@ class Reader:
         self._begin_s = begin_s
         self._last_s = begin_s
         self._leases: dict[str, _Open] = {}
-        self._evictions: list[EvictionStory] = []
-        self._leaving: dict[str, EvictionStory] = {}
+        self._evictions: list[Leaving] = []
         self._gpus: dict[str, GpuStory] = {}
         self._pressed: dict[str, tuple[float, str]] = {}
-        self._marks: list[Mark] = []
+        self.marks: list[Mark] = []
 
     # -- in
-    def gpu(self, gpu: str, title: str, capacity_bytes: int, reserve_bytes: int) -> GpuStory:
-        """Add a GPU that is known."""
-        found = self._gpu(gpu)
-        found.title, found.capacity_bytes, found.reserve_bytes = (
-            title,
-            capacity_bytes,
-            reserve_bytes,
-        )
-        return found
-
-    def mark(self, mark: Mark) -> None:
-        """Add a moment that no event tells."""
-        self._marks.append(mark)
-
-    def reading(self, at_s: float, gpu: str, used_bytes: int) -> None:
-        """Add a reading of a GPU."""
-        self._gpu(gpu).measured.append((at_s, used_bytes))
+    def gpu(self, gpu: str, title: str = "", capacity: int = 0, reserve: int = 0) -> GpuStory:
+        """Return a GPU, which is added at first sight."""
+        return self._gpus.setdefault(gpu, GpuStory(gpu, title or gpu, capacity, reserve))
 
     def snapshot(self, at_s: float, leases: Iterable[LeaseView]) -> None:
         """Add the leases as they are at a moment. One that is not among them is over."""
         seen = set()
         for view in leases:
             seen.add(view.lease_id)
+            state = _OF_VIEW.get(view.state, view.state)
             known = self._leases.get(view.lease_id)
             if known is None or known.ended:
                 since = view.granted_s if view.granted_s is not None else view.since_s
                 begin = max(self._begin_s, at_s - max(since, view.since_s))
-                known = self._add(view.lease_id, view.consumer, view.gpu, view.state, begin)
-                if view.gpu is not None:
-                    known.story.charges.append((begin, view.charge_bytes))
-            if known.state != view.state:
-                self._move(known, view.state, max(at_s - view.since_s, known.since_s))
+                known = self._add(view.lease_id, view.consumer, view.gpu, state, begin)
+            if (known.state, state) != ("quiesce", "revoke"):
+                self._move(known, state, max(at_s - view.since_s, known.since_s))
             if view.gpu is not None and not known.story.charges:
                 known.story.charges.append((known.since_s, view.charge_bytes))
         for lease_id, one in self._leases.items():
@@ -147,47 +98,50 @@ class Reader:
             text = str(event.get("reason") or event.get("action") or "")
             who = str(event.get("consumer") or event.get("name") or event.get("action") or "")
             told = f"{kind.replace('_', ' ')} {who}".strip() + (f": {text}" if text else "")
-            self._marks.append(Mark(at_s, kind, told, event.get("gpu")))
+            self.marks.append(Mark(at_s, kind, told, event.get("gpu")))
         if kind == "pressure":
             self._pressure(at_s, event)
-        lease_id = event.get("lease_id")
-        if lease_id and kind not in ("operator", "switch"):
-            self._of_lease(str(lease_id), at_s, kind, event)
-        if kind == "switch":
-            self._sizes_of_evicted(event)
+        elif event.get("lease_id") and kind not in ("operator", "switch"):
+            self._of_lease(self._known(at_s, kind, event), at_s, kind, event)
 
     # -- one lease
-    def _of_lease(self, lease_id: str, at_s: float, kind: str, event: JsonMap) -> None:
-        known, gpu = self._leases.get(lease_id), event.get("gpu")
+    def _known(self, at_s: float, kind: str, event: JsonMap) -> _Open:
+        """Return the lease of an event; one that is not known has begun before the range."""
+        lease_id, gpu = str(event["lease_id"]), event.get("gpu")
+        known = self._leases.get(lease_id)
+        begins = kind in ("queued", "granted")
         if known is None:
-            begins = kind in ("queued", "granted")
-            state = _NEXT[kind] if begins else _state_before(kind, event)
+            state = _NEXT[kind] if begins else event.get("was") or _BEFORE.get(kind, "held")
+            state = _OF_VIEW.get(str(state), str(state))
             begin = at_s if begins else self._begin_s
             known = self._add(lease_id, str(event.get("consumer", "")), gpu, state, begin)
-        elif known.ended and kind in ("queued", "granted", "standby", "parked"):
+        elif known.ended and (begins or kind in AWAY):
             known.ended, known.state, known.since_s, known.note = False, _NEXT[kind], at_s, ""
-        elif known.ended:
-            return
-        if gpu is not None:
+        if gpu is not None and not known.ended:
             known.story.gpu = str(gpu)
-        self._use(known, at_s, kind, event)
-        self._eviction(known, at_s, kind, event)
+        return known
+
+    def _of_lease(self, lease: _Open, at_s: float, kind: str, event: JsonMap) -> None:
+        if lease.ended:
+            return
+        self._use(lease, at_s, kind, event)
+        self._eviction(lease, at_s, kind, event)
         charge = event.get("charge_bytes")
         if kind in ("granted", "ready") and isinstance(charge, int):
-            known.story.charges.append((at_s, charge))
+            lease.story.charges.append((at_s, charge))
         if kind == "reattached":
-            self._move(known, str(event.get("state", known.state)), at_s)
+            state = str(event.get("state", lease.state))
+            self._move(lease, _OF_VIEW.get(state, state), at_s)
         elif kind == "verified" and event.get("resolved"):
-            self._freed(known, at_s)
-        elif kind in _ENDS:
-            self._end(known, at_s)
+            lease.story.charges.append((at_s, 0))
+            if lease.state not in AWAY:
+                self._end(lease, at_s)
+        elif kind in _ENDS or (kind in _LOSSES and lease.state in AWAY):
+            self._end(lease, at_s)
         elif kind in _LOSSES:
-            if known.state in RESIDENT:
-                self._move(known, "verifying", at_s)
-            else:
-                self._end(known, at_s)
-        elif kind in _NEXT:
-            self._move(known, _NEXT[kind], at_s, str(event.get("reason") or ""))
+            self._move(lease, "verify", at_s)
+        elif kind in _NEXT and (kind != "revoke_acked" or lease.state == "revoke"):
+            self._move(lease, _NEXT[kind], at_s, str(event.get("reason") or ""))
 
     def _add(self, lease_id: str, consumer: str, gpu: object, state: str, since_s: float) -> _Open:
         story = LeaseStory(lease_id, consumer, None if gpu is None else str(gpu))
@@ -198,27 +152,22 @@ class Reader:
         if state == lease.state:
             lease.note = lease.note or note
             return
-        self._close_state(lease, at_s)
+        self._close(lease, at_s)
         lease.state, lease.since_s, lease.note = state, at_s, note
 
-    def _close_state(self, lease: _Open, at_s: float, *, going: bool = False) -> None:
+    def _close(self, lease: _Open, at_s: float, *, going: bool = False) -> None:
         if at_s > lease.since_s or going:
             span = Span(lease.since_s, max(at_s, lease.since_s), lease.state, lease.note, going)
             lease.story.states.append(span)
 
-    def _freed(self, lease: _Open, at_s: float) -> None:
-        """Note that the bytes of a lease are gone; one that is away lives on."""
-        lease.story.charges.append((at_s, 0))
-        if lease.state not in ("standby", "parked", "queued") and not lease.ended:
-            self._end(lease, at_s)
-
-    def _end(self, lease: _Open, at_s: float) -> None:
-        self._close_state(lease, at_s)
+    def _end(self, lease: _Open, at_s: float, *, going: bool = False) -> None:
+        """End a lease; `going`: only its story, at the end of the range."""
+        self._close(lease, at_s, going=going)
         for began_s, label in lease.running.values():
-            lease.story.uses.append(Span(began_s, at_s, label))
+            lease.story.uses.append(Span(began_s, at_s, label, going=going))
         lease.running.clear()
         lease.ended = True
-        if lease.story.charges and lease.story.charges[-1][1]:
+        if lease.story.charges and lease.story.charges[-1][1] and not going:
             lease.story.charges.append((at_s, 0))
 
     def _use(self, lease: _Open, at_s: float, kind: str, event: JsonMap) -> None:
@@ -229,85 +178,50 @@ class Reader:
         elif kind == "use_ended":
             since = max(self._begin_s, at_s - float(event.get("ms") or 0.0) / 1e3)
             began_s, label = lease.running.pop(use_id, (since, label))
-            if kind == "use_ended" or began_s < at_s:
-                lease.story.uses.append(Span(began_s, at_s, label))
+            lease.story.uses.append(Span(began_s, at_s, label))
 
     # -- evictions, pressure
     def _eviction(self, lease: _Open, at_s: float, kind: str, event: JsonMap) -> None:
-        lease_id, told = lease.story.lease_id, lease.story
+        told, eviction = lease.story, lease.eviction
         if kind == "revoke_asked":
-            made = EvictionStory(
-                lease_id,
-                told.consumer,
-                told.gpu,
-                str(event.get("wanted_by") or ""),
-                str(event.get("reason") or ""),
-                at_s,
-            )
+            by, reason = str(event.get("wanted_by") or ""), str(event.get("reason") or "")
+            made = Leaving(told.lease_id, told.consumer, told.gpu, by, reason, at_s)
             self._evictions.append(made)
-            self._leaving[lease_id] = made
-            return
-        leaving = self._leaving.get(lease_id)
-        if leaving is None:
-            return
-        if kind == "revoke_withdrawn":
-            leaving.verdict, leaving.withdrawn_s = "withdrawn", at_s
-            del self._leaving[lease_id]
-        elif kind == "revoke_acked" and leaving.acked_s is None:
-            leaving.acked_s = at_s
-        elif kind == "unloading":
-            leaving.unloading_s = at_s
-        elif kind in ("released", *_LOSSES):
-            leaving.released_s = at_s
-        elif kind == "verified":
-            leaving.verdict = str(event.get("verdict") or "")
-            if event.get("resolved"):
-                leaving.verified_s = at_s
-                del self._leaving[lease_id]
-
-    def _sizes_of_evicted(self, event: JsonMap) -> None:
-        """A switch names the charges of the leases that left for it: of those whose grant is not
-        known."""
-        for gone in event.get("evicted", ()):
-            known = self._leases.get(str(gone.get("lease_id")))
-            charges = None if known is None else known.story.charges
-            if charges is not None and charges and not any(count for _, count in charges):
-                begin = known.story.states[0].begin_s if known and known.story.states else 0.0
-                charges.insert(0, (begin, int(gone.get("charge_bytes") or 0)))
+            lease.eviction = made
+        elif eviction is not None and kind in ("revoke_withdrawn", "verified"):
+            eviction.verdict = str(event.get("verdict") or "withdrawn")
+            if kind == "revoke_withdrawn" or event.get("resolved"):
+                eviction.end_s, lease.eviction = at_s, None
 
     def _pressure(self, at_s: float, event: JsonMap) -> None:
         gpu, over = str(event.get("gpu")), int(event.get("pressure_bytes") or 0)
         began = self._pressed.pop(gpu, None)
         if began is not None:
-            self._gpu(gpu).pressure.append(Span(began[0], at_s, "pressure", began[1]))
+            self.gpu(gpu).pressure.append(Span(began[0], at_s, "pressure", began[1]))
         if over:
             self._pressed[gpu] = (at_s, f"{over} bytes more than the budget")
 
-    def _gpu(self, gpu: str) -> GpuStory:
-        if gpu not in self._gpus:
-            self._gpus[gpu] = GpuStory(gpu, gpu)
-        return self._gpus[gpu]
-
     # -- out
-    def story(self, end_s: float, notices: Sequence[str] = ()) -> Story:
-        """Return the story up to `end_s`. What still goes on ends there."""
+    def story(
+        self, end_s: float, notices: Sequence[str] = (), begin_s: float | None = None
+    ) -> Story:
+        """Return the story from `begin_s`, or from its first moment after that, to `end_s`. What
+        still goes on ends there."""
         for lease in self._leases.values():
             if not lease.ended:
-                self._close_state(lease, end_s, going=True)
-                for began_s, label in lease.running.values():
-                    lease.story.uses.append(Span(began_s, end_s, label, going=True))
-                lease.running.clear()
+                self._end(lease, end_s, going=True)
             if lease.story.gpu is not None and lease.story.charges:
-                self._gpu(lease.story.gpu)
+                self.gpu(lease.story.gpu)
         for gpu, (began_s, note) in self._pressed.items():
-            self._gpu(gpu).pressure.append(Span(began_s, end_s, "pressure", note, going=True))
+            self.gpu(gpu).pressure.append(Span(began_s, end_s, "pressure", note, going=True))
         story = Story(
             self._begin_s,
             end_s,
             tuple(self._gpus.values()),
             tuple(lease.story for lease in self._leases.values()),
             tuple(self._evictions),
-            tuple(self._marks),
+            tuple(self.marks),
             tuple(notices),
         )
-        return within(story, self._begin_s, end_s)
+        begin = self._begin_s if begin_s is None else begin_s
+        return within(story, max(begin, story.first_s), end_s)

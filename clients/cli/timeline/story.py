@@ -1,12 +1,14 @@
-"""What happened on the GPUs: leases with their states and bytes, waits, uses, evictions with their
-phases, pressure, and single moments. Times are wall seconds. `reader` makes it from events."""
+"""What happened on the GPUs: leases with their states and bytes, waits, uses, evictions, pressure,
+and single moments. Times are wall seconds. `reader` makes it from events."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-PHASES = ("revoke", "quiesce", "unload", "verify")
-"""Of an eviction: until the holder answers, until its uses end, until it released, until its bytes
-are measured gone."""
+LEAVING = ("revoke", "quiesce", "unload", "verify")
+"""States of a lease that leaves: until its holder answers, until its uses end, until it released,
+until its bytes are measured gone."""
+AWAY = ("queued", "standby", "parked")
+"""States without bytes on a GPU; the others are `loading`, `held` and those of `LEAVING`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +33,8 @@ class Mark:
 
 
 @dataclass(slots=True)
-class EvictionStory:
-    """A lease that was revoked, and when it passed each step. None: not yet, or not seen."""
+class Leaving:
+    """A lease that was revoked. `end_s` None: it is still leaving."""
 
     lease_id: str
     consumer: str
@@ -40,27 +42,8 @@ class EvictionStory:
     wanted_by: str
     reason: str
     asked_s: float
-    acked_s: float | None = None
-    unloading_s: float | None = None
-    released_s: float | None = None
-    verified_s: float | None = None
-    withdrawn_s: float | None = None  # nothing wanted the room any more
+    end_s: float | None = None
     verdict: str = ""
-
-    def phases(self, until_s: float) -> tuple[Span, ...]:
-        """Return the phases that were passed; the one under way ends at `until_s`."""
-        ends = (self.acked_s, self.unloading_s, self.released_s, self.verified_s)
-        spans, begin = [], self.asked_s
-        for at, (name, end) in enumerate(zip(PHASES, ends, strict=True)):
-            if end is None and any(later is not None for later in ends[at + 1 :]):
-                continue  # not seen: its time counts for the next phase
-            if end is None:
-                going = self.withdrawn_s is None
-                spans.append(Span(begin, self.withdrawn_s or until_s, name, going=going))
-                break
-            spans.append(Span(begin, end, name))
-            begin = end
-        return tuple(spans)
 
 
 @dataclass(slots=True)
@@ -97,7 +80,7 @@ class Story:
     end_s: float
     gpus: tuple[GpuStory, ...]
     leases: tuple[LeaseStory, ...]
-    evictions: tuple[EvictionStory, ...]
+    evictions: tuple[Leaving, ...]
     marks: tuple[Mark, ...]
     notices: tuple[str, ...] = ()
 
@@ -116,34 +99,23 @@ class Story:
         begins += [points[0][0] for gpu in self.gpus for points in gpu.held.values() if points]
         return min(begins, default=self.begin_s)
 
-    def evictions_by_lease(self) -> dict[str, list[EvictionStory]]:
-        """Return the evictions of each lease, in their order."""
-        found: dict[str, list[EvictionStory]] = {}
-        for one in self.evictions:
-            found.setdefault(one.lease_id, []).append(one)
-        return found
-
     def bytes_by_name(self, gpu: GpuStory) -> dict[str, list[tuple[float, int]]]:
         """Return the steps of each name's bytes on a GPU: of its log, else charges by consumer."""
         if gpu.held:
             return gpu.held
         changes: dict[str, list[tuple[float, int]]] = {}
         for lease in self.leases:
-            if lease.gpu != gpu.gpu:
-                continue
             before = 0
-            for at_s, count in lease.charges:
+            for at_s, count in lease.charges if lease.gpu == gpu.gpu else ():
                 changes.setdefault(lease.consumer, []).append((at_s, count - before))
                 before = count
         found: dict[str, list[tuple[float, int]]] = {}
         for name, deltas in changes.items():
-            total, steps = 0, list[tuple[float, int]]()
+            total = 0
             for at_s, delta in sorted(deltas):
                 total += delta
-                steps.append((at_s, total))
-            if any(count for _, count in steps):
-                found[name] = steps
-        return found
+                found.setdefault(name, []).append((at_s, total))
+        return {name: steps for name, steps in found.items() if any(count for _, count in steps)}
 
 
 def within(story: Story, begin_s: float, end_s: float) -> Story:
@@ -182,7 +154,7 @@ def within(story: Story, begin_s: float, end_s: float) -> Story:
         tuple(
             one
             for one in story.evictions
-            if one.asked_s <= end_s and one.phases(end_s)[-1].end_s >= begin_s
+            if one.asked_s <= end_s and (one.end_s is None or one.end_s >= begin_s)
         ),
         tuple(mark for mark in story.marks if begin_s <= mark.at_s <= end_s),
         story.notices,

@@ -20,8 +20,6 @@ from vram_arbiter.schemas.runtime.printable import printable
 
 TICK_S = 1.0
 """Between two redraws without news: ages are shown in seconds."""
-SELECTED_LEAST, SELECTED_MOST = 2, 8
-"""Lines for the selected lease: where the list is long, and where it leaves room."""
 SAID_S = 8.0
 """For so long the outcome of an order is shown in the last line."""
 
@@ -34,6 +32,7 @@ class Top(App[None]):
     #head, #gpus, #titles, #selected, #events, #keys { height: auto; }
     #titles { text-style: bold underline; }
     #selected, #events { border-top: solid $panel; }
+    #selected { max-height: 50%; }
     Leases { height: 1fr; min-height: 3; scrollbar-size-vertical: 1; overflow-x: hidden; }
     #filter { display: none; height: 1; border: none; padding: 0; }
     #filter.shown { display: block; }
@@ -78,7 +77,7 @@ class Top(App[None]):
     def on_resize(self, event: Resize) -> None:
         self.call_after_refresh(self.show)
 
-    def on_leases_moved(self) -> None:
+    def on_option_list_option_highlighted(self) -> None:
         self._show_selected()
 
     # -- drawing
@@ -120,36 +119,26 @@ class Top(App[None]):
         return shown
 
     def _show_selected(self) -> None:
-        base = self.screen_stack[0]
-        leases, panel = base.query_one(Leases), base.query_one("#selected", Static)
-        row = leases.row
-        spare = leases.size.height - leases.virtual_size.height + max(0, panel.size.height)
-        most = max(SELECTED_LEAST, min(SELECTED_MOST, spare))
-        lines = gpus.selected_lines(row, self.size.width, most)
-        if row is None and self._feed.status is not None:
-            known = self._feed.status.leases
-            lines = [f"no lease matches {printable(self._wanted)!r}" if known else "no leases"]
-        panel.update(Text("\n".join(lines), no_wrap=True))
+        base, status = self.screen_stack[0], self._feed.status
+        lines = gpus.selected_lines(base.query_one(Leases).row)
+        if not lines and status is not None:
+            wanted = f"no lease matches {printable(self._wanted)!r}"
+            lines = [wanted if status.leases else "no leases"]
+        base.query_one("#selected", Static).update(Text("\n".join(lines)))
 
     def _keys(self) -> Text:
         until, said, style = self._said
         if time.monotonic() < until:
             return Text(said, style=style)
-        shown = Text(no_wrap=True, overflow="ellipsis")
-        refused = bool(self._feed.refusal)
+        shown, wide = Text(no_wrap=True, overflow="ellipsis"), self.size.width >= 70
         drained = self._feed.status is not None and bool(self._feed.status.drained)
-        order = self._order if self.size.width >= 70 else ""
-        for key, what in (("s", f"sort {order}".rstrip()), ("/", "filter")):
-            shown.append(f"{key} ", "bold").append(f"{what}  ")
-        names = (("e", "evict"), ("p", "pin"), ("d", "resume" if drained else "drain"))
-        if refused:
-            shown.append("e p d: operators only  ", "dim")
-        else:
-            for key, what in names:
-                shown.append(f"{key} ", "bold").append(f"{what}  ")
-        for key, what in (("?", "keys"), ("q", "quit")):
-            shown.append(f"{key} ", "bold").append(f"{what}  ")
-        if self._wanted and self.size.width >= 70:
+        orders = [("e", "evict"), ("p", "pin"), ("d", "resume" if drained else "drain")]
+        if self._feed.refusal:
+            orders = [("", "e p d: operators only")]
+        sort = f"sort {self._order}" if wide else "sort"
+        for key, what in [("s", sort), ("/", "filter"), *orders, ("?", "keys"), ("q", "quit")]:
+            shown.append(f"{key} " if key else "", "bold").append(f"{what}  ", "" if key else "dim")
+        if self._wanted and wide:
             shown.append(f"filter: {printable(self._wanted)}", "bold yellow")
         return shown
 

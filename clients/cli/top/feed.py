@@ -16,7 +16,7 @@ from functools import partial
 from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.cli.top.gpus import Samples
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.net.request import Unreachable, ask
+from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.errors import NotPermitted, VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.replies import StatusReply
@@ -124,7 +124,7 @@ class Feed:
     # -- orders
     async def _learn_role(self) -> None:
         """Ask whether this user may operate: the hello as operator is answered by that."""
-        with contextlib.suppress(Unreachable):
+        with contextlib.suppress(VramError):
             reply = await self._ask("ping", {})
             if reply.get("ok"):
                 self.refusal = ""
@@ -136,8 +136,8 @@ class Feed:
         fields = {"reason": order.reason} | ({"target": order.target} if order.target else {})
         try:
             reply = await self._ask(order.action, fields)
-        except Unreachable as error:
-            return False, f"{error} ({error.hint})"
+        except VramError as error:
+            return False, str(error)
         self._happened.set()
         if not reply.get("ok"):
             return False, _said(reply["error"])

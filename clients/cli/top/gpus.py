@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import ceil
 
-from rich.cells import cell_len, chop_cells
+from rich.cells import cell_len
 
 from vram_arbiter.clients.cli.text import duration, plural
 from vram_arbiter.clients.cli.top.rows import Row, brief_bytes, fitted
@@ -138,9 +138,9 @@ def _bar(gpu: GpuView, width: int) -> str:
     return f"[{'█' * charged}{'▒' * strange}{'░' * free}{'·' * kept}]"
 
 
-def selected_lines(row: Row | None, width: int, most: int) -> list[str]:
-    """Return what is known of the selected lease, wrapped to `most` lines."""
-    if row is None or most < 1:
+def selected_lines(row: Row | None) -> list[str]:
+    """Return what is known of the selected lease, in lines of any length."""
+    if row is None:
         return []
     lease = row.lease
     told = [
@@ -150,26 +150,10 @@ def selected_lines(row: Row | None, width: int, most: int) -> list[str]:
     told += [f"pinned by {lease.pinned}"] if lease.pinned else []
     told += ["comes back by itself"] if lease.standby and row.tier.startswith("GPU") else []
     why = None if row.detail is None else row.detail.why
-    lines = [printable(", ".join(told))]
-    if why is not None:
-        lines = [printable(why.text), *(printable(f"then {step.text}") for step in why.plan)]
-        if why.eta_s is not None:
-            lines[0] += f"; loaded in {duration(why.eta_s)}, as usual"
-    wrapped = [part for line in lines for part in _wrapped(line, width)]
-    if len(wrapped) <= most:
-        return wrapped
-    return [*wrapped[: most - 1], fitted(f"{wrapped[most - 1]} {wrapped[most]}", width)]
-
-
-def _wrapped(line: str, width: int) -> list[str]:
-    shown, rest = [], ""
-    for word in line.split(" "):
-        if rest and cell_len(f"{rest} {word}") > width:
-            shown.append(rest)
-            rest = word
-        else:
-            rest = f"{rest} {word}" if rest else word
-    return [part for piece in [*shown, rest] for part in chop_cells(piece, max(1, width))]
+    if why is None:
+        return [printable(", ".join(told))]
+    eta = "" if why.eta_s is None else f"; loaded in {duration(why.eta_s)}, as usual"
+    return [printable(why.text) + eta, *(printable(f"then {step.text}") for step in why.plan)]
 
 
 def panel(status: StatusReply, samples: Sequence[Samples], width: int, height: int) -> list[str]:

@@ -1,99 +1,62 @@
-"""List of leases of `vramctl top`: selection, scrolling, and only the visible lines drawn."""
+"""List of leases of `vramctl top`: selection and scrolling."""
 
 from collections.abc import Sequence
 from typing import ClassVar
 
 from rich.text import Text
 from textual.binding import Binding, BindingType
-from textual.events import Click
-from textual.geometry import Region, Size
-from textual.message import Message
-from textual.scroll_view import ScrollView
-from textual.strip import Strip
+from textual.widgets import OptionList
+from textual.widgets.option_list import Option
 
 from vram_arbiter.clients.cli.top.rows import Row, Table
 
-type Line = tuple[str, str, Row]
-"""A line of the list: text, style, and its lease."""
 
+class Leases(OptionList):
+    """Leases, one line each, and a second one for what a waiter waits for."""
 
-class Leases(ScrollView, can_focus=True):
-    """Leases, one line each, and a second one for what a waiter waits for. Draws only the lines
-    that are visible."""
-
+    DEFAULT_CSS = """
+    Leases { border: none; padding: 0; background: transparent; }
+    Leases:focus { border: none; background-tint: transparent; }
+    Leases > .option-list--option { padding: 0; }
+    Leases > .option-list--option-hover { padding: 0; background: transparent; }
+    Leases > .option-list--option-highlighted, Leases:focus > .option-list--option-highlighted {
+        color: $foreground; background: transparent; text-style: reverse;
+    }
+    """
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("up,k", "move(-1)", "up", show=False),
-        Binding("down,j", "move(1)", "down", show=False),
-        Binding("pageup", "page(-1)", "page up", show=False),
-        Binding("pagedown", "page(1)", "page down", show=False),
-        Binding("home", "move(-1000000)", "first", show=False),
-        Binding("end", "move(1000000)", "last", show=False),
+        Binding("k", "cursor_up", show=False),
+        Binding("j", "cursor_down", show=False),
     ]
-
-    class Moved(Message):
-        """Another lease is selected."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._lines: list[Line] = []
-        self._rows: list[Row] = []
-        self._chosen = ""  # lease id
+    rows: Sequence[Row] = ()
 
     @property
     def row(self) -> Row | None:
         """The selected row."""
-        at = self._place()
-        return None if at is None else self._rows[at]
+        return None if self.highlighted is None or not self.rows else self.rows[self.highlighted]
 
     def show(self, rows: Sequence[Row], table: Table) -> None:
         """Replace all rows; the selection stays at its lease, or at its place."""
-        before = self._place() or 0
-        self._rows, self._lines = list(rows), []
-        if self._place() is None and rows:
-            self._chosen = rows[min(before, len(rows) - 1)].lease.lease_id
-        for row in rows:
-            self._lines.append((table.line(row), _style(row), row))
-            if reason := table.reason(row):
-                self._lines.append((reason, "yellow", row))
-        self.virtual_size = Size(table.width, len(self._lines))
-        self.refresh()
+        chosen, at = self.row, self.highlighted or 0
+        before = [row.lease.lease_id for row in self.rows]
+        ids = [row.lease.lease_id for row in rows]
+        self.rows = rows
+        texts = [_text(row, table) for row in rows]
+        if ids == before:
+            for place, text in enumerate(texts):
+                self.replace_option_prompt_at_index(place, text)
+            return
+        self.clear_options()
+        self.add_options([Option(text) for text in texts])
+        if ids:
+            same = "" if chosen is None else chosen.lease.lease_id
+            self.highlighted = ids.index(same) if same in ids else min(at, len(ids) - 1)
 
-    def render_line(self, y: int) -> Strip:
-        at = self.scroll_offset.y + y
-        width = self.size.width
-        if at >= len(self._lines):
-            return Strip.blank(width, self.rich_style)
-        text, style, row = self._lines[at]
-        chosen = row.lease.lease_id == self._chosen
-        shown = Text(text, style=f"{style} reverse" if chosen else style, no_wrap=True)
-        segments = shown.render(self.app.console)
-        filler = shown.get_style_at_offset(self.app.console, 0) if chosen else None
-        strip = Strip(segments).adjust_cell_length(width, filler)
-        return strip.apply_style(self.rich_style)
 
-    def action_move(self, by: int) -> None:
-        at = self._place()
-        if at is not None:
-            self._choose(max(0, min(len(self._rows) - 1, at + by)))
-
-    def action_page(self, by: int) -> None:
-        self.action_move(by * max(1, self.size.height - 1))
-
-    def on_click(self, event: Click) -> None:
-        at = self.scroll_offset.y + event.y
-        if at < len(self._lines):
-            self._choose(self._rows.index(self._lines[at][2]))
-
-    def _place(self) -> int | None:
-        ids = [row.lease.lease_id for row in self._rows]
-        return ids.index(self._chosen) if self._chosen in ids else None
-
-    def _choose(self, at: int) -> None:
-        self._chosen = self._rows[at].lease.lease_id
-        mine = [y for y, line in enumerate(self._lines) if line[2].lease.lease_id == self._chosen]
-        self.scroll_to_region(Region(0, mine[0], self.size.width, len(mine)), animate=False)
-        self.refresh()
-        self.post_message(self.Moved())
+def _text(row: Row, table: Table) -> Text:
+    shown = Text(table.line(row), style=_style(row), no_wrap=True)
+    if reason := table.reason(row):
+        shown.append(f"\n{reason}", "yellow")
+    return shown
 
 
 def _style(row: Row) -> str:

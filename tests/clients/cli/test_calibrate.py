@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,38 +20,31 @@ from tests.support.paths import CONFIGS
 from tests.support.process import ArbiterProcess
 from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration import entry as entries
-from vram_arbiter.clients.calibration.basis import Basis, Pace
-from vram_arbiter.clients.calibration.gpu import FakeGpu, NvmlGpu, Reading, open_gpu
-from vram_arbiter.clients.calibration.measure import Asked, measure_model, measure_program
-from vram_arbiter.clients.calibration.requests import asking, noise_png, observation_of
-from vram_arbiter.clients.calibration.sampler import OwnBytes, Sampler
-from vram_arbiter.clients.calibration.series import Figures, Series, of_life
-from vram_arbiter.clients.cli.calibrate import source_of
+from vram_arbiter.clients.calibration import model
+from vram_arbiter.clients.calibration.gpu import Gpu, Reading, fake_gpu, nvml_gpu, open_gpu
+from vram_arbiter.clients.calibration.record import Figures, Record, of_life, of_marks
+from vram_arbiter.clients.cli.calibrate import MODEL, source_of
 from vram_arbiter.clients.cli.main import run_main
-from vram_arbiter.clients.sidecar.perception import DetectorClient
-from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.clients.cli.run import run_alone
+from vram_arbiter.clients.foreign.run_spec import RunSpec
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, NoGpu, ProbeFailed
+from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.sidecars.images import header
 from vram_arbiter.sidecars.settings import read_footprints
 
 MIB, GIB = 2**20, 2**30
-QUICK = Pace(rate_hz=200.0, rest_s=0.05)
+QUICK: dict[str, Any] = {"rate_hz": 200.0, "rest_s": 0.05}
 FLAGS = ("--rate", "200", "--rest", "0.05")
 PATIENCE_S = 60.0
 
 
-def series_of(*levels: tuple[float, int]) -> Series:
+def series_of(*levels: tuple[float, int]) -> list[tuple[float, int]]:
     """Return a series of (seconds, MiB): a reading every 10 ms for so long."""
-    series, at_s = Series(), 0.0
-    for lasts_s, size in levels:
-        for _ in range(round(lasts_s * 100)):
-            series.add(at_s, size * MIB)
-            at_s += 0.01
-    return series
+    sizes = [size for lasts_s, size in levels for _ in range(round(lasts_s * 100))]
+    return [(at / 100, size * MIB) for at, size in enumerate(sizes)]
 
 
 # -- series → figures
@@ -67,8 +60,6 @@ def test_the_figures_of_a_life() -> None:
         retained=None,
         after_exit=0,
     )
-    assert series.rate_hz == pytest.approx(100)
-    assert len(series.levels) == 7, "kept where they change"
 
 
 def test_a_program_that_stays_until_the_last_reading_has_figures() -> None:
@@ -79,71 +70,25 @@ def test_a_program_that_stays_until_the_last_reading_has_figures() -> None:
 
 def test_no_bytes_are_no_figures() -> None:
     """Noise of the used bytes below 1 MiB is not a program's."""
-    series = series_of((1, 0))
-    series.add(2.0, MIB // 2)
-    assert of_life(series, 0, 0) is None
-    assert of_life(Series(), 0, 0) is None
+    assert of_life([*series_of((1, 0)), (2.0, MIB // 2)], 0, 0) is None
+    marks = {"asked": 0.5, "answered": 0.6, "unloaded": 0.9, "requests": 1.0}
+    assert of_marks(series_of((1, 0)), marks, 0, 0) is None
 
 
-def test_bytes_are_at_rest_while_they_hardly_change() -> None:
-    series = series_of((1, 500), (1, 900))
-    series.add(2.5, 900 * MIB + MIB // 2)
-    assert series.rested_s() == pytest.approx(1.5)
-    series.add(2.6, 901 * MIB + MIB)
-    assert series.rested_s() == 0.0
-    assert Series().rested_s() == 0.0
-
-
-def test_the_sampler_dates_a_reading_by_its_end_and_keeps_its_error() -> None:
-    now = [10.0]
-    answers: list[int | ProbeFailed] = [5, 5, 7, ProbeFailed("gone")]
-
-    def read() -> int:
-        now[0] += 0.5
-        answer = answers.pop(0)
-        if isinstance(answer, ProbeFailed):
-            raise answer
-        return answer
-
-    sampler = Sampler(read, period_s=0.0, clock=lambda: now[0])
-    with sampler:
-        sampler._thread.join(PATIENCE_S)  # the failed reading ends it
-    assert sampler.series.levels == [(10.5, 5), (11.5, 7)]
-    assert sampler.series.readings == 3
-    with pytest.raises(ProbeFailed, match="gone"):
-        sampler.check()
-
-
-def test_bytes_of_the_tree_are_its_own_also_when_a_parent_has_ended() -> None:
-    listed: dict[int, int] = {}
-    gpu: Any = SimpleNamespace(read=lambda: Reading(9 * GIB, listed))
-    own = OwnBytes(gpu, Basis(listed=True, context_bytes=0, baseline_bytes=0))
-    with subprocess.Popen(
-        [sys.executable, "-c", CHILD_OF_A_CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as child:
-        assert child.stdout is not None
-        assert child.stdin is not None
-        below = int(child.stdout.readline())
-        listed.update({os.getppid(): 4 * GIB, child.pid: MIB, below: 2 * MIB})
-        assert own() == 3 * MIB
-        child.stdin.write(b"\n")
-        child.stdin.flush()
-        child.wait(PATIENCE_S)
-        del listed[child.pid]
-        assert own() == 2 * MIB, "adopted by another process, and ours all the same"
-    with pytest.raises(ProbeFailed, match="stopped listing"):
-        OwnBytes(
-            SimpleNamespace(read=lambda: Reading(1, None)),
-            Basis(True, 0, 0),  # type: ignore[arg-type]
-        )()
-
-
-CHILD_OF_A_CHILD = """
-import subprocess, sys
-child = subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=0)
-print(child.pid, flush=True)
-sys.stdin.readline()
-"""
+def test_the_figures_of_a_model_are_those_between_its_marks() -> None:
+    series = series_of((0.5, 0), (0.2, 2000), (1, 1500), (0.1, 1700), (0.5, 1500), (1, 100))
+    marks = {"asked": 1.65, "answered": 1.95, "unloaded": 3.0, "requests": 3.0}
+    assert of_marks(series, marks, 300 * MIB, 0) == Figures(
+        context=300 * MIB,
+        load_peak=2000 * MIB,
+        steady=1500 * MIB,
+        inference_peak=1700 * MIB,
+        retained=100 * MIB,
+        after_exit=0,
+    )
+    unasked = of_marks(series, marks | {"requests": 0.0}, 300 * MIB, 0)
+    assert unasked is not None
+    assert unasked.inference_peak is None
 
 
 # -- figures → the footprint file
@@ -265,13 +210,13 @@ def fails(error: Exception) -> Any:
 
 
 def test_a_reading_of_nvml() -> None:
-    gpu = NvmlGpu(0, nvml())
+    gpu = nvml_gpu(0, nvml())
     assert gpu.read() == Reading(5, {1: 11, 3: 5})
     assert (gpu.name, gpu.device, gpu.environ["CUDA_VISIBLE_DEVICES"]) == (
         "Test GPU", "cuda", "GPU-1",
     )  # fmt: skip
     unlisted = nvml(nvmlDeviceGetComputeRunningProcesses=lambda handle: fails(NvmlFault("no")))
-    assert NvmlGpu(0, unlisted).read() == Reading(5, None)
+    assert nvml_gpu(0, unlisted).read() == Reading(5, None)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +236,7 @@ def test_a_gpu_that_cannot_be_measured(
     changes: dict[str, Any], error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
-        NvmlGpu(0, nvml(**changes))
+        nvml_gpu(0, nvml(**changes))
 
 
 def test_devices_by_name(tmp_path: Path) -> None:
@@ -302,7 +247,7 @@ def test_devices_by_name(tmp_path: Path) -> None:
 
 
 def test_noise_is_a_picture() -> None:
-    assert header(noise_png(64)).width == 64
+    assert header(model.noise_png(64)).width == 64
 
 
 @pytest.mark.heavy
@@ -310,7 +255,7 @@ def test_an_observation_as_the_manifest_describes_it() -> None:
     import numpy as np
 
     grab = load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml")
-    observation = observation_of(grab, "grab it")
+    observation = model.observation_of(grab, "grab it")
     shapes = {key: value.shape for key, value in observation.items() if key != "task"}
     assert shapes == {
         "observation.state": (6,),
@@ -323,15 +268,20 @@ def test_an_observation_as_the_manifest_describes_it() -> None:
 
 def test_pictures_of_a_folder(tmp_path: Path) -> None:
     detector = load_manifest(CONFIGS / "rskills/so101-detector/rskill.yaml")
-    client = DetectorClient("ipc:///nowhere")
     with pytest.raises(ConfigError, match="holds no picture"):
-        asking(client, detector, tmp_path, None)
+        model.check(detector, tmp_path)
     with pytest.raises(ConfigError, match="cannot be read: No such file"):
-        asking(client, detector, tmp_path / "x", None)
+        model.check(detector, tmp_path / "x")
+    (tmp_path / "a.png").write_bytes(model.noise_png(8))
+    model.check(detector, tmp_path)
+    assert model.pictures_of(str(tmp_path)) == [model.noise_png(8)]
+
+
+@pytest.mark.heavy
+def test_a_policy_takes_no_pictures(tmp_path: Path) -> None:
+    grab = load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml")
     with pytest.raises(ConfigError, match="a policy is asked with noise"):
-        asking(PolicyClient("ipc:///nowhere"), detector, tmp_path, None)
-    (tmp_path / "a.png").write_bytes(noise_png(8))
-    asking(client, detector, tmp_path, None)
+        model.check(grab, tmp_path)
 
 
 # -- programs
@@ -363,20 +313,6 @@ print("has worked")
 """Goes on to the next phase when the present one was read."""
 
 
-class Watched(FakeGpu):
-    """A simulated GPU that tells a program in a folder which sizes, in MiB, were read."""
-
-    def __init__(self, fake_folder: Path, seen: Path) -> None:
-        super().__init__(fake_folder)
-        self.folder, self.seen = fake_folder, seen
-
-    def read(self) -> Reading:
-        reading = super().read()
-        for count in (*(reading.processes or {}).values(), reading.used_bytes):
-            (self.seen / str(count // MIB)).touch()
-        return reading
-
-
 @pytest.fixture
 def fake_folder(tmp_path: Path) -> Path:
     make_gpu(tmp_path / "gpu", 8 * GIB, release_lag_s=0.0)
@@ -384,13 +320,32 @@ def fake_folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def gpu(fake_folder: Path) -> Watched:
-    (fake_folder.parent / "seen").mkdir()
-    return Watched(fake_folder, fake_folder.parent / "seen")
+def seen(tmp_path: Path) -> Path:
+    (tmp_path / "seen").mkdir()
+    return tmp_path / "seen"
 
 
-def command(gpu: Watched, program: str = PROGRAM) -> list[str]:
-    return [sys.executable, "-c", program, str(gpu.seen)]
+@pytest.fixture
+def gpu(fake_folder: Path, seen: Path) -> Gpu:
+    """A simulated GPU that tells a program in a folder which sizes, in MiB, were read."""
+    plain = fake_gpu(fake_folder)
+
+    def read() -> Reading:
+        reading = plain.read()
+        for count in (*(reading.processes or {}).values(), reading.used_bytes):
+            (seen / str(count // MIB)).touch()
+        return reading
+
+    return replace(plain, read=read)
+
+
+async def recorded(record: Record, *command: str, limit_s: float | None = None) -> int:
+    """Run a program for its record, without a lease."""
+    spec = RunSpec(
+        list(command), "test", 1, "any", 40, None, True, "priority", 5.0,
+        environ=record.gpu.environ, limit_s=limit_s, record=record,
+    )  # fmt: skip
+    return await run_alone(spec)
 
 
 def hide(fake_folder: Path) -> None:
@@ -403,13 +358,14 @@ def hide(fake_folder: Path) -> None:
 @pytest.mark.anyio
 @pytest.mark.parametrize("listed", [True, False], ids=["listed", "hidden"])
 async def test_a_program_under_observation(
-    listed: bool, gpu: Watched, fake_folder: Path, capfd: pytest.CaptureFixture[str]
+    listed: bool, gpu: Gpu, seen: Path, fake_folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     if not listed:
         hide(fake_folder)
-    measured = await measure_program(gpu, QUICK, command(gpu), None, print)
-    assert measured.basis.listed is listed
-    assert measured.figures == Figures(
+    record = Record(gpu, **QUICK)
+    assert await recorded(record, sys.executable, "-c", PROGRAM, str(seen)) == 0
+    assert record.listed is listed
+    assert record.figures({}) == Figures(
         context=RESIDUE_BYTES,
         load_peak=1500 * MIB,
         steady=1000 * MIB,
@@ -422,22 +378,45 @@ async def test_a_program_under_observation(
 
 @pytest.mark.e2e
 @pytest.mark.anyio
-async def test_programs_without_figures(gpu: Watched, fake_folder: Path) -> None:
-    async def run(program: str, pace: Pace = QUICK) -> CalibrationFailed:
-        with pytest.raises(CalibrationFailed) as caught:
-            await measure_program(gpu, pace, command(gpu, program), None, print)
-        return caught.value
+async def test_bytes_of_the_tree_are_its_own_also_when_a_parent_has_ended(
+    gpu: Gpu, seen: Path
+) -> None:
+    record = Record(gpu, **QUICK)
+    assert await recorded(record, sys.executable, "-c", ADOPTED, PROGRAM, str(seen)) == 0
+    found = record.figures({})
+    assert found is not None
+    assert found.load_peak == 1500 * MIB
 
-    died = await run("import sys; print('loading'); sys.exit('out of luck')")
-    assert died.details == {"exit_code": 1, "log": "loading\nout of luck"}
-    killed = await run("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
-    assert "SIGKILL" in killed.message
-    assert "no bytes" in (await run("pass")).message
-    with pytest.raises(CalibrationFailed, match="cannot start"):
-        await measure_program(gpu, QUICK, ["/no/such/program"], None, print)
+
+ADOPTED = """
+import os, subprocess, sys
+
+begin = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', *sys.argv[1:]], close_fds=0)"
+ended, alive = os.pipe()
+subprocess.run([sys.executable, "-c", begin, *sys.argv[1:]], pass_fds=[alive])
+os.close(alive)
+os.read(ended, 1)
+"""
+"""Its child starts a program and ends; it ends with that program."""
+
+
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_a_server_is_ended_after_its_time(gpu: Gpu) -> None:
+    record = Record(gpu, **QUICK)
+    assert await recorded(record, "sleep", "600", limit_s=0.2) == 0
+    assert record.figures({}) is None
+
+
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_another_program_disturbs_a_measurement_by_the_total(
+    gpu: Gpu, fake_folder: Path
+) -> None:
     hide(fake_folder)
-    disturbed = await run(STOWAWAY, replace(QUICK, limit_s=1.0))
-    assert "another program used it meanwhile" in disturbed.message
+    record = Record(gpu, limit_s=1.0, **QUICK)
+    with pytest.raises(CalibrationFailed, match="another program used it meanwhile"):
+        await recorded(record, sys.executable, "-c", STOWAWAY)
 
 
 STOWAWAY = """
@@ -469,22 +448,22 @@ detector: {labels: [cube]}
 
 @pytest.mark.e2e
 @pytest.mark.anyio
-async def test_a_model_in_a_sidecar_of_its_own(gpu: Watched) -> None:
+async def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, seen: Path, fake_folder: Path) -> None:
     """Its load peak is seen although it is freed at once: memory comes back later."""
-    config = fakegpu.parse_config((gpu.folder / fakegpu.GPU_FILE).read_text())
+    config = fakegpu.parse_config((fake_folder / fakegpu.GPU_FILE).read_text())
     slow = config.model_copy(update={"release_lag_s": 0.3})
-    (gpu.folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
-    (gpu.seen / "rskill.yaml").write_text(MANIFEST)
-    measured = await measure_model(
-        gpu,
-        replace(QUICK, rate_hz=50.0, rest_s=0.6),
-        load_manifest(gpu.seen / "rskill.yaml"),
-        ("--rskill", str(gpu.seen / "rskill.yaml"), "--footprint", "1200MiB,1GiB,300MiB"),
-        Asked(3),
-        print,
-        (sys.executable, str(echo_sidecar.__file__), str(gpu.seen)),
-    )
-    assert measured.figures == Figures(
+    (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
+    (seen / "rskill.yaml").write_text(MANIFEST)
+    sidecar = [
+        sys.executable, str(echo_sidecar.__file__), str(seen), "--name", "calibrate",
+        "--no-arbiter", "--device", gpu.device, "--rskill", str(seen / "rskill.yaml"),
+        "--footprint", "1200MiB,1GiB,300MiB",
+    ]  # fmt: skip
+    marks = seen / "marks"
+    plan = model.Plan(str(seen / "rskill.yaml"), sidecar, 3, 0.6, str(marks))
+    record = Record(gpu, rate_hz=50.0, rest_s=0.6)
+    assert await recorded(record, *MODEL, json.dumps(asdict(plan))) == 0
+    assert record.figures(json.loads(marks.read_text())) == Figures(
         context=RESIDUE_BYTES,
         load_peak=1200 * MIB,
         steady=GIB,
@@ -492,11 +471,10 @@ async def test_a_model_in_a_sidecar_of_its_own(gpu: Watched) -> None:
         retained=0,
         after_exit=0,
     )
-    source = source_of(gpu, measured, datetime(2026, 1, 2, tzinfo=UTC))
     assert re.fullmatch(
         r"measured 2026-01-02 on Simulated GPU \(driver simulated\), bytes of its processes, "
         r"\d+ readings/s, 3 requests, margin 2 % up to 48 MiB",
-        source,
+        source_of(record, 3, datetime(2026, 1, 2, tzinfo=UTC)),
     )
 
 
@@ -556,18 +534,18 @@ time.sleep(0.2)  # ten readings
 @pytest.mark.e2e
 def test_a_robot_goes_first(
     calibrate: Callable[..., int],
-    gpu: Watched,
+    seen: Path,
     arbiter_daemon: ArbiterProcess,
-    capsys: pytest.CaptureFixture[str],
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     """A request of a higher priority ends the calibration and its program; nothing is written."""
     waiting = subprocess.Popen(
-        [sys.executable, "-c", REQUEST, arbiter_daemon.endpoint, str(gpu.seen)],
+        [sys.executable, "-c", REQUEST, arbiter_daemon.endpoint, str(seen)],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     program = "import sys, pathlib, signal; pathlib.Path(sys.argv[1], 'up').touch(); signal.pause()"
-    assert calibrate("--", *command(gpu, program)) == 1
-    assert "the GPU is needed" in capsys.readouterr().err
+    assert calibrate("--", sys.executable, "-c", program, str(seen)) == 1
+    assert "the GPU is needed" in capfd.readouterr().err
     assert waiting.communicate(timeout=PATIENCE_S)[0] == "granted\n"
 
 
@@ -588,6 +566,10 @@ with Client("robot", endpoint=sys.argv[1]) as client, client.lease(vram="1GiB", 
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
+        (["--no-arbiter", "--", "/no/such/program"], 127, "not found"),
+        (["--no-arbiter", *FLAGS, "--", "false"], 1, "local/false ended with exit code 1"),
+        (["--no-arbiter", *FLAGS, "--", "sh", "-c", "kill -9 $$"], 1, "ended with SIGKILL"),
+        (["--no-arbiter", *FLAGS, "--", "true"], 1, "no bytes of local/true were seen"),
         ([], 2, "expected either MANIFEST or `-- COMMAND`"),
         (["so101-detector", "--", "true"], 2, "expected either MANIFEST or `-- COMMAND`"),
         (["so101-detector", "--seconds", "3"], 2, "belong to `-- COMMAND`"),
@@ -600,7 +582,7 @@ with Client("robot", endpoint=sys.argv[1]) as client, client.lease(vram="1GiB", 
         (["so101-detector", "--write", "configs/models/footprints.yaml"], 2, "stands for"),
     ],
 )
-def test_refused_before_anything_is_measured(
+def test_what_cannot_be_measured_is_refused(
     words: list[str],
     code: int,
     said: str,

@@ -63,7 +63,7 @@ def test_the_state_folder_is_that_of_the_configuration(machine: Machine) -> None
     """Files put aside there were not seen."""
     lay(machine.root, {"/etc/vram-arbiter/arbiter.yaml": "state:\n  dir: /srv/a\n"})
     lay(machine.root, {"/srv/a/journal.sqlite.corrupt-1": ""})
-    (found,) = examine(machine, (("files", doctor.orphans.files),))
+    (found,) = examine(machine, (("files", doctor.leftovers.files, ""),))
     assert found.fix == "sudo rm /srv/a/journal.sqlite.corrupt-1"
 
 
@@ -83,7 +83,7 @@ def test_the_state_folder_is_that_of_the_configuration(machine: Machine) -> None
         ("parked.unknown", {"/proc/meminfo": None}, lambda m: m),
         ("orphans.unknown", {"/proc/net/unix": None}, lambda m: m),
         ("files.unknown", {}, field(endpoint="ipc:///run/user/1/a.sock")),
-        ("ports.unknown", {"/etc/vram-arbiter/arbiter.yaml": "http: [\n"}, lambda m: m),
+        ("files.unknown", {"/etc/vram-arbiter/arbiter.yaml": "http: [\n"}, lambda m: m),
         ("permissions.unknown", {SOCKET: None}, silent),
         ("units.unknown", {}, lambda m: os.rename(m.path("/run/systemd"), m.root / "x") or m),
     ],
@@ -122,14 +122,14 @@ def test_a_driver_that_needs_no_units_for_a_suspend(
 ) -> None:
     """NVIDIA 595 with open modules saves memory by the kernel's notifiers."""
     lay(machine.root, {"/proc/driver/nvidia/params": params, "/sys/power/state": state})
-    findings = examine(machine, (("suspend", doctor.driver.suspend),))
+    findings = examine(machine, (("suspend", doctor.driver.suspend, "x"),))
     assert [one.severity for one in findings] == [Severity.OK]
 
 
 def test_a_jetson_has_a_driver_of_its_own(machine: Machine) -> None:
     """NVML is missing there, and doctor said that there was no GPU."""
     lay(machine.root, {**GONE, "/dev/nvmap": ""})
-    (found,) = examine(NOT_FOUND(machine), (("driver", doctor.driver.driver),))
+    (found,) = examine(NOT_FOUND(machine), (("driver", doctor.driver.driver, ""),))
     assert (found.code, found.severity) == ("driver.tegra", Severity.OK)
 
 

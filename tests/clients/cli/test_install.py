@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from vram_arbiter.clients.cli.installation import completion as completing
-from vram_arbiter.clients.cli.installation import environment, install, machine
+from vram_arbiter.clients.cli.installation import environment, machine
 from vram_arbiter.clients.cli.installation.site import PROGRAMS
 from vram_arbiter.clients.cli.main import COMMANDS, command_parser, run_main
 from vram_arbiter.schemas.errors import ConfigError
@@ -236,11 +236,11 @@ def test_what_cannot_be_installed_is_refused(
 def test_the_machine_itself_is_for_root_and_a_user_for_himself(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(install.os, "getuid", lambda: 1000)
+    monkeypatch.setattr(os, "getuid", lambda: 1000)
     for command in ("install", "uninstall"):
         assert run_main([command]) == 2
         assert f"`vramctl {command} --user-units`" in capsys.readouterr().err
-    monkeypatch.setattr(install.os, "getuid", lambda: 0)
+    monkeypatch.setattr(os, "getuid", lambda: 0)
     assert run_main(["install", "--user-units"]) == 2
     assert "without sudo" in capsys.readouterr().err
     monkeypatch.setattr(machine, "_BOOTED", tmp_path / "nothing")
@@ -272,9 +272,9 @@ def test_a_removal_stops_units_of_ours_alone(
     wants.mkdir()
     for name in ("vram-runner@deploy.service", "ssh.service"):
         (wants / name).touch()
-    found = machine.Services(system=True).known(["vram-runner@*.service"], tmp_path)
+    found = machine.known_units(["vram-runner@*.service"], tmp_path, system=True)
     assert found == ["vram-runner@deploy.service", "vram-runner@sim.service"]
-    assert machine.Services(system=True).known([], tmp_path) == []
+    assert machine.known_units([], tmp_path, system=True) == []
 
 
 # -- the environment that the units run
@@ -297,7 +297,7 @@ def test_a_program_that_a_user_may_change_is_not_run_by_a_unit(
             environment.check_path(link)
     link.unlink()
     link.symlink_to(link)
-    with pytest.raises(ConfigError, match="too many links"):
+    with pytest.raises(ConfigError, match=f"{link}: .*links|Symlink loop"):
         environment.check_path(link)
 
 

@@ -5,9 +5,7 @@ import contextlib
 import importlib.util
 import json
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +13,17 @@ import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
 from tests.support.waiting import until
-from vram_arbiter.clients.cli.timeline import collect
+from vram_arbiter.clients.cli.timeline import chart, collect
 from vram_arbiter.clients.cli.timeline.collect import BadEventLog, EmptyTimeline, Range
 from vram_arbiter.clients.cli.timeline.command import write
-from vram_arbiter.clients.cli.timeline.layout import draw
 from vram_arbiter.clients.cli.timeline.reader import Reader
 from vram_arbiter.clients.cli.timeline.story import Story, within
-from vram_arbiter.clients.cli.timeline.svg import page
 from vram_arbiter.clients.cli.timeline.trace import trace
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
+PHASES = ["revoke", "quiesce", "unload", "verify"]
 HOSTILE = "</title><script>x</script>\x1b[2J\u202e$x^2$&"
 
 
@@ -99,7 +96,7 @@ def logged_states(daemon: ArbiterProcess) -> dict[str, list[str]]:
 def test_the_history_tells_waits_uses_states_and_phases(printed: Story) -> None:
     found = lease_states(printed)
     assert found["encoder"] == ["loading", "held"]
-    assert found["detector"] == ["loading", "held", "revoking", "unloading", "verifying"]
+    assert found["detector"] == ["loading", "held", *PHASES]
     assert found["grab"] == ["queued", "loading"]
     detector, grab = (
         next(lease for lease in printed.leases if lease.consumer == name)
@@ -113,8 +110,9 @@ def test_the_history_tells_waits_uses_states_and_phases(printed: Story) -> None:
     assert (eviction.consumer, eviction.wanted_by, eviction.verdict) == (
         "detector", "grab", "verified"
     )  # fmt: skip
-    phases = eviction.phases(printed.end_s)
-    assert [phase.name for phase in phases] == ["revoke", "quiesce", "unload", "verify"]
+    phases = detector.states[2:]
+    assert eviction.asked_s == phases[0].begin_s
+    assert eviction.end_s == phases[-1].end_s
     assert phases[0].begin_s <= detector.uses[0].end_s <= phases[2].begin_s
     assert printed.begin_s > printed.end_s - 600, "it begins with the daemon, not an hour ago"
     (gpu,) = printed.gpus
@@ -128,7 +126,7 @@ def test_the_event_log_tells_the_same_offline(switched: ArbiterProcess, printed:
     logged = collect.story_of(read_back, Range())
     assert lease_states(logged) == lease_states(printed)
     (one,), (other,) = logged.evictions, printed.evictions
-    assert [phase.name for phase in one.phases(0)] == [phase.name for phase in other.phases(0)]
+    assert (one.lease_id, one.verdict) == (other.lease_id, other.verdict)
     assert [[count for _, count in lease.charges] for lease in logged.leases] == [
         [count for _, count in lease.charges] for lease in printed.leases
     ]
@@ -187,23 +185,40 @@ def test_standby_loss_and_pressure() -> None:
         {"at_wall_s": 40, "kind": "a_kind_of_tomorrow", "gpu": "G"},
     )
     assert lease_states(story) == {
-        "a": ["loading", "held", "revoking", "verifying", "standby", "loading", "verifying"],
-        "old": ["held", "verifying"],
+        "a": ["loading", "held", "revoke", "verify", "standby", "loading", "verify"],
+        "old": ["held", "verify"],
         "never": ["queued"],
     }
     lease = story.leases[0]
     assert lease.charges == [(1, 4), (2, 3), (8, 0), (10, 4), (12, 0)]
     (eviction,) = story.evictions
-    assert [(one.name, one.end_s - one.begin_s) for one in eviction.phases(99)] == [
-        ("unload", 1), ("verify", 2)
-    ]  # fmt: skip
+    assert (eviction.asked_s, eviction.end_s, eviction.verdict) == (5, 8, "verified")
     assert [(span.begin_s, span.end_s) for span in story.gpus[0].pressure] == [(30, 31)]
     assert [mark.kind for mark in story.marks] == ["lost", "denied"]
     part = within(story, 4.5, 9.0)
-    assert [span.name for span in part.leases[0].states] == [
-        "held", "revoking", "verifying", "standby"
-    ]  # fmt: skip
+    assert [span.name for span in part.leases[0].states] == ["held", "revoke", "verify", "standby"]
     assert part.leases[0].charges == [(4.5, 3), (8, 0)]
+
+
+def test_a_withdrawn_revoke_and_a_second_one() -> None:
+    """The holder stays; an acknowledgement that is repeated while it unloads changes nothing."""
+    story = read_back(
+        made_event(1, "granted", charge_bytes=4),
+        made_event(2, "ready", charge_bytes=3),
+        made_event(3, "revoke_asked", wanted_by="b"),
+        made_event(4, "revoke_withdrawn"),
+        made_event(5, "revoke_asked", wanted_by="c"),
+        made_event(6, "revoke_acked"),
+        made_event(7, "unloading"),
+        made_event(8, "revoke_acked"),
+        end_s=9.0,
+    )
+    assert lease_states(story)["a"] == [
+        "loading", "held", "revoke", "held", "revoke", "quiesce", "unload"
+    ]  # fmt: skip
+    first, second = story.evictions
+    assert (first.verdict, first.end_s) == ("withdrawn", 4)
+    assert (second.wanted_by, second.verdict, second.end_s) == ("c", "", None)
 
 
 # -- forms
@@ -234,7 +249,7 @@ def rules_of_trace(printed: Mapping[str, Any]) -> list[str]:
                 if one["s"] not in ("g", "p", "t"):
                     broken.append(f"scope: {one}")
             case "M":
-                if one["name"] not in ("process_name", "process_sort_index", "thread_name"):
+                if one["name"] not in ("process_name", "thread_name"):
                     broken.append(f"metadata: {one}")
             case _:
                 broken.append(f"phase: {one}")
@@ -272,8 +287,7 @@ def test_the_json_keeps_the_trace_formats_rules(printed: Story, tmp_path: Path) 
         found = json.loads((tmp_path / "t.json").read_text())
         assert rules_of_trace(found) == []
     events = trace(printed)["traceEvents"]
-    phases = ["revoke", "quiesce", "unload", "verify"]
-    assert [one["name"] for one in events if one["ph"] == "X" and one["cat"] in phases] == phases
+    assert [one["name"] for one in events if one["ph"] == "X" and one["cat"] in PHASES] == PHASES
     counters = [one["args"] for one in events if one["ph"] == "C" and "grab" in one["args"]]
     assert counters[-1] == {"encoder": GIB // 2, "detector": 0, "grab": 6 * GIB}
     assert [one["cat"] for one in events if one["ph"] == "b"] == ["use", "queued"]
@@ -281,46 +295,19 @@ def test_the_json_keeps_the_trace_formats_rules(printed: Story, tmp_path: Path) 
     assert rules_of_trace({"traceEvents": broken}), "the check can fail"
 
 
-class Elements(HTMLParser):
-    """Elements and attributes of a page, and whether each is closed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attributes)))
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-
 @pytest.mark.e2e
-def test_the_html_is_one_file_for_every_reader(printed: Story) -> None:
-    for story in (printed, hostile(), read_back()):
-        written = page(story, draw(story, HOSTILE))
-        parser = Elements()
-        parser.feed(written)
-        tags = {tag for tag, _ in parser.found}
-        assert tags.isdisjoint({"script", "link", "img", "iframe", "object", "style/"})
-        loads = {"src", "href", "onload", "onclick", "style", "xlink:href"}
-        assert not [one for one in parser.found if loads & one[1].keys()]
-        assert "url(" not in written
-        assert "@import" not in written
-        assert "prefers-color-scheme: dark" in written
-        (picture,) = re.findall(r"<svg.*</svg>", written, re.DOTALL)
-        svg = ET.fromstring(picture)
-        assert (svg.get("role"), svg.get("aria-labelledby")) == ("img", "t d")
-        assert [one.get("id") for one in svg[:2]] == ["t", "d"]
-        assert all(one.text for one in svg[:2])
-        assert "\x1b" not in written
-        assert "\u202e" not in written
-        used = set(re.findall(r"var\(--([\w-]+)\)", written))
-        assert used <= set(re.findall(r"--([\w-]+):", written)), "each paint has a color"
-    text = page(printed, draw(printed))
-    assert "<h2>Evictions</h2>" in text
-    assert ">grab needs the room</td>" in text
+def test_the_lines_show_each_consumer_from_left_to_right(printed: Story) -> None:
+    """Bytes of the GPU, then one line for each consumer, in the order of their first lease."""
+    shown = chart.lines(printed)
+    assert shown[1].startswith("GPU 0 Simulated GPU")
+    assert shown[1].endswith("of 8 GiB")
+    by_name = {line[: chart.NAME_CHARS].strip(): line[chart.NAME_CHARS + 2 :] for line in shown}
+    assert re.fullmatch(" *▒?█+", by_name["encoder"])
+    assert re.fullmatch(" *▒?█*▼+", by_name["detector"])
+    assert re.fullmatch(" *·*▒+", by_name["grab"])
+    assert len(by_name["encoder"]) == chart.CELLS, "it is held to the end"
+    for story in (hostile(), read_back()):
+        assert all(line.isprintable() for line in chart.lines(story))
 
 
 @pytest.mark.heavy
@@ -338,20 +325,22 @@ def test_the_png_is_drawn(printed: Story, tmp_path: Path) -> None:
 @pytest.mark.e2e
 def test_the_command_writes_what_its_ending_says(switched: ArbiterProcess, tmp_path: Path) -> None:
     environ, log = switched.environ, str(switched.state)
-    made = vramctl("timeline", "-o", f"{tmp_path}/a.html", "--last", "1h", environ=environ)
+    made = vramctl("timeline", "-o", f"{tmp_path}/a.json", "--last", "1h", environ=environ)
     assert made.returncode == 0, made.stderr
     assert made.stdout.endswith("3 leases, 1 eviction\n")
-    assert (tmp_path / "a.html").read_text().startswith("<!doctype html>")
+    assert json.loads((tmp_path / "a.json").read_text())["traceEvents"]
+    lines = vramctl("timeline", "--last", "1h", environ=environ)
+    assert (lines.returncode, lines.stdout.count("\n")) == (0, 6), lines.stderr
     offline = ("timeline", "-o", f"{tmp_path}/b.json", "--event-log", log)
     assert vramctl(*offline, environ=environ).returncode == 0
     assert json.loads((tmp_path / "b.json").read_text())["traceEvents"]
     for arguments, code, says in (
-        (("-o", "a.gif"), 2, "ends in .png, .html, .json"),
-        (("-o", "a.html", "--last", "soon"), 2, "expected 90s, 10m, 2h or 1d"),
-        (("-o", "a.html", "--last", "1h", "--since", "1h"), 2, "not allowed with"),
-        (("-o", f"{tmp_path}/no/a.html"), 2, "cannot be written: No such file"),
-        (("-o", "a.html", "--event-log", f"{tmp_path}"), 1, "no event log here"),
-        (("-o", "a.html", "--endpoint", f"ipc://{tmp_path}/s"), 3, "no such socket"),
+        (("-o", "a.gif"), 2, "ends in .png, .json"),
+        (("-o", "a.json", "--last", "soon"), 2, "expected 90s, 10m, 2h or 1d"),
+        (("-o", "a.json", "--last", "1h", "--since", "1h"), 2, "not allowed with"),
+        (("-o", f"{tmp_path}/no/a.json"), 2, "cannot be written: No such file"),
+        (("-o", "a.json", "--event-log", f"{tmp_path}"), 1, "no event log here"),
+        (("-o", "a.json", "--endpoint", f"ipc://{tmp_path}/s"), 3, "no such socket"),
     ):
         done = vramctl("timeline", *arguments, environ=environ)
         assert done.returncode == code, done.stderr

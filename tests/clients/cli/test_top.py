@@ -111,7 +111,7 @@ def words(line: str) -> str:
 
 
 def names(pilot: Pilot[None]) -> list[str]:
-    return [row.lease.consumer for row in pilot.app.screen_stack[0].query_one(Leases)._rows]
+    return [row.lease.consumer for row in pilot.app.screen_stack[0].query_one(Leases).rows]
 
 
 def keys(pilot: Pilot[None]) -> str:
@@ -311,8 +311,8 @@ def test_columns_fit_and_obey_no_name(told_lines: StatusReply, width: int) -> No
     assert {cell_len(line) for line in lines[: 1 + len(rows)]} == {width}
     lines += gpus.panel(poisoned, [Samples()], width, 24)
     lines += [gpus.header(poisoned, "operator", width)]
-    lines += [line for row in rows for line in gpus.selected_lines(row, width, 3)]
     assert all(cell_len(line) <= width for line in lines)
+    lines += [line for row in rows for line in gpus.selected_lines(row)]  # the screen wraps them
     said = "".join([*lines, *gpus.notices(poisoned)])
     assert not [letter for letter in said if unicodedata.category(letter) in ("Cc", "Cf")]
     for order in ORDERS:
@@ -329,17 +329,6 @@ def test_a_sparkline_shows_the_largest_reading_of_each_interval() -> None:
     samples.add(20 * step, 0)
     assert len(samples.points) == 1, "older readings are forgotten"
     assert Samples().sparkline(3, GIB) == "   "
-
-
-def test_a_reason_that_is_cut_says_so(told_lines: StatusReply) -> None:
-    """Regression: the second of two lines was an ellipsis alone."""
-    row, width = rows_of(told_lines)[0], 30
-    whole = gpus.selected_lines(row, width, 8)
-    assert len(whole) > 2
-    first, second = gpus.selected_lines(row, width, 2)
-    assert first == whole[0]
-    assert second.startswith(whole[1][:20])
-    assert second.endswith("…")
 
 
 def test_sizes_are_short() -> None:

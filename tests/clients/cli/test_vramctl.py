@@ -275,4 +275,4 @@ def test_doctor_fails_on_a_drained_daemon(
 def test_doctor_with_a_daemon(arbiter_daemon: ArbiterProcess) -> None:
     done = vramctl("doctor", environ=arbiter_daemon.environ)
     assert done.returncode == 0, done.stdout
-    assert "its probe answers (a simulated GPU)" in done.stdout, "what reads the GPU is said"
+    assert "its probe answers (source fake)" in done.stdout, "what reads the GPU is said"

@@ -1,0 +1,76 @@
+"""`vramctl demo --quick`: a real arbiter, a simulated GPU of 8 GiB, and three stand-in programs
+that take turns on it (`demo_stand_in`). Needs the base install only.
+"""
+
+import asyncio
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Final
+
+from vram_arbiter.clients.cli.demo_display import QUIET_KINDS, describe
+from vram_arbiter.clients.cli.demo_programs import Program, Programs
+from vram_arbiter.clients.cli.timeline import chart, collect
+from vram_arbiter.clients.cli.timeline.collect import Range
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.errors import ArbiterUnreachable
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
+from vram_arbiter.schemas.runtime.printable import printable
+
+STAND_INS: Final = {"detector": "5.3GB", "scene-vlm": "3.3GB", "grab": "4.3GB"}
+LIMIT_S: Final = 60.0
+"""It takes a third of that on two idle cores."""
+
+
+def run() -> int:
+    """Return 0 if all programs did their jobs, took turns, and never ran out of memory."""
+    return asyncio.run(_demo())
+
+
+async def _demo() -> int:
+    runtime = Path(tempfile.mkdtemp(prefix="vram-demo-"))  # short, for the paths of its sockets
+    folder = runtime / "fakegpu"
+    environ = {RUNTIME_VARIABLE: str(runtime), fakegpu.FOLDER_VARIABLE: str(folder)}
+    programs = Programs(runtime, environ)
+    endpoint = f"ipc://{runtime}/arbiter.sock"
+    try:
+        print("starting the arbiter on a simulated GPU of 8 GiB, and three programs")
+        await programs.start("arbiter", "arbiter", "--gpu", "fake:8GiB")
+        async with AsyncClient("demo", endpoint=endpoint, connect_timeout_s=LIMIT_S) as client:
+            started = [
+                await programs.start(name, "clients.cli.demo_stand_in", name, size)
+                for name, size in STAND_INS.items()
+            ]
+            events = await _follow(client, started)
+        failed = [one for one in started if one.process.returncode != 0]
+        for program in failed:
+            print(f"{program.name} did not do its jobs:\n{program.tail()}", file=sys.stderr)
+        kinds = {event["kind"] for event in events}
+        if "granted" in kinds:
+            first_s = min(event["at_wall_s"] for event in events if event["kind"] == "granted")
+            print("\n" + "\n".join(chart.lines(collect.from_history(Range(first_s), endpoint))))
+        return 0 if not failed and "oom" not in kinds and "verified" in kinds else 1
+    except ArbiterUnreachable:
+        programs.check()  # says why it ended
+        raise
+    finally:
+        await programs.stop_all()
+        shutil.rmtree(runtime, ignore_errors=True)
+
+
+async def _follow(client: AsyncClient, started: list[Program]) -> list[JsonMap]:
+    """Print what happens until all programs have ended. Returns the events."""
+    events, began_s, going = list[JsonMap](), time.time(), True
+    while going:
+        left_s = LIMIT_S - (time.time() - began_s)
+        going = left_s > 0 and any(one.process.returncode is None for one in started)
+        for event in (await client.history(after=events[-1]["seq"] if events else 0)).events:
+            events.append(event)
+            if event["kind"] not in QUIET_KINDS:
+                print(printable(f"{event['at_wall_s'] - began_s:5.1f} s  {describe(event)}"))
+        await asyncio.sleep(0.1)
+    return events
