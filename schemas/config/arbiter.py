@@ -5,7 +5,7 @@ Pure: `load_config(text, name)` takes the text of a file; the daemon reads the f
 No key is required: an empty file is the default configuration.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Literal, Self
 
@@ -15,7 +15,7 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
 from vram_arbiter.schemas.urls import collector_url, http_address
-from vram_arbiter.schemas.yamltext import Path, parse_yaml, validated
+from vram_arbiter.schemas.yamltext import parse_yaml, validated
 
 Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
@@ -339,16 +339,6 @@ LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
 and the heartbeat when they connected, so those two stay as they are."""
 
 
-def known_keys() -> Mapping[Path, Collection[str]]:
-    """The keys of every section, by path: what suggestions for a mistyped key are taken from."""
-    found: dict[Path, Collection[str]] = {(): list(ArbiterConfig.model_fields)}
-    for name, field in ArbiterConfig.model_fields.items():
-        section = field.annotation
-        if isinstance(section, type) and issubclass(section, BaseModel):
-            found[(name,)] = list(section.model_fields)
-    return found
-
-
 def load_config(text: str, name: str) -> ArbiterConfig:
     """Read the text of a configuration file; `name` is how errors call the file.
 
@@ -360,7 +350,7 @@ def load_config(text: str, name: str) -> ArbiterConfig:
     if isinstance(data, dict):
         # `verify:` with all its keys commented out is an empty section, not a mistake
         data = {
-            key: {} if value is None and (key,) in known_keys() else value
+            key: {} if value is None and key in ArbiterConfig.model_fields else value
             for key, value in data.items()
         }
-    return validated(ArbiterConfig, replace(source, data=data), known_keys())
+    return validated(ArbiterConfig, replace(source, data=data))

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, ControlMode
-from vram_arbiter.schemas.manifest.problems import Problem, raise_if
+from vram_arbiter.schemas.findings import Problem, raise_if
 from vram_arbiter.schemas.manifest.vocabulary import (
     DetectorEngine,
     DetectorMode,

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
+from vram_arbiter.schemas.findings import Problem, raise_if
 from vram_arbiter.schemas.manifest.contracts import Finite, ManifestBlock, PositiveInt
-from vram_arbiter.schemas.manifest.problems import Problem, raise_if
 from vram_arbiter.schemas.manifest.vocabulary import (
     JOINT_SPACE_LAYOUTS,
     TASK_SPACE_LAYOUTS,

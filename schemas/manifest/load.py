@@ -3,19 +3,38 @@
 `schemas.yamltext` reads the YAML; this module adds what a manifest asks for.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 
 from pydantic import ValidationError
 
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid
+from vram_arbiter.schemas.findings import Problem, problems_of
 from vram_arbiter.schemas.manifest.kinds import KINDS, check_kind
 from vram_arbiter.schemas.manifest.manifest import RSkillManifest
-from vram_arbiter.schemas.manifest.problems import ManifestError, Problem, from_validation_error
 from vram_arbiter.schemas.manifest.vocabulary import Kind
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.yamltext import YamlText, parse_yaml, read_text
+
+
+class ManifestError(ManifestInvalid):
+    """A manifest that cannot be used. `problems` lists every finding, `details["fields"]` the same
+    as plain data."""
+
+    def __init__(self, source: str, problems: Sequence[Problem]) -> None:
+        self.source = source
+        self.problems = tuple(problems)
+        super().__init__(
+            "\n".join(problem.at(source) for problem in self.problems),
+            details={
+                "source": source,
+                "fields": [
+                    {"path": problem.field, "problem": problem.message, "line": problem.line}
+                    for problem in self.problems
+                ],
+            },
+        )
 
 
 def load_manifest(path: str | FilePath) -> RSkillManifest:
@@ -36,7 +55,7 @@ def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillM
     try:
         return RSkillManifest.model_validate(data)
     except ValidationError as error:
-        problems = _with_kind_rules(from_validation_error(error, RSkillManifest, data), data)
+        problems = _with_kind_rules(problems_of(error, RSkillManifest, data), data)
         located = [replace(problem, line=document.line(problem.path)) for problem in problems]
         raise ManifestError(
             source, sorted(located, key=lambda problem: problem.line or 0)

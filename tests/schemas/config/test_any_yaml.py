@@ -132,7 +132,7 @@ def test_a_family_of_a_wrong_type_is_a_finding(raw: str) -> None:
 
 @pytest.mark.parametrize("place", [("embodiment_tags", 0), ("actions", 0), ("sensors_required", 0)])
 def test_one_wrong_entry_is_one_finding(place: tuple[Any, ...]) -> None:
-    """Regression: a list of one wrong entry was "must have at least 1 entry" as well."""
+    """Regression: a list of one wrong entry was "must have at least 1 item" as well."""
     document = yaml.safe_load(
         (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
     )
@@ -142,7 +142,7 @@ def test_one_wrong_entry_is_one_finding(place: tuple[Any, ...]) -> None:
     assert len(caught.value.problems) == 1
     document[place[0]] = []
     if place[0] != "sensors_required":
-        with pytest.raises(ManifestError, match="must have at least 1 entry"):
+        with pytest.raises(ManifestError, match="must have at least 1 item"):
             parse_manifest(yaml_text(document, ("nowhere",), ""))
 
 
