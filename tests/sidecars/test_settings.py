@@ -128,8 +128,8 @@ def test_the_lease_covers_the_inference_peak(rskill):
     [
         ("a/b: {load_peak: 1GB, steady: 1GB, residu: 1}", "footprints.yaml:1: a/b.residu"),
         ("a/b:\n  load_peak: much\n  steady: 1GB\n", "footprints.yaml:2: a/b.load_peak"),
-        ("a/b/fp31: {load_peak: 1GB, steady: 1GB}", "footprints.yaml:1: 'a/b/fp31' names no model"),
-        ("- 1", "must be a map"),
+        ("a/b/fp31: {load_peak: 1GB, steady: 1GB}", "footprints.yaml:1: a/b/fp31: names no model"),
+        ("- 1", "must be a mapping"),
         ("a/b: [", "not valid YAML"),
     ],
 )

@@ -154,7 +154,10 @@ def load_vlm_nf4(weights: Weights, device: str) -> Any:
     from transformers import AutoModelForImageTextToText
 
     return load_transformers(
-        AutoModelForImageTextToText, weights, device_map={"": device}, nf4=Nf4(min_params=0)
+        AutoModelForImageTextToText,
+        weights,
+        device_map={"": device},
+        nf4=Nf4(min_params_to_quantize=0),
     )
 
 
@@ -359,7 +362,7 @@ def test_a_quantized_policy_is_loaded_as_it_is(
     from lerobot.policies.factory import get_policy_class
     from safetensors.torch import load_file, save_file
 
-    nf4 = Nf4(min_params=0)
+    nf4 = Nf4(min_params_to_quantize=0)
     shutil.copytree(saved("act"), tmp_path, dirs_exist_ok=True)
     weights = Weights(str(tmp_path), local=True)
     config = read_config(PreTrainedConfig, weights)
