@@ -71,6 +71,23 @@ def raise_if(problems: Sequence[Problem]) -> None:
         raise RuleError(problems)
 
 
+def misplaced(values: object, rules: Mapping[str, str], of: str) -> list[Problem]:
+    """Return what a block that is `of` a kind lacks, or must not say: by field, `R` is required,
+    `F` forbidden, `-` free."""
+    problems = []
+    for field, rule in rules.items():
+        given = bool(getattr(values, field))
+        if (rule == "R" and not given) or (rule == "F" and given):
+            verb = "is required for" if rule == "R" else "is not allowed for"
+            problems.append(Problem((field,), f"{verb} {of!r}"))
+    return problems
+
+
+def wrong(problem: str, *path: str | int) -> RuleError:
+    """Return the error of one finding."""
+    return RuleError([Problem(path, problem)])
+
+
 def dotted(path: Path) -> str:
     """`verify.poll_s[0]`"""
     text = ""

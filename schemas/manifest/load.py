@@ -14,8 +14,7 @@ from vram_arbiter.schemas.findings import Problem, problems_of
 from vram_arbiter.schemas.manifest.kinds import KINDS, check_kind
 from vram_arbiter.schemas.manifest.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Kind
-from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import YamlText, parse_yaml, read_text
+from vram_arbiter.schemas.yamltext import parse_yaml, read_text
 
 
 class ManifestError(ManifestInvalid):
@@ -50,7 +49,10 @@ def load_manifest(path: str | FilePath) -> RSkillManifest:
 def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillManifest:
     """Check the text of a manifest. Raises ManifestError with every finding; `source` names the
     text in messages."""
-    document = _read_yaml(content, source)
+    try:
+        document = parse_yaml(content, source)
+    except ConfigError as error:
+        raise _unreadable(source, error) from error
     data = document.data
     try:
         return RSkillManifest.model_validate(data)
@@ -62,40 +64,16 @@ def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillM
         ) from error
 
 
-def _with_kind_rules(problems: list[Problem], data: JsonMap) -> list[Problem]:
+def _with_kind_rules(problems: list[Problem], data: object) -> list[Problem]:
     """Add what the kind demands: pydantic stops before that rule as soon as any single field is
     wrong."""
-    kind = data.get("kind")
-    if kind not in KINDS:
+    kind = data.get("kind") if isinstance(data, Mapping) else None
+    if not isinstance(data, Mapping) or kind not in KINDS:
         return problems
     known = {problem.path for problem in problems}
     return problems + [
         problem for problem in check_kind(Kind(kind), data) if problem.path not in known
     ]
-
-
-def _read_yaml(content: str | bytes, source: str) -> YamlText:
-    """Return the document, which is a map with texts as keys. Raises ManifestError."""
-    try:
-        document = parse_yaml(content, source)
-    except ConfigError as error:
-        raise _unreadable(source, error) from error
-    data = document.data
-    if not isinstance(data, Mapping):
-        problem = "must be a mapping of fields, not a list or a single value"
-        raise ManifestError(source, [Problem((), problem, 1)])
-    if not data:
-        raise ManifestError(source, [Problem((), "is empty; it must be a mapping of fields")])
-    wrong = [key for key in data if not isinstance(key, str)]
-    if wrong:
-        raise ManifestError(
-            source,
-            [
-                Problem((), f"field names must be texts, not {key!r}", document.line((str(key),)))
-                for key in wrong
-            ],
-        )
-    return document
 
 
 def _unreadable(source: str, error: ConfigError) -> ManifestError:
