@@ -10,7 +10,7 @@ import reprlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import EnumType
-from typing import Final, get_args
+from typing import Final, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -180,10 +180,15 @@ def _said(finding: JsonMap, path: Path, model: type[BaseModel]) -> str:
 
 def _model_at(model: type[BaseModel] | None, path: Path) -> type[BaseModel] | None:
     """Return the model of the value at a path; None where there is none."""
+    keyed = False  # the next key is one of a map, not a field
     for key in path:
-        if isinstance(key, str) and model is not None:
-            field = model.model_fields.get(key) or model.model_fields.get("root")
-            model = _model_in(field.annotation) if field else None
+        if keyed or isinstance(key, int) or model is None:
+            keyed = False
+            continue
+        named = model.model_fields.get(key)
+        field = named or model.model_fields.get("root")
+        model = _model_in(field.annotation) if field else None
+        keyed = named is not None and _is_map(named.annotation)
     return model
 
 
@@ -193,3 +198,7 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
         return annotation
     found = [_model_in(argument) for argument in get_args(annotation)]
     return next((model for model in found if model is not None), None)
+
+
+def _is_map(annotation: object) -> bool:
+    return get_origin(annotation) is dict or any(map(_is_map, get_args(annotation)))

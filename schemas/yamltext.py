@@ -4,7 +4,8 @@ ConfigError with every place.
 Only YAML's plain types are read: maps with single values as keys, lists, strings, numbers,
 booleans, null, dates. Size of the file, nesting, number of values (aliases expanded) and length of
 a number are bounded, so that no file ends in a traceback, a full memory or a hang. A key given
-twice is an error instead of the last one winning.
+twice is an error instead of the last one winning. PyYAML's nodes carry the lines; other loaders do,
+too, but bound nothing, so that the walk below would be the same.
 """
 
 from collections.abc import Mapping
