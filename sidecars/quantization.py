@@ -63,9 +63,9 @@ class Nf4(BaseModel):
         """Return the names of the linear layers to quantize.
 
         Left alone: modules that the manifest skips, by any part of their path; layers with fewer
-        than `min_params_to_quantize` weights, or rows that do not fill whole bytes; weights that another module
-        shares; subclasses of `Linear`, and layers of torch's own transformer: their owners read the
-        weight themselves.
+        than `min_params_to_quantize` weights, or rows that do not fill whole bytes; weights that
+        another module shares; subclasses of `Linear`, and layers of torch's own transformer: their
+        owners read the weight themselves.
 
         Raises: ConfigError if the manifest skips a module that the model does not have,
         UnsupportedQuantization if no layer is left.
@@ -102,7 +102,7 @@ class Nf4(BaseModel):
         if not found:
             raise UnsupportedQuantization(
                 f"{type(model).__name__} has no linear layer to quantize: none with at least "
-                f"{self.min_params_to_quantize} weights outside of {', '.join(kept) or 'no module'}",
+                f"{self.min_params_to_quantize} weights outside of {', '.join(kept) or 'none'}",
                 hint="lower quantization.extra.min_params_to_quantize, or write dtype: bf16",
             )
         return found
@@ -230,8 +230,9 @@ def _read(manifest: RSkillManifest) -> Nf4:
 
 
 def quantize_linear(module: "Module", manifest: RSkillManifest, device: str = "cpu") -> None:
-    """Quantize the linear layers of a model in host RAM to NF4, in place, one after the other, where
-    its manifest says int4; for the device `meta`, only choose them.
+    """Quantize the linear layers of a model in host RAM to NF4, in place, one after the other.
+
+    Only where its manifest says int4; for the device `meta` they are only chosen.
 
     For models that transformers does not load. Cast the rest of the model before: what is quantized
     must never be cast. Each weight keeps the `dtype` that its model's code may ask it for. A model

@@ -21,13 +21,11 @@ RATE_HZ_MAX = 1000.0
 MAX_AGE_MS = 100.0
 
 Text = Annotated[str, Field(min_length=1, max_length=256)]
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
 class SensorBackend(StrEnum):
@@ -91,7 +89,7 @@ class DetectorConfig(_Section):
     queries: tuple[Text, ...] = ()
     """What to look for; empty: the labels of its manifest."""
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
-    rate_hz: Annotated[float, Field(gt=0, le=30)] = 2.0
+    rate_hz: Annotated[float, Field(gt=0, le=30, allow_inf_nan=False)] = 2.0
     """Looks a second at most."""
     max_age_ms: Positive = 1000.0
     """Detections are absent once their picture was taken longer ago than this."""
@@ -174,8 +172,8 @@ class RobotEnvironment(_Section):
     vla: VlaSpec | None = None
     safety: SafetyEnvelope | None = None
     """Tightens the robot's own limits; it can never widen them."""
-    rate_hz: Annotated[float, Field(gt=0, le=RATE_HZ_MAX)] = 30.0
-    thumbnail_hz: Annotated[float, Field(ge=0)] = 25.0
+    rate_hz: Annotated[float, Field(gt=0, le=RATE_HZ_MAX, allow_inf_nan=False)] = 30.0
+    thumbnail_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 25.0
     deadline_overrun_policy: Literal["warn", "drop", "raise"] = "warn"
     max_ticks: Annotated[int, Field(gt=0)] | None = None
     save_dir: str | None = None

@@ -14,7 +14,7 @@ REMEASURE: Final = "measure its footprint: vramctl calibrate"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Block:
-    """One allocation of `size_bytes`; pass it to `free` exactly once. Each is equal to itself only."""
+    """One allocation of `size_bytes`, equal to itself only; pass it to `free` exactly once."""
 
     label: str
     size_bytes: int
