@@ -7,7 +7,7 @@ that says nothing is fitted only by skills for any robot that ask for nothing.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -57,9 +57,8 @@ class Body(BaseModel):
                 ("embodiment_tags", f"it is made for {' or '.join(tags)}; this robot {here}")
             )
         for name, wanted in manifest.capabilities_required.items():
-            have = self.capabilities.get(name)
-            if not _has(have, wanted):
-                found.append((f"capabilities_required.{name}", _lacks(name, have, wanted)))
+            if problem := _lacks(name, self.capabilities.get(name), wanted):
+                found.append((f"capabilities_required.{name}", problem))
         return found
 
     def misfit(self, manifest: RSkillManifest) -> str:
@@ -82,32 +81,19 @@ def read_body(value: object) -> Body:
         return UNKNOWN_BODY
 
 
-def _has(have: Any, wanted: Capability) -> bool:
-    match wanted:
-        case bool():
-            return have is True if wanted else have is not True
-        case int() | float():
-            return isinstance(have, int | float) and not isinstance(have, bool) and have >= wanted
-        case str():
-            return bool(have == wanted)
-
-
 def _lacks(name: str, have: Capability | None, wanted: Capability) -> str:
+    """Return what is wrong with a capability; empty: the robot has it."""
     match wanted:
         case True:
-            return (
-                f"it needs {name}, which this robot "
-                f"{'lacks' if have in (None, False) else f'has as {have!r}'}"
-            )
+            has = "lacks" if have in (None, False) else f"has as {have!r}"
+            return "" if have is True else f"it needs {name}, which this robot {has}"
         case False:
-            return f"it is not for a robot with {name}"
+            return f"it is not for a robot with {name}" if have is True else ""
         case int() | float():
-            return (
-                f"it needs {name} of at least {wanted:g}; this robot has "
-                f"{'none' if have is None else have}"
-            )
+            if isinstance(have, int | float) and not isinstance(have, bool) and have >= wanted:
+                return ""
+            shown = "none" if have is None else have
+            return f"it needs {name} of at least {wanted:g}; this robot has {shown}"
         case _:
-            return (
-                f"it needs {name} {wanted!r}; this robot has "
-                f"{'none' if have is None else repr(have)}"
-            )
+            shown = "none" if have is None else repr(have)
+            return "" if have == wanted else f"it needs {name} {wanted!r}; this robot has {shown}"

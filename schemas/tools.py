@@ -14,7 +14,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Literal, TypedDict, get_args
 
 from pydantic import (
     AliasChoices,
@@ -35,10 +35,15 @@ PROGRESS_WINDOW_MAX_S = 60.0
 TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
 
 Text = Annotated[str, Field(max_length=4096)]
+Camera = Annotated[
+    str, Field(max_length=128, description="Name of the camera; empty: the default one.")
+]
 
 
 class _Tool(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False
+    )
 
     rationale: Annotated[
         Text,
@@ -66,7 +71,6 @@ class ExecuteRskill(_Tool):
         float,
         Field(
             ge=0,
-            allow_inf_nan=False,
             description="Seconds until it is cancelled; 0: as the manifest says.",
         ),
     ] = 0.0
@@ -74,7 +78,6 @@ class ExecuteRskill(_Tool):
         float | None,
         Field(
             gt=0,
-            allow_inf_nan=False,
             description="Cancel it when its progress stands still for so long, seconds.",
         ),
     ] = None
@@ -83,7 +86,6 @@ class ExecuteRskill(_Tool):
         Field(
             ge=0,
             le=1,
-            allow_inf_nan=False,
             description="A gain of progress (0..1) no larger than this is none.",
         ),
     ] = None
@@ -125,9 +127,7 @@ class LocateInView(_Tool):
     query: Annotated[
         Text, Field(min_length=1, description="The object, in words, e.g. `red cube`.")
     ]
-    camera: Annotated[
-        str, Field(max_length=128, description="Name of the camera; empty: the default one.")
-    ] = ""
+    camera: Camera = ""
 
 
 class QueryScene(_Tool):
@@ -137,18 +137,14 @@ class QueryScene(_Tool):
     question: Annotated[
         Text, Field(min_length=1, description="A question that the picture can answer.")
     ]
-    camera: Annotated[
-        str, Field(max_length=128, description="Name of the camera; empty: the default one.")
-    ] = ""
+    camera: Camera = ""
 
 
 class Look(_Tool):
     """Look at a camera's present picture yourself. Moves nothing."""
 
     tool: Literal["look"] = "look"
-    camera: Annotated[
-        str, Field(max_length=128, description="Name of the camera; empty: the default one.")
-    ] = ""
+    camera: Camera = ""
 
 
 class QueryTaskProgress(_Tool):
@@ -161,7 +157,6 @@ class QueryTaskProgress(_Tool):
         Field(
             gt=0,
             le=PROGRESS_WINDOW_MAX_S,
-            allow_inf_nan=False,
             description="How far to look back, seconds.",
         ),
     ] = 8.0
@@ -214,15 +209,7 @@ ToolCall = (
 )
 
 TOOLS: dict[str, type[ToolCall]] = {
-    "execute_rskill": ExecuteRskill,
-    "locate_in_view": LocateInView,
-    "query_scene": QueryScene,
-    "look": Look,
-    "query_task_progress": QueryTaskProgress,
-    "lifecycle_transition": LifecycleTransition,
-    "emit_prompt": EmitPrompt,
-    "wait": WaitOn,
-    "stop_goal": StopGoal,
+    tool.model_fields["tool"].default: tool for tool in get_args(ToolCall)
 }
 
 TOOL_CALL: TypeAdapter[ToolCall] = TypeAdapter(Annotated[ToolCall, Field(discriminator="tool")])

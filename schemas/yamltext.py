@@ -4,15 +4,13 @@ ConfigError with every place.
 Only YAML's plain types are read: maps with single values as keys, lists, strings, numbers,
 booleans, null, dates. Size of the file, nesting, number of values (aliases expanded) and length of
 a number are bounded, so that no file ends in a traceback, a full memory or a hang. A key given
-twice is an error instead of the last one winning.
+twice is an error instead of the last one winning. PyYAML's nodes carry the lines; other loaders do,
+too, but bound nothing, so that the walk below would be the same.
 """
 
-import difflib
 import os
-import re
-import reprlib
 import stat
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
@@ -21,10 +19,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.plain import JsonMap
-
-Path = tuple[str | int, ...]
-"""Keys and list positions from the top of a document to one value."""
+from vram_arbiter.schemas.findings import Path, dotted, problems_of
 
 TEXT_MAX_BYTES = 1 << 20
 NODES_MAX = 100_000
@@ -123,13 +118,11 @@ def parse_yaml(content: str | bytes, name: str) -> YamlText:
         root = loader.get_single_node()
         if root is None:
             return YamlText(name, {}, {(): 1})
-        survey = _Survey()
-        survey.of(root, ())
-        if survey.problems:
-            raise config_error(name, sorted(survey.problems, key=lambda problem: problem.line))
-        lines: dict[Path, int] = {(): root.start_mark.line + 1}
-        _note_lines(root, (), lines)
-        return YamlText(name, loader.construct_document(root), lines)
+        walk = _Walk()
+        walk.visit(root, (), root)
+        if walk.problems:
+            raise config_error(name, [walk.problems[place] for place in sorted(walk.problems)])
+        return YamlText(name, loader.construct_document(root), walk.lines)
     except yaml.reader.ReaderError as error:  # a control character
         line = text.count("\n", 0, error.position) + 1
         column = error.position - text.rfind("\n", 0, error.position)
@@ -159,15 +152,8 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         self._depth += 1
         self._nodes += 1
-        if self._depth > DEPTH_MAX or self._nodes > NODES_MAX:
-            deep = self._depth > DEPTH_MAX
-            limit = (
-                f"nested deeper than {DEPTH_MAX} levels"
-                if deep
-                else f"more than {NODES_MAX} values"
-            )
-            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-            raise yaml.composer.ComposerError(None, None, limit, mark)
+        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        _check_limits(self._depth - 1, self._nodes, mark)
         try:
             return super().compose_node(parent, index)
         finally:
@@ -182,64 +168,50 @@ class _Loader(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(None, None, shown, node.start_mark) from error
 
 
-class _Survey:
-    """Look at composed nodes before anything is made of them: tags, keys, texts, and what aliases
-    multiply."""
+class _Walk:
+    """Looks at composed nodes, aliases expanded, before anything is made of them: tags, keys,
+    texts and limits. Notes the line of each path."""
 
     def __init__(self) -> None:
-        self.problems: list[Mistake] = []
-        self._known: dict[int, tuple[int, int]] = {}  # node → values in it, and levels
-        self._open: set[int] = set()
+        self.lines: dict[Path, int] = {}
+        self.problems: dict[tuple[int, int], Mistake] = {}
+        self._open: list[yaml.Node] = []
 
-    def of(self, node: yaml.Node, path: Path) -> tuple[int, int]:
-        """Return the number of values and of levels of a node, aliases expanded."""
-        if id(node) in self._open:
+    def visit(self, node: yaml.Node, path: Path, at: yaml.Node) -> None:
+        """`at` is the node whose line the path has: the key, or the value itself."""
+        self.lines[path] = at.start_mark.line + 1
+        if any(outer is node for outer in self._open):
             self._say(node, path, "contains itself")
-            return 1, 1
-        if id(node) in self._known:
-            return self._known[id(node)]
-        self._open.add(id(node))
+            return
+        first = (*self._open[1:2], node)[0]  # what is at the top, not what an alias stands for
+        _check_limits(len(self._open), len(self.lines), first.start_mark, ", aliases expanded")
         if node.tag not in _TAGS:
             shown = node.tag.replace(_TAG, "!!")
             self._say(node, path, f"the tag {shown} is not read here: only YAML's plain types are")
+        self._open.append(node)
         if isinstance(node, yaml.MappingNode):
-            parts = self._pairs(node, path)
+            self._visit_pairs(node, path)
         elif isinstance(node, yaml.SequenceNode):
-            parts = [self.of(item, (*path, index)) for index, item in enumerate(node.value)]
+            for index, item in enumerate(node.value):
+                self.visit(item, (*path, index), item)
         else:
-            parts = []
-            self._scalar(node, path)
-        size = 1 + sum(values for values, _ in parts)
-        levels = 1 + max((levels for _, levels in parts), default=0)
-        if size > NODES_MAX or levels > DEPTH_MAX:
-            limit = (
-                f"more than {NODES_MAX} values"
-                if size > NODES_MAX
-                else f"nested deeper than {DEPTH_MAX} levels"
-            )
-            raise yaml.composer.ComposerError(
-                None, None, f"{limit}, aliases expanded", node.start_mark
-            )
-        self._open.discard(id(node))
-        self._known[id(node)] = size, levels
-        return size, levels
+            self._check_text(node, path)
+        self._open.pop()
 
-    def _pairs(self, node: yaml.MappingNode, path: Path) -> list[tuple[int, int]]:
-        parts = []
+    def _visit_pairs(self, node: yaml.MappingNode, path: Path) -> None:
         seen: dict[str, int] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 self._say(key, path, "a key must be a single value, not a list or a map")
                 continue
-            self.of(key, path)
-            name, line = str(key.value), key.start_mark.line + 1
-            if name in seen:
-                self._say(key, (*path, name), f"key given twice; first in line {seen[name]}")
-            seen.setdefault(name, line)
-            parts.append(self.of(value, (*path, name)))
-        return parts
+            inner = (*path, str(key.value))
+            if key.value in seen:
+                self._say(key, inner, f"key given twice; first in line {seen[key.value]}")
+            seen.setdefault(key.value, key.start_mark.line + 1)
+            self.visit(key, inner, key)
+            self.visit(value, inner, key)
 
-    def _scalar(self, node: yaml.Node, path: Path) -> None:
+    def _check_text(self, node: yaml.Node, path: Path) -> None:
         if node.tag != f"{_TAG}str" and len(node.value) > NUMBER_MAX_CHARACTERS:
             kind = node.tag.removeprefix(_TAG)
             self._say(node, path, f"{len(node.value)} characters are too many for the type {kind}")
@@ -249,19 +221,19 @@ class _Survey:
             )
 
     def _say(self, node: yaml.Node, path: Path, problem: str) -> None:
-        mark = node.start_mark
-        self.problems.append(Mistake(mark.line + 1, dotted(path), problem, mark.column + 1))
+        place = node.start_mark.line + 1, node.start_mark.column + 1
+        self.problems.setdefault(place, Mistake(place[0], dotted(path), problem, place[1]))
 
 
-def _note_lines(node: yaml.Node, path: Path, lines: dict[Path, int]) -> None:
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            lines[(*path, str(key.value))] = key.start_mark.line + 1
-            _note_lines(value, (*path, str(key.value)), lines)
-    elif isinstance(node, yaml.SequenceNode):
-        for index, item in enumerate(node.value):
-            lines[(*path, index)] = item.start_mark.line + 1
-            _note_lines(item, (*path, index), lines)
+def _check_limits(depth: int, values: int, mark: Any, how: str = "") -> None:
+    """Raise ComposerError beyond the limits."""
+    if depth >= DEPTH_MAX or values > NODES_MAX:
+        limit = (
+            f"nested deeper than {DEPTH_MAX} levels"
+            if depth >= DEPTH_MAX
+            else f"more than {NODES_MAX} values"
+        )
+        raise yaml.composer.ComposerError(None, None, limit + how, mark)
 
 
 def _text_of(content: str | bytes, name: str) -> str:
@@ -273,20 +245,6 @@ def _text_of(content: str | bytes, name: str) -> str:
         line = content[: error.start].count(b"\n") + 1  # type: ignore[arg-type]
         what = f"not UTF-8 text: {error.reason} at byte {error.start}"
         raise config_error(name, [Mistake(line, "", what)]) from error
-
-
-def dotted(path: Path) -> str:
-    """`verify.poll_s[0]`"""
-    text = ""
-    for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
-def did_you_mean(word: str, known: Collection[str]) -> str:
-    """`; did you mean timeout_s?`, else the list of what is known."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(sorted(known))}"
 
 
 def config_error(name: str, problems: list[Mistake]) -> ConfigError:
@@ -304,53 +262,13 @@ def config_error(name: str, problems: list[Mistake]) -> ConfigError:
     )
 
 
-def validated[M: BaseModel](
-    model: type[M], source: YamlText, known: Mapping[Path, Collection[str]] | None = None
-) -> M:
+def validated[M: BaseModel](model: type[M], source: YamlText) -> M:
     """Return the document as `model`. Raises ConfigError with every mistake and its line."""
     try:
         return model.model_validate(source.data)
     except ValidationError as error:
-        known = {(): list(model.model_fields)} if known is None else known
-        raise config_error(source.name, problems_of(error, source, known)) from error
-
-
-def problems_of(
-    error: ValidationError, source: YamlText, known: Mapping[Path, Collection[str]]
-) -> list[Mistake]:
-    """Pydantic's findings with the lines of the text. `known` lists the keys of each section, for
-    suggestions."""
-    problems = []
-    for finding in error.errors(include_url=False):
-        if only_counts_wrong_entries(finding):
-            continue
-        path: Path = tuple(finding["loc"])
-        if finding["type"] == "extra_forbidden":
-            text = "unknown key" + did_you_mean(str(path[-1]), known.get(path[:-1], ()))
-        else:
-            text = _said(finding)
-        problems.append(Mistake(source.line(path), dotted(path), text))
-    return sorted(problems, key=lambda problem: problem.line)
-
-
-def _said(finding: JsonMap) -> str:
-    """Return what is wrong, with the value: `must be a valid number, not 'abc'`."""
-    if finding["type"] == "missing":
-        return "is missing"
-    text = str(finding["msg"]).removeprefix("Value error, ").removeprefix("Assertion failed, ")
-    before, should, wanted = text.partition("Input should be ")
-    if before or not should:
-        return text
-    wanted = re.sub(r", unable to .*| or instance of \w+", "", wanted)
-    return f"must be {wanted}, not {reprlib.repr(finding['input'])}"
-
-
-def only_counts_wrong_entries(finding: JsonMap) -> bool:
-    """Whether a finding says "too short" of a list that is long enough: pydantic does not count
-    wrong entries, which have findings of their own."""
-    given = finding["input"]
-    return (
-        finding["type"] == "too_short"
-        and isinstance(given, list | tuple)
-        and len(given) >= finding["ctx"]["min_length"]
-    )
+        mistakes = [
+            Mistake(source.line(found.path), found.field, found.message)
+            for found in problems_of(error, model, source.data)
+        ]
+        raise config_error(source.name, sorted(mistakes, key=lambda found: found.line)) from error

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import json
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -45,6 +46,9 @@ from vram_arbiter.sidecars.settings import (
 from vram_arbiter.sidecars.weights_keeper import ENVIRONMENT
 
 FOOTPRINTS = "models/footprints.yaml"
+_LIMITS = ("min_residency_s", "wait_timeout_s", "request_timeout_s", "idle_release_s")
+_SETTINGS = ("name", "gpu", "priority", "standby", "nice", "port", *_LIMITS)
+"""Flags that are settings as they are."""
 
 
 @terminal.program
@@ -108,8 +112,9 @@ def settings_from(flags: argparse.Namespace) -> Settings:
     manifest, weights = read_model(wanted.rskill, wanted.configs)
     entry, device, endpoint = wanted.footprint(manifest), wanted.device, _endpoint(flags)
     need_gpu(manifest, device)
+    same = {name: getattr(flags, name) for name in _SETTINGS}
     return Settings(
-        name=flags.name,
+        **same,
         manifest=manifest,
         weights=weights,
         footprint=entry.on_wire(),
@@ -121,16 +126,7 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         else flags.arbiter or arbiter_endpoint(os.environ, os.getuid()),
         stands_for=entry.stands_for,
         throttle_bytes_per_s=entry.throttle,
-        gpu=flags.gpu,
-        priority=flags.priority,
         evictable=not flags.pinned,
-        min_residency_s=flags.min_residency_s,
-        wait_timeout_s=flags.wait_timeout_s,
-        request_timeout_s=flags.request_timeout_s,
-        idle_release_s=flags.idle_release_s,
-        standby=flags.standby,
-        nice=flags.nice,
-        port=flags.port,
     )
 
 
@@ -179,12 +175,7 @@ def _device(text: str | None) -> str:
     if text is None:
         folder = os.environ.get(FOLDER_VARIABLE)
         return f"fake:{folder}" if folder else "cuda"
-    kind, colon, rest = text.partition(":")
-    if (
-        text in ("none", "cuda")
-        or (kind == "fake" and rest)
-        or (kind == "cuda" and colon and rest.isdecimal())
-    ):
+    if re.fullmatch(r"none|cuda(:[0-9]+)?|fake:.+", text):
         return text
     raise ConfigError(
         f"--device {text} is not a device", hint="write fake:FOLDER, cuda, cuda:1 or none"

@@ -9,7 +9,7 @@ import importlib.util
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from vram_arbiter.schemas.defaults import RESERVE_BYTES
@@ -65,7 +65,8 @@ def check(wanted: Wanted) -> list[Finding]:
     except ConfigError as error:
         findings.append(_bad("weights", error))
     adapter: ModelAdapter | None = None
-    family, refused = Finding("family", True, f"served as {_family(manifest)}"), None
+    served = f"served as {manifest.kind} {manifest.model_family or ''}".rstrip()
+    family, refused = Finding("family", True, served), None
     try:
         adapter = wanted.adapter_for(manifest, weights or Weights(manifest.weights_uri or ""))
     except UnsupportedQuantization as error:
@@ -75,11 +76,13 @@ def check(wanted: Wanted) -> list[Finding]:
     findings.append(family)
     if manifest.weights_uri is None:
         return findings  # nothing to load: no bytes
-    findings.append(packages := _packages(manifest))
+    packages = _checked("packages", "installed", need_packages, manifest)
     precision = (
-        _precision(manifest, wanted.device) if refused is None else _bad("precision", refused)
+        _checked("precision", manifest.quantization.dtype, need_precision, manifest, wanted.device)
+        if refused is None
+        else _bad("precision", refused)
     )
-    findings.append(precision)
+    findings += [packages, precision]
     comparable = adapter is not None and packages.ok and precision.ok
     findings += _weights(manifest, weights, wanted.adapter_for if comparable else None)
     return findings + _bytes(manifest, wanted)
@@ -105,14 +108,21 @@ def _bad(what: str, error: VramError) -> Finding:
     return Finding(what, False, str(error), retry=isinstance(error, NoGpu))
 
 
+def _checked[**P](
+    what: str, says: str, need: Callable[P, None], *given: P.args, **named: P.kwargs
+) -> Finding:
+    """Return what a check says that raises its refusal."""
+    try:
+        need(*given, **named)
+    except VramError as error:
+        return _bad(what, error)
+    return Finding(what, True, says)
+
+
 def _license(manifest: RSkillManifest, allow_noncommercial: bool) -> Finding:
     if why := manifest.license_refusal(allow_noncommercial=allow_noncommercial):
         return Finding("license", False, why)
     return Finding("license", True, str(manifest.license))
-
-
-def _family(manifest: RSkillManifest) -> str:
-    return f"{manifest.kind} {manifest.model_family or ''}".rstrip()
 
 
 def need_packages(manifest: RSkillManifest) -> None:
@@ -124,26 +134,10 @@ def need_packages(manifest: RSkillManifest) -> None:
         policy_families.need_packages(manifest)
 
 
-def _packages(manifest: RSkillManifest) -> Finding:
-    try:
-        need_packages(manifest)
-    except ConfigError as error:
-        return _bad("packages", error)
-    return Finding("packages", True, "installed")
-
-
 def need_precision(manifest: RSkillManifest, device: str) -> None:
     """Raise UnsupportedQuantization where the model cannot be run in its number format."""
     if not is_passthrough(manifest):
         check_precision(manifest, device)
-
-
-def _precision(manifest: RSkillManifest, device: str) -> Finding:
-    try:
-        need_precision(manifest, device)
-    except VramError as error:
-        return _bad("precision", error)
-    return Finding("precision", True, str(manifest.quantization.dtype))
 
 
 def _weights(
@@ -232,17 +226,14 @@ def _bytes(manifest: RSkillManifest, wanted: Wanted) -> list[Finding]:
     except ConfigError as error:
         findings.append(_bad("footprint", error))
     if wanted.device == "none":
-        try:
-            need_gpu(manifest, wanted.device)
-        except NoGpu as error:
-            return [*findings, _bad("gpu", error)]
-        return [*findings, Finding("gpu", None, "not checked: --device none")]
+        gpu = _checked("gpu", "not checked: --device none", need_gpu, manifest, wanted.device)
+        return [*findings, replace(gpu, ok=None) if gpu.ok else gpu]
     try:
         found = capacities(wanted.device)
     except (NoGpu, ConfigError) as error:
         return [*findings, _bad("gpu", error)]
-    gpu, most = max(found.items(), key=lambda item: item[1])
-    has = f"{gpu} has {format_bytes(most)}"
+    uuid, most = max(found.items(), key=lambda item: item[1])
+    has = f"{uuid} has {format_bytes(most)}"
     if needed is None:
         return [*findings, Finding("gpu", None, f"not compared: no footprint; {has}")]
     room = most - RESERVE_BYTES

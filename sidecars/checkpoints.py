@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.sidecars.packed_weights import PackedHeader, install, packed_in, read_packed
@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 
 META = "meta"
 NAMES_SHOWN = 4
+_KINDS: Final = {
+    "missing": "missing from it",
+    "foreign": "unknown to the model",
+    "misshapen": "of another shape",
+    "broken": "with NaN or infinity",
+}
 _REMOTE_CODE = ("trust_remote_code", "code_revision")
 
 
@@ -44,26 +50,21 @@ class Differences:
 
     def refuse(self, source: str) -> None:
         """Raise ModelError if there are any, with counts and the first names."""
-        kinds = {
-            "missing from it": sorted(self.missing),
-            "unknown to the model": sorted(self.foreign),
-            "of another shape": [
-                f"{name} {shapes}" for name, shapes in sorted(self.misshapen.items())
-            ],
-            "with NaN or infinity": sorted(self.broken),
-        }
-        parts = [f"{len(names)} {kind} ({_first(names)})" for kind, names in kinds.items() if names]
+        found = {kind: sorted(getattr(self, kind)) for kind in _KINDS}
+        parts = [
+            f"{len(names)} {_KINDS[kind]} ({_first(map(self._shown, names))})"
+            for kind, names in found.items()
+            if names
+        ]
         if parts:
             raise ModelError(
                 f"{source} does not hold this model: of the parameters {', '.join(parts)}",
                 hint="get the whole checkpoint, of the class that its config names",
-                details={
-                    "missing": len(self.missing),
-                    "foreign": len(self.foreign),
-                    "misshapen": len(self.misshapen),
-                    "broken": len(self.broken),
-                },
+                details={kind: len(names) for kind, names in found.items()},
             )
+
+    def _shown(self, name: str) -> str:
+        return f"{name} {self.misshapen[name]}" if name in self.misshapen else name
 
 
 def load_transformers(cls: Any, weights: Weights, *, nf4: Nf4 | None = None, **options: Any) -> Any:
@@ -212,10 +213,10 @@ def _load_recorded(cls: Any, weights: Weights, config: Any, record: "_Record") -
             _recording(cls, record, config.device == META), weights, config=config
         )
     except ModelError:
-        record.refuse_differences()  # the reason, where the loader's own message is vague
+        record.refuse(unless_copied=False)  # the reason, where the loader's message is vague
         raise
     try:
-        record.refuse()
+        record.refuse(unless_copied=True)
     except ModelError:
         del model
         raise
@@ -232,7 +233,7 @@ class _Record:
         self._found = Differences()
         self._loaded: set[str] = set()
         self._compared = False
-        self._copied = False
+        self.copied = False
         self.built = False
 
     @property
@@ -268,18 +269,12 @@ class _Record:
             name for name, tensor in own.items() if _identity(tensor) not in tied
         } | header.missing
         if self._found.foreign or self._found.misshapen or self._found.broken:
-            self.refuse_differences()
+            self.refuse(unless_copied=False)
 
-    def copied(self) -> None:
-        self._copied = True
-
-    def refuse_differences(self) -> None:
+    def refuse(self, *, unless_copied: bool) -> None:
+        """Raise ModelError for differences, and `unless_copied` where nothing was loaded."""
         self._found.refuse(self._source)
-
-    def refuse(self) -> None:
-        """Raise ModelError unless everything was loaded."""
-        self.refuse_differences()
-        if not self._copied:
+        if unless_copied and not self.copied:
             raise ModelError(
                 f"{self._source}: the loader read no weights from it",
                 hint="check that model.safetensors is complete; the sidecar's log has the loader's "
@@ -307,7 +302,7 @@ def _recording(cls: Any, record: _Record, without_bytes: bool) -> Any:
                 state_dict = install(self, state_dict, header, nf4)
             with _silence():
                 result = super().load_state_dict(state_dict, *arguments, **options)
-            record.copied()
+            record.copied = True
             return result
 
         @classmethod

@@ -18,9 +18,9 @@ from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.sidecars.host_copy import HostCopy
-from vram_arbiter.sidecars.model_process import Model
+from vram_arbiter.sidecars.model_process import ModelProcess
 from vram_arbiter.sidecars.settings import Settings
-from vram_arbiter.sidecars.weights_keeper import Models
+from vram_arbiter.sidecars.weights_keeper import ModelProcesses
 
 State = Literal["unloaded", "waiting", "loading", "resident", "parking", "parked", "unloading"]
 TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
@@ -40,7 +40,11 @@ class GpuCopy:
     """One model on or off one GPU. `died`: told when its process ended while it was resident."""
 
     def __init__(
-        self, settings: Settings, models: Models, host: HostCopy, died: Callable[[VramError], None]
+        self,
+        settings: Settings,
+        models: ModelProcesses,
+        host: HostCopy,
+        died: Callable[[VramError], None],
     ) -> None:
         self._settings = settings
         self._models = models
@@ -49,7 +53,7 @@ class GpuCopy:
         self._left = asyncio.Event()  # the unload or parking in progress is over
         self._called_off = asyncio.Event()  # the load in progress is not wanted any more
         self._watching: asyncio.Task[None] | None = None  # the process's end
-        self.model: Model | None = None
+        self.model: ModelProcess | None = None
         self.state: State = "unloaded"
         self.resident_since_s = time.monotonic()  # the last time that it became resident
 
@@ -70,30 +74,27 @@ class GpuCopy:
         On failure everything is undone before the lease is released. Raises NotResident where it
         was given up, else what ended the load.
         """
-        attributes = self._labels() | (
-            {telemetry.ATTR_LEASE: lease.lease_id} if lease is not None else {}
-        )
-        with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=attributes):
-            await self._load_measured(lease, given_up)
-
-    async def _load_measured(self, lease: AsyncLease | None, given_up: Callable[[], bool]) -> None:
+        attributes = self._labels()
+        if lease is not None:
+            attributes[telemetry.ATTR_LEASE] = lease.lease_id
         began = time.monotonic()
         labels = {telemetry.ATTR_MODEL: self._settings.manifest.name}
-        try:
-            model, used_bytes = await self._to_the_gpu(lease, given_up)
-        except BaseException as error:
-            await self._undo_load(lease, error)
-            if given_up():
-                _log.info("the load was undone")
-                raise unwanted(self._settings.name) from None
-            _log.error("loading failed: %s", error)
-            if isinstance(error, Exception):
-                labels[telemetry.ATTR_ERROR_TYPE] = tracing.error_type(error)
-                meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
-            raise
+        with tracing.span(telemetry.SPAN_SIDECAR_LOAD, attributes=attributes):
+            try:
+                model, used_bytes = await self._to_the_gpu(lease, given_up)
+            except BaseException as error:
+                await self._undo_load(lease, error)
+                if given_up():
+                    _log.info("the load was undone")
+                    raise unwanted(self._settings.name) from None
+                _log.error("loading failed: %s", error)
+                if isinstance(error, Exception):
+                    labels[telemetry.ATTR_ERROR_TYPE] = tracing.error_type(error)
+                    meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
+                raise
+            if used_bytes is not None:
+                tracing.note({telemetry.ATTR_BYTES: used_bytes})
         meters.measure(telemetry.METRIC_SIDECAR_LOAD, time.monotonic() - began, labels)
-        if used_bytes is not None:
-            tracing.note({telemetry.ATTR_BYTES: used_bytes})
         self.resident_since_s = time.monotonic()
         self.to("resident")
         self._watching = asyncio.create_task(self._watch(model, lease), name="watch the model")
@@ -104,7 +105,7 @@ class GpuCopy:
 
     async def _to_the_gpu(
         self, lease: AsyncLease | None, given_up: Callable[[], bool]
-    ) -> tuple[Model, int | None]:
+    ) -> tuple[ModelProcess, int | None]:
         """Read the weights, start a process and copy them. Return it and its bytes on the GPU."""
 
         def need_wanted() -> None:
@@ -145,7 +146,7 @@ class GpuCopy:
         finally:
             await _released(lease)
 
-    async def _watch(self, model: Model, lease: AsyncLease | None) -> None:
+    async def _watch(self, model: ModelProcess, lease: AsyncLease | None) -> None:
         """Release the lease of a model whose process died: its bytes are free."""
         await model.ended.wait()
         if model is not self.model:

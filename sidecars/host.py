@@ -33,10 +33,6 @@ _log = logging.getLogger("sidecars")
 WORK_SHARE = 0.5
 
 
-def _no_log() -> None:
-    """Leave the log as it is."""
-
-
 class SidecarHost:
     """Server of one model until `stop`, SIGTERM or SIGINT.
 
@@ -47,7 +43,7 @@ class SidecarHost:
         self,
         settings: Settings,
         adapter_for: AdapterFor,
-        set_up_log: Callable[[], None] = _no_log,
+        set_up_log: Callable[[], None],
     ) -> None:
         """`set_up_log`: sets up the log of the model's processes; they can be told its name."""
         self._settings = settings
@@ -87,21 +83,13 @@ class SidecarHost:
             residency = self._residency = Residency(settings, self._processes, client)
             if client is not None:
                 client.on_prepare(residency.announce)
-            background = [
-                asyncio.create_task(server.serve(Wire(self, server.send).handle), name="serve")
-            ]
             residency.prepare()
-            background.append(
-                asyncio.create_task(self._stop_without_gpu(residency), name="prepare")
-            )
+            work = [server.serve(Wire(self, server.send).handle), self._stop_without_gpu(residency)]
             if client is None:
-                background.append(asyncio.create_task(self._load_at_start(residency), name="load"))
+                work.append(self._load_at_start(residency))
             elif settings.idle_release_s is not None:
-                background.append(
-                    asyncio.create_task(
-                        residency.release_when_idle(settings.idle_release_s), name="idle"
-                    )
-                )
+                work.append(residency.release_when_idle(settings.idle_release_s))
+            background = [asyncio.create_task(one) for one in work]
             _log.info(
                 "%s serves %s on %s", settings.name, settings.manifest.name, settings.endpoint
             )

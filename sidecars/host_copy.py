@@ -6,12 +6,12 @@ and once they are on a GPU: where it could never let them stay for a parked leas
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
-from typing import Final
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, Final
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.sidecars.weights_keeper import Models
+from vram_arbiter.sidecars.weights_keeper import ModelProcesses
 
 FORESEEN_S: Final = 120.0
 """How long weights that were read ahead wait for a request: longer than a drive."""
@@ -25,13 +25,14 @@ class HostCopy:
     they are never read ahead and always stay.
     """
 
-    def __init__(self, models: Models, client: AsyncClient | None, expected_bytes: int) -> None:
+    def __init__(
+        self, models: ModelProcesses, client: AsyncClient | None, expected_bytes: int
+    ) -> None:
         self._models, self._client, self._expected_bytes = models, client, expected_bytes
         self._reading: asyncio.Task[int] | None = None  # under way, or there
         self._foreseen: asyncio.Task[None] | None = None  # reads ahead of a request
         self._expiry: asyncio.TimerHandle | None = None  # drops them where no request comes
-        self._asking: asyncio.Task[None] | None = None  # whether they may stay
-        self._dropping: set[asyncio.Task[None]] = set()
+        self._background: set[asyncio.Task[None]] = set()
         self.size_bytes: int | None = None  # when they were there the last time; None: read first
 
     def fetch(self) -> asyncio.Task[int]:
@@ -49,9 +50,12 @@ class HostCopy:
 
     def drop(self) -> None:
         """Free their host RAM, after what is asked of them now; a later `fetch` reads them."""
-        task = asyncio.create_task(self._models.drop(), name="drop the weights")
-        self._dropping.add(task)
-        task.add_done_callback(self._dropping.discard)
+        self._in_background(self._models.drop(), "drop the weights")
+
+    def _in_background(self, work: Coroutine[Any, Any, None], name: str) -> None:
+        task = asyncio.create_task(work, name=name)
+        self._background.add(task)
+        task.add_done_callback(self._background.discard)
 
     def read_ahead(
         self, prepared: Callable[[], Awaitable[None]], wanted: Callable[[], bool]
@@ -71,8 +75,7 @@ class HostCopy:
     def drop_if_too_large(self, resident: Callable[[], bool]) -> None:
         """Drop them where the arbiter could never let them stay, if they are `resident` then."""
         if self._client is not None and self.size_bytes:
-            asking = self._drop_if_too_large(self._client, resident)
-            self._asking = asyncio.create_task(asking, name="host RAM")
+            self._in_background(self._drop_if_too_large(self._client, resident), "host RAM")
 
     async def stop(self) -> None:
         """End what is under way."""

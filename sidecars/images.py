@@ -20,7 +20,6 @@ SIDE_MAX = 16_384
 SCANS_MAX = 12  # scans of a JPEG: progressive encoders write 6 to 10, each a pass over all pixels
 SEGMENTS_MAX = 1_000  # segments before a JPEG's picture; cameras and editors write a few dozen
 CHUNKS_MAX = 8_192  # chunks of a PNG: 16 MiB in the 8 KiB chunks of libpng are 2,048
-FORMATS = ("PNG", "JPEG")
 
 _HINT = "send PNG (or JPEG) bytes of an RGB picture"
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -149,7 +148,7 @@ def decode_all(images: Sequence[bytes]) -> list["Image.Image"]:
     decoded = []
     for data, said in zip(images, headers, strict=True):
         try:
-            picture = Image.open(io.BytesIO(data), formats=FORMATS)
+            picture = Image.open(io.BytesIO(data), formats=("PNG", "JPEG"))
             if picture.size != (said.width, said.height):  # the header was of another picture
                 raise ValueError(f"{picture.size} is not the size in its header")
             decoded.append(picture.convert("RGB"))

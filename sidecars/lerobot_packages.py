@@ -2,7 +2,10 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from typing import Final, Literal
+
+from vram_arbiter.sidecars.quantization import load_bitsandbytes
 
 _FLAGS: Final[Mapping[str, tuple[str, ...]]] = {
     "diffusers": ("_diffusers_available",),
@@ -12,9 +15,14 @@ _FLAGS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def import_policies(without: Sequence[Literal["diffusers", "peft"]]) -> None:
-    """Import the code of all of lerobot's policies, as if some packages were not installed."""
+    """Import the code of all of lerobot's policies, as if some packages were not installed.
+
+    The others import bitsandbytes, which comes first: alone it initializes CUDA.
+    """
     from lerobot.utils import import_utils
 
+    if len(without) < len(_FLAGS) and find_spec("bitsandbytes") is not None:
+        load_bitsandbytes()
     known = {flag: getattr(import_utils, flag) for name in without for flag in _FLAGS[name]}
     for flag in known:
         setattr(import_utils, flag, False)

@@ -78,7 +78,7 @@ def keep(
                 _send(stream, {"pid": pid})
             else:
                 with _ending_with(host_pid):
-                    reply = keeper.answer(message)
+                    reply = _answer(keeper, message)
                 _send(stream, reply)
         os._exit(0)  # a million objects of imported code need no tidying
 
@@ -89,27 +89,21 @@ class _Keeper:
         self.weights: HostWeights | None = None
         self._settings = settings
 
-    def answer(self, message: Message) -> Message:
-        try:
-            match message["do"]:
-                case "prepare":
-                    self.adapter.prepare()
-                    return {}
-                case "load":
-                    return {"bytes": self._load()}
-                case "drop":
-                    if self.weights is not None:
-                        self.weights.drop()
-                        self.weights = None
-                    gc.collect()
-                    return {}
-                case "reap":
-                    _, status = os.waitpid(message["pid"], 0)
-                    return {"code": os.waitstatus_to_exitcode(status)}
-        # any failure inside a model is an answer to the caller
-        except Exception as error:  # noqa: BLE001
-            return {"error": _typed(error).to_wire()}
-        raise AssertionError(f"the host asked for {message['do']}")
+    def perform(self, message: Message) -> Message:
+        match message["do"]:
+            case "prepare":
+                self.adapter.prepare()
+            case "load":
+                return {"bytes": self._load()}
+            case "drop":
+                if self.weights is not None:
+                    self.weights.drop()
+                    self.weights = None
+                gc.collect()
+            case "reap":
+                _, status = os.waitpid(message["pid"], 0)
+                return {"code": os.waitstatus_to_exitcode(status)}
+        return {}
 
     def _load(self) -> int:
         """Read the weights into shared memory. Return their bytes: those of the production model
@@ -140,7 +134,7 @@ def _live(model: "_Model", threads: int, others: tuple[int, ...], host: socket.s
             torch.set_num_threads(threads)
         with host, host.makefile("rwb") as stream:
             while message := _receive(stream):
-                _send(stream, model.answer(message))
+                _send(stream, _answer(model, message))
         model.close()
         logging.shutdown()
         code = 0
@@ -161,23 +155,17 @@ class _Model:
         self._weights = weights
         self._memory: DeviceMemory | None = None
 
-    def answer(self, message: Message) -> Message:
-        try:
-            match message["do"]:
-                case "check":
-                    open_memory(self._settings)
-                    return {}
-                case "load":
-                    return {"used_bytes": self._load(message["gpu"])}
-                case "run":
-                    call = parse(message["call"], self._adapter.ops)
-                    assert isinstance(call, ModelCall), "the host answers all others"
-                    answer: Message = npy.pack(self._adapter.run(call))
-                    return {"answer": answer}
-        # any failure inside a model is an answer to the caller
-        except Exception as error:  # noqa: BLE001
-            return {"error": _typed(error).to_wire()}
-        raise AssertionError(f"the host asked for {message['do']}")
+    def perform(self, message: Message) -> Message:
+        match message["do"]:
+            case "check":
+                open_memory(self._settings)
+            case "load":
+                return {"used_bytes": self._load(message["gpu"])}
+            case "run":
+                call = parse(message["call"], self._adapter.ops)
+                assert isinstance(call, ModelCall), "the host answers all others"
+                return {"answer": npy.pack(self._adapter.run(call))}
+        return {}
 
     def close(self) -> None:
         if self._memory is not None:
@@ -211,6 +199,14 @@ class _Model:
             )
             memory.empty_cache()
         return memory.used_bytes()
+
+
+def _answer(process: "_Keeper | _Model", message: Message) -> Message:
+    """Any failure inside a model is an answer to the caller."""
+    try:
+        return process.perform(message)
+    except Exception as error:  # noqa: BLE001
+        return {"error": _typed(error).to_wire()}
 
 
 def _stands_in(settings: Settings) -> bool:
@@ -247,12 +243,16 @@ def _typed(error: BaseException) -> VramError:
 def _end_with(*pids: int) -> NoReturn:
     """End this process when another one ends, also in the middle of its work: no program would use
     its memory, and no lease covers it any more."""
+    select.select([_watched(pid) for pid in pids], [], [])
+    os._exit(1)
+
+
+def _watched(pid: int) -> int:
+    """Return a descriptor that is readable once a process has ended; end with it if it has."""
     try:
-        others = [os.pidfd_open(pid) for pid in pids]
+        return os.pidfd_open(pid)
     except ProcessLookupError:
         os._exit(1)
-    select.select(others, [], [])
-    os._exit(1)
 
 
 @contextlib.contextmanager
@@ -261,10 +261,7 @@ def _ending_with(host_pid: int) -> Iterator[None]:
     done, finish = os.pipe()
 
     def watch() -> None:
-        try:
-            host = os.pidfd_open(host_pid)
-        except ProcessLookupError:
-            os._exit(1)
+        host = _watched(host_pid)
         if host in select.select([host, done], [], [])[0]:
             os._exit(1)
         os.close(host)

@@ -12,7 +12,7 @@ import logging
 import os
 import signal
 from collections.abc import Awaitable, Callable
-from typing import Final, Protocol
+from typing import Final
 
 import msgpack
 
@@ -23,39 +23,6 @@ from vram_arbiter.sidecars.model_main import LENGTH
 END_S: Final = 5.0
 """How long a process may take to free its memory in order; then it is killed."""
 _log = logging.getLogger("sidecars")
-
-
-class Model(Protocol):
-    """One residency of a model, as `gpu_copy` needs it."""
-
-    ended: asyncio.Event
-    """The process is gone, and its memory with it."""
-
-    async def load(self, gpu: str) -> int | None:
-        """Copy the weights onto a GPU (its UUID; "": the only one). Return the bytes on it, None if
-        unknown.
-
-        Raises OutOfMemory, NoGpu or ModelError; end the process then.
-        """
-        ...
-
-    async def run(
-        self, call: Message, *, begin_s: float, end_s: float, begins: Callable[[], None]
-    ) -> Message:
-        """Answer one request of the model's wire, one after the other.
-
-        `begins` is called when its turn comes, and may raise. Raises WaitTimeout where that was not
-        within `begin_s`, and ModelError where the answer took longer than `end_s`: the process has
-        been killed then.
-        """
-        ...
-
-    async def end(self, *, at_once: bool = False) -> None:
-        """End the process after its present work, and wait until it is gone. Idempotent.
-
-        `at_once`: in the middle of its work, for a load that is not wanted any more.
-        """
-        ...
 
 
 class Channel:
@@ -98,7 +65,10 @@ class Channel:
 
 
 class ModelProcess:
-    """A `Model` in a process of its own. `reap` returns its exit code once it has ended."""
+    """One residency of a model, in a process of its own.
+
+    `ended`: it is gone, and its memory with it. `reap` returns its exit code once it has ended.
+    """
 
     def __init__(
         self,
@@ -122,6 +92,11 @@ class ModelProcess:
         await self._channel.ask({"do": "check"})
 
     async def load(self, gpu: str) -> int | None:
+        """Copy the weights onto a GPU (its UUID; "": the only one). Return the bytes on it, None if
+        unknown.
+
+        Raises OutOfMemory, NoGpu or ModelError; end the process then.
+        """
         async with self._turn:
             used: int | None = (await self._channel.ask({"do": "load", "gpu": gpu}))["used_bytes"]
             return used
@@ -129,6 +104,12 @@ class ModelProcess:
     async def run(
         self, call: Message, *, begin_s: float, end_s: float, begins: Callable[[], None]
     ) -> Message:
+        """Answer one request of the model's wire, one after the other.
+
+        `begins` is called when its turn comes, and may raise. Raises WaitTimeout where that was not
+        within `begin_s`, and ModelError where the answer took longer than `end_s`: the process has
+        been killed then.
+        """
         try:
             async with asyncio.timeout(begin_s):
                 await self._turn.acquire()
@@ -162,6 +143,10 @@ class ModelProcess:
             self._turn.release()
 
     async def end(self, *, at_once: bool = False) -> None:
+        """End the process after its present work, and wait until it is gone. Idempotent.
+
+        `at_once`: in the middle of its work, for a load that is not wanted any more.
+        """
         if at_once:
             self.kill()
         async with self._turn:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 _BLOB: Final = ".quant_state.bitsandbytes__nf4"  # JSON: shape, block size
 _NESTED: Final = ("nested_absmax", "nested_quant_map")  # statistics of the statistics
 _STATISTICS: Final = ("absmax", "quant_map", *_NESTED)
-_BYTES: Final = {"U8": 1, "F16": 2, "BF16": 2, "F32": 4}  # of an element, as safetensors names it
 _CODES: Final = 16
 _NESTED_CODES: Final = 256
 
@@ -40,62 +39,51 @@ class PackedHeader:
 
 
 def read_packed(files: Iterable[Path]) -> PackedHeader:
-    """Read the headers of safetensors files, and of each packed weight the bytes that tell its
-    shape. Raises what safetensors and JSON raise for a file that is not whole."""
+    """Return the header of safetensors files, of which only names and shapes are read, and of each
+    packed weight the bytes that tell its shape. Raises what safetensors and JSON raise for a file
+    that is not whole."""
+    import torch
     from safetensors import safe_open
+    from transformers.modeling_utils import str_to_torch_dtype
 
-    shapes: dict[str, list[int]] = {}
-    sizes: dict[str, int] = {}
-    states: dict[str, JsonMap] = {}
+    tensors: dict[str, Tensor] = {}
     for path in files:
         with safe_open(path, "pt") as file:
             for name in file.keys():  # noqa: SIM118  not a mapping
                 part = file.get_slice(name)
-                shapes[name] = part.get_shape()
-                sizes[name] = math.prod(shapes[name]) * _BYTES.get(part.get_dtype(), 0)
-                if name.endswith(_BLOB):
-                    states[name.removesuffix(_BLOB)] = _state(file.get_tensor(name))
-    return _header(shapes, sizes, states)
+                dtype = str_to_torch_dtype[part.get_dtype()]
+                tensors[name] = (
+                    file.get_tensor(name)
+                    if name.endswith(_BLOB)
+                    else torch.empty(part.get_shape(), dtype=dtype, device="meta")
+                )
+    return packed_in(tensors)
 
 
 def packed_in(state_dict: "Mapping[str, Tensor]") -> PackedHeader:
     """Return the header of a state dict."""
-    return _header(
-        {name: tensor.shape for name, tensor in state_dict.items()},
-        {name: tensor.nbytes for name, tensor in state_dict.items()},
-        {
-            name.removesuffix(_BLOB): _state(tensor)
-            for name, tensor in state_dict.items()
-            if name.endswith(_BLOB)
-        },
-    )
-
-
-def _state(blob: "Tensor") -> JsonMap:
-    found: JsonMap = json.loads(bytes(blob.tolist()))
-    return found
-
-
-def _header(
-    shapes: Mapping[str, Iterable[int]], sizes: Mapping[str, int], states: Mapping[str, JsonMap]
-) -> PackedHeader:
     import torch
 
     found = PackedHeader()
-    for name, shape in shapes.items():
+    states: dict[str, JsonMap] = {
+        name.removesuffix(_BLOB): json.loads(bytes(blob.tolist()))
+        for name, blob in state_dict.items()
+        if name.endswith(_BLOB)
+    }
+    for name, tensor in state_dict.items():
         weight, _, last = name.rpartition(".")
-        if last in _STATISTICS and (weight in shapes or weight in states):
+        if last in _STATISTICS and (weight in state_dict or weight in states):
             if weight not in states:
                 found.missing.add(weight + _BLOB)
         elif not name.endswith(_BLOB) and name not in states:
-            found.tensors[name] = torch.empty(tuple(shape), device="meta")
+            found.tensors[name] = torch.empty(tensor.shape, device="meta")
     for weight, state in states.items():
         expected = _sizes_of(weight, state)
-        found.missing |= expected.keys() - shapes.keys() - {weight}
-        for name in expected.keys() & shapes.keys():
-            if sizes[name] != expected[name]:
-                found.misshapen[name] = f"{sizes[name]} bytes, not {expected[name]}"
-        if weight in shapes:
+        found.missing |= expected.keys() - state_dict.keys() - {weight}
+        for name in expected.keys() & state_dict.keys():
+            if (size := state_dict[name].nbytes) != expected[name]:
+                found.misshapen[name] = f"{size} bytes, not {expected[name]}"
+        if weight in state_dict:
             found.tensors[weight] = torch.empty(state["shape"], device="meta")
             found.quantized.append(weight)
     return found

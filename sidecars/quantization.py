@@ -9,12 +9,13 @@ import logging
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vram_arbiter.schemas.errors import ConfigError, UnsupportedQuantization
+from vram_arbiter.schemas.findings import problems_of
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype, QuantizationBackend
 from vram_arbiter.schemas.plain import JsonMap
@@ -33,33 +34,44 @@ KEPT: Final = ("lm_head", "visual")
 """Modules that are not quantized unless the manifest names others."""
 _WHOLE_BYTES: Final = 8  # 4-bit weights of a row fill whole elements of any number format
 _MIN_CAPABILITY: Final = {Dtype.BF16: (8, 0), Dtype.FP16: (5, 3), Dtype.INT4: (6, 0)}
+_NARROWER: Final = {
+    (Dtype.INT4, Dtype.BF16): "write compute_dtype: float16 in quantization.extra",
+    (Dtype.BF16, Dtype.BF16): "write dtype: fp16",
+}
 _LOADERS_KEYS: Final = ("loader", "trust_remote_code")
 
 
-@dataclass(frozen=True, slots=True)
-class Nf4:
-    """What a manifest's `quantization.extra` says about NF4."""
+class Nf4(BaseModel):
+    """What a manifest's `quantization.extra` says about NF4, in the field's words."""
 
-    compute_dtype: Dtype = Dtype.BF16
-    skip_modules: tuple[str, ...] | None = None
-    min_params: int = MIN_PARAMS
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    scheme: Literal["nf4"] = "nf4"
+    quantizer: Literal["bitsandbytes"] = "bitsandbytes"
+    compute_dtype: Literal["float32", "float16", "bfloat16"] = "bfloat16"
+    skip_modules: tuple[Annotated[str, Field(min_length=1)], ...] | None = None
+    min_params_to_quantize: Annotated[int, Field(strict=True, ge=0)] = MIN_PARAMS
+
+    @property
+    def computes_in(self) -> Dtype:
+        return next(dtype for dtype, name in TORCH_NAMES.items() if name == self.compute_dtype)
 
     @property
     def compute_type(self) -> "torch.dtype":
-        return torch_type(self.compute_dtype)
+        return torch_type(self.computes_in)
 
     def chosen(self, model: "Module") -> list[str]:
         """Return the names of the linear layers to quantize.
 
         Left alone: modules that the manifest skips, by any part of their path; layers with fewer
-        than `min_params` weights, or rows that do not fill whole bytes; weights that another module
-        shares; subclasses of `Linear`, and layers of torch's own transformer: their owners read the
-        weight themselves.
+        than `min_params_to_quantize` weights, or rows that do not fill whole bytes; weights that
+        another module shares; subclasses of `Linear`, and layers of torch's own transformer: their
+        owners read the weight themselves.
 
         Raises: ConfigError if the manifest skips a module that the model does not have,
         UnsupportedQuantization if no layer is left.
         """
         import torch
+        from accelerate.utils import find_tied_parameters
 
         names = [name for name, _ in model.named_modules()]
         for skipped in self.skip_modules or ():
@@ -72,9 +84,7 @@ class Nf4:
         kept = self.skip_modules
         if kept is None:
             kept = (*KEPT, *_vision_towers(model))
-        uses = Counter(
-            id(parameter) for _, parameter in model.named_parameters(remove_duplicate=False)
-        )
+        shared = {name for group in find_tied_parameters(model) for name in group}
         readers = [
             name
             for name, module in model.named_modules()
@@ -84,15 +94,15 @@ class Nf4:
             name
             for name, module in model.named_modules()
             if type(module) is torch.nn.Linear
-            and module.weight.numel() >= self.min_params
+            and module.weight.numel() >= self.min_params_to_quantize
             and module.in_features % _WHOLE_BYTES == 0
-            and uses[id(module.weight)] == 1
+            and f"{name}.weight" not in shared
             and not any(_within(name, part) for part in (*kept, *readers))
         ]
         if not found:
             raise UnsupportedQuantization(
                 f"{type(model).__name__} has no linear layer to quantize: none with at least "
-                f"{self.min_params} weights outside of {', '.join(kept) or 'no module'}",
+                f"{self.min_params_to_quantize} weights outside of {', '.join(kept) or 'none'}",
                 hint="lower quantization.extra.min_params_to_quantize, or write dtype: bf16",
             )
         return found
@@ -206,40 +216,23 @@ def check_checkpoint(manifest: RSkillManifest, config: JsonMap | None) -> None:
 
 def _read(manifest: RSkillManifest) -> Nf4:
     """Read `quantization.extra`. Raises ConfigError."""
-    extra = dict(manifest.quantization.extra)
-
-    def refuse(key: str, expected: str) -> ConfigError:
-        value = manifest.quantization.extra[key]
-        return ConfigError(f"quantization.extra.{key} is {value!r}", hint=f"write {expected}")
-
-    for key, only in (("scheme", "nf4"), ("quantizer", "bitsandbytes")):
-        if extra.pop(key, only) != only:
-            raise refuse(key, only)
-    types = {name: dtype for dtype, name in TORCH_NAMES.items()}
-    compute = types.get(str(extra.pop("compute_dtype", "bfloat16")))
-    if compute is None:
-        raise refuse("compute_dtype", f"one of {', '.join(types)}")
-    least = extra.pop("min_params_to_quantize", MIN_PARAMS)
-    if not isinstance(least, int) or isinstance(least, bool) or least < 0:
-        raise refuse("min_params_to_quantize", "a number of weights, e.g. 4000000")
-    names = extra.pop("skip_modules", None)
-    if names is not None and not (
-        isinstance(names, list) and all(isinstance(name, str) and name for name in names)
-    ):
-        raise refuse("skip_modules", "a list of module names, e.g. [lm_head, visual]")
-    for key in _LOADERS_KEYS:
-        extra.pop(key, None)
-    if extra:
-        known = "scheme, quantizer, compute_dtype, min_params_to_quantize, skip_modules"
+    extra = {
+        key: value for key, value in manifest.quantization.extra.items() if key not in _LOADERS_KEYS
+    }
+    try:
+        return Nf4.model_validate(extra)
+    except ValidationError as error:
+        problems = problems_of(error, Nf4, extra)
         raise ConfigError(
-            f"quantization.extra has {', '.join(extra)}, which no loader honors",
-            hint=f"known: {known}, {', '.join(_LOADERS_KEYS)}",
-        )
-    return Nf4(compute, None if names is None else tuple(map(str, names)), least)
+            "; ".join(f"quantization.extra.{problem}" for problem in problems),
+            hint=f"known: {', '.join((*Nf4.model_fields, *_LOADERS_KEYS))}",
+        ) from None
 
 
-def quantize_linear(module: "Module", manifest: RSkillManifest) -> None:
+def quantize_linear(module: "Module", manifest: RSkillManifest, device: str = "cpu") -> None:
     """Quantize the linear layers of a model in host RAM to NF4, in place, one after the other.
+
+    Only where its manifest says int4; for the device `meta` they are only chosen.
 
     For models that transformers does not load. Cast the rest of the model before: what is quantized
     must never be cast. Each weight keeps the `dtype` that its model's code may ask it for. A model
@@ -248,7 +241,9 @@ def quantize_linear(module: "Module", manifest: RSkillManifest) -> None:
     Raises: ConfigError, UnsupportedQuantization.
     """
     nf4 = nf4_of(manifest)
-    if nf4 is None:
+    if nf4 is None or device == "meta":
+        if nf4 is not None:
+            nf4.chosen(module)
         return
     if layers := nf4_layers(module):
         for layer in layers.values():
@@ -352,26 +347,16 @@ def load_bitsandbytes() -> Any:
     """
     # it warns of a kernel for repacked weights, which are not used (`settle`)
     logging.getLogger("bitsandbytes.backends.cpu.ops").setLevel(logging.ERROR)
-    with _capability_without_cuda():
-        import bitsandbytes
-    return bitsandbytes
-
-
-def _torch() -> Any:
     import torch
 
-    return torch
-
-
-@contextmanager
-def _capability_without_cuda() -> Iterator[None]:
-    cuda = _torch().cuda
+    cuda: Any = torch.cuda
     own = cuda.get_device_capability
     cuda.get_device_capability = lambda device=None: max(capabilities("cuda"), default=(0, 0))
     try:
-        yield
+        import bitsandbytes
     finally:
         cuda.get_device_capability = own
+    return bitsandbytes
 
 
 def check_precision(manifest: RSkillManifest, device: str) -> None:
@@ -390,20 +375,14 @@ def check_precision(manifest: RSkillManifest, device: str) -> None:
     else:
         found = capabilities(device)
     asked = manifest.quantization.dtype
-    needed = max(
-        _MIN_CAPABILITY.get(dtype, (0, 0))
-        for dtype in ([asked] if nf4 is None else [asked, nf4.compute_dtype])
-    )
+    computes = asked if nf4 is None else nf4.computes_in
+    needed = max(_MIN_CAPABILITY.get(dtype, (0, 0)) for dtype in (asked, computes))
     if found and max(found) < needed:
         has, needs = (".".join(map(str, version)) for version in (max(found), needed))
-        computed = "" if nf4 is None else f" computed in {nf4.compute_dtype.value}"
+        computed = "" if nf4 is None else f" computed in {computes.value}"
         raise UnsupportedQuantization(
             f"{manifest.name}: quantization.dtype {asked.value!r}{computed} needs compute "
             f"capability {needs}, and {device} has {has}",
-            hint="write compute_dtype: float16 in quantization.extra"
-            if nf4 is not None and nf4.compute_dtype is Dtype.BF16
-            else "write dtype: fp16"
-            if asked is Dtype.BF16
-            else "write dtype: fp32",
+            hint=_NARROWER.get((asked, computes), "write dtype: fp32"),
             details={"dtype": asked.value, "needs": needs, "has": has},
         )

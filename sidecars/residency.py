@@ -30,11 +30,11 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.sidecars.gpu_copy import GpuCopy, State, unwanted
 from vram_arbiter.sidecars.host_copy import HostCopy
-from vram_arbiter.sidecars.model_process import Model
+from vram_arbiter.sidecars.model_process import ModelProcess
 from vram_arbiter.sidecars.settings import Settings
 from vram_arbiter.sidecars.standby import AWAY, Recall, left_s, still
 from vram_arbiter.sidecars.uses import Uses
-from vram_arbiter.sidecars.weights_keeper import Models
+from vram_arbiter.sidecars.weights_keeper import ModelProcesses
 
 Token = tuple[int, int]
 _GONE = (LeaseRevoking, LeaseLost, LeaseExpired, StaleToken, UnknownLease, Evicted)
@@ -47,7 +47,9 @@ class Residency:
     `client` None: no arbiter, so the model is loaded without a lease and stays.
     """
 
-    def __init__(self, settings: Settings, models: Models, client: AsyncClient | None) -> None:
+    def __init__(
+        self, settings: Settings, models: ModelProcesses, client: AsyncClient | None
+    ) -> None:
         self._settings = settings
         self._models = models
         self._client = client
@@ -368,7 +370,7 @@ class Residency:
             details={"state": self.state},
         )
 
-    def _begins(self, model: Model, came_s: float, fresh_s: float | None) -> None:
+    def _begins(self, model: ModelProcess, came_s: float, fresh_s: float | None) -> None:
         """Check that no unload came between, and that the picture is not too old."""
         if model is not self._gpu.model or self.state != "resident":
             raise self._evicted()

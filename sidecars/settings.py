@@ -9,15 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    RootModel,
+    ValidationError,
+    model_validator,
+)
 
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.findings import problems_of
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
-from vram_arbiter.schemas.units import ByteSize, parse_bytes
+from vram_arbiter.schemas.units import ByteSize
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
-from vram_arbiter.schemas.yamltext import read_yaml
+from vram_arbiter.schemas.yamltext import read_yaml, validated
 from vram_arbiter.sidecars.weights import Weights, resolve, with_processors
 
 NICE_VARIABLE = "VRAM_ARBITER_SIDECAR_NICE"
@@ -143,33 +152,21 @@ def read_model(rskill: Path, configs: Path) -> tuple[RSkillManifest, Weights]:
     return manifest, with_processors(weights, manifest, configs)
 
 
-def read_footprints(path: Path) -> dict[str, FootprintEntry]:
-    """Read all entries of a footprint file. Raises ConfigError naming file, line and problem."""
-    document = read_yaml(path)
-    if not isinstance(document.data, Mapping):
-        raise ConfigError(
-            f"{path}: must be a map from models to footprints",
-            hint="write OWNER/NAME: {load_peak: 5.3GB, steady: 5.3GB}",
+def _model(key: str) -> str:
+    if not _KEY.fullmatch(key):
+        raise ValueError(
+            "names no model: write OWNER/NAME or OWNER/NAME/DTYPE, DTYPE one of " + ", ".join(Dtype)
         )
-    entries = {}
-    for key, value in document.data.items():
-        name = str(key)
-        if not _KEY.fullmatch(name):
-            raise ConfigError(
-                f"{path}:{document.line((name,))}: {name!r} names no model",
-                hint="write OWNER/NAME or OWNER/NAME/DTYPE, DTYPE one of " + ", ".join(Dtype),
-            )
-        try:
-            entries[name] = FootprintEntry.model_validate(value)
-        except ValidationError as error:
-            problem = error.errors()[0]
-            where = (name, *problem["loc"])
-            raise ConfigError(
-                f"{path}:{document.line(where)}: {'.'.join(str(part) for part in where)}: "
-                f"{problem['msg']}",
-                hint="a footprint is {load_peak: 5.3GB, steady: 5.3GB, residue: 450MiB}",
-            ) from None
-    return entries
+    return key
+
+
+class _Footprints(RootModel[dict[Annotated[str, AfterValidator(_model)], FootprintEntry]]):
+    pass
+
+
+def read_footprints(path: Path) -> dict[str, FootprintEntry]:
+    """Read all entries of a footprint file. Raises ConfigError with every mistake and its line."""
+    return validated(_Footprints, read_yaml(path)).root
 
 
 def parse_footprint(text: str) -> FootprintEntry:
@@ -179,14 +176,15 @@ def parse_footprint(text: str) -> FootprintEntry:
     """
     hint = "write PEAK,STEADY,RESIDUE,INFERENCE_PEAK, e.g. 5.3GB,5.3GB,450MiB,6GB"
     names = ("load_peak", "steady", "residue", "inference_peak")
+    sizes = text.split(",")
+    given = dict(zip(names, sizes, strict=False))
+    if len(sizes) > len(names):
+        raise ConfigError(f"--footprint {text}: at most {len(names)} sizes", hint=hint)
     try:
-        sizes = [parse_bytes(part) for part in text.split(",")]
-        given = dict(zip(names, sizes, strict=False))
-        if len(sizes) > len(names):
-            raise ValueError(f"at most {len(names)} sizes")
-        return FootprintEntry.model_validate({"steady": given["load_peak"], **given})
-    except ValueError as error:
-        raise ConfigError(f"--footprint {text}: {_reason(error)}", hint=hint) from None
+        return FootprintEntry.model_validate({"steady": sizes[0], **given})
+    except ValidationError as error:
+        problem = problems_of(error, FootprintEntry, given)[0]
+        raise ConfigError(f"--footprint {text}: {problem.message}", hint=hint) from None
 
 
 def footprint_for(
@@ -223,7 +221,3 @@ def _repository(uri: str | None) -> str:
     """Return OWNER/REPO of an address of the hub, else an empty text."""
     scheme, _, rest = (uri or "").partition("://")
     return rest.partition("@")[0] if scheme == "hf" else ""
-
-
-def _reason(error: ValueError) -> str:
-    return error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)

@@ -113,7 +113,7 @@ def model_type(weights: Weights, key: str) -> str:
     """Return a text of a local checkpoint's `config.json`, such as `model_type`; "" if it has none
     that a module could be named by."""
     try:
-        found = json.loads((Path(weights.source) / "config.json").read_text(encoding="utf-8"))
+        found = json.loads((Path(weights.source) / CONFIG_FILE).read_text(encoding="utf-8"))
         named = found.get(key)
     except (OSError, ValueError, AttributeError):
         return ""
@@ -200,7 +200,10 @@ def fitting(cls: Any, weights: Weights) -> Iterator[None]:
         # torch's error, which says more than that the weights are bad
         if type(error).__name__ == "OutOfMemoryError":
             raise
-        raise _unfit(cls, weights, error) from error
+        raise ModelError(
+            f"{cls.__name__} cannot load {weights.source}: {reason(error)}",
+            hint="check that it is complete and of the manifest's kind",
+        ) from error
 
 
 def read_config(cls: Any, weights: Weights) -> Any:
@@ -211,20 +214,11 @@ def read_config(cls: Any, weights: Weights) -> Any:
     """
     import draccus
 
-    try:
-        fields = json.loads(_config_file(weights).read_text(encoding="utf-8"))
+    with fitting(cls, weights):
+        fields = _config_fields(weights)
         kind = cls.get_choice_class(fields.pop("type"))
         with draccus.config_type("json"):
             return draccus.decode(kind, fields)
-    except Exception as error:
-        raise _unfit(cls, weights, error) from error
-
-
-def _unfit(cls: Any, weights: Weights, error: Exception) -> ModelError:
-    return ModelError(
-        f"{cls.__name__} cannot load {weights.source}: {reason(error)}",
-        hint="check that it is complete and of the manifest's kind",
-    )
 
 
 def reason(error: BaseException) -> str:
@@ -269,8 +263,7 @@ def quantization_config(weights: Weights) -> JsonMap | None:
     Raises: ModelError.
     """
     try:
-        fields = json.loads(_config_file(weights).read_text(encoding="utf-8"))
-        found: JsonMap | None = fields.get("quantization_config")
+        found: JsonMap | None = _config_fields(weights).get("quantization_config")
     except Exception as error:
         raise ModelError(
             f"{weights.source}: its {CONFIG_FILE} cannot be read: {type(error).__name__}: {error}",
@@ -280,21 +273,9 @@ def quantization_config(weights: Weights) -> JsonMap | None:
 
 
 def safetensors_files(weights: Weights) -> list[Path]:
-    """Return the files of a checkpoint's weights, fetched from the hub if need be.
-
-    Raises: ModelError if there are none.
-    """
-    from huggingface_hub import snapshot_download
-
-    folder = Path(weights.source)
-    if not weights.local:
-        folder = Path(
-            snapshot_download(
-                weights.source,
-                revision=weights.revision,
-                allow_patterns=["*.json", "*.safetensors"],
-            )
-        )
+    """Return the files of a checkpoint's weights, fetched from the hub if need be. Raises
+    ModelError."""
+    folder = Path(fetched(weights).source)
     whole, index = folder / "model.safetensors", folder / "model.safetensors.index.json"
     if whole.is_file() or not index.is_file():
         return [whole]
@@ -302,9 +283,12 @@ def safetensors_files(weights: Weights) -> list[Path]:
     return [folder / name for name in dict.fromkeys(parts)]
 
 
-def _config_file(weights: Weights) -> Path:
+def _config_fields(weights: Weights) -> Message:
+    """Return the checkpoint's `config.json`. Raises what the hub and JSON raise."""
     from huggingface_hub import hf_hub_download
 
-    if weights.local:
-        return Path(weights.source) / CONFIG_FILE
-    return Path(hf_hub_download(weights.source, CONFIG_FILE, revision=weights.revision))
+    file = Path(weights.source) / CONFIG_FILE
+    if not weights.local:
+        file = Path(hf_hub_download(weights.source, CONFIG_FILE, revision=weights.revision))
+    found: Message = json.loads(file.read_text(encoding="utf-8"))
+    return found

@@ -15,16 +15,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from functools import partial
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext, ForkServerProcess
-from typing import Final, Protocol
+from typing import Final
 
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.sidecars import model_main
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.model_main import THREADS_VARIABLE
-from vram_arbiter.sidecars.model_process import Channel, Model, ModelProcess, how_ended
+from vram_arbiter.sidecars.model_process import Channel, ModelProcess, how_ended
 from vram_arbiter.sidecars.settings import HOST_VARIABLE, NICE_VARIABLE, Settings
 
 ENVIRONMENT: Final = {
@@ -39,33 +40,6 @@ ENVIRONMENT: Final = {
 
 
 _log = logging.getLogger("sidecars")
-
-
-class Models(Protocol):
-    """The weights of a model and the processes that use them, as its host needs them."""
-
-    async def prepare(self) -> None:
-        """Do what needs neither weights nor a device. Repeatable. Raises ModelError or NoGpu."""
-        ...
-
-    async def load(self) -> int:
-        """Read the weights into host RAM, if they are not there. Return their bytes.
-
-        Raises ModelError or ConfigError.
-        """
-        ...
-
-    async def start(self) -> Model:
-        """Start a process that can copy them onto a GPU. Raises as `load`."""
-        ...
-
-    async def drop(self) -> None:
-        """Free the host RAM of the weights. Never raises."""
-        ...
-
-    async def end(self) -> None:
-        """End everything. Idempotent."""
-        ...
 
 
 class _Keeper:
@@ -140,7 +114,8 @@ class _Keeper:
 
 
 class ModelProcesses:
-    """`Models` in processes. The server of imports ends with this program."""
+    """The weights of a model and the processes that use them. The server of imports ends with this
+    program."""
 
     def __init__(
         self,
@@ -166,26 +141,34 @@ class ModelProcesses:
         self._context.set_forkserver_preload(["vram_arbiter.sidecars.preload", *modules])
 
     async def prepare(self) -> None:
+        """Do what needs neither weights nor a device. Repeatable. Raises ModelError or NoGpu."""
         async with self._turn:
             await self._prepared()
 
     async def load(self) -> int:
+        """Read the weights into host RAM, if they are not there. Return their bytes.
+
+        Raises ModelError or ConfigError.
+        """
         async with self._turn:
             return await (await self._prepared()).load()
 
     async def start(self) -> ModelProcess:
+        """Start a process that can copy them onto a GPU. Raises as `load`."""
         async with self._turn:
             keeper = await self._prepared()
             await keeper.load()  # they may have been dropped since
             return await keeper.fork()
 
     async def drop(self) -> None:
+        """Free the host RAM of the weights. Never raises."""
         async with self._turn:
             if self._keeper is not None:
                 with contextlib.suppress(ModelError):  # gone, and the weights with it
                     await self._keeper.drop()
 
     async def end(self) -> None:
+        """End everything. Idempotent."""
         async with self._turn:
             if self._keeper is not None:
                 await self._keeper.end()
@@ -260,25 +243,15 @@ def _main_unnamed() -> Iterator[None]:
 
 async def _in_a_thread(work: Callable[[], None]) -> None:
     """Do the work in a thread that the program's end does not wait for."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[None] = loop.create_future()
-
-    def tell(error: BaseException | None) -> None:
-        if done.cancelled():
-            return
-        if error is None:
-            done.set_result(None)
-        else:
-            done.set_exception(error)
+    done: Future[None] = Future()
+    done.set_running_or_notify_cancel()
 
     def run() -> None:
-        error: BaseException | None = None
         try:
             work()
-        except BaseException as failed:  # noqa: BLE001  raised where it is awaited
-            error = failed
-        with contextlib.suppress(RuntimeError):  # the program has ended
-            loop.call_soon_threadsafe(tell, error)
+            done.set_result(None)
+        except BaseException as error:  # noqa: BLE001  raised where it is awaited
+            done.set_exception(error)
 
     threading.Thread(target=run, name="start a model", daemon=True).start()
-    await done
+    await asyncio.wrap_future(done)

@@ -134,7 +134,8 @@ class Wire:
         self._pending += 1
         try:
             if name == "load":
-                return await self._host.load(_timeout_s(call))
+                assert isinstance(call, LoadOp), "of either family"
+                return await self._host.load(call.timeout_s)
             assert isinstance(call, DetectOp | QueryOp | ScoreOp | EndpointCall), (
                 "the model's own requests"
             )
@@ -164,6 +165,10 @@ def parse(message: Message, model_ops: frozenset[str]) -> Call:
         if family == "op":
             return OP_REQUEST.validate_python(message)
         call = ENDPOINT_REQUEST.validate_python({**message, "data": _unpack(message.get("data"))})
+        if name != "load":
+            return call
+        limit_s = (call.data or {}).get("timeout_s")
+        return LoadOp(op="load", timeout_s=limit_s, token=call.token, traceparent=call.traceparent)
     except ValidationError as error:
         fields = [
             _field(problem, family)
@@ -172,8 +177,6 @@ def parse(message: Message, model_ops: frozenset[str]) -> Call:
         raise BadRequest(
             f"{name}: {fields[0]}", hint="see schemas/sidecar.py", details={"fields": fields}
         ) from None
-    _timeout_s(call)
-    return call
 
 
 def name_of(call: Call) -> str:
@@ -218,24 +221,6 @@ def _unpack(data: Any) -> Any:
         raise BadRequest(
             f"data: {error}", hint="arrays are {'__ndarray_class__': true, 'as_npy': bytes}"
         ) from None
-
-
-def _timeout_s(call: Call) -> float | None:
-    """Return the time limit of a `load` of either family. Raises BadRequest."""
-    if isinstance(call, LoadOp):
-        return call.timeout_s
-    if isinstance(call, EndpointCall) and call.endpoint == "load" and call.data:
-        value = call.data.get("timeout_s")
-        if value is not None and (
-            isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0
-        ):
-            raise BadRequest(
-                "load: data.timeout_s must be seconds, 0 or more",
-                hint="or leave it out, to wait without a limit",
-                details={"fields": ["data.timeout_s"]},
-            )
-        return value
-    return None
 
 
 def _field(problem: JsonMap, family: Family) -> str:

@@ -91,7 +91,7 @@ def kind(written: str) -> str:
 
     known = {*NOTES, *DAEMON_KINDS}
     if written not in known:
-        from vram_arbiter.schemas.yamltext import did_you_mean
+        from vram_arbiter.schemas.findings import did_you_mean
 
         raise argparse.ArgumentTypeError(f"{written!r} is not one{did_you_mean(written, known)}")
     return written

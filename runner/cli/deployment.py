@@ -24,9 +24,9 @@ from vram_arbiter.runner.sensors.world_state import JOINT_STATE
 from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.config.robot import RobotEnvironment, VlaSpec, robot_of
 from vram_arbiter.schemas.errors import ConfigError, UnknownSkill
+from vram_arbiter.schemas.findings import Path as FieldPath
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest
 from vram_arbiter.schemas.yamltext import Mistake, YamlText, config_error, parse_yaml, read_text
-from vram_arbiter.schemas.yamltext import Path as FieldPath
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,8 @@ from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.units import POSITION, JointScale, JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.yamltext import Mistake, config_error, did_you_mean, dotted
+from vram_arbiter.schemas.findings import did_you_mean, dotted
+from vram_arbiter.schemas.yamltext import Mistake, config_error
 
 LEROBOT = "lerobot:"
 MUJOCO = "so101_mujoco"

@@ -13,9 +13,10 @@ from vram_arbiter.runner.robots.lerobot_robot import Estop
 from vram_arbiter.runner.robots.units import JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.findings import Path, did_you_mean, dotted
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import Mistake, Path, config_error, did_you_mean, dotted
+from vram_arbiter.schemas.yamltext import Mistake, config_error
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

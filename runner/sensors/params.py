@@ -6,14 +6,14 @@ Everything here happens while a reader is made, before any device is opened.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.findings import problems_of
 from vram_arbiter.schemas.plain import JsonObject
-from vram_arbiter.schemas.yamltext import Mistake, YamlText, config_error, problems_of
+from vram_arbiter.schemas.yamltext import Mistake, config_error
 
 
 class BackendParams(BaseModel):
@@ -32,9 +32,10 @@ def read_params[P: BackendParams](config: SensorReaderConfig, model: type[P]) ->
     try:
         return model.model_validate(dict(config.backend_params))
     except ValidationError as error:
-        empty = YamlText("", {}, {})  # the lines are known where the file was read
-        known: Mapping[tuple[str | int, ...], list[str]] = {(): list(model.model_fields)}
-        found = [(p.field, p.problem) for p in problems_of(error, empty, known)]
+        found = [
+            (problem.field, problem.message)
+            for problem in problems_of(error, model, config.backend_params)
+        ]
         raise _error(config, found) from error
 
 

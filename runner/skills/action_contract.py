@@ -14,10 +14,10 @@ from vram_arbiter.runner.skills.actions import TWIST, ActionPlan, Command, Kind
 from vram_arbiter.runner.skills.kinematics import ArmModel
 from vram_arbiter.runner.skills.units import SAME, Scale, of_joint, opening
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
+from vram_arbiter.schemas.findings import Path, Problem
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.contracts import ActuatorRequirement, ControlModeSemantics
 from vram_arbiter.schemas.manifest.io_contracts import ActionContract, ActionSlot
-from vram_arbiter.schemas.manifest.problems import Path, Problem
 from vram_arbiter.schemas.manifest.vocabulary import (
     ActionRepresentation,
     GripperConvention,

@@ -16,9 +16,9 @@ from vram_arbiter.runner.skills.kinematics import ArmModel, Pose3
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers
 from vram_arbiter.runner.skills.units import SAME, Scale, of_joint
 from vram_arbiter.schemas.errors import StateStale
+from vram_arbiter.schemas.findings import Path, Problem
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.io_contracts import StateBindings, StateContract
-from vram_arbiter.schemas.manifest.problems import Path, Problem
 from vram_arbiter.schemas.manifest.vocabulary import JOINT_SPACE_LAYOUTS, Rotation
 from vram_arbiter.schemas.world import WorldState
 

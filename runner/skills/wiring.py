@@ -22,9 +22,9 @@ from vram_arbiter.runner.skills.states import StatePlan, plan_state
 from vram_arbiter.runner.skills.states import needs_frames as state_needs_frames
 from vram_arbiter.schemas.control import JOINT_MODES
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.findings import Problem
 from vram_arbiter.schemas.manifest import ManifestError, RSkillManifest
 from vram_arbiter.schemas.manifest.manifest import IMAGES_PREFIX
-from vram_arbiter.schemas.manifest.problems import Problem
 from vram_arbiter.schemas.sidecar import LEFT_OVER_MAX
 
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise

@@ -5,7 +5,7 @@ Pure: `load_config(text, name)` takes the text of a file; the daemon reads the f
 No key is required: an empty file is the default configuration.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Literal, Self
 
@@ -15,15 +15,17 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
 from vram_arbiter.schemas.urls import collector_url, http_address
-from vram_arbiter.schemas.yamltext import Path, parse_yaml, validated
+from vram_arbiter.schemas.yamltext import parse_yaml, validated
 
-Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
-Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(gt=0, le=86_400)]
+Share = Annotated[float, Field(gt=0, le=1)]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?$")]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False
+    )
 
 
 class GpuConfig(_Section):
@@ -73,9 +75,7 @@ class SchedulingConfig(_Section):
     """A waiter gains one point of priority per so many seconds, so that none starves."""
     thrash_window_s: Seconds = d.THRASH_WINDOW_S
     """Two consumers that made each other leave within so many seconds are thrashing."""
-    thrash_hold_max_s: Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)] = (
-        d.THRASH_HOLD_MAX_S
-    )
+    thrash_hold_max_s: Annotated[float, Field(ge=0, le=86_400)] = d.THRASH_HOLD_MAX_S
     """Of two consumers that thrash, the resident one stays for the cost of a switch, at most this
     long. 0: never."""
 
@@ -83,7 +83,7 @@ class SchedulingConfig(_Section):
 class RevokeConfig(_Section):
     """The ladder towards a holder that is asked to leave."""
 
-    resend_s: Annotated[float, Field(ge=0.01, le=60, allow_inf_nan=False)] = d.REVOKE_RESEND_S
+    resend_s: Annotated[float, Field(ge=0.01, le=60)] = d.REVOKE_RESEND_S
     """`revoke` is sent again at this interval until the holder acknowledges it."""
     remind_s: Seconds = d.REVOKE_REMIND_S
     """After this long without a safe point the history says so."""
@@ -98,7 +98,7 @@ class VerifyConfig(_Section):
     timeout_s: Seconds = d.VERIFY_TIMEOUT_S
     """A verification ends with a verdict after this long."""
     poll_s: Annotated[
-        tuple[Annotated[float, Field(ge=0.001, le=10, allow_inf_nan=False)], ...],
+        tuple[Annotated[float, Field(ge=0.001, le=10)], ...],
         Field(min_length=1, max_length=16),
     ] = d.VERIFY_POLL_S
     """Pauses between samples, the first one while memory usually comes back; the last one
@@ -106,7 +106,7 @@ class VerifyConfig(_Section):
     poll_until_s: Annotated[tuple[Seconds, ...], Field(max_length=15)] = d.VERIFY_POLL_UNTIL_S
     """Until when after the release each pause but the last is kept. A consumer known to take longer
     is looked at for longer."""
-    confirm_s: Annotated[float, Field(ge=0.001, le=1, allow_inf_nan=False)] = d.VERIFY_CONFIRM_S
+    confirm_s: Annotated[float, Field(ge=0.001, le=1)] = d.VERIFY_CONFIRM_S
     """After a sample that is on target: when the second one is taken, which has to agree."""
     slow_poll_s: Seconds = d.VERIFY_SLOW_POLL_S
     """Pause between samples after a verdict that does not allow a grant."""
@@ -132,7 +132,7 @@ class ProbeConfig(_Section):
     """A reading that takes longer has failed: the GPU is unknown, which blocks grants."""
     period_s: Seconds = d.PROBE_PERIOD_S
     """Period of background readings while there are leases or waiters."""
-    load_s: Annotated[float, Field(ge=0.005, le=60, allow_inf_nan=False)] = d.LOAD_PROBE_S
+    load_s: Annotated[float, Field(ge=0.005, le=60)] = d.LOAD_PROBE_S
     """Period of readings while a lease loads: its load peak is learned from them, and a peak
     between two is not seen."""
     sample_max_age_s: Seconds = d.SAMPLE_MAX_AGE_S
@@ -142,7 +142,7 @@ class ProbeConfig(_Section):
 class LeaseConfig(_Section):
     """Life of a lease on the daemon's side."""
 
-    fence_grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = d.FENCE_GRACE_S
+    fence_grace_s: Annotated[float, Field(ge=0, le=3600)] = d.FENCE_GRACE_S
     """After a lease's ttl and this grace without the arbiter a client unloads by itself."""
 
 
@@ -175,9 +175,7 @@ class LimitsConfig(_Section):
     user_share: Share = d.USER_SHARE
     """The same for all processes of one user together, but that operators always find room as
     clients."""
-    priority_reserve: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = (
-        d.PRIORITY_RESERVE
-    )
+    priority_reserve: Annotated[float, Field(ge=0, le=0.5)] = d.PRIORITY_RESERVE
     """Part of the places of `waiters_max` that is kept for requests above the default priority."""
     leases_per_client_max: Annotated[int, Field(ge=1, le=4096)] = d.LEASES_PER_CLIENT_MAX
     """Live leases of one client."""
@@ -197,7 +195,7 @@ class HistoryConfig(_Section):
 
     max_events: Annotated[int, Field(ge=100, le=10_000_000)] = d.HISTORY_MAX_EVENTS
     """Older events are dropped beyond this number."""
-    days: Annotated[float, Field(gt=0, le=3650, allow_inf_nan=False)] = d.HISTORY_DAYS
+    days: Annotated[float, Field(gt=0, le=3650)] = d.HISTORY_DAYS
     """Older events are dropped after this many days."""
 
 
@@ -218,7 +216,7 @@ class WireConfig(_Section):
     endpoint: str | None = None
     """`ipc:///run/vram-arbiter/arbiter.sock`. Null: `VRAM_ARBITER_ENDPOINT`, else `arbiter.sock` in
     the runtime folder."""
-    heartbeat_s: Annotated[float, Field(ge=0.1, le=60, allow_inf_nan=False)] = d.HEARTBEAT_S
+    heartbeat_s: Annotated[float, Field(ge=0.1, le=60)] = d.HEARTBEAT_S
     """How often clients are asked to say that they are there."""
     group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
     """Unix group that may connect and hold leases, beside the daemon's own user and root. Null:
@@ -260,7 +258,7 @@ class TelemetryConfig(_Section):
     prometheus_port: Annotated[int, Field(ge=0, le=65_535)] | None = None
     """Port of a Prometheus endpoint on 127.0.0.1; 0: any free one, said in the log. Null: none,
     unless `OTEL_METRICS_EXPORTER` says so."""
-    sample_ratio: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None = None
+    sample_ratio: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of the traces that begin in the daemon; the others are kept where their beginning was.
     Null: `OTEL_TRACES_SAMPLER_ARG`, else 1."""
 
@@ -337,16 +335,6 @@ LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
 and the heartbeat when they connected, so those two stay as they are."""
 
 
-def known_keys() -> Mapping[Path, Collection[str]]:
-    """The keys of every section, by path: what suggestions for a mistyped key are taken from."""
-    found: dict[Path, Collection[str]] = {(): list(ArbiterConfig.model_fields)}
-    for name, field in ArbiterConfig.model_fields.items():
-        section = field.annotation
-        if isinstance(section, type) and issubclass(section, BaseModel):
-            found[(name,)] = list(section.model_fields)
-    return found
-
-
 def load_config(text: str, name: str) -> ArbiterConfig:
     """Read the text of a configuration file; `name` is how errors call the file.
 
@@ -358,7 +346,7 @@ def load_config(text: str, name: str) -> ArbiterConfig:
     if isinstance(data, dict):
         # `verify:` with all its keys commented out is an empty section, not a mistake
         data = {
-            key: {} if value is None and (key,) in known_keys() else value
+            key: {} if value is None and key in ArbiterConfig.model_fields else value
             for key, value in data.items()
         }
-    return validated(ArbiterConfig, replace(source, data=data), known_keys())
+    return validated(ArbiterConfig, replace(source, data=data))

@@ -4,7 +4,7 @@ Pure: `load_hooks(text, name)` takes the text of a file. `configs/hooks.yaml` sh
 """
 
 import ipaddress
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Final, Self
 from urllib.parse import urlsplit
 
@@ -17,9 +17,10 @@ from pydantic import (
     model_validator,
 )
 
+from vram_arbiter.schemas.findings import did_you_mean
 from vram_arbiter.schemas.urls import webhook_url
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
-from vram_arbiter.schemas.yamltext import Path, did_you_mean, parse_yaml, validated
+from vram_arbiter.schemas.yamltext import parse_yaml, validated
 
 EVICTED: Final = "evicted"
 ALIASES: Final[Mapping[str, str]] = {"revoked": "revoke_asked", "verdict": "verified"}
@@ -115,14 +116,11 @@ class HooksConfig(BaseModel):
 def load_hooks(text: str, name: str) -> HooksConfig:
     """Read the text of a configuration file. Raises ConfigError with every mistake and its line."""
     source = parse_yaml(text, name)
-    keys = list(Hook.model_fields)
-    known: dict[Path, Collection[str]] = {(): list(HooksConfig.model_fields)}
     hooks = source.data.get("hooks") if isinstance(source.data, dict) else None
-    for at, hook in enumerate(hooks if isinstance(hooks, list) else ()):
-        known["hooks", at] = keys
+    for hook in hooks if isinstance(hooks, list) else ():
         if isinstance(hook, dict) and True in hook:
             hook["on"] = hook.pop(True)  # YAML 1.1 reads the key `on` as a truth value
-    return validated(HooksConfig, source, known)
+    return validated(HooksConfig, source)
 
 
 def _is_private(url: str) -> bool:

@@ -7,7 +7,6 @@ reader needs beyond these fields stands in `transport`, `params` and `backend_pa
 by that adapter, before anything moves.
 """
 
-from collections.abc import Collection, Mapping
 from enum import StrEnum
 from typing import Annotated, Literal, Self, get_args
 
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, m
 from vram_arbiter.schemas.body import Body, Capability
 from vram_arbiter.schemas.manifest.contracts import Quantization, SafetyEnvelope
 from vram_arbiter.schemas.manifest.vocabulary import DetectorMode, EmbodimentTag
-from vram_arbiter.schemas.yamltext import Path, YamlText, validated
+from vram_arbiter.schemas.yamltext import YamlText, validated
 
 RATE_HZ_MAX = 1000.0
 MAX_AGE_MS = 100.0
@@ -211,22 +210,7 @@ class RobotEnvironment(_Section):
         return tuple(tag for tag in self.embodiment_tags if tag in get_args(EmbodimentTag))
 
 
-def known_keys() -> Mapping[Path, Collection[str]]:
-    """The keys of each section, for suggestions."""
-    return {
-        (): list(RobotEnvironment.model_fields),
-        ("sync",): list(SyncConfig.model_fields),
-        ("hal",): list(HalConfig.model_fields),
-        ("task",): list(TaskSpec.model_fields),
-        ("vla",): list(VlaSpec.model_fields),
-        ("vla", "quantization"): list(Quantization.model_fields),
-        ("safety",): list(SafetyEnvelope.model_fields),
-        **{("sensors", index): list(SensorReaderConfig.model_fields) for index in range(64)},
-        **{("detectors", index): list(DetectorConfig.model_fields) for index in range(64)},
-    }
-
-
 def robot_of(source: YamlText) -> RobotEnvironment:
     """Return a parsed deployment file as its model. Raises ConfigError with every mistake and its
     line."""
-    return validated(RobotEnvironment, source, known_keys())
+    return validated(RobotEnvironment, source)

@@ -1,8 +1,8 @@
 """rSkill manifests: the field's `rskill.yaml` files, read unchanged and checked field by field."""
 
-from vram_arbiter.schemas.manifest.load import load_manifest, parse_manifest
+from vram_arbiter.schemas.findings import Problem
+from vram_arbiter.schemas.manifest.load import ManifestError, load_manifest, parse_manifest
 from vram_arbiter.schemas.manifest.manifest import LICENSE_FLAG, LICENSE_HELP, RSkillManifest
-from vram_arbiter.schemas.manifest.problems import ManifestError, Problem
 from vram_arbiter.schemas.manifest.vocabulary import Kind, License, ModelFamily, Role, SkillAction
 
 __all__ = [

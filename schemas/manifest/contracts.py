@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, ControlMode
-from vram_arbiter.schemas.manifest.problems import Problem, raise_if
+from vram_arbiter.schemas.findings import misplaced, raise_if, wrong
 from vram_arbiter.schemas.manifest.vocabulary import (
     DetectorEngine,
     DetectorMode,
@@ -68,19 +68,12 @@ class ActuatorRequirement(ManifestBlock):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        rules = (
-            ("gripper_convention", self.kind in GRIPPER_MODES),
-            ("reference_frame", self.kind in CARTESIAN_MODES),
-        )
-        problems = []
-        for field, needed in rules:
-            given = getattr(self.control_mode_semantics, field) is not None
-            if given != needed:
-                verb = "is required for" if needed else "is not allowed for"
-                problems.append(
-                    Problem(("control_mode_semantics", field), f"{verb} {self.kind.value!r}")
-                )
-        raise_if(problems)
+        rules = {
+            "gripper_convention": "R" if self.kind in GRIPPER_MODES else "F",
+            "reference_frame": "R" if self.kind in CARTESIAN_MODES else "F",
+        }
+        problems = misplaced(self.control_mode_semantics, rules, self.kind.value)
+        raise_if([problem.below(("control_mode_semantics",)) for problem in problems])
         return self
 
 
@@ -206,23 +199,17 @@ class RewardContract(ManifestBlock):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        problems = []
         low, high = self.progress_range
         if not high > low:
-            problems.append(
-                Problem(
-                    ("progress_range",), f"must be [low, high] with high > low, not [{low}, {high}]"
-                )
+            raise wrong(
+                f"must be [low, high] with high > low, not [{low}, {high}]", "progress_range"
             )
         if self.check_floor > self.success_threshold:
-            problems.append(
-                Problem(
-                    ("check_floor",),
-                    f"must not exceed success_threshold ({self.success_threshold}), not "
-                    f"{self.check_floor}",
-                )
+            raise wrong(
+                f"must not exceed success_threshold ({self.success_threshold}), not "
+                f"{self.check_floor}",
+                "check_floor",
             )
-        raise_if(problems)
         return self
 
 

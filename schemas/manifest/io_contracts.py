@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
+from vram_arbiter.schemas.findings import Problem, misplaced, raise_if, wrong
 from vram_arbiter.schemas.manifest.contracts import Finite, ManifestBlock, PositiveInt
-from vram_arbiter.schemas.manifest.problems import Problem, raise_if
 from vram_arbiter.schemas.manifest.vocabulary import (
     JOINT_SPACE_LAYOUTS,
     TASK_SPACE_LAYOUTS,
@@ -42,9 +42,7 @@ class Processors(ManifestBlock):
     @model_validator(mode="after")
     def _distinct(self) -> Self:
         if self.preprocessor_uri == self.postprocessor_uri:
-            raise_if(
-                [Problem(("postprocessor_uri",), "must be another file than preprocessor_uri")]
-            )
+            raise wrong("must be another file than preprocessor_uri", "postprocessor_uri")
         return self
 
 
@@ -65,7 +63,7 @@ class ImagePreprocessing(ManifestBlock):
     def _pair(self) -> Self:
         if (self.resize_width is None) != (self.resize_height is None):
             missing = "resize_width" if self.resize_width is None else "resize_height"
-            raise_if([Problem((missing,), "is required: width and height are given together")])
+            raise wrong("is required: width and height are given together", missing)
         return self
 
 
@@ -100,13 +98,7 @@ class StatePart(ManifestBlock):
             "frame": {"ee_pose": "R", "base_pose": "R"}.get(self.kind, "F"),
             "rotation": "-" if self.kind.endswith("_pose") else "F",
         }
-        problems = []
-        for field, rule in rules.items():
-            given = bool(getattr(self, field))
-            if (rule == "R" and not given) or (rule == "F" and given):
-                verb = "is required for" if rule == "R" else "is not allowed for"
-                problems.append(Problem((field,), f"{verb} {self.kind!r}"))
-        raise_if(problems)
+        raise_if(misplaced(self, rules, self.kind))
         return self
 
 
@@ -129,44 +121,27 @@ class StateContract(ManifestBlock):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        needed = TASK_SPACE_LAYOUTS.get(self.layout or "", ())
-        problems = []
+        needed, layout = TASK_SPACE_LAYOUTS.get(self.layout or "", ()), f"layout {self.layout!r}"
         if self.parts is not None and self.layout is not None:
-            problems.append(Problem(("parts",), "is not allowed beside layout: give one of them"))
-        if self.bindings is None:
-            if needed:
-                problems.append(
-                    Problem(
-                        ("bindings",),
-                        f"is required for layout {self.layout!r}, with {' and '.join(needed)}",
-                    )
-                )
-        elif needed:
-            for field in needed:
-                if not getattr(self.bindings, field):
-                    problems.append(
-                        Problem(("bindings", field), f"is required for layout {self.layout!r}")
-                    )
-        elif self.layout is None or self.layout in JOINT_SPACE_LAYOUTS:
-            problems.append(
-                Problem(
-                    ("bindings",),
-                    f"is not allowed for layout {self.layout!r}: joint values need no source",
-                )
-            )
-        raise_if(problems)
+            raise wrong("is not allowed beside layout: give one of them", "parts")
+        if needed and self.bindings is None:
+            raise wrong(f"is required for {layout}, with {' and '.join(needed)}", "bindings")
+        lacking = [field for field in needed if not getattr(self.bindings, field)]
+        raise_if([Problem(("bindings", field), f"is required for {layout}") for field in lacking])
+        of_joints = self.layout is None or self.layout in JOINT_SPACE_LAYOUTS
+        if self.bindings is not None and of_joints:
+            raise wrong(f"is not allowed for {layout}: joint values need no source", "bindings")
         return self
 
 
-_SLOT_RULES: tuple[tuple[frozenset[ControlMode], str, str, str], ...] = (
-    # modes                                     ee   frame joint_names     R required, F forbidden,
-    # - free
-    (JOINT_MODES, "F", "F", "-"),
-    (CARTESIAN_MODES, "R", "R", "F"),
-    (GRIPPER_MODES, "R", "F", "F"),
-    (frozenset({ControlMode.BODY_TWIST}), "F", "R", "F"),
-    (frozenset({ControlMode.COMPOSITE_MODE}), "F", "F", "F"),
-)
+_SLOT_RULES = {
+    # control mode: rules of ee, frame, joint_names (`findings.misplaced`)
+    **dict.fromkeys(JOINT_MODES, "FF-"),
+    **dict.fromkeys(CARTESIAN_MODES, "RRF"),
+    **dict.fromkeys(GRIPPER_MODES, "RFF"),
+    ControlMode.BODY_TWIST: "FRF",
+    ControlMode.COMPOSITE_MODE: "FFF",
+}
 
 
 _OF_A_COMMAND = (
@@ -212,13 +187,12 @@ class ActionSlot(ManifestBlock):
             )
         if self.discard or self.terminate:
             kind = "discarded" if self.discard else "terminate"
+            alien = _OF_A_COMMAND if not self.discard else (*_OF_A_COMMAND, "terminate")
             problems += [
                 Problem((field,), f"is not allowed in a {kind} slot")
-                for field in _OF_A_COMMAND
+                for field in alien
                 if getattr(self, field)
             ]
-            if self.terminate and self.discard:
-                problems.append(Problem(("terminate",), "is not allowed in a discarded slot"))
             if self.terminate and self.width > 1:
                 problems.append(
                     Problem(("range",), f"must cover one value for terminate, not {self.width}")
@@ -233,21 +207,10 @@ class ActionSlot(ManifestBlock):
         return self
 
     def _check_mode(self, mode: ControlMode) -> list[Problem]:
-        problems = []
-        for modes, *rules in _SLOT_RULES:
-            if mode not in modes:
-                continue
-            for field, rule in zip(("ee", "frame", "joint_names"), rules, strict=True):
-                given = bool(getattr(self, field))
-                if (rule == "R" and not given) or (rule == "F" and given):
-                    verb = "is required for" if rule == "R" else "is not allowed for"
-                    problems.append(Problem((field,), f"{verb} {mode.value!r}"))
-        for field, allowed in (
-            ("rotation", frozenset({ControlMode.CARTESIAN_POSE})),
-            ("gripper_convention", GRIPPER_MODES),
-        ):
-            if getattr(self, field) is not None and mode not in allowed:
-                problems.append(Problem((field,), f"is not allowed for {mode.value!r}"))
+        rules = dict(zip(("ee", "frame", "joint_names"), _SLOT_RULES.get(mode, ""), strict=False))
+        rules["rotation"] = "-" if mode is ControlMode.CARTESIAN_POSE else "F"
+        rules["gripper_convention"] = "-" if mode in GRIPPER_MODES else "F"
+        problems = misplaced(self, rules, mode.value)
         if self.joint_names and len(self.joint_names) != self.width > 0 and not problems:
             problems.append(
                 Problem(

@@ -5,7 +5,7 @@ Works on plain values, so that the same rules judge a half-written file and a fi
 
 from collections.abc import Mapping
 
-from vram_arbiter.schemas.manifest.problems import Problem
+from vram_arbiter.schemas.findings import Problem
 from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES, Kind
 
 KINDS = tuple(Kind)

@@ -3,19 +3,37 @@
 `schemas.yamltext` reads the YAML; this module adds what a manifest asks for.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 
 from pydantic import ValidationError
 
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, ManifestInvalid
+from vram_arbiter.schemas.findings import Problem, problems_of
 from vram_arbiter.schemas.manifest.kinds import KINDS, check_kind
 from vram_arbiter.schemas.manifest.manifest import RSkillManifest
-from vram_arbiter.schemas.manifest.problems import ManifestError, Problem, from_validation_error
 from vram_arbiter.schemas.manifest.vocabulary import Kind
-from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import YamlText, parse_yaml, read_text
+from vram_arbiter.schemas.yamltext import parse_yaml, read_text
+
+
+class ManifestError(ManifestInvalid):
+    """A manifest that cannot be used. `problems` lists every finding, `details["fields"]` the same
+    as plain data."""
+
+    def __init__(self, source: str, problems: Sequence[Problem]) -> None:
+        self.source = source
+        self.problems = tuple(problems)
+        super().__init__(
+            "\n".join(problem.at(source) for problem in self.problems),
+            details={
+                "source": source,
+                "fields": [
+                    {"path": problem.field, "problem": problem.message, "line": problem.line}
+                    for problem in self.problems
+                ],
+            },
+        )
 
 
 def load_manifest(path: str | FilePath) -> RSkillManifest:
@@ -31,52 +49,31 @@ def load_manifest(path: str | FilePath) -> RSkillManifest:
 def parse_manifest(content: str | bytes, source: str = "rskill.yaml") -> RSkillManifest:
     """Check the text of a manifest. Raises ManifestError with every finding; `source` names the
     text in messages."""
-    document = _read_yaml(content, source)
+    try:
+        document = parse_yaml(content, source)
+    except ConfigError as error:
+        raise _unreadable(source, error) from error
     data = document.data
     try:
         return RSkillManifest.model_validate(data)
     except ValidationError as error:
-        problems = _with_kind_rules(from_validation_error(error, RSkillManifest, data), data)
+        problems = _with_kind_rules(problems_of(error, RSkillManifest, data), data)
         located = [replace(problem, line=document.line(problem.path)) for problem in problems]
         raise ManifestError(
             source, sorted(located, key=lambda problem: problem.line or 0)
         ) from error
 
 
-def _with_kind_rules(problems: list[Problem], data: JsonMap) -> list[Problem]:
+def _with_kind_rules(problems: list[Problem], data: object) -> list[Problem]:
     """Add what the kind demands: pydantic stops before that rule as soon as any single field is
     wrong."""
-    kind = data.get("kind")
-    if kind not in KINDS:
+    kind = data.get("kind") if isinstance(data, Mapping) else None
+    if not isinstance(data, Mapping) or kind not in KINDS:
         return problems
     known = {problem.path for problem in problems}
     return problems + [
         problem for problem in check_kind(Kind(kind), data) if problem.path not in known
     ]
-
-
-def _read_yaml(content: str | bytes, source: str) -> YamlText:
-    """Return the document, which is a map with texts as keys. Raises ManifestError."""
-    try:
-        document = parse_yaml(content, source)
-    except ConfigError as error:
-        raise _unreadable(source, error) from error
-    data = document.data
-    if not isinstance(data, Mapping):
-        problem = "must be a mapping of fields, not a list or a single value"
-        raise ManifestError(source, [Problem((), problem, 1)])
-    if not data:
-        raise ManifestError(source, [Problem((), "is empty; it must be a mapping of fields")])
-    wrong = [key for key in data if not isinstance(key, str)]
-    if wrong:
-        raise ManifestError(
-            source,
-            [
-                Problem((), f"field names must be texts, not {key!r}", document.line((str(key),)))
-                for key in wrong
-            ],
-        )
-    return document
 
 
 def _unreadable(source: str, error: ConfigError) -> ManifestError:

@@ -9,6 +9,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, JsonValue, StringConstraints, model_validator
 
+from vram_arbiter.schemas.findings import Problem, raise_if
 from vram_arbiter.schemas.manifest.contracts import (
     ActuatorRequirement,
     DetectorContract,
@@ -35,7 +36,6 @@ from vram_arbiter.schemas.manifest.io_contracts import (
     StateContract,
 )
 from vram_arbiter.schemas.manifest.kinds import check_kind
-from vram_arbiter.schemas.manifest.problems import Problem, raise_if
 from vram_arbiter.schemas.manifest.vocabulary import (
     COMMERCIAL_LICENSES,
     JOINT_SPACE_LAYOUTS,

@@ -10,11 +10,11 @@ It must not know what is said on the socket.
 import os
 import pwd
 import socket
-import struct
 from collections.abc import Mapping
 from typing import Final, Literal
 
 from vram_arbiter.schemas.errors import ConfigError, UntrustedServer
+from vram_arbiter.schemas.runtime.peercred import credentials
 
 USERS_VARIABLE: Final = "VRAM_ARBITER_SERVER_USERS"
 ROOT: Final = 0
@@ -28,7 +28,6 @@ SERVICE_USERS: Final[Mapping[Program, str]] = {
 }
 """The users of configs/systemd. Only root can make a user of such a name."""
 
-_UCRED = struct.Struct("iII")  # pid, uid, gid
 _TABLES: Final = ("/proc/self/net/tcp", "/proc/self/net/tcp6")
 _NOT_ACCEPTED: Final = ("01", "03")  # established, its handshake
 _LISTEN: Final = "0A"
@@ -49,10 +48,7 @@ def check_server(connected: socket.socket, program: Program, where: str) -> None
 def server_uid(connected: socket.socket) -> int:
     """The uid of the process that called listen() on the other end of a connected unix socket
     (SO_PEERCRED)."""
-    _, uid, _ = _UCRED.unpack(
-        connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size)
-    )
-    return int(uid)
+    return credentials(connected)[1]
 
 
 def port_uids(connected: socket.socket) -> set[int]:

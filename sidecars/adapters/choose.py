@@ -1,5 +1,8 @@
 """Choice of the adapter for a manifest's model."""
 
+from collections.abc import Callable, Mapping
+from typing import Final
+
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import DetectorEngine, Runtime
@@ -11,6 +14,12 @@ from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.reward import RewardAdapter
 from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter
 from vram_arbiter.sidecars.weights import Weights
+
+_ADAPTERS: Final[Mapping[Kind, Callable[[RSkillManifest, Weights], ModelAdapter]]] = {
+    Kind.VLM: SceneVlmAdapter,
+    Kind.VLA: PolicyAdapter,
+    Kind.REWARD: RewardAdapter,
+}
 
 
 def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
@@ -39,14 +48,10 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
                 hint=f"write {ZERO_SHOT_LOADER}, or {LOADER} for LocateAnything",
             )
         return DetectorAdapter(manifest, weights)
-    if manifest.kind is Kind.VLM:
-        return SceneVlmAdapter(manifest, weights)
     if manifest.kind is Kind.VLA and is_passthrough(manifest):
         return GpuPassthroughAdapter(manifest)
-    if manifest.kind is Kind.VLA:
-        return PolicyAdapter(manifest, weights)
-    if manifest.kind is Kind.REWARD:
-        return RewardAdapter(manifest, weights)
+    if adapter := _ADAPTERS.get(manifest.kind):
+        return adapter(manifest, weights)
     raise ConfigError(
         f"{manifest.name}: kind {manifest.kind.value!r} is not served",
         hint="sidecars serve detector, vlm, vla and reward",

@@ -14,9 +14,9 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import QUERIES_MAX, DetectionResult, DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
-from vram_arbiter.sidecars.adapters.inputs import processed, to_model
+from vram_arbiter.sidecars.adapters.inputs import picture_of, processed, to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
-from vram_arbiter.sidecars.images import decode, sizes, within
+from vram_arbiter.sidecars.images import sizes
 from vram_arbiter.sidecars.weights import (
     Weights,
     from_pretrained,
@@ -74,9 +74,8 @@ class DetectorAdapter(OneNetwork):
     def run(self, call: ModelCall) -> Message:
         assert isinstance(call, DetectOp)
         labels = split_query(call.query)
-        picture = decode(call.image)
+        picture, shrunk = picture_of(call, self._contract)
         width, height = picture.size
-        shrunk = within(picture, min(call.max_side, self._contract.max_side or call.max_side))
         threshold = (
             self._contract.score_threshold if call.score_threshold is None else call.score_threshold
         )

@@ -5,7 +5,6 @@ refused, and so is a state that is not finite numbers. It never computes on the 
 simulated GPU (`fake:FOLDER`) the bytes are simulated like every model's.
 """
 
-from collections.abc import Mapping
 from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, NoGpu
@@ -14,9 +13,14 @@ from vram_arbiter.schemas.manifest.vocabulary import Modality
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
+from vram_arbiter.sidecars.adapters.policy_observations import (
+    STATE,
+    numbers_of,
+    observation_of,
+    pixels_of,
+)
 
 ADAPTER = "gpu_passthrough"
-STATE_KEY = "observation.state"
 SIDE_MAX = 64  # pixels a side that are sent to the GPU: every n-th, as a preview would
 
 
@@ -77,12 +81,7 @@ class GpuPassthroughAdapter:
         if call.endpoint == "reset":
             self._pose = None
             return {"ok": True}
-        observation = (call.data or {}).get("observation")
-        if not isinstance(observation, Mapping):
-            raise BadRequest(
-                "get_action needs data.observation, a map",
-                hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
-            )
+        observation = observation_of(call)
         state = _state(observation)
         brightness = {
             name: self._brightness(_pixels(observation, name, *size))
@@ -102,36 +101,23 @@ class GpuPassthroughAdapter:
         return float((picture.to(torch.float32) / 255).mean().cpu())
 
 
-def _state(observation: JsonMap) -> Any:
-    import numpy as np
+def _value(observation: JsonMap, name: str) -> Any:
+    if observation.get(name) is None:
+        raise BadRequest(f"the observation lacks {name}", hint=f"it has {sorted(observation)}")
+    return observation[name]
 
-    try:
-        state = np.array(observation[STATE_KEY], dtype=np.float32)
-    except KeyError:
-        raise BadRequest(
-            f"the observation lacks {STATE_KEY}", hint=f"it has {sorted(observation)}"
-        ) from None
-    except (TypeError, ValueError):
-        raise BadRequest(
-            f"{STATE_KEY} must be numbers", hint="send the joints' positions in a row"
-        ) from None
-    if state.ndim != 1 or not len(state) or not np.isfinite(state).all():
-        raise BadRequest(
-            f"{STATE_KEY} must be a row of finite numbers, not of shape {state.shape}",
-            hint="a stale or missing sensor must stop the goal",
-        )
+
+def _state(observation: JsonMap) -> Any:
+    hint = "send the joints' positions in a row"
+    state = numbers_of(STATE, _value(observation, STATE), hint)
+    if state.ndim != 1 or not len(state):
+        raise BadRequest(f"{STATE} must be a row, not of shape {state.shape}", hint=hint)
     return state
 
 
 def _pixels(observation: JsonMap, name: str, height: int, width: int) -> Any:
-    import numpy as np
-
-    pixels = observation.get(name)
-    if pixels is None:
-        raise BadRequest(f"the observation lacks {name}", hint=f"it has {sorted(observation)}")
-    if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 3:
-        raise BadRequest(f"{name} must be uint8 (H, W, 3)", hint="send the camera's picture")
-    if pixels.shape[2] != 3 or pixels.shape[0] < height or pixels.shape[1] < width:
+    pixels = pixels_of(name, _value(observation, name))
+    if pixels.shape[0] < height or pixels.shape[1] < width:
         raise BadRequest(
             f"{name} must be at least ({height}, {width}, 3), not {pixels.shape}",
             hint="send the camera's picture in its own size",

@@ -4,10 +4,19 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import BadRequest
-from vram_arbiter.sidecars.images import sizes
+from vram_arbiter.schemas.manifest.contracts import DetectorContract
+from vram_arbiter.schemas.sidecar import DetectOp
+from vram_arbiter.sidecars.images import decode, sizes, within
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+
+
+def picture_of(call: DetectOp, contract: DetectorContract) -> "tuple[Image, Image]":
+    """Return a caller's picture, whole and within the limits of call and manifest. Raises
+    BadRequest."""
+    picture = decode(call.image)
+    return picture, within(picture, min(call.max_side, contract.max_side or call.max_side))
 
 
 def processed(processor: Any, pictures: "Sequence[Image]", **given: Any) -> Mapping[str, Any]:

@@ -17,9 +17,8 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp
 from vram_arbiter.sidecars.adapters.base import ModelCall, OneNetwork
 from vram_arbiter.sidecars.adapters.detector import split_query
-from vram_arbiter.sidecars.adapters.inputs import processed, to_model
+from vram_arbiter.sidecars.adapters.inputs import picture_of, processed, to_model
 from vram_arbiter.sidecars.checkpoints import load_transformers
-from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.weights import CONFIG_FILE, Weights, from_pretrained, model_options
 
 LOADER: Final = "transformers.AutoModel"
@@ -83,9 +82,8 @@ class LocateAnythingAdapter(OneNetwork):
                 "a query with < or >, which mark the model's own tokens",
                 hint="describe the object in words",
             )
-        picture = decode(call.image)
+        picture, shrunk = picture_of(call, self._contract)
         width, height = picture.size
-        shrunk = within(picture, min(call.max_side, self._contract.max_side or call.max_side))
         answer = self._answer(shrunk, labels, call.mode, call.max_new_tokens)
         return {
             "ok": True,
@@ -162,18 +160,8 @@ def _refuse_code_of_others(weights: Weights) -> None:
             _raise_exceptions_for_connection_errors=False,  # what is cached is all that is loaded
         )
         named = {} if path is None else json.loads(Path(path).read_text(encoding="utf-8"))
-        for reference in _texts(named.get("auto_map")):
-            if "--" in reference:
-                raise ConfigError(
-                    f"{weights.source}: {name} names code of another repository: {reference}",
-                    hint="put the code beside the weights, and its name without the repository's",
-                )
-
-
-def _texts(value: object) -> list[str]:
-    """Return all texts of a JSON value."""
-    if isinstance(value, str):
-        return [value]
-    if isinstance(value, dict):
-        value = list(value.values())
-    return [text for part in value for text in _texts(part)] if isinstance(value, list) else []
+        if found := re.search(r'"([^"]*--[^"]*)"', json.dumps(named.get("auto_map"))):
+            raise ConfigError(
+                f"{weights.source}: {name} names code of another repository: {found[1]}",
+                hint="put the code beside the weights, and its name without the repository's",
+            )

@@ -29,6 +29,7 @@ from vram_arbiter.sidecars.adapters.policy_observations import (
     Batch,
     Observations,
     misfits,
+    observation_of,
 )
 from vram_arbiter.sidecars.adapters.policy_pace import Pace, pace_of, settle
 from vram_arbiter.sidecars.checkpoints import META, load_lerobot
@@ -182,7 +183,7 @@ class PolicyAdapter:
         self._pace = settle(policy, pace, self._manifest)
         self._guided = self._begun = False
         self._policy = policy if self._has_own_dtype else _cast(policy, torch_type(self._dtype))
-        self._quantize(device)
+        quantize_linear(self._policy, self._manifest, device)
         if self._family.replays:
             self._encoders = lingbot.load_encoders(policy)
         self._make_processors()
@@ -197,14 +198,6 @@ class PolicyAdapter:
             self._manifest.image_preprocessing,
             self._pace.observations,
         )
-
-    def _quantize(self, device: str) -> None:
-        """Quantize linear layers to NF4 where the manifest says int4; on `meta`, choose them."""
-        nf4 = nf4_of(self._manifest)
-        if nf4 is not None and device == META:
-            nf4.chosen(self._policy)
-        elif nf4 is not None:
-            quantize_linear(self._policy, self._manifest)
 
     @property
     def networks(self) -> Sequence[Any]:
@@ -259,18 +252,13 @@ class PolicyAdapter:
             self._policy.reset()
             self._begun = False
             return {"ok": True, "n_obs_steps": seen, "n_action_steps": played}
-        observation = (call.data or {}).get("observation")
-        if not isinstance(observation, Mapping):
-            raise BadRequest(
-                "get_action needs data.observation, a map",
-                hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
-            )
         assert self._observations is not None
-        actions = self._act(self._observations.read(observation), call.rtc)
+        actions = self._act(self._observations.read(observation_of(call)), call.rtc)
         return {"action": actions if call.whole_chunk else actions[:played]}
 
     def _act(self, steps: list[Batch], rtc: RealTimeChunking | None) -> "NDArray[Any]":
         import torch
+        from transformers import BatchFeature
 
         dtype = torch_type(self._dtype)
         casts = dtype != torch.float32 and not self._has_own_dtype
@@ -281,7 +269,9 @@ class PolicyAdapter:
             # operations that the policy's code does in float32 meet weights of another type
             torch.autocast(torch.device(self._device).type, dtype, enabled=casts),
         ):
-            inputs = [_inputs(self._before(step), dtype, casts) for step in steps]
+            inputs: list[Mapping[str, Any]] = [self._before(step) for step in steps]
+            if casts:
+                inputs = [BatchFeature(dict(batch)).to(dtype).data for batch in inputs]
             chunk = self._predict(inputs, guidance)
             # postprocessors take (B, D), as lerobot's own server does
             rows = [self._after(chunk[:, step].to(torch.float32)) for step in range(chunk.shape[1])]
@@ -405,17 +395,3 @@ def _select(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
         rows += queue
         queue.clear()
     return torch.stack(rows, dim=1)
-
-
-def _inputs(batch: Mapping[str, Any], dtype: Any, casts: bool) -> Mapping[str, Any]:
-    """Return a preprocessed batch with its numbers in the model's type."""
-    import torch
-
-    if not casts:
-        return batch
-    return {
-        name: value.to(dtype)
-        if isinstance(value, torch.Tensor) and value.is_floating_point()
-        else value
-        for name, value in batch.items()
-    }

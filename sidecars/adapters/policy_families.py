@@ -161,7 +161,7 @@ def computing_type(manifest: RSkillManifest, family: Family) -> Dtype:
             f"{manifest.name}: a policy of family {manifest.model_family} is not quantized",
             hint=f"use {' or '.join(sorted(family.precisions))}",
         )
-    dtype = manifest.quantization.dtype if nf4 is None else nf4.compute_dtype
+    dtype = manifest.quantization.dtype if nf4 is None else nf4.computes_in
     if dtype not in family.precisions:
         raise UnsupportedQuantization(
             f"{manifest.name}: a policy of family {manifest.model_family} does not compute in "

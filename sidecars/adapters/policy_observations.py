@@ -7,10 +7,12 @@ from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.io_contracts import ImagePreprocessing
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.images import decode
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
+    from numpy.typing import NDArray
     from torch import Tensor
 
 IMAGE_PREFIX = "observation.images."
@@ -87,17 +89,7 @@ class Observations:
         import numpy as np
         import torch
 
-        pixels = np.asarray(decode(value)) if isinstance(value, bytes) else value
-        if (
-            not isinstance(pixels, np.ndarray)
-            or pixels.dtype != np.uint8
-            or pixels.ndim != 3
-            or pixels.shape[2] != 3
-        ):
-            raise BadRequest(
-                f"{name} must be uint8 (H, W, 3) or PNG bytes, not {_shape(pixels)}",
-                hint="send the camera's picture",
-            )
+        pixels = pixels_of(name, np.asarray(decode(value)) if isinstance(value, bytes) else value)
         rules = self._rules
         if rules is not None and rules.flip_180:
             pixels = pixels[::-1, ::-1]
@@ -153,6 +145,45 @@ def _is_padded(name: str) -> bool:
     return name.startswith(EMPTY_CAMERA)
 
 
+def observation_of(call: EndpointCall) -> JsonMap:
+    """Return the observation of a `get_action`. Raises BadRequest."""
+    observation = (call.data or {}).get("observation")
+    if not isinstance(observation, Mapping):
+        raise BadRequest(
+            "get_action needs data.observation, a map",
+            hint='{"endpoint": "get_action", "data": {"observation": {…}}}',
+        )
+    return observation
+
+
+def pixels_of(name: str, value: Any) -> "NDArray[Any]":
+    """Return a picture, uint8 (H, W, 3). Raises BadRequest."""
+    import numpy as np
+
+    if getattr(value, "dtype", None) == np.uint8 and value.ndim == 3 and value.shape[2] == 3:
+        return value
+    raise BadRequest(
+        f"{name} must be uint8 (H, W, 3) or PNG bytes, not {_shape(value)}",
+        hint="send the camera's picture",
+    )
+
+
+def numbers_of(name: str, value: Any, hint: str) -> "NDArray[Any]":
+    """Return finite numbers as float32. Raises BadRequest."""
+    import numpy as np
+
+    try:
+        numbers = np.array(value, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise BadRequest(f"{name} must be numbers, not {_shape(value)}", hint=hint) from None
+    if not np.isfinite(numbers).all():
+        raise BadRequest(
+            f"{name} has numbers that are not finite",
+            hint="a stale or missing sensor must stop the goal",
+        )
+    return numbers
+
+
 def _pictures(value: Any) -> list[Any]:
     """Return the pictures of a camera, one a step; a lone picture is one step."""
     if isinstance(value, list | tuple):
@@ -165,21 +196,11 @@ def _vectors(name: str, value: Any, shape: tuple[int, ...]) -> list[Any]:
     import numpy as np
     import torch
 
-    try:
-        numbers = np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError):
-        raise BadRequest(
-            f"{name} must be numbers of shape {tuple(shape)}, not {_shape(value)}", hint=_COMPARE
-        ) from None
+    numbers = numbers_of(name, value, f"of shape {tuple(shape)}; {_COMPARE}")
     steps = numbers if numbers.ndim == len(shape) + 1 else numbers[None]
     if steps.shape[1:] != tuple(shape) or not len(steps):
         raise BadRequest(
             f"{name} must have shape {tuple(shape)}, not {numbers.shape}", hint=_COMPARE
-        )
-    if not np.isfinite(steps).all():
-        raise BadRequest(
-            f"{name} has numbers that are not finite",
-            hint="a stale or missing sensor must stop the goal",
         )
     return [torch.from_numpy(np.ascontiguousarray(step)) for step in steps]
 

@@ -5,15 +5,14 @@ Pictures of a robot at work and its task in, progress and success out.
 
 import importlib
 import math
-from collections.abc import Sequence
 from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import ScoreOp
-from vram_arbiter.sidecars.adapters.base import LEROBOT, ModelCall
-from vram_arbiter.sidecars.checkpoints import META, load_lerobot
+from vram_arbiter.sidecars.adapters.base import LEROBOT, ModelCall, OneNetwork
+from vram_arbiter.sidecars.checkpoints import load_lerobot
 from vram_arbiter.sidecars.images import decode_all, of_one_size
 from vram_arbiter.sidecars.quantization import check_weights, nf4_of, quantize_linear
 from vram_arbiter.sidecars.weights import Weights, read_config, reason
@@ -23,7 +22,7 @@ _OWN_MODELS = ("vram_arbiter.sidecars.models.compact_progress",)
 BYTES_A_PIXEL = 3
 
 
-class RewardAdapter:
+class RewardAdapter(OneNetwork):
     """The op `score`.
 
     A model that judges every picture (`score(batch)`: progress and success, each (B, T)) answers a
@@ -42,7 +41,6 @@ class RewardAdapter:
         self._weights = weights
         self._config: Any = None
         self._model_class: Any = None
-        self._model: Any = None
         self._before: Any = None
 
     @property
@@ -64,19 +62,12 @@ class RewardAdapter:
         nf4 = nf4_of(self._manifest)
         self._model = load_lerobot(self._model_class, self._weights, self._config, nf4)
         check_weights(self._model, self._manifest)
-        if nf4 is not None and device == META:
-            nf4.chosen(self._model)
-        else:
-            quantize_linear(self._model, self._manifest)
+        quantize_linear(self._model, self._manifest, device)
         self._make_processor()
-
-    @property
-    def networks(self) -> Sequence[Any]:
-        return (self._model,)
 
     def place(self, device: str) -> None:
         self._config.device = device
-        self._model.to(device)
+        super().place(device)
         self._make_processor()
 
     def _make_processor(self) -> None:
@@ -120,11 +111,8 @@ class RewardAdapter:
             return [float(self._model.compute_reward(batch)[-1])], []
 
     def _picture_key(self) -> str:
-        known = [
-            key
-            for key, feature in self._config.input_features.items()
-            if feature.type.value == "VISUAL"
-        ]
+        inputs = self._config.input_features
+        known = [key for key in inputs if inputs[key].type.value == "VISUAL"]
         if len(known) != 1:
             raise ModelError(
                 f"{self._weights.source} looks at {len(known)} cameras",

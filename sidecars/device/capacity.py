@@ -1,7 +1,8 @@
 """Capacity and compute capability of the GPUs that `--device` names, read without using one."""
 
+import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,11 @@ def capacities(
 
         nvml = pynvml
     try:
-        nvml.nvmlInit()
-        try:
+        with _initialized(nvml):
             found = {
                 str(nvml.nvmlDeviceGetUUID(handle)): _bytes(nvml, handle)
                 for handle in visible(device, environ, nvml)
             }
-        finally:
-            nvml.nvmlShutdown()
     except nvml.NVMLError as error:
         raise NoGpu(
             f"no NVIDIA driver answers: {error}",
@@ -77,38 +75,39 @@ def capabilities(device: str) -> list[tuple[int, int]]:
     import pynvml
 
     try:
-        pynvml.nvmlInit()
-        try:
+        with _initialized(pynvml):
             return [
                 tuple(pynvml.nvmlDeviceGetCudaComputeCapability(handle))
                 for handle in visible(device, os.environ, pynvml)
             ]
-        finally:
-            pynvml.nvmlShutdown()
     except pynvml.NVMLError:
         return []
 
 
+@contextlib.contextmanager
+def _initialized(nvml: Any) -> Iterator[None]:
+    nvml.nvmlInit()
+    try:
+        yield
+    finally:
+        nvml.nvmlShutdown()
+
+
 def visible(device: str, environ: Mapping[str, str], nvml: Any) -> list[Any]:
     """Return the handles of the GPUs that `cuda` or `cuda:N` may mean, of an initialized `nvml`."""
-    found, number = _visible(nvml, environ), device.partition(":")[2]
-    return found[int(number) : int(number) + 1] if number else found
-
-
-def _visible(nvml: Any, environ: Mapping[str, str]) -> list[Any]:
-    """Return the handles of the GPUs that CUDA would show, in its order."""
     named = environ.get(cuda.VISIBLE)
     if named is None:
-        return [
-            nvml.nvmlDeviceGetHandleByIndex(index) for index in range(nvml.nvmlDeviceGetCount())
-        ]
-    words = [word.strip() for word in named.split(",") if word.strip()]
-    return [
+        words = [str(index) for index in range(nvml.nvmlDeviceGetCount())]
+    else:
+        words = [word.strip() for word in named.split(",") if word.strip()]
+    found = [
         nvml.nvmlDeviceGetHandleByIndex(int(word))
         if word.isdecimal()
         else nvml.nvmlDeviceGetHandleByUUID(word)
         for word in words
     ]
+    number = device.partition(":")[2]
+    return found[int(number) : int(number) + 1] if number else found
 
 
 def _bytes(nvml: Any, handle: Any) -> int:

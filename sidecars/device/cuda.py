@@ -9,14 +9,14 @@ from typing import Any
 from vram_arbiter.clients import cuda
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import BadState, NoGpu, OutOfMemory
-from vram_arbiter.sidecars.device.memory import REMEASURE, Block
+from vram_arbiter.sidecars.device.memory import REMEASURE, Block, DeviceMemory
 
 _ALLOCATOR_VARIABLE = "PYTORCH_CUDA_ALLOC_CONF"
 _CHECK_VARIABLE = "PYTORCH_NVML_BASED_CUDA_CHECK"
 
 
-class CudaMemory:
-    """`DeviceMemory` on GPU `index`, or on the first one that is granted.
+class CudaMemory(DeviceMemory):
+    """Memory on GPU `index`, or on the first one that is granted.
 
     Raises NoGpu if torch sees no such GPU. CUDA reads its visible GPUs when it is initialized, so a
     process stays on the GPU that it was granted first. `context_bytes` is the assumed cost of the
@@ -41,9 +41,9 @@ class CudaMemory:
             )
         self._torch = torch
         self._index = index
+        self.torch_device = f"cuda:{index}"
         self._context_guess_bytes = context_bytes
-        self._ballast: dict[int, Any] = {}
-        self._number = 0
+        self._ballast: dict[Block, Any] = {}
         self._touched = False
         self._bound: str | None = None
 
@@ -59,10 +59,6 @@ class CudaMemory:
             self._bound = gpu
         return self._bound
 
-    @property
-    def torch_device(self) -> str:
-        return f"cuda:{self._index}"
-
     def touch(self) -> None:
         self._torch.cuda.init()
         self._torch.zeros(1, device=self.torch_device)
@@ -70,18 +66,18 @@ class CudaMemory:
 
     def allocate(self, label: str, size_bytes: int) -> Block:
         self._touched = True
-        self._number += 1
         try:
             tensor = self._torch.empty(
                 size_bytes, dtype=self._torch.uint8, device=self.torch_device
             )
         except self._torch.OutOfMemoryError as error:
             raise self.out_of_memory(error, size_bytes) from error
-        self._ballast[self._number] = tensor
-        return Block(label, size_bytes, self._number)
+        block = Block(label, size_bytes)
+        self._ballast[block] = tensor
+        return block
 
     def free(self, block: Block) -> None:
-        del self._ballast[block.number]
+        del self._ballast[block]
 
     def empty_cache(self) -> None:
         if self._touched:
@@ -97,9 +93,6 @@ class CudaMemory:
         if listed is not None:
             return listed
         return int(self._torch.cuda.memory_reserved(self._index)) + self._context_guess_bytes
-
-    def throttle_bytes_per_s(self) -> int | None:
-        return None
 
     def close(self) -> None:
         """Free what can be freed before the process ends; its CUDA context goes with it."""

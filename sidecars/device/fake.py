@@ -14,17 +14,15 @@ from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import NoGpu
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
-from vram_arbiter.sidecars.device.memory import Block
+from vram_arbiter.sidecars.device.memory import Block, DeviceMemory
 
 
-class FakeMemory:
-    """`DeviceMemory` on the simulated GPU in `folder`. Raises NoGpu if there is none.
+class FakeMemory(DeviceMemory):
+    """Memory on the simulated GPU in `folder`. Raises NoGpu if there is none.
 
     The weights themselves stay in host memory; the GPU is charged the footprint of the production
     model. `context_bytes` is the cost of the first touch (a CUDA context with its libraries).
     """
-
-    torch_device = "cpu"
 
     def __init__(self, folder: Path, name: str, context_bytes: int = RESIDUE_BYTES) -> None:
         self._folder = folder
@@ -33,14 +31,10 @@ class FakeMemory:
         self._key = ProcessKey(os.getpid(), procfs.start_ticks(os.getpid()) or 0)
         # flock guards against other processes, not against threads of this one
         self._thread_lock = threading.Lock()
-        self._number = 0
         if not (folder / fakegpu.GPU_FILE).exists():
             raise NoGpu(
                 f"no simulated GPU in {folder}", hint="start the arbiter with --gpu fake:8GiB"
             )
-
-    def bind(self, gpu: str) -> str | None:
-        return None  # the lease names the GPU of this folder
 
     def touch(self) -> None:
         """Create the context. Raises SimulatedOutOfMemory if it does not fit."""
@@ -58,8 +52,7 @@ class FakeMemory:
             )
 
         self._do(change)
-        self._number += 1
-        return Block(label, size_bytes, self._number)
+        return Block(label, size_bytes)
 
     def free(self, block: Block) -> None:
         self._do(lambda gpu, now: fakegpu.free(gpu, self._key, block.label, block.size_bytes, now))

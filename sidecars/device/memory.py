@@ -6,23 +6,23 @@ Calls block and belong to the host's worker thread. Must not know leases.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 REMEASURE: Final = "measure its footprint: vramctl calibrate"
 """What to do about a model that needs more bytes than its lease is charged."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class Block:
-    """One allocation of `size_bytes`; pass it to `free` exactly once."""
+    """One allocation of `size_bytes`, equal to itself only; pass it to `free` exactly once."""
 
     label: str
     size_bytes: int
-    number: int
 
 
-class DeviceMemory(Protocol):
-    """Bytes on one GPU for this process.
+class DeviceMemory:
+    """Bytes on one GPU for this process; this class is a process without a GPU, where every
+    allocation is free and nothing is measured.
 
     `allocate` raises `schemas.errors.OutOfMemory` when the GPU is full, and nothing is allocated
     then. As in every caching framework, `free` returns nothing to the GPU: `empty_cache` does. The
@@ -30,10 +30,8 @@ class DeviceMemory(Protocol):
     process has on the GPU, context and caches included; None if unknown.
     """
 
-    @property
-    def torch_device(self) -> str:
-        """Device of the model's weights: `cpu` or `cuda:N`."""
-        ...
+    torch_device = "cpu"
+    """Device of the model's weights: `cpu` or `cuda:N`."""
 
     def bind(self, gpu: str) -> str | None:
         """Put further allocations on the granted GPU.
@@ -41,40 +39,13 @@ class DeviceMemory(Protocol):
         Returns the only GPU that this process can use from now on, None for any. Raises BadState
         where it is another one.
         """
-        ...
-
-    def touch(self) -> None: ...
-
-    def allocate(self, label: str, size_bytes: int) -> Block: ...
-
-    def free(self, block: Block) -> None: ...
-
-    def empty_cache(self) -> None: ...
-
-    def used_bytes(self) -> int | None: ...
-
-    def throttle_bytes_per_s(self) -> int | None: ...
-
-    def close(self) -> None: ...
-
-
-class NoDevice:
-    """A process without a GPU: every allocation is free and nothing is measured."""
-
-    torch_device = "cpu"
-
-    def __init__(self) -> None:
-        self._number = 0
-
-    def bind(self, gpu: str) -> str | None:
         return None
 
     def touch(self) -> None:
         pass
 
     def allocate(self, label: str, size_bytes: int) -> Block:
-        self._number += 1
-        return Block(label, size_bytes, self._number)
+        return Block(label, size_bytes)
 
     def free(self, block: Block) -> None:
         pass

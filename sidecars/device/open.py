@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from vram_arbiter.sidecars.device.memory import DeviceMemory, NoDevice
+from vram_arbiter.sidecars.device.memory import DeviceMemory
 from vram_arbiter.sidecars.settings import Settings
 
 
 def open_memory(settings: Settings) -> DeviceMemory:
     """Open the device of the settings. Raises NoGpu or ConfigError."""
     if settings.device == "none":
-        return NoDevice()
+        return DeviceMemory()
     if settings.device.startswith("fake:"):
         from vram_arbiter.sidecars.device.fake import FakeMemory
 

@@ -34,7 +34,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tests.sidecars.adapters.conftest import save_act, save_owlvit, save_qwen
+from tests.sidecars.adapters.policies import save_act
+from tests.sidecars.adapters.tiny_vision import save_owlvit, save_qwen3_5
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 
@@ -86,7 +87,7 @@ def _owlvit(folder: Path) -> None:
 
 def _qwen(folder: Path) -> None:
     layers = ["linear_attention", "full_attention"] * 5
-    save_qwen(
+    save_qwen3_5(
         folder, hidden_size=1024, intermediate_size=4096, num_hidden_layers=10, layer_types=layers
     )
 

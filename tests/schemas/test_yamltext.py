@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.deployment import load_robot
+from vram_arbiter.schemas import yamltext
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 from vram_arbiter.schemas.yamltext import (
     DEPTH_MAX,
-    NODES_MAX,
     TEXT_MAX_BYTES,
     parse_yaml,
     read_yaml,
@@ -49,7 +49,6 @@ def said(content: str | bytes) -> str:
         ("? " * 100_000, "nested deeper than 64 levels"),
         (DEEP_BY_ALIASES, "nested deeper than 64 levels, aliases expanded"),
         (LAUGHS, "more than 100000 values, aliases expanded"),
-        ("[" + "1," * (NODES_MAX + 1) + "]", "more than 100000 values"),
         ("a: !!timestamp x", "x.yaml:1:4: not valid YAML: 'x' cannot be read as timestamp"),
         ("a: !!bool x", "x.yaml:1:4: not valid YAML: 'x' cannot be read as bool"),
         ("a: !!int ''", "x.yaml:1:4: not valid YAML: '' cannot be read as int"),
@@ -69,12 +68,28 @@ def said(content: str | bytes) -> str:
         ("%YAML " + "9" * 5000 + ".1\n--- a", "x.yaml:1: not valid YAML"),
         ("a: 1\nb: \x07", "x.yaml:2:4: not valid YAML: special characters are not allowed"),
         ("a: 1\na: 2\nb: 1\nb: 2", "x.yaml:4:1: b: key given twice; first in line 3"),
+        ("a: 1\n---\nb: 2\n", "x.yaml:2:1: not valid YAML: expected a single document"),
+        ("a: *nobody", "x.yaml:1:4: not valid YAML: found undefined alias 'nobody'"),
         (b"a: 1\nb: \xff", "x.yaml:2: not UTF-8 text"),
         (b"#" * (TEXT_MAX_BYTES + 1), "x.yaml: larger than 1048576 bytes"),
     ],
 )  # fmt: skip
 def test_a_text_that_cannot_be_read_names_its_place(content: str | bytes, expected: str) -> None:
     assert expected in said(content)
+
+
+def test_values_are_counted_before_they_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(yamltext, "NODES_MAX", 100)
+    assert "x.yaml:1:200: not valid YAML: more than 100 values" in said("[" + "1," * 200 + "]")
+    assert parse_yaml("[" + "1," * 99 + "]", "x").data
+
+
+def test_an_alias_that_multiplies_is_named_by_its_line() -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
+    assert said("\n".join(lines)) == (
+        "x.yaml:5:5: not valid YAML: more than 100000 values, aliases expanded"
+    )
 
 
 def test_the_limits_leave_room_for_what_people_write() -> None:

@@ -65,47 +65,6 @@ def test_unload_leaves_nothing_on_the_gpu_and_the_next_request_loads_again(box, 
     assert sidecar.detect()["ok"]
 
 
-def test_an_evicted_sidecar_is_loaded_again_by_the_next_request(box, arbiter):
-    detector = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
-    grab = box.start("grab", "--min-residency-s", "0", footprint="4GB,4GB,100MB")
-    assert detector.detect()["ok"]
-    assert grab.detect()["ok"]
-    assert detector.state() == "unloaded"
-    assert box.used() == 4 * GB, "not even a context of the detector is left"
-    assert detector.detect()["ok"], "evicted is never an answer to a request that brings no token"
-    assert (grab.state(), detector.state()) == ("unloaded", "resident")
-
-
-def test_a_token_is_checked_before_every_op(box):
-    sidecar = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
-    token = sidecar.ask("load")["token"]
-    assert sidecar.detect(token=token)["ok"]
-    stranger = sidecar.detect(token=[token[0], token[1] + 1])
-    assert (stranger["ok"], stranger["code"]) == (False, "evicted")
-    assert stranger["error"].startswith("Evicted: detector is not resident under this token")
-    other = box.start("grab", footprint="5GB,5GB,100MB")
-    other.detect()
-    late = sidecar.detect(token=token)
-    assert (late["code"], late["details"]["state"]) == ("evicted", "unloaded")
-    assert sidecar.state() == "unloaded", "a stale token loads nothing"
-
-
-def test_ping_is_answered_and_a_revoke_acknowledged_while_an_op_runs_which_is_not_cut_short(
-    box, arbiter
-):
-    detector = box.start("detector", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
-    grab = box.start("grab", footprint="5GB,5GB,100MB")
-    running = detector.hold()
-    waiting = grab.send_detect()
-    until(lambda: leases(arbiter)["detector"]["state"] == "revoking")
-    assert detector.state() == "resident"
-    assert grab.state() == "waiting"
-    detector.let_go()
-    assert detector.client.reply(running)["answer"] == "hold go"
-    assert grab.client.reply(waiting, PATIENCE_S)["ok"]
-    assert detector.state() == "unloaded"
-
-
 def test_a_callers_use_on_the_lease_keeps_the_model_until_it_ends(box, arbiter):
     policy = box.start("policy", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
     other = box.start("other", footprint="5GB,5GB,100MB")

@@ -88,12 +88,25 @@ def test_a_jpeg_of_thousands_of_scans_costs_nothing() -> None:
         (b"RIFF\x00\x00\x00\x00WEBP", "neither PNG nor JPEG"),
         (b"II*\x00", "neither PNG nor JPEG"),
         (b"", "neither PNG nor JPEG"),
+        (png(4200, 4200, 1, 0), "4200 x 4200"),
+        (png(64, 64)[:60], "cannot be decoded"),
     ],
 )  # fmt: skip
 def test_what_asks_for_too_much_is_refused_by_its_header(data: bytes, told: str) -> None:
     """Regression: Pillow clips 16-bit gray at 255, so such a PNG was seen as white."""
     with pytest.raises(BadRequest, match=told):
         images.decode(data)
+
+
+def test_pictures_are_shrunk_never_enlarged() -> None:
+    from PIL import Image
+
+    for size, side, expected in (
+        ((800, 600), 400, (400, 300)),
+        ((3000, 1), 30, (30, 1)),
+        ((80, 60), 400, (80, 60)),
+    ):
+        assert images.within(Image.new("RGB", size), side).size == expected
 
 
 def test_a_frame_header_that_is_not_the_decoders_is_refused() -> None:

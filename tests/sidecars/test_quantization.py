@@ -48,22 +48,26 @@ def int4(**extra: Any) -> RSkillManifest:
 
 
 def test_what_the_field_writes_about_nf4_is_read() -> None:
-    assert nf4_of(grab_manifest("int4", extra=FIELD)) == Nf4(min_params=4_000_000)
+    assert nf4_of(grab_manifest("int4", extra=FIELD)) == Nf4(min_params_to_quantize=4_000_000)
     assert nf4_of(grab_manifest("int4")) == Nf4()
     assert nf4_of(grab_manifest("bf16")) is None
     assert nf4_of(int4(skip_modules=["visual"], compute_dtype="float16")) == Nf4(
-        quantization.Dtype.FP16, ("visual",), 0
+        compute_dtype="float16", skip_modules=("visual",), min_params_to_quantize=0
     )
 
 
 @pytest.mark.parametrize(
     ("extra", "told"),
     [
-        ({"skip_modules": "lm_head"}, "a list of module names"),
-        ({"min_params_to_quantize": "4M"}, "a number of weights"),
-        ({"compute_dtype": "int8"}, "one of float32, float16, bfloat16"),
-        ({"scheme": "fp4"}, "write nf4"),
-        ({"group_size": 128}, "group_size, which no loader honors"),
+        ({"skip_modules": "lm_head"}, "skip_modules: must be a list, not 'lm_head'"),
+        (
+            {"min_params_to_quantize": "4M"},
+            "min_params_to_quantize: must be a valid integer, not '4M'",
+        ),
+        ({"min_params_to_quantize": True}, "must be a valid integer, not True"),
+        ({"compute_dtype": "int8"}, "one of 'float32', 'float16' or 'bfloat16'"),
+        ({"scheme": "fp4"}, "scheme: 'fp4' is not one of 'nf4'"),
+        ({"group_size": 128}, "group_size: unknown key"),
     ],
 )
 def test_what_cannot_be_honored_is_refused(extra: dict[str, Any], told: str) -> None:

@@ -128,8 +128,8 @@ def test_the_lease_covers_the_inference_peak(rskill):
     [
         ("a/b: {load_peak: 1GB, steady: 1GB, residu: 1}", "footprints.yaml:1: a/b.residu"),
         ("a/b:\n  load_peak: much\n  steady: 1GB\n", "footprints.yaml:2: a/b.load_peak"),
-        ("a/b/fp31: {load_peak: 1GB, steady: 1GB}", "footprints.yaml:1: 'a/b/fp31' names no model"),
-        ("- 1", "must be a map"),
+        ("a/b/fp31: {load_peak: 1GB, steady: 1GB}", "footprints.yaml:1: a/b/fp31: names no model"),
+        ("- 1", "must be a mapping"),
         ("a/b: [", "not valid YAML"),
     ],
 )
@@ -154,55 +154,23 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     make_gpu(tmp_path / "gpu", 8 * 2**30)
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "/run/x")
     monkeypatch.setenv("VRAM_FAKE_GPU", str(tmp_path / "gpu"))
-    found = settings(
-        "--name",
-        "detector",
-        "--rskill",
-        rskill,
-        "--footprint",
-        "2GB",
-        "--priority",
-        "70",
-        "--pinned",
-    )
-    assert (found.endpoint, found.arbiter) == (
-        "ipc:///run/x/detector.sock",
-        "ipc:///run/x/arbiter.sock",
-    )
+    model = ("--rskill", rskill, "--footprint", "2GB")
+    found = settings("--name", "detector", *model, "--priority", "70", "--pinned")
+    assert found.endpoint == "ipc:///run/x/detector.sock"
+    assert found.arbiter == "ipc:///run/x/arbiter.sock"
     assert found.device == f"fake:{tmp_path / 'gpu'}"
     assert found.weights == Weights("a/b", "rev")
     spec = found.lease_spec()
     assert (spec.consumer, spec.model_id, spec.revision) == ("detector", "test/model", "rev")
     assert (spec.priority, spec.evictable, spec.footprint.load_peak_bytes) == (70, False, 2 * 10**9)
-    assert (found.gpu, leased_gpu(found.device)) == (
-        None,
-        FakeProbe([tmp_path / "gpu"]).gpus()[0].id,
-    ), "the GPU that is charged is the GPU that is leased"
-    alone = settings(
-        "--name",
-        "d",
-        "--rskill",
-        rskill,
-        "--footprint",
-        "2GB",
-        "--no-arbiter",
-        "--device",
-        "cuda:1",
-    )
+    own = FakeProbe([tmp_path / "gpu"]).gpus()[0].id
+    assert (found.gpu, leased_gpu(found.device)) == (None, own), "charged and leased is one GPU"
+    alone = settings("--name", "d", *model, "--no-arbiter", "--device", "cuda:1")
     assert (alone.arbiter, alone.device) == (None, "cuda:1")
     with pytest.raises(ConfigError, match="--device gpu"):
-        settings("--name", "d", "--rskill", rskill, "--footprint", "2GB", "--device", "gpu")
+        settings("--name", "d", *model, "--device", "gpu")
     with pytest.raises(ConfigError, match="any user of the machine"):
-        settings(
-            "--name",
-            "d",
-            "--rskill",
-            rskill,
-            "--footprint",
-            "2GB",
-            "--endpoint",
-            "tcp://127.0.0.1:5757",
-        )
+        settings("--name", "d", *model, "--endpoint", "tcp://127.0.0.1:5757")
 
 
 @pytest.mark.parametrize(
@@ -251,18 +219,6 @@ def test_what_only_a_person_can_mend_is_not_started_again(rskill, tmp_path, caps
 def test_a_name_that_nobody_could_use_is_refused_at_once(rskill, capsys, name):
     """Regression: `--name ""` and `--name ../x` served at a path that no client looks at."""
     with pytest.raises(SystemExit) as caught:
-        main(
-            [
-                "--name",
-                name,
-                "--rskill",
-                str(rskill),
-                "--footprint",
-                "2GB",
-                "--device",
-                "none",
-                "--check",
-            ]
-        )
+        main(["--name", name, "--rskill", str(rskill), "--device", "none", "--check"])
     assert caught.value.code == 2
     assert "argument --name: must be" in capsys.readouterr().err

@@ -9,11 +9,9 @@ import msgpack
 import pytest
 import zmq
 
-from tests.support.pictures import encoded
 from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.schemas.errors import CODES, BadRequest, ModelError, OutOfMemory, UnknownOp
 from vram_arbiter.schemas.sidecar import PICTURES_MAX, DetectOp, EndpointCall, ScoreOp
-from vram_arbiter.sidecars.images import decode, within
 from vram_arbiter.sidecars.wires import PENDING_MAX, Wire, parse, unread_reply
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -149,16 +147,7 @@ def test_a_bad_message_gets_a_typed_error_that_names_the_field(message, code, to
 def test_the_known_ops_are_told():
     with pytest.raises(UnknownOp) as caught:
         parse({"op": "dance"}, OPS)
-    assert caught.value.details["known"] == [
-        "detect",
-        "get_action",
-        "load",
-        "ping",
-        "reset",
-        "score",
-        "shutdown",
-        "unload",
-    ]
+    assert caught.value.details["known"] == sorted({"load", "ping", "shutdown", "unload"} | OPS)
 
 
 def npy(array, **options):
@@ -260,38 +249,6 @@ def test_clients_of_the_field_get_their_familys_shapes():
     assert [reply["success"] for reply in replies] == [[0.0, 0.0], []]
     assert unread_reply(frozenset({"get_action", "reset"}))(error) == policy
     assert unread_reply(OPS)(error) == detector
-
-
-# -- pictures
-def test_pictures_of_any_mode_become_rgb():
-    pytest.importorskip("PIL")
-    for data in (
-        encoded("PNG", mode="RGBA"),
-        encoded("PNG", mode="L"),
-        encoded("PNG", mode="P"),
-        encoded("JPEG"),
-    ):
-        found = decode(data)
-        assert (found.mode, found.size) == ("RGB", (8, 6))
-
-
-def test_what_is_no_picture_or_too_large_is_refused():
-    pytest.importorskip("PIL")
-    whole = encoded("PNG", size=(64, 64))
-    for data, told in (
-        (b"no picture", "cannot be decoded"), (whole[: len(whole) // 2], "cannot be decoded"),
-        (encoded("GIF"), "cannot be decoded"),
-        (encoded("PNG", size=(4200, 4200), mode="1"), "4200 x 4200"),
-    ):  # fmt: skip
-        with pytest.raises(BadRequest, match=told):
-            decode(data)
-
-
-def test_pictures_are_shrunk_never_enlarged():
-    image = pytest.importorskip("PIL.Image")
-    assert within(image.new("RGB", (800, 600)), 400).size == (400, 300)
-    assert within(image.new("RGB", (3000, 1)), 30).size == (30, 1)
-    assert within(image.new("RGB", (80, 60)), 400).size == (80, 60)
 
 
 # -- on a real socket

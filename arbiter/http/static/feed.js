@@ -5,7 +5,7 @@ const STALE_MS = 4000,
   HIDDEN_MS = 60000,
   EVENTS_KEPT = 3000,
   USES_KEPT = 500;
-export const USES = new Set(["use_began", "use_ended", "use_yielded"]);
+export const USES = new Set(["use_began", "use_ended"]);
 const PROBLEMS = {
   401: "the token is refused: open /?token=TOKEN once",
   503: "too many pages are open",

@@ -65,6 +65,11 @@ READERS: dict[str, tuple[Reader, list[str]]] = {
 }
 
 
+def grab() -> Any:
+    text = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
+    return yaml.safe_load(text)
+
+
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     yield at
     items = (
@@ -121,8 +126,7 @@ def test_any_value_at_any_key_is_read_or_found_fault_with(
 @pytest.mark.parametrize("raw", ["[]", "{}", "{a: 1}", "!!timestamp x", "5"])
 def test_a_family_of_a_wrong_type_is_a_finding(raw: str) -> None:
     """Regression: a list or a map ended in a TypeError, a broken timestamp in a ValueError."""
-    text = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
-    document = yaml.safe_load(text)
+    document = grab()
     with pytest.raises(ManifestError) as caught:
         parse_manifest(yaml_text(document, ("model_family",), raw))
     (problem,) = caught.value.problems
@@ -132,24 +136,20 @@ def test_a_family_of_a_wrong_type_is_a_finding(raw: str) -> None:
 
 @pytest.mark.parametrize("place", [("embodiment_tags", 0), ("actions", 0), ("sensors_required", 0)])
 def test_one_wrong_entry_is_one_finding(place: tuple[Any, ...]) -> None:
-    """Regression: a list of one wrong entry was "must have at least 1 entry" as well."""
-    document = yaml.safe_load(
-        (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
-    )
+    """Regression: a list of one wrong entry was "must have at least 1 item" as well."""
+    document = grab()
     document[place[0]] = document[place[0]][:1]
     with pytest.raises(ManifestError) as caught:
         parse_manifest(yaml_text(document, place, "[]"))
     assert len(caught.value.problems) == 1
     document[place[0]] = []
     if place[0] != "sensors_required":
-        with pytest.raises(ManifestError, match="must have at least 1 entry"):
+        with pytest.raises(ManifestError, match="must have at least 1 item"):
             parse_manifest(yaml_text(document, ("nowhere",), ""))
 
 
 def test_one_wrong_range_is_one_finding() -> None:
-    document = yaml.safe_load(
-        (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
-    )
+    document = grab()
     document["action_contract"] = {
         "dim": 3,
         "slots": [

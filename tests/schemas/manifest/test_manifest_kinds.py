@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from vram_arbiter.schemas.findings import problems_of
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.kinds import KINDS, RULES, check_kind
-from vram_arbiter.schemas.manifest.problems import from_validation_error
 
 FOLDER = Path(__file__).parent / "samples"
 SAMPLES: dict[Kind, dict[str, Any]] = {
@@ -45,7 +45,7 @@ def problems(data: dict[str, Any]) -> set[str]:
     try:
         RSkillManifest.model_validate(data)
     except ValidationError as error:
-        return {problem.field for problem in from_validation_error(error, RSkillManifest, data)}
+        return {problem.field for problem in problems_of(error, RSkillManifest, data)}
     return set()
 
 

@@ -9,7 +9,7 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +21,8 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.connection import OUT_MESSAGES_MAX, Bounds, Connection
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import FRAMES_MAX, GREETING, READY, Oversize, encode
+
+pytestmark = [pytest.mark.anyio, pytest.mark.timeout(60)]
 
 GREETING_AND_READY = (
     bytes.fromhex("ff00000000000000017f03014e554c4c")
@@ -85,14 +87,6 @@ async def serving_router(
         await router.aclose()
     assert not path.exists()
     assert len(router) == 0
-
-
-def with_router(scenario: Callable[[], Awaitable[None]]) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(WAIT_S):
-            await scenario()
-
-    asyncio.run(limited())
 
 
 async def comes_true(condition: Callable[[], bool]) -> None:
@@ -162,23 +156,20 @@ def ask_with_libzmq(
     ],
     ids=["DEALER", "REQ", "REQ_CORRELATE", "REQ_RELAXED"],
 )
-def test_an_unmodified_peer_is_answered(path: Path, kind: int, options: tuple[int, ...]) -> None:
+async def test_an_unmodified_peer_is_answered(
+    path: Path, kind: int, options: tuple[int, ...]
+) -> None:
     """A REQ with request ids was answered without them, discarded every answer and waited on."""
     payloads = (b"", b"a", b"b" * 255, b"c" * 256, b"d" * ((1 << 20) - 4))
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            answers = await asyncio.to_thread(
-                ask_with_libzmq, path, kind, *payloads, options=options
-            )
-            assert answers == list(payloads)
-            await comes_true(lambda: len(handler.ended) == 1)
-
-    with_router(scenario)
+    handler = Echo()
+    async with serving_router(path, handler):
+        answers = await asyncio.to_thread(ask_with_libzmq, path, kind, *payloads, options=options)
+        assert answers == list(payloads)
+        await comes_true(lambda: len(handler.ended) == 1)
 
 
-def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
+async def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
     """An identity equal to libzmq's next automatic routing id ended the daemon with `Assertion
     failed`."""
     ready = (
@@ -187,22 +178,17 @@ def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
         + b"\x01"
     )
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            raws = [
-                await (await Raw.connect(path, GREETING_AND_READY[:64] + ready)).ready()
-                for _ in range(3)
-            ]
-            assert [await raw.echo(b"%d" % n) for n, raw in enumerate(raws)] == [b"0", b"1", b"2"]
-            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [
-                b"honest"
-            ]
-            assert len(handler.open) >= 3
-            for raw in raws:
-                raw.close()
-
-    with_router(scenario)
+    handler = Echo()
+    async with serving_router(path, handler):
+        raws = [
+            await (await Raw.connect(path, GREETING_AND_READY[:64] + ready)).ready()
+            for _ in range(3)
+        ]
+        assert [await raw.echo(b"%d" % n) for n, raw in enumerate(raws)] == [b"0", b"1", b"2"]
+        assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [b"honest"]
+        assert len(handler.open) >= 3
+        for raw in raws:
+            raw.close()
 
 
 @pytest.mark.parametrize(
@@ -215,134 +201,111 @@ def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
     ],
     ids=["empty frames", "MORE for ever", "a huge frame", "no frames at all"],
 )
-def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
+async def test_a_peer_that_breaks_the_protocol_is_cut_and_others_are_served(
     path: Path, attack: bytes
 ) -> None:
     """A message of two million empty frames let others wait for 18 s; MORE for ever grew without
     bound."""
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler) as router:
-            raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(attack)
-            await raw.ended()
-            await comes_true(lambda: len(handler.ended) == 1)
-            assert "protocol error" in handler.ended[0]
-            assert router._users == {}
-            assert router._processes == {}
-            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [
-                b"honest"
-            ]
-
-    with_router(scenario)
+    handler = Echo()
+    async with serving_router(path, handler) as router:
+        raw = await (await Raw.connect(path)).ready()
+        raw.writer.write(attack)
+        await raw.ended()
+        await comes_true(lambda: len(handler.ended) == 1)
+        assert "protocol error" in handler.ended[0]
+        assert router._users == {}
+        assert router._processes == {}
+        assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [b"honest"]
 
 
-def test_a_message_over_the_limit_is_answered_and_the_connection_lives(path: Path) -> None:
-    async def scenario() -> None:
-        async with serving_router(path, Echo()):
-            answers = await asyncio.to_thread(
-                ask_with_libzmq, path, zmq.REQ, bytes((1 << 20) + 1), b"next"
-            )
-            assert answers == [b"oversize %d" % ((1 << 20) + 1), b"next"]
-
-    with_router(scenario)
+async def test_a_message_over_the_limit_is_answered_and_the_connection_lives(path: Path) -> None:
+    async with serving_router(path, Echo()):
+        answers = await asyncio.to_thread(
+            ask_with_libzmq, path, zmq.REQ, bytes((1 << 20) + 1), b"next"
+        )
+        assert answers == [b"oversize %d" % ((1 << 20) + 1), b"next"]
 
 
-def test_a_stranger_may_send_little_until_it_is_admitted(path: Path) -> None:
-    async def scenario() -> None:
-        handler = Echo(admits=False)
-        async with serving_router(path, handler):
-            raw = await (await Raw.connect(path)).ready()
-            assert await raw.echo(b"hello") == b"hello"
-            raw.writer.write(encode(bytes(1 << 17)))
-            assert await raw.reader.readexactly(2 + 15) == encode(b"oversize 131072")
-            next(iter(handler.open.values())).admit()
-            raw.writer.write(encode(bytes(1 << 17)))
-            assert len(await raw.reader.readexactly(9 + (1 << 17))) == 9 + (1 << 17)
-            raw.close()
-
-    with_router(scenario)
+async def test_a_stranger_may_send_little_until_it_is_admitted(path: Path) -> None:
+    handler = Echo(admits=False)
+    async with serving_router(path, handler):
+        raw = await (await Raw.connect(path)).ready()
+        assert await raw.echo(b"hello") == b"hello"
+        raw.writer.write(encode(bytes(1 << 17)))
+        assert await raw.reader.readexactly(2 + 15) == encode(b"oversize 131072")
+        next(iter(handler.open.values())).admit()
+        raw.writer.write(encode(bytes(1 << 17)))
+        assert len(await raw.reader.readexactly(9 + (1 << 17))) == 9 + (1 << 17)
+        raw.close()
 
 
-def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(path: Path) -> None:
+async def test_a_peer_that_does_not_read_is_not_read_either_and_its_bytes_come_back(
+    path: Path,
+) -> None:
     """One slow reader of `history` had 2.5 GiB queued: limits counted messages, not bytes."""
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler) as router:
-            slow = await (await Raw.connect(path)).ready()
-            slow.writer.write(encode(bytes(1 << 19)) * 64)
-            await comes_true(lambda: any(user.out_bytes for user in router._users.values()))
-            connection = next(iter(handler.open.values()))
-            handled = len(handler.received_from)
-            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [
-                b"honest"
-            ]
-            assert len(handler.received_from) - handled <= 2
-            # pushes have a bound, too
-            while connection.send(bytes(1 << 16)):
-                pass
-            assert connection._out_bytes <= LIMITS.out_max_bytes
-            slow.close()
-            await comes_true(lambda: not handler.open)
-            assert router._users == {}
-        assert handler.dropped == 0
-
-    with_router(scenario)
+    handler = Echo()
+    async with serving_router(path, handler) as router:
+        slow = await (await Raw.connect(path)).ready()
+        slow.writer.write(encode(bytes(1 << 19)) * 64)
+        await comes_true(lambda: any(user.out_bytes for user in router._users.values()))
+        connection = next(iter(handler.open.values()))
+        handled = len(handler.received_from)
+        assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [b"honest"]
+        assert len(handler.received_from) - handled <= 2
+        # pushes have a bound, too
+        while connection.send(bytes(1 << 16)):
+            pass
+        assert connection._out_bytes <= LIMITS.out_max_bytes
+        slow.close()
+        await comes_true(lambda: not handler.open)
+        assert router._users == {}
+    assert handler.dropped == 0
 
 
-def test_small_messages_to_a_peer_that_does_not_read_are_counted(path: Path) -> None:
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            raw = await (await Raw.connect(path)).ready()
-            await comes_true(lambda: bool(handler.open))
-            connection = next(iter(handler.open.values()))
-            connection.send(bytes(1 << 20))
-            sent = 0
-            while connection.send(b"push"):
-                sent += 1
-            assert sent <= OUT_MESSAGES_MAX
-            raw.close()
-
-    with_router(scenario)
+async def test_small_messages_to_a_peer_that_does_not_read_are_counted(path: Path) -> None:
+    handler = Echo()
+    async with serving_router(path, handler):
+        raw = await (await Raw.connect(path)).ready()
+        await comes_true(lambda: bool(handler.open))
+        connection = next(iter(handler.open.values()))
+        connection.send(bytes(1 << 20))
+        sent = 0
+        while connection.send(b"push"):
+            sent += 1
+        assert sent <= OUT_MESSAGES_MAX
+        raw.close()
 
 
-def test_silent_connections_are_cut(path: Path) -> None:
+async def test_silent_connections_are_cut(path: Path) -> None:
     """4,000 connections without hello were never cut."""
 
-    async def scenario() -> None:
-        handler = Echo(admits=False)
-        limits = Bounds(handshake_s=0.0, hello_s=0.01, process_share=1.0, user_share=1.0)
-        async with serving_router(path, handler, limits) as router:
-            bare = [await Raw.connect(path, b"") for _ in range(50)]
-            shaken = await Raw.connect(path)
-            for raw in (*bare, shaken):
-                await raw.ended()
-            await comes_true(lambda: len(router) == 0)
-            assert router._processes == {}
-
-    with_router(scenario)
+    handler = Echo(admits=False)
+    limits = Bounds(handshake_s=0.0, hello_s=0.01, process_share=1.0, user_share=1.0)
+    async with serving_router(path, handler, limits) as router:
+        bare = [await Raw.connect(path, b"") for _ in range(50)]
+        shaken = await Raw.connect(path)
+        for raw in (*bare, shaken):
+            await raw.ended()
+        await comes_true(lambda: len(router) == 0)
+        assert router._processes == {}
 
 
-def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
+async def test_the_newest_connection_finds_room_among_silent_ones(path: Path) -> None:
     """Bare connects used up all places; each newcomer now takes that of the oldest silent one."""
 
-    async def scenario() -> None:
-        handler = Echo()
-        limits = Bounds(
-            connections_max=8, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
-        )
-        async with serving_router(path, handler, limits) as router:
-            bare = [await Raw.connect(path, b"") for _ in range(20)]
-            honest = await (await Raw.connect(path)).ready()
-            assert await honest.echo(b"here") == b"here"
-            assert len(router) == 8
-            for raw in (*bare, honest):
-                raw.close()
-
-    with_router(scenario)
+    handler = Echo()
+    limits = Bounds(
+        connections_max=8, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
+    )
+    async with serving_router(path, handler, limits) as router:
+        bare = [await Raw.connect(path, b"") for _ in range(20)]
+        honest = await (await Raw.connect(path)).ready()
+        assert await honest.echo(b"here") == b"here"
+        assert len(router) == 8
+        for raw in (*bare, honest):
+            raw.close()
 
 
 _HONEST = """
@@ -354,56 +317,45 @@ assert peer.recv() == b"x"
 """
 
 
-def test_a_process_has_a_share_of_the_connections(path: Path) -> None:
-    async def scenario() -> None:
-        handler = Echo()
-        limits = Bounds(
-            connections_max=8, process_share=0.5, user_share=1.0, handshake_s=30, hello_s=30
-        )
-        async with serving_router(path, handler, limits):
-            greedy = [await (await Raw.connect(path)).ready() for _ in range(4)]
-            refused = await Raw.connect(path)
-            await refused.ended()
-            other = await asyncio.create_subprocess_exec(
-                sys.executable, "-c", _HONEST, f"ipc://{path}"
-            )
-            assert await other.wait() == 0
-            for raw in greedy:
-                raw.close()
-
-    with_router(scenario)
-
-
-def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) -> None:
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            flood = await (await Raw.connect(path)).ready()
-            honest = await (await Raw.connect(path)).ready()
-            await comes_true(lambda: len(handler.open) == 2)
-            flooder, other = handler.open
-            reading = asyncio.create_task(flood.reader.read(-1))
-            flood.writer.write(encode(b"") * 20_000)  # both lie in their sockets from here on
-            assert await honest.echo(b"now") == b"now"
-            assert handler.received_from.index(other) < 2_000  # a turn of the flood, or two
-            await comes_true(lambda: handler.received_from.count(flooder) == 20_000)
-            for raw in (flood, honest):
-                raw.close()
-            await reading
-
-    with_router(scenario)
-
-
-def test_a_connection_over_its_rate_rests_and_loses_nothing(path: Path) -> None:
-    async def scenario() -> None:
-        handler = Echo(within_rate=False)
-        async with serving_router(path, handler):
-            raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(encode(b"abc") * 20)
-            assert await raw.reader.readexactly(20 * 5) == encode(b"abc") * 20
+async def test_a_process_has_a_share_of_the_connections(path: Path) -> None:
+    handler = Echo()
+    limits = Bounds(
+        connections_max=8, process_share=0.5, user_share=1.0, handshake_s=30, hello_s=30
+    )
+    async with serving_router(path, handler, limits):
+        greedy = [await (await Raw.connect(path)).ready() for _ in range(4)]
+        refused = await Raw.connect(path)
+        await refused.ended()
+        other = await asyncio.create_subprocess_exec(sys.executable, "-c", _HONEST, f"ipc://{path}")
+        assert await other.wait() == 0
+        for raw in greedy:
             raw.close()
 
-    with_router(scenario)
+
+async def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: Path) -> None:
+    handler = Echo()
+    async with serving_router(path, handler):
+        flood = await (await Raw.connect(path)).ready()
+        honest = await (await Raw.connect(path)).ready()
+        await comes_true(lambda: len(handler.open) == 2)
+        flooder, other = handler.open
+        reading = asyncio.create_task(flood.reader.read(-1))
+        flood.writer.write(encode(b"") * 20_000)  # both lie in their sockets from here on
+        assert await honest.echo(b"now") == b"now"
+        assert handler.received_from.index(other) < 2_000  # a turn of the flood, or two
+        await comes_true(lambda: handler.received_from.count(flooder) == 20_000)
+        for raw in (flood, honest):
+            raw.close()
+        await reading
+
+
+async def test_a_connection_over_its_rate_rests_and_loses_nothing(path: Path) -> None:
+    handler = Echo(within_rate=False)
+    async with serving_router(path, handler):
+        raw = await (await Raw.connect(path)).ready()
+        raw.writer.write(encode(b"abc") * 20)
+        assert await raw.reader.readexactly(20 * 5) == encode(b"abc") * 20
+        raw.close()
 
 
 _ORPHAN = """
@@ -419,92 +371,74 @@ while peer.recv(1 << 16):
 """
 
 
-def test_a_child_does_not_speak_on_its_dead_parents_connection(path: Path) -> None:
+async def test_a_child_does_not_speak_on_its_dead_parents_connection(path: Path) -> None:
     """The kernel named the parent at accept: what a child sends later is not the parent's word."""
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            process = await asyncio.create_subprocess_exec(
-                sys.executable, "-c", _ORPHAN, path, GREETING_AND_READY.hex()
-            )
-            await process.wait()
-            await comes_true(lambda: bool(handler.ended))
-            assert handler.ended == ["its process has ended"]
-
-    with_router(scenario)
+    handler = Echo()
+    async with serving_router(path, handler):
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", _ORPHAN, path, GREETING_AND_READY.hex()
+        )
+        await process.wait()
+        await comes_true(lambda: bool(handler.ended))
+        assert handler.ended == ["its process has ended"]
 
 
-def test_a_defect_of_the_handler_costs_one_answer(path: Path) -> None:
-    async def scenario() -> None:
-        async with serving_router(path, Echo()):
-            raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(encode(b"fail"))
-            assert await raw.echo(b"next") == b"next"
-            raw.close()
-
-    with_router(scenario)
+async def test_a_defect_of_the_handler_costs_one_answer(path: Path) -> None:
+    async with serving_router(path, Echo()):
+        raw = await (await Raw.connect(path)).ready()
+        raw.writer.write(encode(b"fail"))
+        assert await raw.echo(b"next") == b"next"
+        raw.close()
 
 
-def test_what_was_sent_before_closing_arrives(path: Path) -> None:
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            raw = await (await Raw.connect(path)).ready()
-            assert await raw.echo(b"close") == b"closing"
-            await raw.ended()
-            assert handler.ended == ["as asked"]
-
-    with_router(scenario)
+async def test_what_was_sent_before_closing_arrives(path: Path) -> None:
+    handler = Echo()
+    async with serving_router(path, handler):
+        raw = await (await Raw.connect(path)).ready()
+        assert await raw.echo(b"close") == b"closing"
+        await raw.ended()
+        assert handler.ended == ["as asked"]
 
 
-def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) -> None:
+async def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Path) -> None:
     """Regression: a finished connection was not read any more, so closing waited its whole flush
     time for absent peers."""
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler) as router:
-            raw = await (await Raw.connect(path)).ready()
-            raw.writer.write(encode(bytes(1 << 19)))
-            await comes_true(lambda: bool(handler.received_from))
-            ending = asyncio.create_task(router.aclose(WAIT_S))
-            assert len(await raw.reader.read(-1)) == 9 + (1 << 19)
-            assert next(iter(handler.open.values())).send(b"late") is False
-            raw.close()
-            await ending
-
-    with_router(scenario)
+    handler = Echo()
+    async with serving_router(path, handler) as router:
+        raw = await (await Raw.connect(path)).ready()
+        raw.writer.write(encode(bytes(1 << 19)))
+        await comes_true(lambda: bool(handler.received_from))
+        ending = asyncio.create_task(router.aclose(WAIT_S))
+        assert len(await raw.reader.read(-1)) == 9 + (1 << 19)
+        assert next(iter(handler.open.values())).send(b"late") is False
+        raw.close()
+        await ending
 
 
-def test_a_deleted_socket_file_is_bound_again(path: Path) -> None:
+async def test_a_deleted_socket_file_is_bound_again(path: Path) -> None:
     """A cleaner of temporary folders made a running daemon unreachable until its restart."""
 
-    async def scenario() -> None:
-        handler = Echo()
-        async with serving_router(path, handler):
-            before = await (await Raw.connect(path)).ready()
-            path.unlink()
-            await comes_true(path.exists)
-            assert await asyncio.to_thread(ask_with_libzmq, path, zmq.REQ, b"again") == [b"again"]
-            assert await before.echo(b"still here") == b"still here"
-            before.close()
-
-    with_router(scenario)
-
-
-def test_another_file_in_the_place_of_the_socket_is_left_alone(path: Path) -> None:
-    async def scenario() -> None:
-        router = Router(path, Echo())
-        router.bind()
-        router.start(asyncio.get_running_loop())
+    handler = Echo()
+    async with serving_router(path, handler):
+        before = await (await Raw.connect(path)).ready()
         path.unlink()
-        path.write_text("mine")
-        router._restore_file()
-        await router.aclose()
-        assert path.read_text() == "mine"
+        await comes_true(path.exists)
+        assert await asyncio.to_thread(ask_with_libzmq, path, zmq.REQ, b"again") == [b"again"]
+        assert await before.echo(b"still here") == b"still here"
+        before.close()
 
-    with_router(scenario)
+
+async def test_another_file_in_the_place_of_the_socket_is_left_alone(path: Path) -> None:
+    router = Router(path, Echo())
+    router.bind()
+    router.start(asyncio.get_running_loop())
+    path.unlink()
+    path.write_text("mine")
+    router._restore_file()
+    await router.aclose()
+    assert path.read_text() == "mine"
 
 
 def test_the_socket_is_for_user_and_group_from_the_first_instant(path: Path) -> None:

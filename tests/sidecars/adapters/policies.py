@@ -41,7 +41,9 @@ def statistics(*cameras: str) -> dict[str, dict[str, Any]]:
     return {STATE: numbers(0.5), "action": numbers(3.0)} | dict.fromkeys(cameras, pixels)
 
 
-def save(folder: Path, config: Any, *cameras: str, change: Callable[[Any], None] | None = None):
+def save(
+    folder: Path, config: Any, *cameras: str, change: Callable[[Any], None] | None = None
+) -> None:
     """Save a policy of `config` with random weights, and its processors."""
     import torch
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors

@@ -53,7 +53,7 @@ def act(adapter, observation):
 def test_a_chunk_in_the_units_of_the_checkpoint(adapter, observation):
     actions = act(adapter, observation)
     assert (actions.shape, str(actions.dtype)) == ((5, 6), "float32")
-    assert 80 < actions.mean() < 120, "the postprocessor of the checkpoint ran: its mean is 100"
+    assert 2 < actions.mean() < 4, "the postprocessor of the checkpoint ran: its mean is 3"
     assert (act(adapter, observation) == actions).all()
 
 
@@ -77,7 +77,7 @@ def test_what_is_missing_or_misshapen_is_named(adapter, observation):
     import numpy as np
 
     wrong = [
-        ({"observation.state": None}, r"observation\.state must be numbers|must have shape"),
+        ({"observation.state": None}, r"observation\.state has numbers that are not finite"),
         ({"observation.state": np.zeros(5, np.float32)}, r"shape \(6,\), not \(5,\)"),
         ({"observation.state": np.full(6, np.nan, np.float32)}, "not finite"),
         ({"observation.images.base_cam": np.zeros((64, 64), np.uint8)}, "base_cam must be uint8"),

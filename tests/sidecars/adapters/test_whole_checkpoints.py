@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.sidecars.adapters import policies, tiny_vision
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.manifest.contracts import Quantization
@@ -26,108 +27,6 @@ pytestmark = pytest.mark.heavy
 CONFIGS = Path(__file__).parents[3] / "configs"
 DEVICES = ("cpu", "meta")  # a load, and `vram-sidecar --check`
 WHOLE = "model.safetensors"
-
-
-def save_owlv2(folder: Path) -> None:
-    from transformers import Owlv2Config, Owlv2ForObjectDetection
-
-    small = {
-        "hidden_size": 32,
-        "intermediate_size": 32,
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-    }
-    config = Owlv2Config(
-        text_config=small | {"vocab_size": 64, "max_position_embeddings": 16},
-        vision_config=small | {"image_size": 64, "patch_size": 16},
-        projection_dim=32,
-    )
-    Owlv2ForObjectDetection(config).save_pretrained(folder)
-
-
-def save_grounding_dino(folder: Path) -> None:
-    from transformers import (
-        BertConfig,
-        GroundingDinoConfig,
-        GroundingDinoForObjectDetection,
-        SwinConfig,
-    )
-
-    config = GroundingDinoConfig(
-        backbone_config=SwinConfig(
-            image_size=64, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=2,
-            out_features=["stage2", "stage3", "stage4"],
-        ),
-        text_config=BertConfig(vocab_size=64, hidden_size=16, num_hidden_layers=1,
-        num_attention_heads=2, intermediate_size=16),
-        encoder_layers=1, decoder_layers=2, d_model=32, encoder_ffn_dim=16, decoder_ffn_dim=16,
-        encoder_attention_heads=2, decoder_attention_heads=2, num_queries=4, encoder_n_points=1,
-        decoder_n_points=1,
-    )  # fmt: skip
-    GroundingDinoForObjectDetection(config).save_pretrained(folder)
-
-
-def features() -> dict[str, Any]:
-    from lerobot.configs.types import FeatureType, PolicyFeature
-
-    return {
-        "input_features": {
-            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
-            "observation.state": PolicyFeature(FeatureType.STATE, (6,)),
-        },
-        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (6,))},
-        "device": "cpu",
-    }
-
-
-def save_vqbet(folder: Path) -> None:
-    from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
-    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
-
-    config = VQBeTConfig(
-        **features(), pretrained_backbone_weights=None, crop_shape=None, gpt_n_layer=1,
-        gpt_n_head=2, gpt_hidden_dim=16, gpt_input_dim=16,
-        gpt_output_dim=16, vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, vqvae_n_embed=4,
-        spatial_softmax_num_keypoints=4,
-        use_group_norm=True, gpt_block_size=50,
-    )  # fmt: skip
-    VQBeTPolicy(config).save_pretrained(folder)
-
-
-def save_smolvla(folder: Path) -> None:
-    """Its VLM's config and processor lie beside it; SmolVLM's own processor needs num2words."""
-    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
-    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-    from tokenizers import Tokenizer, models
-    from transformers import (
-        Idefics3ImageProcessor,
-        Idefics3Processor,
-        PreTrainedTokenizerFast,
-        SmolVLMConfig,
-    )
-
-    words = Tokenizer(models.WordLevel({"<pad>": 0, "<unknown>": 1}, unk_token="<unknown>"))
-    names = ("fake_image_token", "image_token", "global_image_token", "end_of_utterance_token")
-    special = {name: f"<{name}>" for name in names}
-    tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=words, pad_token="<pad>", extra_special_tokens=special
-    )
-    small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
-    text = small | {
-        "model_type": "llama",
-        "vocab_size": 16,
-        "num_hidden_layers": 2,
-        "num_key_value_heads": 2,
-        "head_dim": 16,
-    }
-    vision = small | {"num_hidden_layers": 1, "image_size": 32, "patch_size": 8}
-    vlm = folder / "vlm"
-    SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=2).save_pretrained(vlm)
-    Idefics3Processor(Idefics3ImageProcessor(), tokenizer).save_pretrained(vlm)
-    config = SmolVLAConfig(
-        **features(), vlm_model_name=str(vlm), load_vlm_weights=False, num_vlm_layers=2
-    )
-    SmolVLAPolicy(config).save_pretrained(folder)
 
 
 def shipped_copy(name: str) -> Callable[[Path], None]:
@@ -154,7 +53,10 @@ def load_vlm_nf4(weights: Weights, device: str) -> Any:
     from transformers import AutoModelForImageTextToText
 
     return load_transformers(
-        AutoModelForImageTextToText, weights, device_map={"": device}, nf4=Nf4(min_params=0)
+        AutoModelForImageTextToText,
+        weights,
+        device_map={"": device},
+        nf4=Nf4(min_params_to_quantize=0),
     )
 
 
@@ -174,6 +76,7 @@ def load_policy(weights: Weights, device: str) -> Any:
 
     config = read_config(PreTrainedConfig, weights)
     config.device = device
+    config.pretrained_backbone_weights = None  # no network here
     return load_lerobot(get_policy_class(config.type), weights, config)
 
 
@@ -189,10 +92,10 @@ def load_reward(weights: Weights, device: str) -> Any:
 
 
 OTHERS: dict[str, Callable[[Path], None]] = {
-    "owlv2": save_owlv2,
-    "grounding_dino": save_grounding_dino,
-    "vqbet": save_vqbet,
-    "smolvla": save_smolvla,
+    "owlv2": tiny_vision.save_owlv2,
+    "grounding_dino": tiny_vision.save_grounding_dino,
+    "vqbet": policies.save_vqbet,
+    "smolvla": policies.save_smolvla,
     "compact_act": shipped_copy("so101-grab"),
     "compact_progress": shipped_copy("so101-progress"),
     "shipped detector": shipped_copy("so101-detector"),
@@ -286,7 +189,7 @@ def test_only_a_whole_checkpoint_is_loaded(
 def test_a_checkpoint_in_parts_needs_all_of_them(tmp_path: Path, device: str) -> None:
     from transformers import Owlv2ForObjectDetection
 
-    save_owlv2(tmp_path / "one")
+    tiny_vision.save_owlv2(tmp_path / "one")
     model = Owlv2ForObjectDetection.from_pretrained(tmp_path / "one")
     model.save_pretrained(tmp_path / "parts", max_shard_size="40KB")
     parts = sorted((tmp_path / "parts").glob("model-*.safetensors"))
@@ -359,11 +262,12 @@ def test_a_quantized_policy_is_loaded_as_it_is(
     from lerobot.policies.factory import get_policy_class
     from safetensors.torch import load_file, save_file
 
-    nf4 = Nf4(min_params=0)
+    nf4 = Nf4(min_params_to_quantize=0)
     shutil.copytree(saved("act"), tmp_path, dirs_exist_ok=True)
     weights = Weights(str(tmp_path), local=True)
     config = read_config(PreTrainedConfig, weights)
     config.device = device
+    config.pretrained_backbone_weights = None  # no network here
     cls = get_policy_class(config.type)
 
     def load(nf4: Nf4 | None = nf4) -> Any:
@@ -423,40 +327,12 @@ def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Pa
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
     from safetensors.torch import save_file
 
-    PI05Config(**features())._save_pretrained(tmp_path)
+    PI05Config(**policies.features(policies.FRONT))._save_pretrained(tmp_path)
     assert "read no weights" in refusal_of(load_policy, tmp_path, "meta").message
     save_file({"another.models.weight": torch.zeros(3)}, tmp_path / WHOLE)
     error = refusal_of(load_policy, tmp_path, "meta")
     assert error.details["foreign"] == 1
     assert error.details["missing"] > 100
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(
-    "part", ["preprocessor_step_3_normalizer", "postprocessor_step_0_unnormalizer"]
-)
-def test_a_policy_without_its_statistics_is_refused(tmp_path: Path, part: str, device: str) -> None:
-    """lerobot's processors leave what they have no statistics of as it is: actions would be in the
-    network's units, not in the robot's."""
-    from safetensors.torch import load_file, save_file
-
-    from vram_arbiter.sidecars.adapters.choose import make_adapter
-
-    shipped_copy("so101-grab")(tmp_path)
-    file = tmp_path / f"policy_{part}_processor.safetensors"
-    kept = "observation.state." if "post" in part else "action."
-    numbers = {key: tensor for key, tensor in load_file(file).items() if key.startswith(kept)}
-    save_file(numbers, file)
-    adapter = make_adapter(
-        load_manifest(CONFIGS / "rskills/so101-grab/rskill.yaml"),
-        Weights(str(tmp_path), local=True),
-    )
-    adapter.prepare()
-    with pytest.raises(ModelError, match=r"(action|observation\.state): no mean and no std"):
-        adapter.load(device)
-    file.unlink()
-    with pytest.raises(ModelError, match="its processors cannot be read"):
-        adapter.load(device)
 
 
 def test_check_compares_the_weights_and_ends_with_2(

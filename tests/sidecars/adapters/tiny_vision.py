@@ -6,14 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.sidecars.adapters.conftest import bytes_alphabet
-
 _SMALL = {
     "hidden_size": 32,
     "intermediate_size": 32,
     "num_hidden_layers": 1,
     "num_attention_heads": 2,
 }
+
+
+def bytes_alphabet() -> list[str]:
+    from tokenizers.pre_tokenizers import ByteLevel
+
+    return sorted(ByteLevel.alphabet())
 
 
 def _save(model: Any, folder: Path) -> None:
@@ -66,7 +70,8 @@ def _swin() -> Any:
     )
 
 
-def save_owlvit(folder: Path) -> None:
+def save_owlvit(folder: Path, **larger: int) -> None:
+    """`larger`: of its vision tower, where the model is to be larger."""
     from transformers import (
         OwlViTConfig,
         OwlViTForObjectDetection,
@@ -78,7 +83,7 @@ def save_owlvit(folder: Path) -> None:
     OwlViTProcessor(
         OwlViTImageProcessor(size=size, crop_size=size, do_center_crop=False), tokenizer
     ).save_pretrained(folder)
-    vision = _SMALL | {"image_size": 64, "patch_size": 16}
+    vision = _SMALL | {"image_size": 64, "patch_size": 16} | larger
     config = OwlViTConfig(
         text_config=_clip_text(tokenizer), vision_config=vision, projection_dim=32
     )
@@ -319,7 +324,8 @@ def save_qwen3_vl(folder: Path) -> None:
     _save_vlm(Qwen3VLForConditionalGeneration(config), tokenizer, folder)
 
 
-def save_qwen3_5(folder: Path) -> None:
+def save_qwen3_5(folder: Path, **larger: Any) -> None:
+    """`larger`: of its language model, where the model is to be larger."""
     from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
 
     tokenizer = _save_qwen3_processor(folder, _QWEN_CHAT)
@@ -340,9 +346,11 @@ def save_qwen3_5(folder: Path) -> None:
         linear_num_value_heads=2,
         rope_parameters=rope,
     )
+    text |= larger
+    vision = {"num_position_embeddings": 64, "out_hidden_size": text["hidden_size"]}
     config = Qwen3_5Config(
         text_config=text,
-        vision_config=_QWEN_VISION | {"num_position_embeddings": 64},
+        vision_config=_QWEN_VISION | vision,
         **_qwen_ids(tokenizer),
     )
     _save_vlm(Qwen3_5ForConditionalGeneration(config), tokenizer, folder)

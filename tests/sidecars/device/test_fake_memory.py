@@ -15,7 +15,7 @@ from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.errors import NoGpu, OutOfMemory
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.sidecars.device.fake import FakeMemory
-from vram_arbiter.sidecars.device.memory import NoDevice, fill
+from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
 
 MIB = 2**20
 GIB = 2**30
@@ -151,7 +151,7 @@ def test_an_out_of_memory_while_filling_leaves_nothing_behind(gpu_folder):
 
 def test_filling_is_throttled():
     slept: list[float] = []
-    blocks = fill(NoDevice(), "w", 300 * MIB, bytes_per_s=100 * MIB, sleep=slept.append)
+    blocks = fill(DeviceMemory(), "w", 300 * MIB, bytes_per_s=100 * MIB, sleep=slept.append)
     assert sum(block.size_bytes for block in blocks) == 300 * MIB
     assert sum(slept) == pytest.approx(3.0)
 
