@@ -6,10 +6,11 @@ import argparse
 import asyncio
 import contextlib
 import logging
+import math
 import os
 import signal
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,44 +30,25 @@ log = logging.getLogger("runner")
 AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
 
 
-def positive(text: str) -> float:
-    """Parse a positive number of seconds."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
+def _number[N: (int, float)](
+    kind: Callable[[str], N], wanted: Callable[[N], bool], said: str
+) -> Callable[[str], N]:
+    """Return the parser of a flag whose number is `said`."""
+
+    def number(text: str) -> N:
+        value = kind(text)
+        if not wanted(value):
+            raise argparse.ArgumentTypeError(f"{text} is not {said}")
+        return value
+
+    return number
 
 
-def positive_int(text: str) -> int:
-    """Parse a positive count."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return value
-
-
-def not_negative_int(text: str) -> int:
-    """Parse a count that may be 0."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
-    return value
-
-
-def share(text: str) -> float:
-    """Parse a number from 0 to 1."""
-    value = float(text)
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Parse a number of 0 or more."""
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
-    return value
+positive = _number(float, lambda value: 0 < value < math.inf, "positive")
+not_negative = _number(float, lambda value: 0 <= value < math.inf, "0 or more")
+share = _number(float, lambda value: 0 <= value <= 1, "between 0 and 1")
+positive_int = _number(int, lambda value: value >= 1, "1 or more")
+not_negative_int = _number(int, lambda value: value >= 0, "0 or more")
 
 
 def add_trace_flag(parser: argparse.ArgumentParser) -> None:

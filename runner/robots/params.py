@@ -15,7 +15,15 @@ from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import Mistake, Path, config_error, did_you_mean, dotted
+from vram_arbiter.schemas.yamltext import (
+    Mistake,
+    Path,
+    YamlText,
+    config_error,
+    did_you_mean,
+    dotted,
+    problems_of,
+)
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -129,16 +137,14 @@ def read_params[T: Params](kind: type[T], config: HalConfig, source: str) -> T:
     try:
         return kind.model_validate(config.params)
     except ValidationError as error:
-        problems = []
-        for finding in error.errors(include_url=False, include_context=False):
-            path: Path = ("hal", "params", *finding["loc"])
-            text = finding["msg"].removeprefix("Value error, ")
-            if finding["type"] == "extra_forbidden":
-                fields = list(kind.model_fields) if len(path) == 3 else []
-                if len(path) == 5 and path[2] == "joints":
-                    fields = list(JointParams.model_fields)
-                text = f"unknown key{did_you_mean(str(path[-1]), fields)}"
-            problems.append(Mistake(0, dotted(path), text))
+        joints = config.params.get("joints")
+        known: dict[Path, list[str]] = {(): list(kind.model_fields)}
+        for name in joints if isinstance(joints, dict) else ():
+            known["joints", name] = list(JointParams.model_fields)
+        problems = [
+            Mistake(0, f"hal.params.{found.field}", found.problem)
+            for found in problems_of(error, YamlText("", {}, {}), known)
+        ]
         raise config_error(source, problems) from error
 
 

@@ -202,8 +202,15 @@ def test_a_killed_writer_ends_the_recording_after_the_goal_that_runs(
         made.tick(tick(0, of=SECOND))
         until((root / commit.FOLDER / commit.OPEN).exists)
     os.kill(made.pid, signal.SIGKILL)
-    made.tick(tick(1, of=SECOND))
-    if not runs:
+
+    def goes_on() -> Any:
+        made.tick(tick(1, of=SECOND))
+        return made.lost
+
+    if runs:
+        until(goes_on, WAIT_S)
+    else:
+        made.tick(tick(1, of=SECOND))
         made.goal_ended(SECOND, DONE)
     until(lambda: made.lost is not None, WAIT_S)
     if runs:
