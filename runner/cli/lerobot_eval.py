@@ -25,7 +25,6 @@ from vram_arbiter.schemas.runtime.printable import printable_lines
 
 PROGRAM = "lerobot-eval"
 RESULT = "eval_info.json"
-GB = 10**9
 
 
 async def evaluate(args: argparse.Namespace) -> int:
@@ -98,7 +97,7 @@ def _lease(manifest: RSkillManifest, args: argparse.Namespace) -> list[str]:
         )
     endpoint = ["--endpoint", args.arbiter] if args.arbiter else []
     run = [sys.executable, "-P", "-m", "vram_arbiter.clients", "run", *endpoint]
-    return [*run, "--vram", str(round(declared_gb * GB)), "--name", PROGRAM, "--"]
+    return [*run, "--vram", f"{declared_gb:g}GB", "--name", PROGRAM, "--"]
 
 
 def _cell(manifest: RSkillManifest, args: argparse.Namespace, out: Path, code: int) -> Cell:
