@@ -7,12 +7,12 @@ skill states.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, NoReturn, Protocol, runtime_checkable
 
-from vram_arbiter.schemas.errors import TransientError, VramError
+from vram_arbiter.schemas.errors import EstopRequested, TransientError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.world import (
@@ -47,21 +47,6 @@ class DeadlinePolicy(StrEnum):
     WARN = "warn"
     DROP = "drop"
     RAISE = "raise"
-
-
-class InferenceRunner(Protocol):
-    """A loop that turns observations into actions at a rate, on hardware or in a simulator."""
-
-    @property
-    def rate_hz(self) -> float: ...
-
-    def activate(self) -> None: ...
-
-    def tick(self) -> TickResult: ...
-
-    def run(self, max_ticks: int | None = None) -> RunResult: ...
-
-    def deactivate(self) -> None: ...
 
 
 # -- skills
@@ -114,7 +99,6 @@ class Act:
 
     action: Action
     chunk_index: int | None = None
-    inference_ms: float = 0.0
     chunk: ChunkStart | None = None
     problem: str = ""
 
@@ -128,7 +112,6 @@ class Hold:
     """
 
     reason: str
-    inference_ms: float = 0.0
     withheld: bool = False
     standing: bool = False
 
@@ -191,7 +174,6 @@ class Skill(Stepped, Protocol):
     robot then holds.
     """
 
-    manifest: RSkillManifest
     phase: str
     """How far a start is that has not ended, in words; empty: not known."""
 
@@ -219,24 +201,12 @@ class SkillEnded:
 
 # -- recording a goal
 @dataclass(frozen=True, slots=True)
-class Transition:
-    """Step of a world that is not a robot: its observation and its action, by name, in its own
-    units.
-
-    `sent` empty: time stood still.
-    """
-
-    shown: Mapping[str, float]
-    sent: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
 class GoalTick:
     """One finished tick in which a goal's skill was asked. Immutable: any thread may read it.
 
     `targets` are the joint targets in force, rad by joint: a joint without a new target keeps its
     last; a joint without any is missing. `base_velocity` is the base's command (m/s, m/s, rad/s),
-    None without a base. `transition` replaces joint state and targets where there is no robot.
+    None without a base.
     """
 
     goal: Goal
@@ -244,7 +214,6 @@ class GoalTick:
     result: TickResult
     targets: Mapping[str, float]
     base_velocity: tuple[float, float, float] | None = None
-    transition: Transition | None = None
 
 
 class TickSink(Protocol):
@@ -388,6 +357,83 @@ class Picture(Protocol):
     def model(self) -> CameraModel | None:
         """Where the camera stood when the picture was taken, if that is known."""
         ...
+
+
+# -- the runner
+class Work(Protocol):
+    """Takes callables for the control thread, from any thread."""
+
+    def post(
+        self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]
+    ) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class InferenceRunner(Protocol):
+    """A loop that turns observations into actions at a rate, on hardware or in a simulator.
+
+    `control.loop.ControlLoop` is both. `post` to its mailbox whatever is not said to be for any
+    thread; `caption` and what it tells are replaced whole, so that any thread may read them.
+    """
+
+    caption: tuple[str, ...]
+    tick_idx: int
+    deadline_misses: int
+    save_dir: str | None
+
+    @property
+    def mailbox(self) -> Work: ...
+
+    @property
+    def rate_hz(self) -> float: ...
+
+    def activate(self) -> None: ...
+
+    def tick(self) -> TickResult: ...
+
+    def run(self, max_ticks: int | None = None) -> RunResult: ...
+
+    def deactivate(self) -> None: ...
+
+    def request_stop(self) -> None:
+        """End the run before its next tick. Any thread."""
+        ...
+
+    # -- goals
+    @property
+    def progress(self) -> Progress: ...
+
+    def begin_skill(
+        self, skill: Stepped, goal: Goal, on_end: Callable[[SkillEnded], None]
+    ) -> None: ...
+
+    def end_skill(self) -> GoalData: ...
+
+    def follow(self, sink: TickSink, save_dir: str | None = None) -> None:
+        """Report the ticks of all goals to `sink` as well, from before the first goal on."""
+        ...
+
+    # -- emergency stop
+    @property
+    def estop(self) -> EstopRequested | None: ...
+
+    @property
+    def estop_ns(self) -> int: ...
+
+    def request_estop(self, reason: str) -> None:
+        """Latch the stop. Any thread."""
+        ...
+
+    def obey_estop(self) -> EstopRequested | None: ...
+
+    # -- what others look at
+    @property
+    def world(self) -> WorldState | None: ...
+
+    def camera_names(self) -> tuple[str, ...]: ...
+
+    def snapshot(self, camera: str, max_age_s: float) -> Picture: ...
 
 
 # -- cameras

@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
@@ -21,6 +21,9 @@ from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, Kind, RSkillManifest
+
+if TYPE_CHECKING:
+    from vram_arbiter.runner.goals.server import GoalServer
 
 log = logging.getLogger("runner")
 
@@ -137,6 +140,14 @@ async def connect_arbiter(endpoint: str | None, stack: contextlib.AsyncExitStack
         ) from error
 
 
+async def lease_rendering(arbiter: Any, stack: contextlib.AsyncExitStack) -> None:
+    """Lease what rendering takes of a GPU, before the first picture is rendered."""
+    from vram_arbiter.runner.gpu_lease import RENDERER_BYTES, RENDERING, gpu_lease, rendering_gpu
+
+    gpu = rendering_gpu(os.environ)
+    await stack.enter_async_context(gpu_lease(arbiter, gpu, RENDERING, RENDERER_BYTES))
+
+
 def default_skills() -> Path:
     """Folder of the shipped manifests. Raises ConfigError where there is none."""
     folder = configs_folder(os.environ) / "rskills"
@@ -150,6 +161,15 @@ def default_skills() -> Path:
 def announce(endpoint: str) -> None:
     """Say that clients may connect, on stderr: stdout is the run's result."""
     print(f"serving goals on {endpoint}", file=sys.stderr, flush=True)
+
+
+async def serve_for(server: GoalServer, seconds: float | None) -> None:
+    """Serve goals until the server ends, for `seconds` at most."""
+    try:
+        async with asyncio.timeout(seconds):
+            await server.serve()
+    except TimeoutError:
+        log.info("ending after %.0f s, as asked", seconds)
 
 
 def install_signals(stopping: asyncio.Event) -> None:

@@ -25,6 +25,7 @@ from vram_arbiter.runner.cli.common import (
     connect_arbiter,
     default_skills,
     install_signals,
+    serve_for,
     sidecars_given,
 )
 from vram_arbiter.runner.cli.deployment import (
@@ -41,8 +42,6 @@ from vram_arbiter.runner.cli.deployment import (
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
 from vram_arbiter.runner.cli.makers import MakeMakers, policy_makers
 from vram_arbiter.runner.cli.recording import (
-    Recording,
-    add_push_flags,
     check_recording,
     conclude_recording,
     record_into,
@@ -62,7 +61,6 @@ from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,
-    ConfigError,
     RunnerUnreachable,
     VramError,
 )
@@ -96,7 +94,6 @@ def add_parser(
         action="store_true",
         help="check everything, print what would run, open nothing",
     )
-    add_push_flags(deploy)
     add_display_flag(deploy)
     add_serving_flags(deploy)
     return deploy
@@ -130,8 +127,6 @@ class Deploy:
     async def run(self) -> int:
         """Check, then print the plan or carry it out."""
         taken = self._taken()
-        if self._args.push_to_hub is not None and self._file.robot.save_dir is None:
-            raise ConfigError("--push-to-hub is for a file with save_dir")
         check_display_flag(self._args)
         parts = make_parts(self._file, self._clock)
         recorder = None
@@ -164,23 +159,30 @@ class Deploy:
             topic = listened_topic(self._file.robot)
             stack.enter_context(estop_topic(topic, runner.request_estop))
             runner.spans.share = self._args.trace_ticks
-            if (recording := recording_of(self._file.robot, parts)) is not None:
-                recorder = await record_into(recording, runner, self._stopping.set, stack)
-            display_runner(self._args, runner, arbiter, stack)
+            robot = self._file.robot
+            if robot.save_dir is not None:
+                lerobot = parts.lerobot_units if robot.save_format == "lerobot" else None
+                recorder = await record_into(
+                    Path(robot.save_dir),
+                    runner,
+                    self._stopping.set,
+                    stack,
+                    robot.rate_hz,
+                    robot.robot_id,
+                    lerobot,
+                )
+            display_runner(self._args, runner, robot.robot_id, arbiter, stack)
             control = await self._start(runner, stack)
             if control is None:
                 return 0
             if recorder is not None:
-                await check_recording(recorder, control, runner)
+                await check_recording(recorder, control)
             await stack.enter_async_context(watching(self._watches, runner.robot, self._clock))
-            await make_prompt(
-                control, first=self._args.realtime and leaves_room(self._file.robot.rate_hz)
-            )
+            await make_prompt(control, first=self._args.realtime and leaves_room(robot.rate_hz))
             catalogue = self._offered(parts, manifests, arbiter)
             server = GoalServer(
                 self._endpoint,
                 control,
-                runner,
                 catalogue,
                 self._clock,
                 identity=self._identity(parts, arbiter),
@@ -194,7 +196,7 @@ class Deploy:
         if not failed:
             mark.remove()
         code = self._conclude(runner, ended, failed)
-        await conclude_recording(recorder, self._args)
+        await conclude_recording(recorder)
         return code
 
     # -- steps
@@ -281,10 +283,7 @@ class Deploy:
         task = self._file.robot.task
         own = asyncio.create_task(self._own_task(server, runner)) if task is not None else None
         try:
-            async with asyncio.timeout(self._args.max_seconds):
-                await server.serve()
-        except TimeoutError:
-            log.info("ending after %.0f s, as asked", self._args.max_seconds)
+            await serve_for(server, self._args.max_seconds)
         finally:
             if own is not None and not own.done():
                 own.cancel()
@@ -335,15 +334,6 @@ class Deploy:
         return (
             1 if runner.estop is None else 2
         )  # 2: a supervisor that restarts failed programs must not restart this one
-
-
-def recording_of(robot: RobotEnvironment, parts: Parts) -> Recording | None:
-    """Return what is to be recorded of a deployment; None: nothing."""
-    if robot.save_dir is None:
-        return None
-    lerobot = parts.lerobot_units if robot.save_format == "lerobot" else None
-    joints = parts.hal.description.joint_names
-    return Recording(Path(robot.save_dir), robot.rate_hz, robot.robot_id, joints, lerobot)
 
 
 def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:

@@ -14,8 +14,8 @@ from pathlib import Path
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE, Catalogue, Maker
 from vram_arbiter.runner.protocols import Hal, SensorReader
+from vram_arbiter.runner.recording.columns import whole_rate
 from vram_arbiter.runner.recording.commit import check_folder
-from vram_arbiter.runner.recording.rows import whole_rate
 from vram_arbiter.runner.robots.body import body_of
 from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.runner.safety.gate import RobotGate

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Protocol
 
 from vram_arbiter.clients.output_paths import check_output
-from vram_arbiter.runner.control.loop import ControlLoop
-from vram_arbiter.runner.control.robot import Robot
-from vram_arbiter.runner.display.display import Display, Tee
+from vram_arbiter.runner.display.display import Display
+from vram_arbiter.runner.protocols import InferenceRunner
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -43,22 +42,21 @@ def check_display_flag(args: argparse.Namespace) -> None:
             check_output("--display", Path(args.display))
 
 
-def display_runner[R: Robot](
+def display_runner(
     args: argparse.Namespace,
-    runner: ControlLoop[R],
+    runner: InferenceRunner,
+    name: str,
     arbiter: Leases | None,
     stack: contextlib.AsyncExitStack,
 ) -> None:
-    """Show the runner until the stack is left, beside its recorder; call it after `record_into`."""
+    """Show the runner until the stack is left, beside its recorder."""
     if args.display is None:
         return
     from vram_arbiter.runner.display.stream import RerunStream
 
-    name = str(runner.identity.get("robot", "runner"))
     display = Display(lambda: RerunStream(args.display, name), lambda: runner.world)
     stack.push_async_callback(asyncio.to_thread, display.close)
-    follower = runner.slot.follower
-    follower.sink = display if follower.sink is None else Tee((follower.sink, display))
+    runner.follow(display)
     if arbiter is not None:
         polling = asyncio.create_task(_show_leases(arbiter, display), name="leases' display")
         stack.callback(polling.cancel)

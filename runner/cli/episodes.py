@@ -28,7 +28,7 @@ def add_parser(
 
 async def run(args: argparse.Namespace) -> int:
     """Print the episodes. Raises ConfigError for a folder that was not recorded into."""
-    if await asyncio.to_thread(commit.last, args.dataset) is None:
+    if not commit.is_ours(args.dataset):
         raise ConfigError(f"{args.dataset} is not a dataset that this program recorded")
     notes = await asyncio.to_thread(commit.notes, args.dataset)
     if args.marked is not None:

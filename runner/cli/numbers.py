@@ -1,43 +1,26 @@
 """Types of the numbers in command lines."""
 
 import argparse
+from collections.abc import Callable
+from math import inf
 
 
-def positive(text: str) -> float:
-    """Parse a positive number of seconds."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
+def _number[N: (int, float)](
+    kind: Callable[[str], N], wanted: Callable[[N], bool], said: str
+) -> Callable[[str], N]:
+    """Return the parser of a flag whose number is `said`."""
+
+    def number(text: str) -> N:
+        value = kind(text)
+        if not wanted(value):
+            raise argparse.ArgumentTypeError(f"{text} is not {said}")
+        return value
+
+    return number
 
 
-def positive_int(text: str) -> int:
-    """Parse a positive count."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return value
-
-
-def not_negative_int(text: str) -> int:
-    """Parse a count that may be 0."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
-    return value
-
-
-def share(text: str) -> float:
-    """Parse a number from 0 to 1."""
-    value = float(text)
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Parse a number of 0 or more."""
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not 0 or more")
-    return value
+positive = _number(float, lambda value: 0 < value < inf, "positive")
+not_negative = _number(float, lambda value: 0 <= value < inf, "0 or more")
+share = _number(float, lambda value: 0 <= value <= 1, "between 0 and 1")
+positive_int = _number(int, lambda value: value >= 1, "1 or more")
+not_negative_int = _number(int, lambda value: value >= 0, "0 or more")

@@ -10,8 +10,8 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from vram_arbiter.runner.recording.reader import Recorded, RecordedGoal, read_frame
-from vram_arbiter.runner.recording.rows import LEROBOT, ROBOT
+from vram_arbiter.runner.cli.numbers import not_negative_int
+from vram_arbiter.runner.recording.reader import Recorded, read_frame
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
@@ -27,12 +27,12 @@ def add_parser(
     replay.add_argument("--dataset", type=Path, required=True, help="folder of the recording")
     replay.add_argument(
         "--frame",
-        type=_index,
+        type=not_negative_int,
         required=True,
         help="number of the frame over all episodes, from 0 on",
     )
     replay.add_argument(
-        "--episode", type=_index, help="count frames from the beginning of this episode"
+        "--episode", type=not_negative_int, help="count frames from the beginning of this episode"
     )
     replay.add_argument("--json", action="store_true", help="all of it, for programs")
     replay.add_argument(
@@ -79,6 +79,8 @@ def trace_link(recorded: Recorded, template: str | None) -> str | None:
 def as_text(recorded: Recorded, link: str | None) -> str:
     """Format a frame for people, one line per fact."""
     goal, tick = recorded.goal, recorded.tick
+    outcome = ": ".join(filter(None, (goal.get("status"), goal.get("message"))))
+    outcome += f"; marked {goal['marked']}" if "marked" in goal else ""
     lines = [
         ("frame", f"{recorded.frame} of {recorded.root} ({recorded.robot})"),
         (
@@ -86,7 +88,7 @@ def as_text(recorded: Recorded, link: str | None) -> str:
             f"{recorded.episode}, frame {recorded.frame_in_episode} at {recorded.at_s:.3f} s",
         ),
         ("task", recorded.task),
-        ("goal", f"{goal['goal_id']}: {goal['skill']} {_outcome(goal)}".rstrip()),
+        ("goal", f"{goal['goal_id']}: {goal['skill']} {outcome}".rstrip()),
     ]
     if recorded.trace_id:
         kept = (
@@ -115,15 +117,10 @@ def as_text(recorded: Recorded, link: str | None) -> str:
     )
     if tick["violations"]:
         lines.append(("safety", tick["violations"]))
-    if recorded.units in (ROBOT, LEROBOT):
-        unit = " rad" if recorded.units == ROBOT else ""  # lerobot's differ by joint
-        lines += [
-            ("joint", f"{name}: at {value:+.4f}{unit}, told {recorded.action[name]:+.4f}")
-            for name, value in recorded.state.items()
-        ]
-    else:  # a world's own numbers, and what it was sent: they need not be related
-        lines += [("shown", f"{name}: {value:+.4g}") for name, value in recorded.state.items()]
-        lines += [("sent", f"{name}: {value:+.4g}") for name, value in recorded.action.items()]
+    lines += [
+        ("joint", f"{name}: at {value:+.4f} rad, told {recorded.action[name]:+.4f}")
+        for name, value in recorded.state.items()
+    ]
     lines += [
         ("base", f"{what}: " + ", ".join(f"{name} {value:+.3f}" for name, value in values.items()))
         for what, values in recorded.base.items()
@@ -136,18 +133,3 @@ def as_text(recorded: Recorded, link: str | None) -> str:
     if not recorded.complete:
         lines.append(("note", "a recording into this folder is under way, or was cut off"))
     return "\n".join(f"{label:<8} {text}" for label, text in lines)
-
-
-def _outcome(goal: RecordedGoal) -> str:
-    status = str(goal.get("status", ""))
-    said = f"{status}: {goal['message']}" if goal.get("message") else status
-    return f"{said}; marked {goal['marked']}" if "marked" in goal else said
-
-
-def _index(text: str) -> int:
-    if not text.removeprefix("-").isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a frame or episode number, got {text!r}")
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded, TickSink
+from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded, TickSink
 
 
 class GoalFollower:
-    """Forwards goals to `sink`. A goal that ends within a tick is reported after that tick."""
+    """Forwards goals to `sinks`. A goal that ends within a tick is reported after that tick."""
 
     def __init__(self) -> None:
-        self.sink: TickSink | None = None  # set it before the first goal
+        self.sinks: tuple[TickSink, ...] = ()  # complete before the first goal
         self._asked: Goal | None = None  # the goal whose skill this tick asked
         self._over: tuple[Goal, SkillEnded | None] | None = None
 
@@ -21,20 +21,25 @@ class GoalFollower:
 
     def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
         """Report the end of a goal; `ended` None: the robot was taken back."""
-        if self.sink is None:
-            return
         if self._asked is goal:  # its last tick is still to come
             self._over = (goal, ended)
         else:
-            self.sink.goal_ended(goal, ended)
+            self._tell_end(goal, ended)
+
+    def facts(self) -> GoalData:
+        """Return the facts of all sinks."""
+        return {name: fact for sink in self.sinks for name, fact in sink.facts().items()}
 
     def tick_over(self, goal_tick: Callable[[Goal], GoalTick | None]) -> None:
         """Report the tick that just ended. `goal_tick` builds its record; None: there is none."""
         asked, self._asked = self._asked, None
         over, self._over = self._over, None
-        if self.sink is None:
-            return
-        if asked is not None and (tick := goal_tick(asked)) is not None:
-            self.sink.tick(tick)
+        if self.sinks and asked is not None and (tick := goal_tick(asked)) is not None:
+            for sink in self.sinks:
+                sink.tick(tick)
         if over is not None:
-            self.sink.goal_ended(*over)
+            self._tell_end(*over)
+
+    def _tell_end(self, goal: Goal, ended: SkillEnded | None) -> None:
+        for sink in self.sinks:
+            sink.goal_ended(goal, ended)

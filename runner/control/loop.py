@@ -208,8 +208,9 @@ class ControlLoop[R: Robot]:
         return self.slot.take_back()
 
     def follow(self, sink: TickSink, save_dir: str | None = None) -> None:
-        """Report the ticks of all goals to `sink`, from before the first goal on."""
-        self.slot.follower.sink, self.save_dir = sink, save_dir
+        """Report the ticks of all goals to `sink` as well, from before the first goal on."""
+        self.slot.follower.sinks += (sink,)
+        self.save_dir = save_dir or self.save_dir
 
     # -- what others look at
     @property
@@ -260,7 +261,7 @@ class ControlLoop[R: Robot]:
         """Update the world state; the goal ends if the robot cannot go on."""
         if tick.reset:
             return
-        followed = self.slot.follower.sink is not None
+        followed = bool(self.slot.follower.sinks)
         tick.sensed = self.robot.sense(self.slot.skill, followed=followed)
         if tick.sensed.problem:
             tick.decision.violations = (tick.sensed.problem,)
@@ -327,7 +328,6 @@ class ControlLoop[R: Robot]:
         )
         meters.measure(telemetry.METRIC_TICK, result.tick_ms / 1e3, labels)
         self.slot.follower.tick_over(lambda goal: self._goal_tick(goal, tick, result))
-        self.robot.ticked(result)
         if result.deadline_missed:
             self.deadline_misses += 1
             meters.count(telemetry.METRIC_DEADLINE_MISSES, labels)
@@ -359,7 +359,6 @@ class ControlLoop[R: Robot]:
             deadline_missed=ended_s > tick.slot.deadline_s,
             step_idx=applied.step_idx,
             episode_idx=applied.episode_idx,
-            reward=applied.reward,
             terminated=applied.terminated,
             truncated=applied.truncated,
             success=applied.success,
@@ -375,7 +374,6 @@ class ControlLoop[R: Robot]:
             result,
             dict(self.robot.targets()),
             _base_command(self.world, tick.decision.action),
-            self.robot.transition(),
         )
 
     # -- result
@@ -384,7 +382,6 @@ class ControlLoop[R: Robot]:
         tick_ms, inference_ms = self.timings.tick_ms, self.timings.inference_ms
         return RunResult(
             n_ticks=self.tick_idx - self._first_tick,
-            success=self.robot.success(),
             budget_violations=self.deadline_misses,
             avg_inference_ms=mean(inference_ms),
             p99_inference_ms=percentile(inference_ms, 0.99),
@@ -396,8 +393,7 @@ class ControlLoop[R: Robot]:
         )
 
     def _metadata(self) -> GoalData:
-        late_ms, sink = self.timings.late_ms, self.slot.follower.sink
-        recorded = {} if sink is None else dict(sink.facts())  # a mere view has none
+        late_ms, recorded = self.timings.late_ms, self.slot.follower.facts()
         return {
             **self.identity,
             "rate_hz": self.rate_hz,

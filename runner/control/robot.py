@@ -17,10 +17,9 @@ from vram_arbiter.runner.protocols import (
     SafetyGate,
     SkillEnded,
     Stepped,
-    Transition,
 )
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.world import Action, TickResult, WorldState
+from vram_arbiter.schemas.world import Action, WorldState
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,6 @@ class Applied:
     action_applied: bool = False
     step_idx: int | None = None
     episode_idx: int | None = None
-    reward: float | None = None
     terminated: bool | None = None
     truncated: bool | None = None
     success: bool | None = None
@@ -107,10 +105,6 @@ class Robot(Protocol):
         """Carry out an action that passed the gate; None holds."""
         ...
 
-    def ticked(self, result: TickResult) -> None:
-        """Note the measured tick."""
-        ...
-
     # -- safety
     def admit(self, skill: Stepped) -> SafetyGate:
         """Return the gate for one goal of this skill.
@@ -126,14 +120,6 @@ class Robot(Protocol):
     # -- for recordings and reports
     def targets(self) -> Mapping[str, float]:
         """Return the joint targets in force, rad by joint; joints without a target are missing."""
-        ...
-
-    def transition(self) -> Transition | None:
-        """Return this tick's step of a world that is not a robot."""
-        ...
-
-    def success(self) -> bool | None:
-        """Return the verdict on the run; None where nothing judges."""
         ...
 
     def facts(self) -> GoalData:

@@ -11,27 +11,13 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
-from vram_arbiter.runner.control.mailbox import Mailbox
 from vram_arbiter.runner.protocols import Goal, GoalData, InferenceRunner, SkillEnded
 from vram_arbiter.schemas.errors import InternalError, VramError
 from vram_arbiter.schemas.world import RunResult
 
 log = logging.getLogger(__name__)
-
-
-class Controlled(InferenceRunner, Protocol):
-    """A runner that can be driven from outside between its ticks."""
-
-    def request_stop(self) -> None: ...
-
-    @property
-    def mailbox(self) -> Mailbox: ...
-
-    def begin_skill(self, skill: Any, goal: Goal, on_end: Callable[[SkillEnded], None]) -> None: ...
-
-    def end_skill(self) -> GoalData: ...
 
 
 class ControlThread:
@@ -41,7 +27,7 @@ class ControlThread:
     error.
     """
 
-    def __init__(self, runner: Controlled, *, max_ticks: int | None = None) -> None:
+    def __init__(self, runner: InferenceRunner, *, max_ticks: int | None = None) -> None:
         self.runner = runner
         self._max_ticks = max_ticks
         self._thread = threading.Thread(target=self._main, name="control", daemon=True)

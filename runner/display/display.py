@@ -12,10 +12,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
-from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded, TickSink
+from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.world import WorldState
 
@@ -61,24 +61,6 @@ class _Ended:
 class _Leases:
     charged: Mapping[str, float]
     stamp_s: float
-
-
-class Tee:
-    """Several sinks of ticks as one."""
-
-    def __init__(self, sinks: tuple[TickSink, ...]) -> None:
-        self._sinks = sinks
-
-    def tick(self, tick: GoalTick) -> None:
-        for sink in self._sinks:
-            sink.tick(tick)
-
-    def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
-        for sink in self._sinks:
-            sink.goal_ended(goal, ended)
-
-    def facts(self) -> GoalData:
-        return {name: fact for sink in self._sinks for name, fact in sink.facts().items()}
 
 
 class Display:
@@ -130,9 +112,7 @@ class Display:
             if not pictures:
                 self.dropped_pictures += 1
                 bare = tick.world.model_copy(update={"image_frames": None})
-                tick = GoalTick(
-                    tick.goal, bare, tick.result, tick.targets, tick.base_velocity, tick.transition
-                )
+                tick = replace(tick, world=bare)
             self._queue.append(_Shown(tick, pictures))
             self._changed.notify()
 

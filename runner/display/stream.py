@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vram_arbiter.runner.protocols import GoalTick
-from vram_arbiter.runner.recording.rows import COLOURS
-from vram_arbiter.runner.sensors.pictures import as_rgb
+from vram_arbiter.runner.sensors.pictures import COLOURS, as_rgb
 from vram_arbiter.schemas.errors import ConfigError, FrameStale, ModelError
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, WorldState
@@ -146,14 +145,9 @@ class RerunStream:
             self.numbers(
                 "action/base", dict(zip(("vx", "vy", "wz"), tick.base_velocity, strict=True))
             )
-        if tick.transition is not None:
-            self.numbers("state", tick.transition.shown)
-            self.numbers("action", tick.transition.sent)
         withheld = bool(result.safety_violations) and not result.action_applied
         timings = {"ms": result.tick_ms, "inference_ms": result.inference_ms}
         self.numbers("tick", {**timings, "withheld": float(withheld)})
-        if result.reward is not None:
-            self.numbers("tick", {"reward": result.reward})
         for text in result.safety_violations:
             self.event(f"withheld: {text}" if withheld else text, "WARN")
 

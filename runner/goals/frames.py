@@ -7,11 +7,9 @@ know goals or the wire.
 from __future__ import annotations
 
 import asyncio
-from typing import Protocol
 
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
-from vram_arbiter.runner.protocols import Picture
 from vram_arbiter.runner.sensors.pictures import Encoding, encode
 from vram_arbiter.schemas.errors import BadRequest, FrameStale
 from vram_arbiter.schemas.goals import FrameReply
@@ -21,17 +19,8 @@ FIRST_FRAME_GRACE_S = (
 )
 
 
-class FrameSource(Protocol):
-    """What the control thread offers; both are called on it."""
-
-    def camera_names(self) -> tuple[str, ...]: ...
-
-    def snapshot(self, camera: str, max_age_s: float) -> Picture: ...
-
-
 async def fetch(
     control: ControlThread,
-    source: FrameSource,
     clock: Clock,
     camera: str,
     max_age_ms: float,
@@ -41,6 +30,7 @@ async def fetch(
 
     Raises BadRequest for an unknown camera, FrameStale otherwise.
     """
+    source = control.runner
     known = source.camera_names()
     name = camera or (known[0] if known else "")
     if name not in known:

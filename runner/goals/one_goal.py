@@ -13,7 +13,7 @@ import logging
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.runner.control.clock import Clock
@@ -24,7 +24,6 @@ from vram_arbiter.runner.skills.residency import Residency
 from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
-    EstopRequested,
     GoalRejected,
     InternalError,
     VramError,
@@ -49,18 +48,6 @@ FINISH_S = (
 
 Status = Literal["succeeded", "failed", "canceled", "deadline"]
 Tell = Callable[[Peer, Message], Awaitable[None]]
-
-
-class Performer(Protocol):
-    """Parts of the runner that a goal reads and writes. Attributes are replaced whole."""
-
-    caption: tuple[str, ...]
-
-    @property
-    def progress(self) -> Progress: ...
-
-    @property
-    def estop(self) -> EstopRequested | None: ...
 
 
 @dataclass(slots=True)
@@ -91,14 +78,13 @@ class OneGoal:
     def __init__(
         self,
         control: ControlThread,
-        robot: Performer,
         catalogue: Catalogue,
         clock: Clock,
         tell: Tell,
         stopping: asyncio.Event,
     ) -> None:
         self._control = control
-        self._robot = robot
+        self._robot = control.runner
         self._catalogue = catalogue
         self._clock = clock
         self._tell_peer = tell

@@ -13,20 +13,19 @@ import logging
 import os
 import uuid
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any
 
 from vram_arbiter.clients.net.server import Peer, RouterServer, parsed, refusal
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals import frames
 from vram_arbiter.runner.goals.catalogue import Catalogue
-from vram_arbiter.runner.goals.one_goal import OneGoal, Performer
+from vram_arbiter.runner.goals.one_goal import OneGoal
 from vram_arbiter.runner.recording.recorder import Marked, Verdict
 from vram_arbiter.runner.safety.estop import OBEY_S, EstopServer
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
     BadState,
-    EstopRequested,
     GoalRejected,
     InternalError,
     LimitExceeded,
@@ -49,7 +48,6 @@ from vram_arbiter.schemas.goals import (
     ShutdownRunner,
 )
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.world import WorldState
 
 log = logging.getLogger(__name__)
 
@@ -61,29 +59,6 @@ OPS = (
     "goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "reset", "mark",
     "ping", "shutdown",
 )  # fmt: skip
-
-
-class ServedRunner(frames.FrameSource, Performer, Protocol):
-    """Parts of the runner that the server reads.
-
-    Attributes are replaced whole by the control thread.
-    """
-
-    tick_idx: int
-    deadline_misses: int
-
-    @property
-    def world(self) -> WorldState | None: ...
-
-    @property
-    def rate_hz(self) -> float: ...
-
-    @property
-    def estop_ns(self) -> int: ...
-
-    def request_estop(self, reason: str) -> None: ...
-
-    def obey_estop(self) -> EstopRequested | None: ...
 
 
 class GoalServer:
@@ -98,7 +73,6 @@ class GoalServer:
         self,
         endpoint: str,
         control: ControlThread,
-        robot: ServedRunner,
         catalogue: Catalogue,
         clock: Clock,
         *,
@@ -113,7 +87,7 @@ class GoalServer:
     ) -> None:
         self._endpoint = endpoint
         self._control = control
-        self._robot = robot
+        self._robot = control.runner
         self._catalogue = catalogue
         self._clock = clock
         self._ground_truth = ground_truth
@@ -127,7 +101,7 @@ class GoalServer:
         self._reads = 0
         self._session = uuid.uuid4().hex[:12]
         self.stopping = stopping or asyncio.Event()
-        self._goals = OneGoal(control, robot, catalogue, clock, self._send, self.stopping)
+        self._goals = OneGoal(control, catalogue, clock, self._send, self.stopping)
         self.bound = asyncio.Event()
 
     async def serve(self) -> None:
@@ -153,7 +127,6 @@ class GoalServer:
                 EstopServer(
                     self._endpoint,
                     self._robot,
-                    self._control.runner.mailbox,
                     on_stop=on_stop,
                     robot_id=str(self._identity.get("robot", "")),
                     obey_s=self._estop_s,
@@ -225,7 +198,6 @@ class GoalServer:
                 with self._waiting_read():
                     reply = await frames.fetch(
                         self._control,
-                        self._robot,
                         self._clock,
                         request.camera,
                         request.max_age_ms,

@@ -1,29 +1,37 @@
-"""Columns of a dataset, and its rows as lerobot takes them.
+"""Ticks as rows of a dataset: every column with its type, its names and its value.
 
-A dataset has either all columns (`full`), or those that lerobot itself records (`lerobot`): the
-others are then kept beside it. Must not import lerobot or know files.
+Nothing is filled in: a tick that lacks a part of the row is refused with the reason. Units are
+those of `schemas.world` (rad, m, s, and ms where a name says so), or lerobot's for this robot. Must
+not import lerobot, and numpy only in the writer's process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal, TypedDict
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypedDict
 
-from vram_arbiter.runner.recording.rows import TIMINGS, Row, RowFrame
-from vram_arbiter.runner.sensors.pictures import as_rgb
+from vram_arbiter.runner.protocols import GoalTick
+from vram_arbiter.runner.robots.units import LerobotUnits
+from vram_arbiter.runner.sensors.pictures import COLOURS, as_rgb
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.schemas.world import Pose, SensorFrame
 
-Columns = Literal["full", "lerobot"]
-"""All columns in the dataset, or only those that lerobot records, by its names and units."""
-
+TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
+NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
 STATE, ACTION = "observation.state", "action"
 PICTURES = "observation.images."
-REWARD = "next.reward"
+DONE = "next.done"
 SUCCESS = "next.success"  # only of worlds that judge: a skill that says "done" does not know
 
-Frame = dict[str, Any]
-"""One row as lerobot takes it: arrays and texts by column."""
+
+class Column(NamedTuple):
+    """One value of a row. `names` None: a single one."""
+
+    dtype: str
+    names: list[str] | None
+    value: Any
 
 
 class Feature(TypedDict):
@@ -37,144 +45,192 @@ class Feature(TypedDict):
 Features = dict[str, Feature]
 
 
-def features_of(row: Row) -> Features:
-    """Return the dataset's columns, from its first row.
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One tick on its way to the dataset. `success` is the world's verdict; None: it gives none."""
+
+    goal_id: str
+    skill: str
+    task: str
+    trace_id: str
+    success: bool | None
+    columns: Mapping[str, Column]
+    frames: Sequence[SensorFrame]
+
+
+class Incomplete(Exception):
+    """This tick cannot become a row of the dataset; the message names what it lacks."""
+
+
+def whole_rate(rate_hz: float) -> int:
+    """Return the dataset's frames per second.
+
+    Raises ConfigError for a rate that is not a whole number.
+    """
+    if rate_hz < 1 or rate_hz != round(rate_hz):
+        raise ConfigError(
+            f"a recording needs a whole number of ticks a second, not {rate_hz:g}",
+            hint="change the rate",
+        )
+    return round(rate_hz)
+
+
+def row_of(tick: GoalTick, cameras: Sequence[str], lerobot: LerobotUnits | None = None) -> Row:
+    """Return the row. Raises Incomplete.
+
+    `lerobot` records by lerobot's names and units, and only the columns that lerobot records.
+    """
+    goal, result = tick.goal, tick.result
+    frames = [_colours(tick.world.image_frames or {}, camera) for camera in cameras]
+    trace = trace_of((result.trace_context or {}).get("traceparent"))
+    skill = f"{goal.rskill_id}@{goal.revision}" if goal.revision else goal.rskill_id
+    state, action = _joints(tick)
+    if lerobot is not None:
+        columns = {STATE: _vector(lerobot.named(state)), ACTION: _vector(lerobot.named(action))}
+    else:
+        columns = {STATE: _vector(state), ACTION: _vector(action), **_own(tick, frames, trace)}
+        columns |= {"goal_id": _one("string", goal.goal_id), "skill": _one("string", skill)}
+    task = goal.prompt or goal.rskill_id
+    return Row(goal.goal_id, skill, task, trace[0], result.success, columns, frames)
+
+
+def _own(
+    tick: GoalTick, frames: Sequence[SensorFrame], trace: tuple[str, str, bool]
+) -> dict[str, Column]:
+    """Return the columns that lerobot does not record.
 
     Only cameras' columns may have `image` in their names: lerobot takes the statistics of all such
-    columns for those of pictures. Raises ConfigError for pictures that a video cannot hold.
+    columns for those of pictures.
     """
-    features: Features = {ACTION: _vector("float32", row["action_names"])}
-    if row["state_names"]:  # a world may show nothing but pictures
-        features = {STATE: _vector("float32", row["state_names"])} | features
-    for frame in row["frames"]:
-        height, width = frame["height"], frame["width"]
-        if height % 2 or width % 2:
-            raise ConfigError(
-                f"camera {frame['camera']} gives {width} × {height} pixels;"
-                " a video needs even numbers",
-                hint="choose another size for it, or leave it out",
-            )
-        if camera_column(frame["camera"]) in features:
-            raise ConfigError(
-                f"two cameras would have the column {camera_column(frame['camera'])}",
-                hint="rename one of them",
-            )
-        features[camera_column(frame["camera"])] = {
-            "dtype": "video",
-            "shape": (height, width, 3),
-            "names": ["height", "width", "channels"],
-        }
-    if row["base_pose"] is not None:
-        features["base_pose"] = _vector("float32", ["x_m", "y_m", "yaw_rad"])
-    if row["base_velocity"] is not None:
-        features["base_velocity"] = _vector("float32", ["vx", "vy", "wz"])
-    if row["reward"] is not None:
-        features[REWARD] = _one("float32")
-    if row["success"] is not None:  # a column of booleans cannot say "not known": it is left out
-        features[SUCCESS] = _one("bool")
-    if row["frames"]:
-        features["tick.camera_ages_ms"] = _vector(
-            "float32", [frame["camera"] for frame in row["frames"]]
+    world, result = tick.world, tick.result
+    columns: dict[str, Column] = {}
+    if world.base_pose is not None:
+        columns["base_pose"] = _vector(_plane(world.base_pose))
+    if tick.base_velocity is not None:
+        columns["base_velocity"] = _vector(
+            dict(zip(("vx", "vy", "wz"), tick.base_velocity, strict=True))
         )
-    return features | {
-        "next.done": _one("bool"),
-        "tick.index": _one("int64"),
-        "tick.stamp_ns": _one("int64"),
-        "tick.timings_ms": _vector("float32", list(TIMINGS)),
-        "tick.chunk_index": _one("int64"),
-        "tick.action_applied": _one("bool"),
-        "tick.deadline_missed": _one("bool"),
-        "tick.violations": _one("string"),
-        "goal_id": _one("string"),
-        "skill": _one("string"),
-        "trace_id": _one("string"),
-        "span_id": _one("string"),
-        "trace_sampled": _one("bool"),
+    if result.success is not None:  # a column of booleans cannot say "not known": it is left out
+        columns[SUCCESS] = _one("bool", False)
+    if frames:
+        ages_ms = {
+            frame.sensor_id: max(0.0, (world.stamp_ns - frame.stamp_monotonic_ns) / 1e6)
+            for frame in frames
+        }
+        columns["tick.camera_ages_ms"] = _vector(ages_ms)
+    chunk = NO_CHUNK if result.chunk_index is None else result.chunk_index
+    return columns | {
+        DONE: _one("bool", False),
+        "tick.index": _one("int64", result.tick_idx),
+        "tick.stamp_ns": _one("int64", result.stamp_ns),
+        "tick.timings_ms": _vector({name: getattr(result, f"{name}_ms") for name in TIMINGS}),
+        "tick.chunk_index": _one("int64", chunk),
+        "tick.action_applied": _one("bool", result.action_applied),
+        "tick.deadline_missed": _one("bool", result.deadline_missed),
+        "tick.violations": _one("string", "; ".join(result.safety_violations)),
+        "trace_id": _one("string", trace[0]),
+        "span_id": _one("string", trace[1]),
+        "trace_sampled": _one("bool", trace[2]),
     }
 
 
-def frame_of(row: Row, pictures: Sequence[bytes], features: Features) -> Frame:
-    """Return the row as lerobot takes it.
+def _vector(values: Mapping[str, float]) -> Column:
+    return Column("float32", list(values), list(values.values()))
+
+
+def _one(dtype: str, value: Any) -> Column:
+    return Column(dtype, None, value)
+
+
+def _joints(tick: GoalTick) -> tuple[dict[str, float], dict[str, float]]:
+    """Measured joints and their targets (rad)."""
+    joints = tick.world.joint_state
+    if not joints.name:
+        raise Incomplete("the robot has no joints")
+    if missing := [name for name in joints.name if name not in tick.targets]:
+        raise Incomplete(f"joint {missing[0]} has no target yet")
+    state = dict(zip(joints.name, joints.position, strict=True))
+    return state, {name: tick.targets[name] for name in state}
+
+
+def trace_of(traceparent: str | None) -> tuple[str, str, bool]:
+    """Return trace id, span id (hex) and whether the trace is kept, of a W3C traceparent; else
+    empty texts.
+    """
+    parts = (traceparent or "").split("-")
+    if len(parts) < 4 or len(parts[1]) != 32 or len(parts[2]) != 16:
+        return "", "", False
+    try:
+        return parts[1], parts[2], bool(int(parts[3], 16) & 1)
+    except ValueError:
+        return "", "", False
+
+
+def _colours(frames: Mapping[str, SensorFrame], camera: str) -> SensorFrame:
+    frame = frames.get(camera)
+    if frame is None:
+        raise Incomplete(f"camera {camera} has no picture")
+    if frame.data is None or frame.encoding not in COLOURS:
+        raise Incomplete(f"the pictures of camera {camera} ({frame.encoding}) have no colors here")
+    return frame
+
+
+def _plane(pose: Pose) -> dict[str, float]:
+    """x, y (m) and yaw (rad) of the base on its plane."""
+    qx, qy, qz, qw = pose.quat_xyzw
+    yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+    return {"x_m": pose.xyz[0], "y_m": pose.xyz[1], "yaw_rad": yaw}
+
+
+# -- as lerobot takes them
+def camera_column(name: str) -> str:
+    """Return the column of a camera."""
+    return f"{PICTURES}{name.replace('/', '_')}"
+
+
+def features_of(row: Row) -> Features:
+    """Return the dataset's columns. Raises ConfigError for pictures that a video cannot hold."""
+    features: Features = {
+        name: {"dtype": one.dtype, "shape": (len(one.names or "1"),), "names": one.names}
+        for name, one in row.columns.items()
+    }
+    for frame in row.frames:
+        if frame.height % 2 or frame.width % 2:
+            raise ConfigError(
+                f"camera {frame.sensor_id} gives {frame.width} × {frame.height} pixels;"
+                " a video needs even numbers",
+                hint="choose another size for it, or leave it out",
+            )
+        if (column := camera_column(frame.sensor_id)) in features:
+            raise ConfigError(f"two cameras would have the column {column}", hint="rename one")
+        shape, names = (frame.height, frame.width, 3), ["height", "width", "channels"]
+        features[column] = {"dtype": "video", "shape": shape, "names": names}
+    return features
+
+
+def frame_of(row: Row, features: Features) -> dict[str, Any]:
+    """Return the row as lerobot takes it: arrays and texts by column.
 
     Raises ModelError and FrameStale for a picture without colors, ConfigError for one of another
     size than the first.
     """
     import numpy as np
 
-    values: Frame = {
-        STATE: row["state"],
-        ACTION: row["action"],
-        "base_pose": row["base_pose"],
-        "base_velocity": row["base_velocity"],
-        REWARD: row["reward"],
-        "next.done": False,
-        SUCCESS: False,
-        "tick.index": row["tick_idx"],
-        "tick.stamp_ns": row["stamp_ns"],
-        "tick.timings_ms": row["timings_ms"],
-        "tick.chunk_index": row["chunk_index"],
-        "tick.action_applied": row["action_applied"],
-        "tick.deadline_missed": row["deadline_missed"],
-        "tick.violations": row["violations"],
-        "tick.camera_ages_ms": row["ages_ms"],
-        "goal_id": row["goal_id"],
-        "skill": row["skill"],
-        "trace_id": row["trace_id"],
-        "span_id": row["span_id"],
-        "trace_sampled": row["sampled"],
-    }
-    frame: Frame = {"task": row["task"]}
-    for name, feature in features.items():
-        if feature["dtype"] == "video" or name not in values:
-            continue
-        value = values[name]
-        if feature["dtype"] == "string":
-            frame[name] = value
-        elif value is not None:
-            frame[name] = np.atleast_1d(np.asarray(value, dtype=feature["dtype"]))
-    for said, data in zip(row["frames"], pictures, strict=True):
-        rgb = as_rgb(_picture(said, data))
-        column = features.get(camera_column(said["camera"]))
-        wanted = None if column is None else tuple(column["shape"])
+    made: dict[str, Any] = {"task": row.task}
+    for name, one in row.columns.items():
+        if name in features:
+            text = one.dtype == "string"
+            made[name] = one.value if text else np.atleast_1d(np.asarray(one.value, one.dtype))
+    for frame in row.frames:
+        rgb, column = as_rgb(frame), camera_column(frame.sensor_id)
+        wanted = tuple(features[column]["shape"]) if column in features else None
         if tuple(rgb.shape) != wanted:
             raise ConfigError(
-                f"camera {said['camera']} gives pictures of {rgb.shape}, the dataset has {wanted}",
+                f"camera {frame.sensor_id} gives pictures of {rgb.shape}, the dataset has {wanted}",
                 hint="record into a new folder",
             )
-        frame[camera_column(said["camera"])] = rgb
-    return frame
-
-
-def _picture(said: RowFrame, data: bytes) -> SensorFrame:
-    return SensorFrame(
-        sensor_id=said["camera"],
-        stamp_monotonic_ns=0,
-        stamp_wall_ns=0,
-        encoding=FrameEncoding(said["encoding"]),
-        width=said["width"],
-        height=said["height"],
-        data=data,
-    )
-
-
-def camera_column(name: str) -> str:
-    """Return the column of a camera."""
-    return f"{PICTURES}{name.replace('/', '_')}"
-
-
-def _vector(dtype: str, names: Sequence[str]) -> Feature:
-    return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
-
-
-def _one(dtype: str) -> Feature:
-    return {"dtype": dtype, "shape": (1,), "names": None}
-
-
-def own_columns(features: Features) -> set[str]:
-    """Return the columns that lerobot does not record."""
-    return {
-        name for name in features if name not in (STATE, ACTION) and not name.startswith(PICTURES)
-    }
+        made[column] = rgb
+    return made
 
 
 def differences(there: Features, wanted: Features, ignored: Sequence[str] = ()) -> list[str]:
@@ -187,7 +243,7 @@ def differences(there: Features, wanted: Features, ignored: Sequence[str] = ()) 
     ]
 
 
-def _essence(feature: Feature | None) -> tuple[str, tuple[int, ...], list[str] | None] | None:
+def _essence(feature: Feature | None) -> object:
     if feature is None:
         return None
     return feature["dtype"], tuple(feature["shape"]), feature["names"]

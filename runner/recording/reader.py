@@ -1,81 +1,42 @@
 """One frame of a recorded dataset, with its trace and span. Needs neither lerobot nor torch.
 
-Reads the last commit, also while a runner records into the folder. Datasets of other programs are
-refused: their rows lead to no trace.
+Reads finished episodes only, also while a runner records into the folder. Datasets of other
+programs, and those with lerobot's columns only, are refused: their rows lead to no trace.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any
 
 from vram_arbiter.runner.recording import commit
-from vram_arbiter.runner.recording.rows import NO_CHUNK, ROBOT
+from vram_arbiter.runner.recording.columns import (
+    ACTION,
+    DONE,
+    NO_CHUNK,
+    PICTURES,
+    STATE,
+    SUCCESS,
+    Features,
+)
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
-
-if TYPE_CHECKING:
-    from vram_arbiter.runner.recording.columns import Features
-
-TICKS_FILE = commit.TICKS + "/episode-{:06}.parquet"  # of a dataset with lerobot's columns only
-
 
 ParquetRow = dict[str, Any]
 """One row of a table that lerobot wrote, by column."""
 
-
-class DatasetInfo(TypedDict):
-    """Part of `meta/info.json` that is read here."""
-
-    robot_type: str | None
-    data_path: str
-    video_path: str
-    features: Features
-
-
-class RecordedGoal(TypedDict, total=False):
-    """Goal of a recorded frame; its end is known once the episode is committed."""
-
-    goal_id: str
-    skill: str
-    status: str
-    code: str
-    message: str
-    dropped: int
-    incomplete: int
-    marked: str
-
-
-class RecordedTick(TypedDict):
-    """Tick of a recorded frame. `success` None: the world did not judge."""
-
-    index: int
-    stamp_ns: int
-    chunk_index: int | None
-    action_applied: bool
-    deadline_missed: bool
-    violations: str
-    done: bool
-    success: bool | None
-
-
-class RecordedPicture(TypedDict):
-    """Place of a picture: its video and the second in it."""
-
-    path: str
-    at_s: float
+OF_GOAL = ("status", "code", "message", "dropped", "incomplete", "marked")
+OF_TICK = ("index", "stamp_ns", "chunk_index", "action_applied", "deadline_missed", "violations")
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
     """One frame.
 
-    `state` and `action` are by joint (rad), or with `units` "own" by the names of their world, with
-    "lerobot" by lerobot's;
-    `timings_ms` by part of the tick; `pictures` maps a camera to its video's path and the second in
-    it.
+    `state` and `action` are by joint (rad); `timings_ms` by part of the tick; `pictures` maps a
+    camera to its video's path and the second in it. The end of `goal` is that of its episode.
     """
 
     root: str
@@ -85,17 +46,16 @@ class Recorded:
     frame_in_episode: int
     at_s: float
     task: str
-    goal: RecordedGoal
+    goal: Mapping[str, Any]
     trace_id: str
     span_id: str
     trace_sampled: bool
-    tick: RecordedTick
+    tick: Mapping[str, Any]
     timings_ms: Mapping[str, float]
     state: Mapping[str, float]
     action: Mapping[str, float]
-    units: str
     base: Mapping[str, Mapping[str, float]]
-    pictures: Mapping[str, RecordedPicture]
+    pictures: Mapping[str, Mapping[str, Any]]
     complete: bool  # False: a recording is under way, or was cut off
 
 
@@ -105,122 +65,37 @@ def read_frame(root: Path, frame: int, episode: int | None = None) -> Recorded:
     Raises ConfigError for a folder that cannot be read or is not one of ours, BadRequest for a
     frame or an episode that does not exist.
     """
-    info, record = _open(root)
-    names = [name for name in record["files"] if name.startswith("meta/episodes/")]
-    about = _episode(_rows(root, names), frame, episode)
-    index = about["dataset_from_index"] + frame if episode is not None else frame
-    path = info["data_path"].format(
-        chunk_index=about["data/chunk_index"], file_index=about["data/file_index"]
-    )
-    rows = _rows(root, [path], ("index", "==", index))
-    if len(rows) != 1:
-        raise ConfigError(f"{root / path} does not have frame {index}", hint="restore the file")
-    row = rows[0]
-    beside = TICKS_FILE.format(about["episode_index"])
-    if beside in record["files"]:
-        more, columns = _beside(root, beside)
-        info = {**info, "features": {**info["features"], **columns}}
-        row |= more[row["frame_index"]]
-    notes = {note["episode"]: note for note in commit.notes(root)}
-    return _recorded(root, info, about, row, notes.get(about["episode_index"], {}))
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeRows:
-    """All rows of one episode, with the columns beside the dataset; `videos` by camera."""
-
-    index: int
-    note: commit.EpisodeNote
-    features: Features
-    rows: list[ParquetRow]
-    videos: Mapping[str, Path]
-
-    def named(self, row: ParquetRow, column: str) -> dict[str, float]:
-        """Return the values of a column by name; empty without such a column."""
-        return _named(self.features, row, column)
-
-
-def read_episodes(root: Path, wanted: int | None = None) -> Iterator[EpisodeRows]:
-    """Yield the committed episodes, or one of them.
-
-    Raises ConfigError for a folder that cannot be read or is not one of ours, BadRequest for an
-    episode that does not exist.
-    """
-    info, record = _open(root)
-    names = [name for name in record["files"] if name.startswith("meta/episodes/")]
-    episodes = _rows(root, names)
-    if wanted is not None:
-        episodes = [_episode(episodes, 0, wanted)]
-    notes = {note["episode"]: note for note in commit.notes(root)}
-    for about in episodes:
-        index = about["episode_index"]
-        path = info["data_path"].format(
-            chunk_index=about["data/chunk_index"], file_index=about["data/file_index"]
-        )
-        rows = _rows(root, [path], ("episode_index", "==", index))
-        features = info["features"]
-        if (beside := TICKS_FILE.format(index)) in record["files"]:
-            more, columns = _beside(root, beside)
-            features = {**features, **columns}
-            rows = [{**row, **extra} for row, extra in zip(rows, more, strict=True)]
-        yield EpisodeRows(index, notes.get(index, {}), features, rows, _videos(root, info, about))
-
-
-def _videos(root: Path, info: DatasetInfo, about: ParquetRow) -> dict[str, Path]:
-    return {
-        name.removeprefix("observation.images."): root
-        / info["video_path"].format(
-            video_key=name,
-            chunk_index=about[f"videos/{name}/chunk_index"],
-            file_index=about[f"videos/{name}/file_index"],
-        )
-        for name, feature in info["features"].items()
-        if feature["dtype"] == "video"
-    }
-
-
-def _named(features: Features, row: ParquetRow, column: str) -> dict[str, float]:
-    if column not in features:
-        return {}
-    values = row[column]  # of a single number lerobot makes a column of plain numbers
-    return dict(
-        zip(
-            features[column]["names"] or [],
-            values if isinstance(values, list) else [values],
-            strict=True,
-        )
-    )
-
-
-def _open(root: Path) -> tuple[DatasetInfo, commit.Commit]:
-    record = commit.last(root)
-    if record is None:
+    if not commit.is_ours(root):
         raise ConfigError(
             f"{root} is not a dataset that this program recorded",
             hint="name the folder that --record or save_dir named",
         )
+    info = _info(root)
+    about = _episode(_rows(root, "meta/episodes"), frame, episode)
+    index = about["dataset_from_index"] + frame if episode is not None else frame
+    rows = _rows(root, "data", ("index", "==", index))
+    if len(rows) != 1:
+        raise ConfigError(f"{root} does not have frame {index}", hint="restore its files")
+    if "trace_id" not in rows[0]:
+        raise ConfigError(
+            f"{root} has the columns of lerobot only, and no ticks", hint="record it in full"
+        )
+    return _recorded(root, info, about, rows[0])
+
+
+def _info(root: Path) -> dict[str, Any]:
+    path = root / "meta" / "info.json"
     try:
-        info: DatasetInfo = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+        info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"{root / 'meta' / 'info.json'} cannot be read: {error}",
-            hint="the next recording into the folder repairs it",
+            f"{path} cannot be read: {error}", hint="the next recording into the folder repairs it"
         ) from error
-    return info, record
+    return info
 
 
-def _beside(root: Path, name: str) -> tuple[list[ParquetRow], Features]:
-    """Return an episode's rows of the columns that the dataset does not have, and those columns."""
-    import pyarrow.parquet
-
-    rows = _rows(root, [name])
-    features: Features = json.loads(pyarrow.parquet.read_schema(root / name).metadata[b"features"])
-    return rows, features
-
-
-def _rows(
-    root: Path, names: list[str], where: tuple[str, str, int] | None = None
-) -> list[ParquetRow]:
+def _rows(root: Path, folder: str, where: tuple[str, str, int] | None = None) -> list[ParquetRow]:
+    """Return the rows of the tables below a folder."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -228,60 +103,59 @@ def _rows(
         raise ConfigError(
             f"datasets are read with pyarrow: {error}", hint="pip install 'vram-arbiter[dataset]'"
         ) from error
-    rows: list[ParquetRow] = []
-    for name in sorted(names):
+    found: list[ParquetRow] = []
+    for path in commit.finished_files(root, folder):
         try:
-            table = pyarrow.parquet.read_table(
-                root / name, filters=[where] if where is not None else None
-            )
+            table = pyarrow.parquet.read_table(path, filters=where and [where])
         except (OSError, ValueError, pyarrow.ArrowException) as error:
-            raise ConfigError(
-                f"{root / name} cannot be read: {error}", hint="restore the file"
-            ) from error
-        rows += table.select(
-            [each for each in table.column_names if not each.startswith("stats/")]
-        ).to_pylist()
-    return rows
+            raise ConfigError(f"{path} cannot be read: {error}", hint="restore the file") from error
+        kept = [name for name in table.column_names if not name.startswith("stats/")]
+        found += table.select(kept).to_pylist()
+    return found
 
 
 def _episode(episodes: list[ParquetRow], frame: int, wanted: int | None) -> ParquetRow:
-    if wanted is not None:
-        for about in episodes:
-            if about["episode_index"] == wanted:
-                if frame >= about["length"]:
-                    raise BadRequest(
-                        f"episode {wanted} has no frame {frame}", hint=f"0 to {about['length'] - 1}"
-                    )
-                return about
-        raise BadRequest(
-            f"there is no episode {wanted}", hint=f"there are {len(episodes)}, from 0 on"
-        )
     for about in episodes:
-        if about["dataset_from_index"] <= frame < about["dataset_to_index"]:
+        if wanted is None and about["dataset_from_index"] <= frame < about["dataset_to_index"]:
             return about
+        if wanted == about["episode_index"]:
+            if frame < about["length"]:
+                return about
+            hint = f"0 to {about['length'] - 1}"
+            raise BadRequest(f"episode {wanted} has no frame {frame}", hint=hint)
+    if wanted is not None:
+        hint = f"there are {len(episodes)}, from 0 on"
+        raise BadRequest(f"there is no episode {wanted}", hint=hint)
     last = max((about["dataset_to_index"] for about in episodes), default=0) - 1
-    raise BadRequest(
-        f"there is no frame {frame}",
-        hint=f"0 to {last}" if last >= 0 else "nothing is recorded yet",
-    )
+    hint = f"0 to {last}" if last >= 0 else "nothing is recorded yet"
+    raise BadRequest(f"there is no frame {frame}", hint=hint)
 
 
-def _recorded(
-    root: Path,
-    info: DatasetInfo,
-    about: ParquetRow,
-    row: ParquetRow,
-    note: commit.EpisodeNote,
-) -> Recorded:
-    features = info["features"]
+def _recorded(root: Path, info: dict[str, Any], about: ParquetRow, row: ParquetRow) -> Recorded:
+    features: Features = info["features"]
+    notes = {note["episode"]: note for note in commit.notes(root)}
+    note: Mapping[str, Any] = notes.get(about["episode_index"], {})
 
     def named(column: str) -> dict[str, float]:
-        return _named(features, row, column)
+        values = row.get(column, [])  # of a single number lerobot makes a plain one
+        listed = values if isinstance(values, list) else [values]
+        names = features[column]["names"] if column in features else None
+        return dict(zip(names or [], listed, strict=True))
 
-    pictures: dict[str, RecordedPicture] = {}
-    for camera, video in _videos(root, info, about).items():
-        begins_s = about[f"videos/observation.images.{camera}/from_timestamp"]
-        pictures[camera] = {"path": str(video), "at_s": begins_s + row["timestamp"]}
+    pictures = {}
+    for column, feature in features.items():
+        if feature["dtype"] == "video":
+            video = info["video_path"].format(
+                video_key=column,
+                chunk_index=about[f"videos/{column}/chunk_index"],
+                file_index=about[f"videos/{column}/file_index"],
+            )
+            at_s = about[f"videos/{column}/from_timestamp"] + row["timestamp"]
+            pictures[column.removeprefix(PICTURES)] = {"path": str(root / video), "at_s": at_s}
+    tick = {name: row[f"tick.{name}"] for name in OF_TICK}
+    if tick["chunk_index"] == NO_CHUNK:
+        tick["chunk_index"] = None
+    told = {name: note[name] for name in OF_GOAL if name in note}
     return Recorded(
         root=str(root),
         robot=info.get("robot_type") or "",
@@ -289,41 +163,16 @@ def _recorded(
         episode=row["episode_index"],
         frame_in_episode=row["frame_index"],
         at_s=row["timestamp"],
-        task=_task(root, row["task_index"]),
-        goal=_goal(row, note),
+        task=str(note.get("task", "")),
+        goal={"goal_id": row["goal_id"], "skill": row["skill"], **told},
         trace_id=row["trace_id"],
         span_id=row["span_id"],
         trace_sampled=row["trace_sampled"],
-        tick={
-            "index": row["tick.index"],
-            "stamp_ns": row["tick.stamp_ns"],
-            "chunk_index": None if row["tick.chunk_index"] == NO_CHUNK else row["tick.chunk_index"],
-            "action_applied": row["tick.action_applied"],
-            "deadline_missed": row["tick.deadline_missed"],
-            "violations": row["tick.violations"],
-            "done": row["next.done"],
-            "success": row.get("next.success"),  # None: no world judged
-        },
+        tick={**tick, "done": row[DONE], "success": row.get(SUCCESS)},  # None: nothing judged
         timings_ms=named("tick.timings_ms"),
-        state=named("observation.state"),
-        action=named("action"),
-        units=str(note.get("units", ROBOT)),
+        state=named(STATE),
+        action=named(ACTION),
         base={"pose": named("base_pose"), "velocity": named("base_velocity")},
         pictures=pictures,
-        complete=not (root / commit.FOLDER / commit.OPEN).exists(),
+        complete=commit.opened(root) is None,
     )
-
-
-def _goal(row: ParquetRow, note: commit.EpisodeNote) -> RecordedGoal:
-    goal: RecordedGoal = {"goal_id": row["goal_id"], "skill": row["skill"]}
-    for key in ("status", "code", "message", "dropped", "incomplete", "marked"):
-        if key in note:
-            goal[key] = note[key]
-    return goal
-
-
-def _task(root: Path, index: int) -> str:
-    for row in _rows(root, ["meta/tasks.parquet"]):
-        if row["task_index"] == index:
-            return str(next((value for name, value in row.items() if name != "task_index"), ""))
-    return ""

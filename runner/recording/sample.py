@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from vram_arbiter.runner.control.loop import ControlLoop
-from vram_arbiter.runner.control.robot import Robot
-from vram_arbiter.runner.protocols import Goal, GoalTick, Picture
+from vram_arbiter.runner.protocols import Goal, GoalTick, InferenceRunner, Picture
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, TickResult
 
 MAX_AGE_S = 60.0  # its size counts, not what it shows
 
 
-def sample_of[R: Robot](runner: ControlLoop[R]) -> GoalTick | None:
+def sample_of(runner: InferenceRunner) -> GoalTick | None:
     """Return a tick with the present state and a picture of each camera; None before any state.
 
     Control thread. Targets are where the joints are. Raises FrameStale, ModelError for a camera

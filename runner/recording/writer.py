@@ -3,8 +3,8 @@
 Started by `runner.recording.recorder`, never by hand. It is a process of its own because importing
 torch, encoding video and compressing would take the interpreter from the control thread, and
 because it outlives the runner: whatever kills that, the socket ends and the episode so far is
-finished. It ignores SIGTERM and SIGINT for the same reason. It takes rows, the end of a goal and
-the end of all, and answers with what it has finished or could not.
+finished. It ignores SIGTERM and SIGINT for the same reason. Rows are taken without an answer; every
+other message is answered.
 """
 
 from __future__ import annotations
@@ -16,16 +16,22 @@ import os
 import resource
 import shutil
 import signal
-import socket
 import sys
 import warnings
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import cast
+from typing import Any
 
-from vram_arbiter.runner.recording import commit, wire
-from vram_arbiter.runner.recording.columns import SUCCESS, Features, Frame, features_of, frame_of
+from vram_arbiter.runner.recording import commit
+from vram_arbiter.runner.recording.columns import (
+    DONE,
+    SUCCESS,
+    Features,
+    Row,
+    features_of,
+    frame_of,
+)
 from vram_arbiter.runner.recording.lerobot_files import LerobotFiles
-from vram_arbiter.runner.recording.rows import Row
 from vram_arbiter.schemas.errors import (
     BadRequest,
     ConfigError,
@@ -34,6 +40,7 @@ from vram_arbiter.schemas.errors import (
     ModelError,
     VramError,
 )
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime import logging as logs
 
 log = logging.getLogger("vram_arbiter.runner.recording")
@@ -42,200 +49,176 @@ DISCARD = "discard"
 NICENESS = 10  # the control loop goes first
 _CAP_SYS_NICE, _CAPABILITY_VERSION_3 = 23, 0x20080522  # linux/capability.h
 ROWS_MIN = 2  # lerobot has no statistics of a single picture
-ROWS_MAX = 30 * 60 * 30  # half an hour at 30 Hz; a longer goal goes on in the next episode
 
 
 class EpisodeWriter:
     """Rows in, episodes out. One goal at a time, as the runner has one at a time."""
 
-    def __init__(self, peer: socket.socket, files: LerobotFiles, rows_max: int = ROWS_MAX) -> None:
-        self._peer = peer
+    def __init__(self, files: LerobotFiles, units: str) -> None:
         self._files = files
-        self._rows_max = rows_max
+        self._units = units
         self._goal: Row | None = None  # first row of the goal that is being recorded
         self._features: Features = {}
-        self._last: Frame | None = None  # written when it is known whether it is the episode's last
-        self._judged: bool | None = None  # verdict of the world with the last row; None: no verdict
+        # written when it is known whether it is the episode's last, with the world's verdict
+        self._last: tuple[dict[str, Any], bool | None] | None = None
         self._broken = 0  # rows of it with a picture that cannot be read
-        self._refused = ""  # goal whose rows cannot be recorded
+        self._failure: VramError | None = None  # why the goal's rows cannot be recorded
         self._mark = ""  # the operator's verdict on the goal that is being recorded
-        self._finished: list[tuple[str, int]] = []  # goals with an episode, and that episode
+        # goals with an episode, that episode and its frames
+        self._finished: list[tuple[str, int, int]] = []
         self._left_none = False  # the last goal has no episode: the one before has to be named
 
-    def row(self, row: Row, pictures: list[bytes]) -> None:
-        """Add one row of a goal; the first one begins its episode.
-
-        Raises what prevents the recording.
-        """
-        goal_id = row["goal_id"]
-        if goal_id == self._refused:
+    def row(self, row: Row) -> None:
+        """Add one row of a goal; the first one begins its episode. A failure is told at its end."""
+        if self._failure is not None:
             return
-        if self._goal is not None and self._goal["goal_id"] != goal_id:
-            self._close({"status": "unfinished"})
+        try:
+            self._add(row)
+        except Exception as error:
+            log.exception("goal %s is not recorded", row.goal_id)
+            self._failure = (
+                error
+                if isinstance(error, VramError)
+                else InternalError(f"{type(error).__name__}: {error}")
+            )
+
+    def _add(self, row: Row) -> None:
         if self._goal is None:
             self._features = self._files.begin(features_of(row))
             self._goal, self._broken, self._mark = row, 0, ""
         try:
-            frame = frame_of(row, pictures, self._features)
-        except (
-            FrameStale,
-            ModelError,
-        ) as error:  # one broken picture costs one row, not the episode
+            frame = frame_of(row, self._features)
+        except (FrameStale, ModelError) as error:  # a broken picture costs one row, no episode
             self._broken += 1
-            log.warning("tick %d is not recorded: %s", row["tick_idx"], error)
+            log.warning("a tick of goal %s is not recorded: %s", row.goal_id, error)
             return
         if self._last is not None:
-            self._files.add(self._last)
-        self._last, self._judged = frame, row["success"]
-        if self._files.rows + 1 >= self._rows_max:
-            self._close({"status": "continued"})
+            self._files.add(self._last[0])
+        self._last = frame, row.success
 
-    def ended(self, note: commit.EpisodeNote) -> None:
-        """End a goal, with or without rows. Raises what keeps its episode from being finished."""
-        if self._goal is not None and self._goal["goal_id"] == note["goal_id"]:
-            self._close(note)
-        elif self._refused == note["goal_id"]:
-            self._refused = ""
+    def end(self, note: commit.EpisodeNote) -> JsonObject:
+        """End a goal, with or without rows; return what became of it.
 
-    def check(self, row: Row) -> None:
-        """Compare the columns of a row that is not recorded with those of an existing dataset."""
-        try:
-            self._files.check_columns(features_of(row))
-        except VramError as error:
-            self._tell({"kind": "misfit", "error": error.to_wire()})
-        else:
-            self._tell({"kind": "fits"})
-
-    def mark(self, goal_id: str, verdict: str) -> None:
-        """Note the operator's verdict on the goal that is being recorded, or the last one.
-
-        A discarded episode is not written, or is removed. An empty `goal_id` means that goal.
+        Raises what keeps its episode from being finished; the next goal may be recorded again.
         """
-        goal = self._goal["goal_id"] if self._goal is not None else ""
-        finished, episode = self._finished[-1] if self._finished else ("", -1)
+        goal, last, failure = self._goal, self._last, self._failure
+        self._goal = self._last = self._failure = None
+        self._left_none = self._left_none or goal is not None or failure is not None
         try:
-            if goal and goal_id in ("", goal):
-                self._mark = verdict
-                self._tell({"kind": "marked", "goal_id": goal, "episode": None})
-                return
-            unnamed = finished if self._left_none else ""
-            if not finished or goal_id not in (unnamed, finished):
-                what = "no goal was recorded" if not finished else f"the last one is {finished}"
-                hint = "mark a goal while it runs, or before the next one"
-                raise BadRequest(f"goal {goal_id or '?'} cannot be marked: {what}", hint=hint)
-            if verdict == DISCARD:
-                if goal:
-                    raise BadRequest(f"the next goal, {goal}, is being recorded")
-                commit.undo(self._files.root)
-                self._finished.pop()
-                self._left_none = True
-            else:
-                commit.mark(self._files.root, episode, verdict)
-            self._tell({"kind": "marked", "goal_id": finished, "episode": episode})
-        except VramError as error:
-            self._tell({"kind": "unmarked", "error": error.to_wire()})
+            if failure is not None:
+                raise failure
+            if goal is None:
+                return {}
+            rows = self._files.rows + (last is not None)
+            if last is None or rows < ROWS_MIN:
+                return {"skipped": f"{rows} rows are no episode"}
+            if self._mark == DISCARD:
+                return {"discarded": True}
+            index = self._close(goal, *last, note)
+            self._finished.append((goal.goal_id, index, rows))
+            self._left_none = False
+            return {"episode": index, "frames": rows}
+        finally:
+            self._files.abandon()  # what was not finished
 
-    def close(self, status: str) -> None:
-        """End everything; an open goal is finished with its rows so far. Raises like `ended`."""
-        if self._goal is not None:
-            self.ended({"goal_id": self._goal["goal_id"], "status": status})
-
-    def failed(self, goal_id: str, error: Exception) -> None:
-        """Drop the goal's rows and report it; the next goal is tried again."""
-        typed = (
-            error
-            if isinstance(error, VramError)
-            else InternalError(f"{type(error).__name__}: {error}")
-        )
-        self._refused = goal_id
-        self._tell({"kind": "failed", "goal_id": goal_id, "error": typed.to_wire()})
-        self._forget()
-
-    def _close(self, note: commit.EpisodeNote) -> None:
-        first, last = self._goal, self._last
-        if first is None:
-            return
-        rows = self._files.rows + (last is not None)
-        if last is None or rows < ROWS_MIN:
-            self._forget()
-            self._tell(
-                {
-                    "kind": "skipped",
-                    "goal_id": first["goal_id"],
-                    "reason": f"{rows} rows are no episode",
-                }
-            )
-            return
-        if self._mark == DISCARD:
-            self._forget()
-            self._tell({"kind": "discarded", "goal_id": first["goal_id"]})
-            return
-        last["next.done"][0] = True
+    def _close(
+        self, goal: Row, last: dict[str, Any], success: bool | None, note: commit.EpisodeNote
+    ) -> int:
+        if DONE in last:
+            last[DONE][0] = True
         if SUCCESS in last:
-            last[SUCCESS][0] = note.get("status") == "succeeded" and self._judged is True
+            last[SUCCESS][0] = note.get("status") == "succeeded" and success is True
         self._files.add(last)
         about: commit.EpisodeNote = {
-            "goal_id": first["goal_id"],
-            "skill": first["skill"],
-            "task": first["task"],
-            "trace_id": first["trace_id"],
-            "units": first["units"],
-            "judged": self._judged,
+            "goal_id": goal.goal_id,
+            "skill": goal.skill,
+            "task": goal.task,
+            "trace_id": goal.trace_id,
+            "units": self._units,
         }
         if self._mark:
             about["marked"] = self._mark
         incomplete = note.get("incomplete", 0) + self._broken
-        index = self._files.finish({**about, **note, "incomplete": incomplete})
-        self._goal = self._last = None
-        self._finished.append((first["goal_id"], index))
-        self._left_none = False
-        self._tell(
-            {"kind": "episode", "goal_id": first["goal_id"], "episode": index, "frames": rows}
-        )
+        return self._files.finish({**about, **note, "incomplete": incomplete})
 
-    def _forget(self) -> None:
-        self._goal = self._last = None
-        self._left_none = True
-        self._files.abandon()
+    def check(self, row: Row) -> JsonObject:
+        """Compare the columns of a row that is not recorded with those of an existing dataset.
 
-    def _tell(self, message: wire.Header) -> None:
-        _answer(self._peer, message)
+        Raises ConfigError.
+        """
+        self._files.check(features_of(row))
+        return {}
+
+    def mark(self, goal_id: str, verdict: str) -> JsonObject:
+        """Note the operator's verdict on the goal that is being recorded, or the last one.
+
+        A discarded episode is not written, or is removed. An empty `goal_id` means that goal.
+        Raises BadRequest, BadState.
+        """
+        goal = self._goal.goal_id if self._goal is not None else ""
+        if goal and goal_id in ("", goal):
+            self._mark = verdict
+            return {"goal_id": goal, "episode": None}
+        finished, episode, frames = self._finished[-1] if self._finished else ("", -1, 0)
+        unnamed = "" if self._left_none else finished
+        if not finished or (goal_id or unnamed) != finished:
+            what = "no goal was recorded" if not finished else f"the last one is {finished}"
+            hint = "mark a goal while it runs, or before the next one"
+            raise BadRequest(f"goal {goal_id or '?'} cannot be marked: {what}", hint=hint)
+        if verdict != DISCARD:
+            commit.mark(self._files.root, episode, verdict)
+        elif goal:
+            raise BadRequest(f"the next goal, {goal}, is being recorded")
+        else:
+            commit.undo(self._files.root)
+            self._finished.pop()
+            self._left_none = True
+        return {"goal_id": finished, "episode": episode, "frames": frames}
 
 
-def serve(peer: socket.socket) -> int:
+def serve(peer: Connection) -> int:
     """Write until the runner ends or disappears. Returns 0 if everything that came is finished."""
-    opening = wire.receive(peer)
-    if opening is None:
-        return 0
-    said, _ = opening
+    said = peer.recv()
     root = Path(said["root"])
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(commit.locked(root))
             stack.callback(shutil.rmtree, root / commit.FOLDER / commit.CACHE, ignore_errors=True)
             repaired = commit.repair(root)
-            files = LerobotFiles(
-                root, fps=said["fps"], robot=said["robot"], columns=said["columns"]
-            )
+            lerobot = said["units"] == "lerobot"
+            files = LerobotFiles(root, fps=said["fps"], robot=said["robot"], lerobot=lerobot)
             episodes, frames = files.totals()
-            files.check(said["units"], said["joints"], said["cameras"])
         except (ImportError, VramError, OSError) as error:
-            _answer(peer, {"kind": "refused", "error": _typed(root, error).to_wire()})
+            _answer(peer, {"error": _typed(root, error).to_wire()})
             return 2
         os.nice(NICENESS)
         stay_ordinary()
-        _answer(
-            peer, {"kind": "ready", "repaired": repaired, "episodes": episodes, "frames": frames}
-        )
-        writer = EpisodeWriter(peer, files)
+        _answer(peer, {"repaired": repaired, "episodes": episodes, "frames": frames})
+        writer = EpisodeWriter(files, said["units"])
         status = "runner_lost"
-        while status == "runner_lost" and (message := wire.receive(peer)) is not None:
-            if message[0]["kind"] == "close":
-                status = "unfinished"
-            else:
-                _take(writer, *message)
-        _take(writer, {"kind": "close", "goal_id": "", "status": status}, [])
+        with contextlib.suppress(EOFError, ConnectionError):
+            while status == "runner_lost":
+                kind, *given = peer.recv()
+                if kind == "close":
+                    status = "unfinished"
+                elif kind == "row":
+                    writer.row(*given)
+                else:
+                    _answer(peer, _handled(getattr(writer, kind), given))
+        _handled(writer.end, [{"status": status}])
     return 0
+
+
+def _handled(handler: Any, given: list[Any]) -> JsonObject:
+    """Return the answer to one message. Errors never end the process."""
+    try:
+        answer: JsonObject = handler(*given)
+        return answer
+    except VramError as error:
+        return {"error": error.to_wire()}
+    except Exception as error:
+        log.exception("the dataset's writer goes on after an error")
+        return {"error": InternalError(f"{type(error).__name__}: {error}").to_wire()}
 
 
 def stay_ordinary() -> None:
@@ -256,11 +239,9 @@ def stay_ordinary() -> None:
         raise OSError(ctypes.get_errno(), "capset")
 
 
-def _answer(peer: socket.socket, message: wire.Header) -> None:
-    with contextlib.suppress(
-        OSError
-    ):  # the runner is gone; what there is to do is done all the same
-        wire.send(peer, message)
+def _answer(peer: Connection, message: JsonObject) -> None:
+    with contextlib.suppress(OSError):  # the runner is gone; what there is to do is done
+        peer.send(message)
 
 
 def _typed(root: Path, error: Exception) -> VramError:
@@ -274,37 +255,14 @@ def _typed(root: Path, error: Exception) -> VramError:
     return ConfigError(f"nothing can be recorded into {root}: {error}")
 
 
-def _take(writer: EpisodeWriter, header: wire.Header, pictures: list[bytes]) -> None:
-    """Handle one message. Errors never end the process: the next goal may be recorded again."""
-    kind = header.pop("kind")
-    try:
-        if kind == "row":
-            writer.row(cast(Row, header), pictures)
-        elif kind == "end":
-            writer.ended(cast(commit.EpisodeNote, header))
-        elif kind == "check":
-            writer.check(cast(Row, header))
-        elif kind == "mark":
-            writer.mark(header["goal_id"], header["verdict"])
-        else:
-            writer.close(header["status"])
-    except Exception as error:
-        log.exception("goal %s is not recorded", header["goal_id"])
-        try:
-            writer.failed(header["goal_id"], error)
-        except Exception:
-            log.exception("the unfinished episode stays; the next start takes it away")
-
-
 def main(argv: list[str]) -> int:
     """Run the writer; the socket's file descriptor is the only argument."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
-    warnings.filterwarnings(
-        "ignore", module="datasets.utils.tqdm"
-    )  # progress bars are off, as they shall be
+    # progress bars are off, as they shall be
+    warnings.filterwarnings("ignore", module="datasets.utils.tqdm")
     logs.set_up("vram-runner", "WARNING", "human", "%(asctime)s dataset %(levelname)s %(message)s")
-    with socket.socket(fileno=int(argv[0])) as peer:
+    with Connection(int(argv[0])) as peer:
         return serve(peer)
 
 

@@ -23,7 +23,6 @@ from vram_arbiter.runner.protocols import (
     SensorReader,
     SkillEnded,
     Stepped,
-    Transition,
 )
 from vram_arbiter.runner.robots.mobile import with_base
 from vram_arbiter.runner.safety.estop_latch import EstopLatch
@@ -44,7 +43,7 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.world import Action, TickResult, WorldState
+from vram_arbiter.schemas.world import Action, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -313,18 +312,9 @@ class HardwareRobot:
             names = action.joint_names or self.hal.description.joint_names
             self._sent.update(zip(names, action.rows[0], strict=True))
 
-    def ticked(self, result: TickResult) -> None:
-        pass
-
     # -- for recordings and reports
     def targets(self) -> Mapping[str, float]:
         return self._sent
-
-    def transition(self) -> Transition | None:
-        return None
-
-    def success(self) -> bool | None:
-        return None
 
     def facts(self) -> GoalData:
         if not self.detections:

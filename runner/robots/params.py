@@ -13,7 +13,7 @@ from vram_arbiter.runner.robots.lerobot_robot import Estop
 from vram_arbiter.runner.robots.units import JointUnit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.findings import Path, did_you_mean, dotted
+from vram_arbiter.schemas.findings import Path, did_you_mean, dotted, problems_of
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.yamltext import Mistake, config_error
@@ -130,16 +130,10 @@ def read_params[T: Params](kind: type[T], config: HalConfig, source: str) -> T:
     try:
         return kind.model_validate(config.params)
     except ValidationError as error:
-        problems = []
-        for finding in error.errors(include_url=False, include_context=False):
-            path: Path = ("hal", "params", *finding["loc"])
-            text = finding["msg"].removeprefix("Value error, ")
-            if finding["type"] == "extra_forbidden":
-                fields = list(kind.model_fields) if len(path) == 3 else []
-                if len(path) == 5 and path[2] == "joints":
-                    fields = list(JointParams.model_fields)
-                text = f"unknown key{did_you_mean(str(path[-1]), fields)}"
-            problems.append(Mistake(0, dotted(path), text))
+        problems = [
+            Mistake(0, f"hal.params.{found.field}", found.message)
+            for found in problems_of(error, kind, config.params)
+        ]
         raise config_error(source, problems) from error
 
 

@@ -1,17 +1,18 @@
-"""ROS 2 messages of the actions that are asked for and served: fields, CDR and DDS types.
+"""ROS 2 messages of the actions that are asked for and served: fields, and Cyclone's types of them.
 
 A message is a map, as in a goal's `goal_params`: missing fields have ROS's defaults, unknown ones
-are refused. Pure but for `dds_type`, which imports Cyclone DDS.
+are refused.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from vram_arbiter.runner.sensors.ros2_dds import as_bytes
+from vram_arbiter.runner.sensors.ros2_dds import parse, topic_type, written
 
 type Fields = tuple[tuple[str, str], ...]
 
@@ -153,21 +154,15 @@ def fields_of(kind: str) -> Fields:
     }[part]
 
 
-# -- CDR
+# -- CDR, by Cyclone
 def write(kind: str, message: Mapping[str, Any]) -> bytes:
     """Return a message as plain CDR. Raises ValueError with the field that does not fit."""
-    out = bytearray()
-    _put(out, kind, message, "")
-    return b"\x00\x01\x00\x00" + bytes(out)
+    return written(_made(kind, message, ""))
 
 
 def read(kind: str, cdr: bytes) -> dict[str, Any]:
     """Read a message from plain CDR. Raises ValueError."""
-    if len(cdr) < 4 or cdr[0] != 0 or cdr[1] not in (0, 1, 6, 7):
-        raise ValueError("the message is in an encoding other than plain CDR")
-    found, _ = _take(memoryview(cdr)[4:], 0, kind, "<" if cdr[1] & 1 else ">")
-    assert isinstance(found, dict)
-    return found
+    return dataclasses.asdict(parse(_struct(kind), cdr))
 
 
 def _split(kind: str) -> tuple[str, int | None, float]:
@@ -177,84 +172,47 @@ def _split(kind: str) -> tuple[str, int | None, float]:
     return base, (int(count or 0) if bracket else None), float(default or 0)
 
 
-def _put(out: bytearray, kind: str, value: Any, at: str) -> None:
+def _made(kind: str, value: Any, at: str) -> Any:
+    """Return Cyclone's value of an entry. `at` names it in errors."""
     base, count, default = _split(kind)
     if count is not None:
         items = [] if value is None else value
         if not isinstance(items, Sequence) or isinstance(items, str) or len(items) > ITEMS_MAX:
             raise ValueError(f"{at}: expected a list, got {type(items).__name__}")
-        if count == 0:
-            _number(out, "I", len(items), at)
-        elif len(items) != count:
+        if count not in (0, len(items)):
             raise ValueError(f"{at}: expected {count} numbers, got {len(items)}")
-        for index, item in enumerate(items):
-            _put(out, base, item, f"{at}[{index}]")
-    elif base == "string":
+        return [_made(base, item, f"{at}[{index}]") for index, item in enumerate(items)]
+    if base == "string":
         text = "" if value is None else value
         if not isinstance(text, str) or "\x00" in text:
             raise ValueError(f"{at}: expected a text, got {value!r:.40}")
-        raw = text.encode() + b"\x00"
-        _number(out, "I", len(raw), at)
-        out += raw
-    elif base in _NUMBERS:
+        return text
+    if base in _NUMBERS:
         missing: float | bool = default if base != "bool" else False
-        _number(out, _NUMBERS[base], missing if value is None else value, at)
-    else:
-        given = {} if value is None else value
-        if not isinstance(given, Mapping):
-            raise ValueError(f"{at or base}: expected a map, got {type(value).__name__}")
-        fields = fields_of(base)
-        if unknown := sorted(set(given) - {name for name, _ in fields}):
-            raise ValueError(f"{at or base}: unknown field {unknown[0]}")
-        for name, entry in fields:
-            _put(out, entry, given.get(name), f"{at}.{name}" if at else name)
+        return _number(_NUMBERS[base], missing if value is None else value, at)
+    given = {} if value is None else value
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{at or base}: expected a map, got {type(value).__name__}")
+    fields = fields_of(base)
+    if unknown := sorted(set(given) - {name for name, _ in fields}):
+        raise ValueError(f"{at or base}: unknown field {unknown[0]}")
+    below = f"{at}." if at else ""
+    return _struct(base)(
+        **{name: _made(entry, given.get(name), below + name) for name, entry in fields}
+    )
 
 
-def _number(out: bytearray, code: str, value: Any, at: str) -> None:
-    out += b"\x00" * (-len(out) % struct.calcsize(code))
+def _number(code: str, value: Any, at: str) -> float | bool:
     try:
-        whole = value if code in "fd?" else int(value)
+        whole: float | bool = value if code in "fd?" else int(value)
         if isinstance(value, bool) != (code == "?") or whole != value:
             raise ValueError
-        out += struct.pack("<" + code, whole)
+        struct.pack(code, whole)
     except (struct.error, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{at}: expected a number of this field, got {value!r:.40}") from error
+    return whole
 
 
-def _take(data: memoryview, at: int, kind: str, order: str) -> tuple[Any, int]:
-    base, count, _ = _split(kind)
-    if count is not None:
-        if count == 0:
-            count, at = _unpack(data, at, "I", order)
-        if count > ITEMS_MAX:
-            raise ValueError(f"a list of {count} items")
-        items = []
-        for _ in range(count):
-            item, at = _take(data, at, base, order)
-            items.append(item)
-        return items, at
-    if base == "string":
-        size, at = _unpack(data, at, "I", order)
-        if at + size > len(data):
-            raise ValueError("the message ends too early")
-        return bytes(data[at : at + size]).rstrip(b"\x00").decode("utf-8", "replace"), at + size
-    if base in _NUMBERS:
-        return _unpack(data, at, _NUMBERS[base], order)
-    found = {}
-    for name, entry in fields_of(base):
-        found[name], at = _take(data, at, entry, order)
-    return found, at
-
-
-def _unpack(data: memoryview, at: int, code: str, order: str) -> tuple[Any, int]:
-    width = struct.calcsize(code)
-    at += -at % width
-    if at + width > len(data):
-        raise ValueError("the message ends too early")
-    return struct.unpack_from(order + code, data, at)[0], at + width
-
-
-# -- DDS
 def dds_name(kind: str) -> str:
     """Return the name of the DDS type: `nav2_msgs::action::dds_::NavigateToPose_Goal_`."""
     package, _, name = kind.partition("/")
@@ -268,17 +226,22 @@ def dds_name(kind: str) -> str:
 
 
 @functools.cache
-def dds_type(kind: str) -> Any:
-    """Return the DDS type of a message under its ROS name; its samples stay as bytes."""
+def _struct(kind: str) -> Any:
+    """Return Cyclone's IDL type of a message, under its ROS name."""
     from cyclonedds.idl import make_idl_struct, types
 
     def of(entry: str) -> Any:
         base, count, _ = _split(entry)
         plain = {"string": str, "bool": bool}.get(base)
-        one = plain or (getattr(types, base) if base in _NUMBERS else dds_type(base))
+        one = plain or (getattr(types, base) if base in _NUMBERS else _struct(base))
         if count is None:
             return one
         return types.array[one, count] if count else types.sequence[one]
 
     members = {name: of(entry) for name, entry in fields_of(kind)}
-    return as_bytes(make_idl_struct(kind.partition("/")[2] + "_", dds_name(kind), members))
+    return make_idl_struct(kind.partition("/")[2] + "_", dds_name(kind), members)
+
+
+def dds_type(kind: str) -> Any:
+    """Return the type of a topic of these messages; its samples stay as bytes."""
+    return topic_type(_struct(kind))

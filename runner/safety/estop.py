@@ -21,10 +21,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol, Self
+from typing import Self
 
-from vram_arbiter.runner.control.mailbox import Mailbox
 from vram_arbiter.runner.control.realtime import hasten
+from vram_arbiter.runner.protocols import InferenceRunner
 from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError, EstopRequested, InternalError
 from vram_arbiter.schemas.estop import REQUEST_MAX_BYTES, Answer, Reply, path_of, reason_in
 from vram_arbiter.schemas.runtime.peercred import credentials
@@ -42,23 +42,6 @@ PAUSE_S = 0.0002
 CHECK_S = 1.0  # how often the socket's file is looked at
 MODE = 0o660
 _NO_DESCRIPTOR = (errno.EMFILE, errno.ENFILE)
-
-
-class Stoppable(Protocol):
-    """What the server needs of a runner.
-
-    `request_estop` is called on the server's thread, `obey_estop` on the control thread.
-    """
-
-    @property
-    def estop(self) -> EstopRequested | None: ...
-
-    @property
-    def estop_ns(self) -> int: ...
-
-    def request_estop(self, reason: str) -> None: ...
-
-    def obey_estop(self) -> EstopRequested | None: ...
 
 
 @dataclass(slots=True)
@@ -79,7 +62,7 @@ class _Inbox:
 
 
 class EstopServer:
-    """`with EstopServer(endpoint, robot, mailbox): ...` serves `path_of(endpoint)`; the caller
+    """`with EstopServer(endpoint, robot): ...` serves `path_of(endpoint)`; the caller
     holds the goal endpoint's lock.
 
     Args: `on_stop(reason, pid, uid)` is called once, on the server's thread, after the first
@@ -93,8 +76,7 @@ class EstopServer:
     def __init__(
         self,
         endpoint: str,
-        robot: Stoppable,
-        mailbox: Mailbox,
+        robot: InferenceRunner,
         *,
         on_stop: Callable[[str, int, int], None],
         robot_id: str = "",
@@ -104,7 +86,6 @@ class EstopServer:
     ) -> None:
         self.path = path_of(endpoint)
         self._robot = robot
-        self._mailbox = mailbox
         self._on_stop = on_stop
         self._robot_id = robot_id
         self._obey_s = obey_s
@@ -340,7 +321,7 @@ class EstopServer:
         if not self._obeying:
             self._obeying = True
             try:
-                self._mailbox.post(self._robot.obey_estop, self._deliver)
+                self._robot.mailbox.post(self._robot.obey_estop, self._deliver)
             except InternalError as error:
                 self._deliver(None, error)
         if not self._told:

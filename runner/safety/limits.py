@@ -127,14 +127,6 @@ class Limits:
     base_turn_rad_s: float = 0.0
     unkept: tuple[str, ...] = field(default=())
 
-    @property
-    def needs_kinematics(self) -> bool:
-        return (
-            self.box != EVERYWHERE
-            or bool(self.zones)
-            or min(self.ee_speed_m_s, self.ee_step_m) < math.inf
-        )
-
 
 def own_limits(robot: RobotDescription) -> Limits:
     """Return what the robot itself allows."""

@@ -20,7 +20,14 @@ from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.sensors.params import read_params, refuse, refuse_field
 from vram_arbiter.runner.sensors.pipelines import CAPS, SINK, GStreamerParams, build
 from vram_arbiter.runner.sensors.platform import probe_platform
-from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
+from vram_arbiter.runner.sensors.slot import (
+    BROKE_DOWN,
+    STOP_S,
+    Feed,
+    FrameTee,
+    SlotReader,
+    ThreadReader,
+)
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError, FrameStale
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
@@ -30,7 +37,6 @@ log = logging.getLogger(__name__)
 START_S = (
     10.0  # the longest that opening a source and, for a file, decoding its first picture may take
 )
-STOP_S = 2.0  # how long `stop` waits for a driver; its thread then ends by itself, deaf
 CLOCK_LOOKS = 5  # at both clocks, to know how far apart they are: the closest pair counts
 POLL_NS = 50_000_000  # how soon a stop or an error of a source without pictures is noticed
 NANOSECONDS_MAX = 2**64 - 1  # GStreamer's word for "no time known"
@@ -163,7 +169,7 @@ def _explain(problem: str) -> str:
     return f"{problem}; {advice}"
 
 
-class GStreamerReader(SlotReader):
+class GStreamerReader(ThreadReader):
     """One camera through GStreamer.
 
     A source that ends or breaks ends the reader with GStreamer's reason.
@@ -182,8 +188,6 @@ class GStreamerReader(SlotReader):
         self._text = text
         self.decodes_on_gpu = re.search(r"\bnv\w+dec\b", text) is not None
         self._params = params
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def _run_begins(self, feed: Feed) -> None:
         """Wait until the source is open; for a file, until its first picture is decoded.
@@ -191,14 +195,7 @@ class GStreamerReader(SlotReader):
         Raises FrameStale.
         """
         opened: Future[None] = Future()
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(
-            target=self._run,
-            args=(feed, opened, self._stopping),
-            name=f"camera-{self.sensor_id}",
-            daemon=True,
-        )
-        self._thread.start()
+        self._begin(lambda stopping: self._run(feed, opened, stopping))
         try:
             opened.result(START_S + STOP_S)
         except TimeoutError:
@@ -214,17 +211,6 @@ class GStreamerReader(SlotReader):
             hint="look at the camera and its backend_params, then start again",
             details={"sensor_id": self.sensor_id, "reason": reason, "ended": True},
         )
-
-    def _run_ends(self) -> None:
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(STOP_S)
-            if self._thread.is_alive():
-                log.warning(
-                    "camera %s: its driver does not let go; the thread is left behind",
-                    self.sensor_id,
-                )
-            self._thread = None
 
     # -- on the camera's thread
     def _run(self, feed: Feed, opened: Future[None], stopping: threading.Event) -> None:
@@ -242,10 +228,9 @@ class GStreamerReader(SlotReader):
             if not opened.done():
                 opened.set_exception(error)
         finally:
-            reason = "the thread of its reader broke down; its log says why"
-            feed.end(reason)  # if nothing else was said before
+            feed.end(BROKE_DOWN)  # if nothing else was said before
             if not opened.done():
-                opened.set_exception(_Broken(reason))
+                opened.set_exception(_Broken(BROKE_DOWN))
             if run is not None:
                 run.close()
 

@@ -17,13 +17,12 @@ from pydantic import Field, model_validator
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.sensors.lag import LagMeter
 from vram_arbiter.runner.sensors.params import BackendParams, read_params, refuse, require_module
-from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
+from vram_arbiter.runner.sensors.slot import BROKE_DOWN, Feed, FrameTee, SlotReader, ThreadReader
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 FPS_MAX = 1000.0
 RECONNECT_MAX_S = 8.0  # the pause between two tries doubles up to this
-STOP_S = 2.0  # how long `stop` waits for a driver; its thread then ends by itself, deaf
 URL_SCHEMES = ("rtsp", "rtsps")
 
 Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
@@ -113,7 +112,7 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
     return OpenCvReader(config.sensor_id, config.max_age_ms, params, clock, tee)
 
 
-class OpenCvReader(SlotReader):
+class OpenCvReader(ThreadReader):
     """One camera on a thread of its own, which alone touches its `cv2.VideoCapture`."""
 
     def __init__(
@@ -126,24 +125,9 @@ class OpenCvReader(SlotReader):
     ) -> None:
         super().__init__(sensor_id, max_age_ms, clock, tee)
         self._params = params
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def _run_begins(self, feed: Feed) -> None:
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(
-            target=self._run,
-            args=(feed, self._stopping),
-            name=f"camera-{self.sensor_id}",
-            daemon=True,
-        )
-        self._thread.start()
-
-    def _run_ends(self) -> None:
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(STOP_S)
-            self._thread = None
+        self._begin(lambda stopping: self._run(feed, stopping))
 
     # -- on the camera's thread
     def _run(self, feed: Feed, stopping: threading.Event) -> None:
@@ -156,9 +140,7 @@ class OpenCvReader(SlotReader):
             else:
                 self._watch(cv2, feed, stopping)
         finally:
-            feed.end(
-                "the thread of its reader broke down; its log says why"
-            )  # if nothing else was said before
+            feed.end(BROKE_DOWN)  # if nothing else was said before
 
     def _watch(self, cv2: Any, feed: Feed, stopping: threading.Event) -> None:
         """Read a device or a stream until it breaks off, and open it again."""

@@ -27,6 +27,8 @@ _DTYPES: Final = {
     FrameEncoding.MONO8: "u1",
     FrameEncoding.DEPTH16: "<u2",
 }
+COLOURS: Final = frozenset(FrameEncoding) - {FrameEncoding.DEPTH16, FrameEncoding.RAW}
+"""Encodings that `as_rgb` reads."""
 
 
 def encode(rgb: Any, encoding: Encoding) -> bytes:

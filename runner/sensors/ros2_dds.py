@@ -5,18 +5,17 @@ Cyclone DDS chooses the network: `CYCLONEDDS_URI` configures it, as for ROS with
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any
 
 from vram_arbiter.schemas.errors import ConfigError
 
-MessageKind = Literal["image", "compressed"]
-"""`sensor_msgs/Image` or `sensor_msgs/CompressedImage`."""
-
+PLAIN_CDR = (0, 1, 6, 7)  # CDR and CDR 2, both byte orders
 DOMAIN_MAX = 232  # the last one whose ports exist
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 _NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
@@ -49,40 +48,44 @@ def domain_of(environment: Mapping[str, str] = os.environ) -> int:
     return int(text)
 
 
-@functools.cache
-def dds_type(kind: MessageKind) -> Any:
-    """Return the DDS type of a message, under its ROS name.
-
-    Its samples stay as bytes (`cdr_of`, `sample_of`): the fields only describe the type to other
-    participants.
-    """
-    from cyclonedds.idl import make_idl_struct
-    from cyclonedds.idl.types import int32, sequence, uint8, uint32
-
-    time = make_idl_struct(
-        "Time_", "builtin_interfaces.msg.dds_.Time_", {"sec": int32, "nanosec": uint32}
-    )
-    header = make_idl_struct(
-        "Header_", "std_msgs.msg.dds_.Header_", {"stamp": time, "frame_id": str}
-    )
-    if kind == "image":
-        fields = {
-            "header": header, "height": uint32, "width": uint32, "encoding": str,
-            "is_bigendian": uint8, "step": uint32,
-            "data": sequence[uint8],
-        }  # fmt: skip
-        made = make_idl_struct("Image_", "sensor_msgs.msg.dds_.Image_", fields)
-    else:
-        fields = {"header": header, "format": str, "data": sequence[uint8]}
-        made = make_idl_struct("CompressedImage_", "sensor_msgs.msg.dds_.CompressedImage_", fields)
-    return as_bytes(made)
-
-
 def as_bytes(made: Any) -> Any:
     """Let the samples of a DDS type stay as bytes (`cdr_of`, `sample_of`), and return the type."""
     made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
     made.serialize = lambda self, *_, **__: cdr_of(self)
     return made
+
+
+@functools.cache
+def topic_type(message: Any) -> Any:
+    """Return the type of a topic of these IDL messages; its samples stay as bytes.
+
+    Cyclone's description of a type knows `bytes` as a sequence only.
+    """
+    from cyclonedds.idl import make_idl_struct
+    from cyclonedds.idl.types import sequence, uint8
+
+    members = {
+        one.name: sequence[uint8] if one.type is bytes else one.type
+        for one in dataclasses.fields(message)
+    }
+    return as_bytes(make_idl_struct(message.__name__, message.__idl_typename__, members))
+
+
+def parse[M](message: type[M], cdr: bytes) -> M:
+    """Read plain CDR as one of Cyclone's IDL types. Raises ValueError."""
+    if len(cdr) < 4 or cdr[0] != 0 or cdr[1] not in PLAIN_CDR:
+        raise ValueError("the message is in an encoding other than plain CDR")
+    try:
+        read: M = message.__idl__.deserialize(cdr)  # type: ignore[attr-defined]
+    except Exception as error:  # Cyclone has no error of its own for a message that is none
+        raise ValueError(f"the message ends too early, or is none: {error}") from error
+    return read
+
+
+def written(message: Any) -> bytes:
+    """Return one of Cyclone's IDL messages as plain CDR, as ROS writes it."""
+    cdr: bytes = message.serialize(use_version_2=False)
+    return cdr
 
 
 def sample_of(dds_type: Any, cdr: bytes) -> Any:

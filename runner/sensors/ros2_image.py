@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import threading
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
 from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.params import (
     BackendParams,
     read_params,
@@ -19,38 +19,30 @@ from vram_arbiter.runner.sensors.params import (
 from vram_arbiter.runner.sensors.pictures import scaled_down
 from vram_arbiter.runner.sensors.ros2_dds import (
     DOMAIN_MAX,
-    MessageKind,
     cdr_of,
     dds_problems,
     dds_topic,
-    dds_type,
     domain_of,
     full_topic,
+    parse,
     qos_of,
     sample_of,
-)
-from vram_arbiter.runner.sensors.ros2_messages import (
-    ImageContent,
-    RosCompressedImage,
-    RosImage,
-    message_of,
-    picture_of,
-    read_compressed,
-    read_image,
-    write_cdr,
+    topic_type,
+    written,
 )
 from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import SensorFrame
 
+if TYPE_CHECKING:
+    from vram_arbiter.runner.sensors.ros2_messages import RosPicture
+
 log = logging.getLogger(__name__)
 
 TAKE_MAX = (
     4  # samples a turn: the reader keeps one, and there may be words about a publisher beside it
 )
-WAIT_S = 1.0  # the longest that the thread sleeps in DDS; what happens wakes it
-STOP_S = 2.0
 AHEAD_MAX_NS = (
     50_000_000  # a stamp may lie so far in the future: clocks of two machines never agree fully
 )
@@ -62,7 +54,7 @@ class RosImageParams(BackendParams):
 
     topic: Annotated[str, Field(min_length=1, max_length=256)]
     """As `ros2 topic list` shows it."""
-    message: MessageKind = "image"
+    message: Literal["image", "compressed"] = "image"
     """`sensor_msgs/Image`, or `sensor_msgs/CompressedImage` (JPEG)."""
     reliability: Literal["best_effort", "reliable"] = "best_effort"
     """Best effort reads every publisher; reliable only those that offer it."""
@@ -125,78 +117,48 @@ class RosImageReader(SlotReader):
         self._domain_id = domain_id
         self._topic = full_topic(params.topic)
         self._awaits = False  # the first publisher
-        self._guard: Any = None
-        self._thread: threading.Thread | None = None
+        self._message: Any = None  # the IDL type
+        self._thread: DdsThread | None = None
 
     def _run_begins(self, feed: Feed) -> None:
         """Start reading. Raises ConfigError if DDS cannot be started."""
-        from cyclonedds.core import (
-            DDSStatus,
-            GuardCondition,
-            InstanceState,
-            ReadCondition,
-            SampleState,
-            ViewState,
-            WaitSet,
-        )
+        from cyclonedds.core import DDSStatus
         from cyclonedds.domain import DomainParticipant
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
 
+        from vram_arbiter.runner.sensors.ros2_messages import RosCompressedImage, RosImage
+
+        self._message = RosImage if self._params.message == "image" else RosCompressedImage
+        self._awaits = feed.await_source(f"{self._topic} has no publisher yet")
         with dds_problems(self._domain_id):
             participant = DomainParticipant(self._domain_id)
-            reader = DataReader(
+            reader: Any = DataReader(
                 participant,
-                Topic(participant, dds_topic(self._topic), dds_type(self._params.message)),
+                Topic(participant, dds_topic(self._topic), topic_type(self._message)),
                 qos=qos_of(self._params.reliability, writer=False),
             )
             reader.set_status_mask(
                 DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos
             )
-            guard = self._guard = GuardCondition(participant)
-            waitset = WaitSet(participant)
-            data = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
-            for entity in (data, reader, guard):
-                waitset.attach(entity)
-        self._awaits = feed.await_source(f"{self._topic} has no publisher yet")
-        self._thread = threading.Thread(
-            target=self._run,
-            args=(feed, waitset, reader, guard),
-            name=f"camera-{self.sensor_id}",
-            daemon=True,
-        )
-        self._thread.start()
+            self._thread = DdsThread(
+                f"camera-{self.sensor_id}",
+                participant,
+                [reader],
+                [reader],
+                lambda: self._attend(feed, reader),
+                lambda problem: self._dds_failed(feed, problem),
+            )
+        log.info("camera %s reads %s, DDS domain %d", self.sensor_id, self._topic, self._domain_id)
 
     def _run_ends(self) -> None:
         if self._thread is not None:
-            self._guard.set(True)
-            self._thread.join(STOP_S)
-            self._thread = self._guard = None
+            self._thread.close()
+            self._thread = None
 
     # -- on the camera's thread
-    def _run(self, feed: Feed, waitset: Any, reader: Any, guard: Any) -> None:
-        from cyclonedds.core import DDSException
-        from cyclonedds.util import duration
-
-        said = False
-        try:
-            while not guard.read():
-                woken = waitset.wait(duration(seconds=WAIT_S))
-                self._attend(feed, reader)
-                if self._awaits and not woken and not said:
-                    said = True
-                    log.warning(
-                        "camera %s waits for a publisher on %s, DDS domain %d",
-                        self.sensor_id,
-                        self._topic,
-                        self._domain_id,
-                    )
-        except DDSException as error:
-            feed.end(f"DDS failed: {error}")
-        finally:
-            feed.end(
-                "the thread of its reader broke down; its log says why"
-            )  # if nothing else was said before
+    def _dds_failed(self, feed: Feed, problem: str) -> None:
+        feed.end(f"DDS failed: {problem}")
 
     def _attend(self, feed: Feed, reader: Any) -> None:
         """Handle what has come since the last time: changes of publishers, then pictures."""
@@ -241,22 +203,22 @@ class RosImageReader(SlotReader):
         if newest is None:
             return
         try:
-            message = (read_image if self._params.message == "image" else read_compressed)(
-                cdr_of(newest)
-            )
-            picture = picture_of(message)
-            frame = self._frame(message, picture, newest.sample_info.source_timestamp)
+            message = parse(self._message, cdr_of(newest))
+            frame = self._frame(message, newest.sample_info.source_timestamp)
         except ValueError as error:
             feed.interrupt(f"what comes on {self._topic} cannot be used: {error}")
         else:
             self.deliver(feed, frame)
 
-    def _frame(
-        self, message: RosImage | RosCompressedImage, picture: ImageContent, sent_ns: int
-    ) -> SensorFrame:
-        """Return a frame. Raises ValueError for a stamp of the future."""
+    def _frame(self, message: RosPicture, sent_ns: int) -> SensorFrame:
+        """Return a frame. Raises ValueError for a stamp of the future, or no picture."""
+        from vram_arbiter.runner.sensors.ros2_messages import picture_of
+
+        picture = picture_of(message)
         now_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
-        taken_ns = (message.stamp_ns or sent_ns) if self._params.stamp == "header" else wall_ns
+        taken_ns = (
+            (message.header.stamp_ns or sent_ns) if self._params.stamp == "header" else wall_ns
+        )
         if taken_ns < 0:
             raise ValueError("it is stamped before 1970")
         age_ns = wall_ns - taken_ns
@@ -275,7 +237,7 @@ class RosImageReader(SlotReader):
             height=picture.height,
             channels=picture.channels,
             data=picture.data,
-            metadata={"frame_id": message.frame_id, "topic": self._topic},
+            metadata={"frame_id": message.header.frame_id, "topic": self._topic},
         )
 
 
@@ -306,25 +268,22 @@ class RosImagePublisher:
         self._next_ns = 0.0
         self._width = width
         self._failing = False
-        self._kind: MessageKind | None = None
+        self._kind: type | None = None  # of its messages
         self._writer: Any = None
 
     def publish(self, frame: SensorFrame) -> None:
         from cyclonedds.core import DDSException
 
+        from vram_arbiter.runner.sensors.ros2_messages import message_of
+
         if frame.stamp_monotonic_ns < self._next_ns:
             return
         try:
-            if frame.data is None:
-                raise ValueError("the frame's bytes are not in this process")
             if self._width is not None:
                 frame = scaled_down(frame, self._width)
-            picture = ImageContent(
-                frame.encoding, frame.width, frame.height, frame.channels, frame.data or b""
-            )
-            message = message_of(picture, frame.stamp_wall_ns, frame.sensor_id)
-            kind: MessageKind = "image" if isinstance(message, RosImage) else "compressed"
-            self._open(kind).write(sample_of(dds_type(kind), write_cdr(message)))
+            message = message_of(frame)
+            kind: Any = type(message)
+            self._open(kind).write(sample_of(topic_type(kind), written(message)))
         except (ValueError, ConfigError, DDSException) as error:
             self.dropped += 1
             if not self._failing:
@@ -344,7 +303,7 @@ class RosImagePublisher:
         """Leave the domain. `publish` joins it again."""
         self._writer = self._kind = None
 
-    def _open(self, kind: MessageKind) -> Any:
+    def _open(self, kind: type) -> Any:
         from cyclonedds.domain import DomainParticipant
         from cyclonedds.pub import DataWriter
         from cyclonedds.topic import Topic
@@ -352,7 +311,7 @@ class RosImagePublisher:
         if self._writer is None:
             with dds_problems(self.domain_id):
                 participant = DomainParticipant(self.domain_id)
-                topic = Topic(participant, dds_topic(self.topic), dds_type(kind))
+                topic = Topic(participant, dds_topic(self.topic), topic_type(kind))
                 self._writer = DataWriter(participant, topic, qos=qos_of("reliable", writer=True))
             self._kind = kind
         elif kind != self._kind:

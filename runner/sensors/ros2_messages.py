@@ -1,24 +1,23 @@
 """Picture messages of ROS 2 (`sensor_msgs/Image`, `sensor_msgs/CompressedImage`) as frames.
 
-Pure: no DDS, no clock. Their CDR is written and read here because a general codec makes a Python
-list with one integer per byte of every picture, 50 ms of the interpreter for 640 × 480. Nothing is
-guessed: a message whose parts contradict each other is a ValueError.
+No clock and no network: Cyclone's IDL types describe the messages, and write and read their CDR.
+Nothing is guessed: a message whose parts contradict each other is a ValueError. Cyclone takes
+annotations as objects only, so this module has no future import of them.
 """
 
-from __future__ import annotations
-
-import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Self
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import int32, uint8, uint32
 
 from vram_arbiter.runner.sensors.image_header import jpeg_header
-from vram_arbiter.schemas.world import FrameEncoding
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 NANOSECONDS = 1_000_000_000
 STAMP_END_NS = 2**31 * NANOSECONDS
 SIDE_MAX = 16_384  # pixels
-MESSAGE_BYTES_MAX = 256 * 2**20  # 8K pictures with 16 bits a color are 200 MB
 
 _ENCODINGS: Mapping[str, tuple[FrameEncoding, int]] = {
     "bgr8": (FrameEncoding.BGR8, 3),
@@ -37,28 +36,46 @@ _ROS_NAME = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class RosImage:
-    """`sensor_msgs/Image`. `stamp_ns` counts from 1970 by the sender's clock; 0: not stamped."""
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):  # type: ignore[call-arg, misc]
+    sec: int32 = 0
+    nanosec: uint32 = 0
 
-    stamp_ns: int
-    frame_id: str
-    height: int
-    width: int
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):  # type: ignore[call-arg, misc]
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = ""
+
+    @classmethod
+    def of(cls, stamp_ns: int, frame_id: str) -> Self:
+        return cls(Time(stamp_ns // NANOSECONDS, stamp_ns % NANOSECONDS), frame_id)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return when it was taken, from 1970 by the sender's clock; 0: not stamped."""
+        return int(self.stamp.sec * NANOSECONDS + self.stamp.nanosec)
+
+
+@dataclass
+class RosImage(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):  # type: ignore[call-arg, misc]
+    header: Header
+    height: uint32
+    width: uint32
     encoding: str
-    is_bigendian: bool
-    step: int
+    is_bigendian: uint8
+    step: uint32
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class RosCompressedImage:
-    """`sensor_msgs/CompressedImage`."""
-
-    stamp_ns: int
-    frame_id: str
+@dataclass
+class RosCompressedImage(IdlStruct, typename="sensor_msgs.msg.dds_.CompressedImage_"):  # type: ignore[call-arg, misc]
+    header: Header
     format: str
     data: bytes
+
+
+RosPicture = RosImage | RosCompressedImage
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +89,7 @@ class ImageContent:
     data: bytes
 
 
-def picture_of(message: RosImage | RosCompressedImage) -> ImageContent:
+def picture_of(message: RosPicture) -> ImageContent:
     """Return the picture in a message. Raises ValueError with the reason.
 
     Rows lose their padding, 16-bit values become little-endian.
@@ -111,24 +128,23 @@ def _compressed(message: RosCompressedImage) -> ImageContent:
     return ImageContent(FrameEncoding.JPEG, width, height, channels, message.data)
 
 
-def message_of(
-    picture: ImageContent, stamp_ns: int, frame_id: str
-) -> RosImage | RosCompressedImage:
-    """Return the ROS message for a picture.
+def message_of(frame: SensorFrame) -> RosPicture:
+    """Return the ROS message for a frame.
 
     Raises ValueError for an encoding that ROS does not have.
     """
-    if not 0 <= stamp_ns < STAMP_END_NS:
+    if frame.data is None:
+        raise ValueError("the frame's bytes are not in this process")
+    if not 0 <= frame.stamp_wall_ns < STAMP_END_NS:
         raise ValueError("ROS has no stamp for this time: its seconds end in 2038")
-    if picture.encoding is FrameEncoding.JPEG:
-        return RosCompressedImage(stamp_ns, frame_id, "jpeg", picture.data)
-    name = _ROS_NAME.get(picture.encoding)
+    header = Header.of(frame.stamp_wall_ns, frame.sensor_id)
+    if frame.encoding is FrameEncoding.JPEG:
+        return RosCompressedImage(header, "jpeg", frame.data)
+    name = _ROS_NAME.get(frame.encoding)
     if name is None:
-        raise ValueError(f"{picture.encoding} has no name in ROS")
-    step = len(picture.data) // picture.height
-    return RosImage(
-        stamp_ns, frame_id, picture.height, picture.width, name, False, step, picture.data
-    )
+        raise ValueError(f"{frame.encoding} has no name in ROS")
+    step = len(frame.data) // frame.height
+    return RosImage(header, frame.height, frame.width, name, 0, step, frame.data)
 
 
 def jpeg_size(data: bytes) -> tuple[int, int, int]:
@@ -139,102 +155,3 @@ def jpeg_size(data: bytes) -> tuple[int, int, int]:
     if b"\xff\xd9" not in data[-64:]:  # cameras pad after the end mark
         raise ValueError("the JPEG was cut off")
     return width, height, channels
-
-
-# -- CDR
-class _Writer:
-    def __init__(self) -> None:
-        self.parts: list[bytes] = [b"\x00\x01\x00\x00"]  # plain CDR, little-endian
-        self.size = 0
-
-    def put(self, kind: str, *values: Any) -> None:
-        width = struct.calcsize(kind[0])
-        pad = -self.size % width
-        packed = b"\x00" * pad + struct.pack("<" + kind, *values)
-        self.parts.append(packed)
-        self.size += len(packed)
-
-    def blob(self, data: bytes) -> None:
-        self.put("I", len(data))
-        self.parts.append(data)
-        self.size += len(data)
-
-    def text(self, text: str) -> None:
-        self.blob(text.encode() + b"\x00")
-
-    def header(self, stamp_ns: int, frame_id: str) -> None:
-        self.put("i", stamp_ns // NANOSECONDS)
-        self.put("I", stamp_ns % NANOSECONDS)
-        self.text(frame_id)
-
-    def done(self) -> bytes:
-        return b"".join(self.parts)
-
-
-class _Reader:
-    """Offsets count from the end of the four bytes that say how the rest is encoded."""
-
-    def __init__(self, data: bytes) -> None:
-        if (
-            len(data) < 4 or data[0] != 0 or data[1] not in (0, 1, 6, 7)
-        ):  # CDR and CDR 2, plain, both byte orders
-            raise ValueError("the message is in an encoding other than plain CDR")
-        self.data = memoryview(data)[4:]
-        self.order = "<" if data[1] & 1 else ">"
-        self.at = 0
-
-    def number(self, kind: str) -> int:
-        width = struct.calcsize(kind)
-        self.at += -self.at % width
-        if self.at + width > len(self.data):
-            raise ValueError("the message ends too early")
-        value: int = struct.unpack_from(self.order + kind, self.data, self.at)[0]
-        self.at += width
-        return value
-
-    def blob(self) -> bytes:
-        length = self.number("I")
-        if self.at + length > len(self.data):
-            raise ValueError("the message ends too early")
-        blob = bytes(self.data[self.at : self.at + length])
-        self.at += length
-        return blob
-
-    def text(self) -> str:
-        return self.blob().rstrip(b"\x00").decode("utf-8", "replace")
-
-    def header(self) -> tuple[int, str]:
-        stamp_ns = self.number("i") * NANOSECONDS
-        return stamp_ns + self.number("I"), self.text()
-
-
-def write_cdr(message: RosImage | RosCompressedImage) -> bytes:
-    """Return the message's bytes on the wire, after the four bytes that name their encoding."""
-    writer = _Writer()
-    writer.header(message.stamp_ns, message.frame_id)
-    if isinstance(message, RosImage):
-        writer.put("II", message.height, message.width)
-        writer.text(message.encoding)
-        writer.put("B", int(message.is_bigendian))
-        writer.put("I", message.step)
-    else:
-        writer.text(message.format)
-    writer.blob(message.data)
-    return writer.done()
-
-
-def read_image(data: bytes) -> RosImage:
-    """Read `sensor_msgs/Image`. Raises ValueError."""
-    reader = _Reader(data)
-    stamp_ns, frame_id = reader.header()
-    height, width = reader.number("I"), reader.number("I")
-    encoding = reader.text()
-    big, step = bool(reader.number("B")), reader.number("I")
-    return RosImage(stamp_ns, frame_id, height, width, encoding, big, step, reader.blob())
-
-
-def read_compressed(data: bytes) -> RosCompressedImage:
-    """Read `sensor_msgs/CompressedImage`. Raises ValueError."""
-    reader = _Reader(data)
-    stamp_ns, frame_id = reader.header()
-    return RosCompressedImage(stamp_ns, frame_id, reader.text(), reader.blob())

@@ -7,16 +7,22 @@ frames, never older ones.
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Protocol
 
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.schemas.errors import FrameStale
 from vram_arbiter.schemas.world import SensorFrame
 
+log = logging.getLogger(__name__)
+
+STOP_S = 2.0  # how long `stop` waits for a driver; its thread then ends by itself, deaf
 NOT_STARTED = "its reader was not started"
 STOPPED = "its reader was stopped"
+BROKE_DOWN = "the thread of its reader broke down; its log says why"
 
 
 class FrameTee(Protocol):
@@ -243,3 +249,28 @@ class SlotReader(ABC):
         """Stop calling them and close the source, within a bounded time. The feed is ended
         already.
         """
+
+
+class ThreadReader(SlotReader):
+    """A reader with a thread of its own, which alone touches the source."""
+
+    _stopping = threading.Event()  # of this run
+    _thread: threading.Thread | None = None
+
+    def _begin(self, run: Callable[[threading.Event], None]) -> None:
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(
+            target=run, args=(self._stopping,), name=f"camera-{self.sensor_id}", daemon=True
+        )
+        self._thread.start()
+
+    def _run_ends(self) -> None:
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(STOP_S)
+            if self._thread.is_alive():
+                log.warning(
+                    "camera %s: its driver does not let go; the thread is left behind",
+                    self.sensor_id,
+                )
+            self._thread = None

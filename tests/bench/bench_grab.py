@@ -25,7 +25,7 @@ from typing import TypedDict
 from tests.bench.grabs import MANIFEST, benchmark_arguments, grab_sidecar
 from tests.support.paths import ROOT
 from vram_arbiter.runner.cli.benchmark import benchmark_of, entries_of
-from vram_arbiter.runner.sim.benchmark import release, wilson
+from vram_arbiter.runner.sim.benchmark import wilson
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.tasks import GRAB
 
@@ -82,26 +82,22 @@ async def play_seed(seeds: Sequence[int], endpoint: str, commit: str, out: Path)
     (entry,) = entries_of(args, None)
     witness = Witness()
     entry = dataclasses.replace(entry, task=dataclasses.replace(GRAB, judge=witness.judge))
-    contestant = entry.contestant()
     bench = benchmark_of(entry, args)
-    try:
-        for first in range(0, len(seeds), BLOCK):
-            witness.episodes, witness.targets = [], []
-            cell = await bench.play(contestant, seeds[first : first + BLOCK])
-            played = zip(cell.episodes, witness.episodes, witness.targets, strict=True)
-            with out.open("a", encoding="utf-8") as sink:
-                for one, kind, target in played:
-                    if one.success is None:  # no verdict: the next run plays it again
-                        print(f"seed {one.seed}: {one.message}", file=sys.stderr, flush=True)
-                        continue
-                    line: Line = {
-                        "seed": one.seed, "commit": commit, "target": target,
-                        "success": one.success, "steps": one.steps,
-                        "kind": "" if one.success else kind,
-                    }  # fmt: skip
-                    sink.write(json.dumps(line) + "\n")
-    finally:
-        await release(contestant)
+    for first in range(0, len(seeds), BLOCK):
+        witness.episodes, witness.targets = [], []
+        cell = await bench.run(entry.skill(), seeds[first : first + BLOCK])
+        played = zip(cell.episodes, witness.episodes, witness.targets, strict=True)
+        with out.open("a", encoding="utf-8") as sink:
+            for one, kind, target in played:
+                if one.success is None:  # no verdict: the next run plays it again
+                    print(f"seed {one.seed}: {one.message}", file=sys.stderr, flush=True)
+                    continue
+                line: Line = {
+                    "seed": one.seed, "commit": commit, "target": target,
+                    "success": one.success, "steps": one.steps,
+                    "kind": "" if one.success else kind,
+                }  # fmt: skip
+                sink.write(json.dumps(line) + "\n")
 
 
 def read_rows(out: Path, commit: str) -> dict[int, Line]:

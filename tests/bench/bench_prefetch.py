@@ -50,10 +50,11 @@ class Cell:
             manifest.write_text(yaml.safe_dump(raw), encoding="utf-8")
             args = benchmark_arguments(endpoint, manifest, *told)
             (entry,) = entries_of(args, None)
-        cell = asyncio.run(benchmark_of(entry, args).run(entry.contestant(), seeds))
-        if cell.errors or not cell.complete:
+        cell = asyncio.run(benchmark_of(entry, args).run(entry.skill(), seeds))
+        summary = cell.summary()
+        if summary["errors"] or not cell.complete:
             raise RuntimeError(f"{self}: {cell.why or cell.episodes[-1].message}")
-        return cell.summary()
+        return summary
 
     def row(self, summary: CellSummary) -> str:
         """Return the line of the table."""

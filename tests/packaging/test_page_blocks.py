@@ -216,12 +216,6 @@ def robot(**parts: object) -> None:
     load_robot(yaml.safe_dump(whole), "page")
 
 
-def environment(**parts: object) -> None:
-    from vram_arbiter.runner.sim.gym_config import GymConfig
-
-    GymConfig.model_validate(parts)
-
-
 def skill_of_block(**parts: object) -> None:
     shipped = (TREE / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
     parse_manifest(yaml.safe_dump({**yaml.safe_load(shipped), **parts}))
@@ -235,7 +229,6 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"model", "ends"}): lambda text: robot(
         hal={"adapter": "mujoco", "params": yaml.safe_load(text)}
     ),
-    frozenset({"kwargs", "actions"}): lambda text: environment(**yaml.safe_load(text)),
     frozenset({"hooks"}): lambda text: load_hooks(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
     frozenset({"http"}): lambda text: load_config(text, "page"),

@@ -26,7 +26,7 @@ PAGE = (TREE / "README.md").read_text(encoding="utf-8")
 LIMIT_S = 240.0
 INSTALLS = "^(make|pip) "
 OTHER_SIDECARS = "^vram-sidecar --name (detector|scene-vlm) "
-LONG = "^vram-(reasoner|runner (benchmark|sim --policy|replay)) ?"
+LONG = "^vram-(reasoner|runner (benchmark|replay)) ?"
 
 
 class Reader:

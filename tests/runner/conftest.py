@@ -105,6 +105,17 @@ class KinematicEnv:
         self.closed += 1
 
 
+def world_of(
+    env: KinematicEnv,
+    judge: Callable[[KinematicEnv], bool] | None = None,
+    cameras: tuple[str, ...] = (),
+) -> ArmEnvironment:
+    """Return the kinematic robot as a world, with a task's verdict."""
+    arm: Any = env
+    told = None if judge is None else lambda: judge(env)
+    return ArmEnvironment(arm, KINEMATIC, judge=told, cameras=cameras)
+
+
 @pytest.fixture(scope="session")
 def kinematic() -> RobotDescription:
     """What the gate knows of `KinematicEnv`."""
@@ -133,11 +144,9 @@ def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
     """
 
     def make(**options: Any) -> SimRunner:
-        options.setdefault("cameras", ())
+        cameras = options.pop("cameras", ())
         options.setdefault("deadline_policy", DeadlinePolicy.WARN)
-        judge = options.pop("judge", None)
-        world = ArmEnvironment(env, KINEMATIC, judge=None if judge is None else lambda: judge(env))
-        return sim_runner(lambda: world, **options)
+        return sim_runner(world_of(env, options.pop("judge", None), cameras), **options)
 
     return make
 

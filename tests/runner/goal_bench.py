@@ -97,7 +97,6 @@ async def goals_served(
         server = GoalServer(
             endpoint,
             control,
-            runner,
             catalogue,
             SystemClock(),
             estop_s=60.0,  # a machine that stands still for a second is no loop that hangs

@@ -1,6 +1,6 @@
 """Writers of datasets, forked from a process that has imported lerobot: 8 s of a core each.
 
-`FORKING` stands for the module `subprocess` in `vram_arbiter.runner.recording.writer_process`.
+`FORKING` stands for the module `subprocess` in `vram_arbiter.runner.recording.recorder`.
 """
 
 import os
@@ -40,4 +40,6 @@ def _popen(
         os.close(nowhere)
 
 
-FORKING = SimpleNamespace(Popen=_popen, DEVNULL=subprocess.DEVNULL)
+FORKING = SimpleNamespace(
+    Popen=_popen, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired
+)

@@ -2,7 +2,7 @@
 
 from tests.support.dataset_writer import FORKING
 from vram_arbiter.runner import __main__ as runner
-from vram_arbiter.runner.recording import writer_process
+from vram_arbiter.runner.recording import recorder
 
 main = runner.main
-vars(writer_process)["subprocess"] = FORKING
+vars(recorder)["subprocess"] = FORKING

@@ -41,7 +41,7 @@ def serving(
     async def serve() -> AsyncIterator[Any]:
         runner = make_runner(rate_hz=200.0, cameras=("front",), seed=4)
         catalogue = Catalogue([load_manifest(navigate_manifest)], {Kind.ROS_ACTION: make})
-        reset = runner.robot.begin_episode_of
+        reset = runner.robot.begin_episode
         async with goals_served(endpoint, runner, catalogue, reset=reset):
             yield runner
 

@@ -3,7 +3,6 @@ mistakes are said.
 """
 
 import fcntl
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -144,25 +143,9 @@ def test_a_second_runner_records_nothing(
     with open(tmp_path / "runner.sock.lock", "w") as first:
         fcntl.flock(first, fcntl.LOCK_EX)
         there = ["--endpoint", f"ipc://{tmp_path}/runner.sock", "--record", str(tmp_path / "set")]
-        assert main(["sim", *there, "--env", "gym:CartPole-v1", "--no-arbiter"]) == 1
+        assert main(["sim", *there, "--no-arbiter"]) == 1
     assert "already uses" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
-
-
-@pytest.mark.heavy
-def test_a_policy_by_itself_plays_beside_a_runner(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Regression: a run of `--policy`, which takes no goals, was refused where a runner served, or
-    kept a runner from serving.
-    """
-    there = ["--endpoint", f"ipc://{tmp_path}/runner.sock"]
-    flags = ["--env", "gym:CartPole-v1", "--policy", "random", "--rate", "0", "--episodes", "2"]
-    with open(tmp_path / "runner.sock.lock", "w") as first:
-        fcntl.flock(first, fcntl.LOCK_EX)
-        assert main(["sim", *there, *flags]) == 0
-    assert json.loads(capsys.readouterr().out)["n_ticks"] > 0
-    assert {path.name for path in tmp_path.iterdir()} == {"runner.sock.lock"}
 
 
 @pytest.mark.parametrize(

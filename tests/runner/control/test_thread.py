@@ -12,7 +12,7 @@ import pytest
 from vram_arbiter.runner.control.mailbox import MAILBOX_MAX, Mailbox
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.protocols import Goal, Hold, SkillKey, StepOutcome
-from vram_arbiter.runner.sim.robot import SimRunner, sim_runner
+from vram_arbiter.runner.sim.robot import SimRunner
 from vram_arbiter.schemas.errors import BadState, InternalError
 from vram_arbiter.schemas.world import WorldState
 
@@ -52,11 +52,13 @@ def _refuse() -> None:
 
 
 def test_a_runner_that_cannot_start_says_why(make_runner: Make, env: Any, run_async: Run) -> None:
-    def broken() -> Any:
+    def broken(stopping: object) -> None:
         raise FileNotFoundError("no scene")
 
     async def scenario() -> None:
-        control = ControlThread(sim_runner(broken, cameras=()))
+        runner = make_runner()
+        runner.robot.open = broken  # type: ignore[method-assign]
+        control = ControlThread(runner)
         with pytest.raises(FileNotFoundError, match="no scene"):
             await control.__aenter__()
         with pytest.raises(InternalError, match="does not take work"):

@@ -12,7 +12,8 @@ from tests.runner.recording.ticks import DONE, FAILED, goal, tick
 from tests.support.rerun_files import rows_of
 from tests.support.waiting import until
 from vram_arbiter.runner.__main__ import main
-from vram_arbiter.runner.display.display import PICTURES_UNTIL, QUEUE_TICKS, Display, Tee
+from vram_arbiter.runner.control.follow import GoalFollower
+from vram_arbiter.runner.display.display import PICTURES_UNTIL, QUEUE_TICKS, Display
 from vram_arbiter.runner.protocols import GoalTick
 
 
@@ -69,12 +70,14 @@ def test_one_runner_is_recorded_and_displayed() -> None:
     viewer.may_start.set()
     other.may_start.set()
     both = [Display(each.make, lambda: None) for each in (viewer, other)]
-    tee = Tee(tuple(both))
-    tee.tick(tick(0))
-    tee.goal_ended(goal(), None)
+    follower = GoalFollower()
+    follower.sinks = tuple(both)
+    follower.goal_asked(goal())
+    follower.tick_over(lambda _: tick(0))
+    follower.goal_ended(goal(), None)
     for display in both:
         display.close()
-    assert (viewer.shown, other.shown, tee.facts()) == ([True], [True], {})
+    assert (viewer.shown, other.shown, follower.facts()) == ([True], [True], {})
 
 
 @pytest.mark.heavy

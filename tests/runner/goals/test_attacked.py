@@ -42,7 +42,7 @@ async def serving(endpoint: str, manifest: Path) -> AsyncIterator[HardwareRunner
     )
     catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda _: skill})
     async with ControlThread(runner) as control:
-        server = GoalServer(endpoint, control, runner, catalogue, clock, estop_s=60.0)
+        server = GoalServer(endpoint, control, catalogue, clock, estop_s=60.0)
         task = asyncio.create_task(server.serve())
         await server.bound.wait()
         try:

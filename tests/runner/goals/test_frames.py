@@ -33,9 +33,7 @@ def test_the_first_camera_is_the_default(make_runner: Make, run_async: Run) -> N
                 ("", "png", b"\x89PNG"),
                 ("wrist", "jpeg", b"\xff\xd8"),
             ):
-                reply = await frames.fetch(
-                    control, runner, SystemClock(), camera, 60_000.0, encoding
-                )
+                reply = await frames.fetch(control, SystemClock(), camera, 60_000.0, encoding)
                 assert reply["camera"] == (camera or "front")
                 assert reply["data"].startswith(magic)
                 picture = cv2.imdecode(
@@ -45,7 +43,7 @@ def test_the_first_camera_is_the_default(make_runner: Make, run_async: Run) -> N
                 assert 0 <= reply["age_ms"] <= 60_000
                 CameraModel.model_validate(reply["camera_model"])
             with pytest.raises(BadRequest, match="front, wrist"):
-                await frames.fetch(control, runner, SystemClock(), "rear", 500.0, "png")
+                await frames.fetch(control, SystemClock(), "rear", 500.0, "png")
 
     run_async(scenario())
 
@@ -76,7 +74,7 @@ def test_a_control_loop_that_hangs_gives_no_picture(
             await asyncio.to_thread(hung.wait, 60)
             try:
                 with pytest.raises(FrameStale, match="has given no frame"):
-                    await frames.fetch(control, runner, SystemClock(), "front", 20.0, "png")
+                    await frames.fetch(control, SystemClock(), "front", 20.0, "png")
             finally:
                 released.set()
                 await hanging
@@ -93,6 +91,6 @@ def test_an_old_picture_is_never_served(make_runner: Make, run_async: Run, clock
         runner = make_runner(rate_hz=200.0, cameras=("front",))
         async with ControlThread(runner) as control:
             with pytest.raises(FrameStale, match="60000 ms are accepted"):
-                await frames.fetch(control, runner, Late(), "front", 60_000.0, "png")
+                await frames.fetch(control, Late(), "front", 60_000.0, "png")
 
     run_async(scenario())

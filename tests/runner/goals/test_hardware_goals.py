@@ -94,7 +94,6 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
             server = GoalServer(
                 endpoint,
                 control,
-                runner,
                 catalogue,
                 clock,
                 identity={"robot": "bench"},

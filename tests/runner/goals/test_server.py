@@ -441,7 +441,7 @@ def test_a_second_runner_on_the_same_socket_is_refused(
     async def scenario() -> None:
         async with bench() as b, RunnerClient(endpoint) as client:
             control = b.server._control
-            second = GoalServer(endpoint, control, b.runner, b.server._catalogue, SystemClock())
+            second = GoalServer(endpoint, control, b.server._catalogue, SystemClock())
             with pytest.raises(AlreadyRunning):
                 await second.serve()
             assert (await client.ping(timeout_s=60))["ok"]

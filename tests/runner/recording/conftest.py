@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.dataset_writer import FORKING
 from tests.support.prepared import warm
-from vram_arbiter.runner.recording import writer_process
+from vram_arbiter.runner.recording import recorder
 
 
 @pytest.fixture(scope="package")
@@ -14,5 +14,5 @@ def forked_writers() -> Iterator[None]:
     """Let recorders of this process, and of runners that it forks, fork their writers."""
     warm("dataset-writer")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writer_process, "subprocess", FORKING)
+        patch.setattr(recorder, "subprocess", FORKING)
         yield

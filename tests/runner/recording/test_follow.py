@@ -137,29 +137,6 @@ def test_nobody_follows_unless_asked(make_runner: Callable[..., Any]) -> None:
     assert runner.result().save_dir is None
 
 
-def test_a_policy_that_plays_by_itself_is_followed_like_a_goal(
-    make_runner: Callable[..., Any],
-) -> None:
-    from vram_arbiter.runner.recording.rows import row_of
-    from vram_arbiter.runner.sim.policies import policy_of
-
-    follower = Follower()
-    runner = make_runner(
-        rate_hz=0, seed=7, episodes=2, max_steps=3, policy=policy_of("random").play
-    )
-    runner.follow(follower)
-    runner.activate()
-    runner.run()
-    ticks, ends = [("tick", "seed-7")] * 3, [("end", "seed-7")]
-    assert follower.order[:4] == ticks + ends
-    assert follower.order[4:] == [(what, "seed-8") for what, _ in ticks + ends]
-    rows = [row_of(tick, ())[0] for tick in follower.ticks]
-    assert {row["units"] for row in rows} == {"rad"}
-    assert rows[0]["state_names"] == rows[0]["action_names"]
-    assert rows[1]["state"] == rows[0]["action"] != rows[1]["action"]
-    assert rows[0]["base_velocity"] == [0.0, 0.0, 0.0]
-
-
 @pytest.mark.heavy  # a simulated camera's pictures: numpy
 def test_a_simulator_that_is_followed_renders_all_cameras(make_runner: Callable[..., Any]) -> None:
     runner, follower = make_runner(rate_hz=0, cameras=("front", "wrist")), Follower()

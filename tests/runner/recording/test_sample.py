@@ -11,7 +11,7 @@ from tests.runner.small_robots import FedCamera, Twin
 from vram_arbiter.runner.cli.recording import check_recording
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
-from vram_arbiter.runner.recording.rows import row_of
+from vram_arbiter.runner.recording.columns import row_of
 from vram_arbiter.runner.recording.sample import sample_of
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
@@ -31,12 +31,11 @@ def test_a_sample_has_the_robots_columns_and_the_pictures_sizes() -> None:
     runner.activate()
     sample = sample_of(runner)
     assert sample is not None
-    row, pictures = row_of(sample, runner.camera_names())
-    assert (
-        row["state_names"] == row["action_names"] == list(runner.robot.hal.description.joint_names)
-    )
-    assert row["frames"] == [{"camera": "front", "encoding": "rgb8", "width": 2, "height": 1}]
-    assert [len(picture) for picture in pictures] == [6]
+    row = row_of(sample, runner.camera_names())
+    joints = list(runner.robot.hal.description.joint_names)
+    assert row.columns["observation.state"].names == row.columns["action"].names == joints
+    seen = [(frame.sensor_id, frame.width, frame.height, frame.data) for frame in row.frames]
+    assert [(*shape, len(data or b"")) for *shape, data in seen] == [("front", 2, 1, 6)]
     runner.deactivate()
 
 
@@ -62,7 +61,7 @@ def test_a_camera_without_colors_is_refused_before_a_goal() -> None:
         runner = runner_with(Depth("depth", SystemClock()))
         unasked: Any = None  # the sample fails before the writer is asked
         async with ControlThread(runner) as control:
-            await check_recording(unasked, control, runner)
+            await check_recording(unasked, control)
 
     with pytest.raises(ConfigError, match=r"nothing could be recorded: .*depth16"):
         asyncio.run(start())

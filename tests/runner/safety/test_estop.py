@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -90,10 +91,10 @@ def robot() -> Iterator[Robot]:
 @pytest.fixture
 def serve_estop(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
     def make(obey_s: float = WAIT_S, silent_s: float = SILENT_S) -> EstopServer:
+        runner: Any = robot  # as much of a runner as a stop needs
         return EstopServer(
             endpoint,
-            robot,
-            robot.mailbox,
+            runner,
             on_stop=lambda *_: None,
             robot_id="bench",
             obey_s=obey_s,
@@ -316,7 +317,7 @@ def test_the_socket_of_a_killed_runner_is_taken_over_and_nothing_else(
         )  # fits the goal socket, and leaves no room for its emergency stop's
     with pytest.raises(ConfigError, match=r"no-such-folder/s\.estop: No such file"):
         EstopServer(
-            f"ipc://{tmp_path}/no-such-folder/s", robot, robot.mailbox, on_stop=lambda *_: None
+            f"ipc://{tmp_path}/no-such-folder/s", cast(Any, robot), on_stop=lambda *_: None
         ).__enter__()
     with pytest.raises(ConfigError, match="tcp:// is refused"):
         path_of("tcp://127.0.0.1:7")

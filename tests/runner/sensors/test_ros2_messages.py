@@ -9,18 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vram_arbiter.runner.sensors.ros2_dds import parse, written
 from vram_arbiter.runner.sensors.ros2_messages import (
+    Header,
     ImageContent,
     RosCompressedImage,
     RosImage,
     jpeg_size,
     message_of,
     picture_of,
-    read_compressed,
-    read_image,
-    write_cdr,
 )
-from vram_arbiter.schemas.world import FrameEncoding
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 stamps = st.integers(0, (2**31 - 1) * 10**9)
 names = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
@@ -28,12 +27,11 @@ names = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0
 
 def image(**changes: Any) -> RosImage:
     fields: dict[str, Any] = {
-        "stamp_ns": 5,
-        "frame_id": "cam",
+        "header": Header.of(5, "cam"),
         "height": 2,
         "width": 3,
         "encoding": "rgb8",
-        "is_bigendian": False,
+        "is_bigendian": 0,
         "step": 9,
         "data": bytes(range(18)),
     }
@@ -55,27 +53,27 @@ def jpeg(height: int = 4, width: int = 6, channels: int = 3) -> bytes:
 def test_an_image_survives_the_wire(
     stamp_ns: int, frame_id: str, encoding: str, big: bool, data: bytes, step: int
 ) -> None:
-    message = RosImage(stamp_ns, frame_id, 7, 9, encoding, big, step, data)
-    assert read_image(write_cdr(message)) == message
+    message = RosImage(Header.of(stamp_ns, frame_id), 7, 9, encoding, int(big), step, data)
+    assert parse(RosImage, written(message)) == message
 
 
 @given(stamps, names, names, st.binary(max_size=40))
 def test_a_compressed_image_survives_the_wire(
     stamp_ns: int, frame_id: str, form: str, data: bytes
 ) -> None:
-    message = RosCompressedImage(stamp_ns, frame_id, form, data)
-    assert read_compressed(write_cdr(message)) == message
+    message = RosCompressedImage(Header.of(stamp_ns, frame_id), form, data)
+    assert parse(RosCompressedImage, written(message)) == message
 
 
 @given(st.binary(max_size=120), st.integers(0, 60))
 def test_any_bytes_are_read_or_refused(noise: bytes, cut: int) -> None:
-    for data in (noise, b"\x00\x01\x00\x00" + noise, write_cdr(image())[: -1 - cut]):
-        for read in (read_image, read_compressed):
+    for data in (noise, b"\x00\x01\x00\x00" + noise, written(image())[: -1 - cut]):
+        for kind in (RosImage, RosCompressedImage):
             try:
-                message = read(data)
+                message = parse(kind, data)
             except ValueError:
                 continue
-            assert read(write_cdr(message)) == message, "what was read is a whole message"
+            assert parse(kind, written(message)) == message, "what was read is a whole message"
 
 
 @given(st.binary(max_size=200))
@@ -112,7 +110,7 @@ def test_padding_of_rows_is_left_out() -> None:
 
 def test_big_endian_depth_is_turned_around() -> None:
     depths = (1, 300, 65_535, 2, 0, 1000)
-    message = image(encoding="16UC1", is_bigendian=True, step=6, data=struct.pack(">6H", *depths))
+    message = image(encoding="16UC1", is_bigendian=1, step=6, data=struct.pack(">6H", *depths))
     assert struct.unpack("<6H", picture_of(message).data) == depths
 
 
@@ -134,7 +132,7 @@ def test_contradictions_are_refused(changes: dict[str, Any], reason: str) -> Non
 
 @pytest.mark.parametrize("form", ["jpeg", "jpg", "rgb8; jpeg compressed bgr8"])
 def test_a_jpeg_knows_its_size(form: str) -> None:
-    picture = picture_of(RosCompressedImage(1, "cam", form, jpeg(4, 6, 3)))
+    picture = picture_of(RosCompressedImage(Header.of(1, "cam"), form, jpeg(4, 6, 3)))
     assert (picture.encoding, picture.width, picture.height, picture.channels) == ("jpeg", 6, 4, 3)
 
 
@@ -151,20 +149,31 @@ def test_a_jpeg_knows_its_size(form: str) -> None:
 )
 def test_a_broken_jpeg_is_refused(data: bytes, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
-        picture_of(RosCompressedImage(1, "cam", "jpeg", data))
+        picture_of(RosCompressedImage(Header.of(1, "cam"), "jpeg", data))
 
 
 def test_other_compressions_are_refused() -> None:
     with pytest.raises(ValueError, match="compressedDepth"):
-        picture_of(RosCompressedImage(1, "cam", "16UC1; compressedDepth png", b"x"))
+        picture_of(RosCompressedImage(Header.of(1, "cam"), "16UC1; compressedDepth png", b"x"))
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "mono8", "16UC1"])
 def test_frames_become_the_messages_that_they_came_from(encoding: str) -> None:
     per_pixel = {"mono8": 1, "16UC1": 2}.get(encoding, 3)
     message = image(encoding=encoding, step=3 * per_pixel, data=bytes(6 * per_pixel))
-    assert message_of(picture_of(message), 5, "cam") == message
+    picture = picture_of(message)
+    frame = SensorFrame(
+        sensor_id="cam",
+        stamp_monotonic_ns=1,
+        stamp_wall_ns=5,
+        encoding=picture.encoding,
+        width=picture.width,
+        height=picture.height,
+        channels=picture.channels,
+        data=picture.data,
+    )
+    assert message_of(frame) == message
     with pytest.raises(ValueError, match="no name in ROS"):
-        message_of(ImageContent(FrameEncoding.RAW, 2, 2, 3, b"123456"), 5, "cam")
+        message_of(frame.model_copy(update={"encoding": FrameEncoding.RAW}))
     with pytest.raises(ValueError, match="2038"):
-        message_of(picture_of(message), 2**31 * 10**9, "cam")
+        message_of(frame.model_copy(update={"stamp_wall_ns": 2**31 * 10**9}))

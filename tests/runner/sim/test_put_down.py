@@ -27,10 +27,8 @@ TICKS_MAX = 300
 
 @pytest.mark.parametrize("shape", ["cube", "ball", "cylinder"])
 def test_what_was_grasped_stands_again_where_the_arm_takes_things_from(shape: str) -> None:
-    world = so101_world(None)
-    assert world.environment is not None
-    assert world.arm is not None
-    environment, env = world.environment, world.arm
+    environment = so101_world(None)
+    env = environment.arm
     try:
         environment.reset(7)
         env.reset(7, names=(f"red {shape}", "blue cube"))

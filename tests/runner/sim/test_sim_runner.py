@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.runner.conftest import KinematicEnv, world_of
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import (
     Act,
@@ -19,13 +20,10 @@ from vram_arbiter.runner.protocols import (
     Done,
     Goal,
     Hold,
-    RobotDescription,
     SkillEnded,
     SkillKey,
     StepOutcome,
 )
-from vram_arbiter.runner.sim.arm_env import ArmEnvironment
-from vram_arbiter.runner.sim.episodes import Episode, EpisodeView
 from vram_arbiter.runner.sim.robot import sim_runner
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
@@ -106,26 +104,35 @@ def test_the_first_tick_resets_and_every_other_one_steps(make_runner: Make, env:
     )
 
 
-def test_n_episodes_are_n_resets_and_no_phantom_one(make_runner: Make, env: Any) -> None:
-    runner = make_runner(seed=3, rate_hz=0, episodes=2, max_steps=4)
-    runner.activate()
-    result = runner.run()
-    assert env.resets == [3, 4]
-    assert len(env.steps) == 8
-    assert result.n_ticks == 10
-    assert [(e.index, e.steps, e.truncated) for e in runner.robot.episodes] == [
-        (0, 4, True),
-        (1, 4, True),
-    ]
-    assert result.success is None  # nobody judged
+Played = tuple[int | None, int, bool | None, bool | None]
 
 
-def test_a_judge_ends_an_episode(make_runner: Make, env: Any) -> None:
-    runner = make_runner(rate_hz=0, episodes=2, max_steps=5, judge=lambda e: len(e.steps) == 3)
+def episodes_of(ticks: Sequence[TickResult]) -> list[Played]:
+    """Index, steps, verdict and whether it was cut off, of every finished episode."""
+    found: list[Played] = []
+    steps = 0
+    for tick in ticks:
+        steps = 0 if tick.step_idx is None else steps + 1
+        if tick.terminated or tick.truncated:
+            found.append((tick.episode_idx, steps, tick.success, tick.truncated))
+    return found
+
+
+def test_episodes_follow_each_other_with_a_reset_each(make_runner: Make, env: Any) -> None:
+    runner = make_runner(seed=3, rate_hz=0, max_steps=4, judge=lambda e: len(e.steps) == 6)
     runner.activate()
-    result = runner.run()
-    assert [(e.steps, e.success) for e in runner.robot.episodes] == [(3, True), (5, False)]
-    assert result.success is False
+    ticks = [runner.tick() for _ in range(13)]
+    assert env.resets == [3, 4, 5]
+    assert [tick.tick_idx for tick in ticks if tick.step_idx is None] == [0, 5, 8]
+    assert [tick.step_idx for tick in ticks] == [None, 0, 1, 2, 3, None, 0, 1, None, 0, 1, 2, 3]
+    assert episodes_of(ticks) == [(0, 4, False, True), (1, 2, True, False), (2, 4, False, True)]
+    assert runner.result().metadata["episodes"] == 3
+
+
+def test_an_episode_without_a_judge_has_no_verdict(make_runner: Make) -> None:
+    runner = make_runner(rate_hz=0, max_steps=2)
+    runner.activate()
+    assert episodes_of([runner.tick() for _ in range(3)]) == [(0, 2, None, True)]
 
 
 def test_a_live_run_ends_when_asked(make_runner: Make, env: Any) -> None:
@@ -136,58 +143,17 @@ def test_a_live_run_ends_when_asked(make_runner: Make, env: Any) -> None:
     assert runner.run(max_ticks=5).n_ticks == 0
     runner.deactivate()
     runner.deactivate()
-    assert env.closed == 1
-
-
-def episodes_of(ticks: list[TickResult]) -> list[Episode]:
-    view = EpisodeView()
-    for tick in ticks:
-        view.add(tick)
-    return list(view.finished)
-
-
-def test_episodes_are_read_off_the_ticks(make_runner: Make, env: Any) -> None:
-    runner = make_runner(
-        seed=3, rate_hz=0, episodes=3, max_steps=4, judge=lambda e: len(e.steps) == 6
-    )
-    runner.activate()
-    ticks = []
-    while not runner._finished():
-        ticks.append(runner.tick())
-    assert episodes_of(ticks) == runner.robot.episodes
-    resets = [tick.tick_idx for tick in ticks if tick.step_idx is None]
-    assert resets == [0, 5, 8]
-    assert [tick.step_idx for tick in ticks if tick.step_idx is not None] == [
-        0,
-        1,
-        2,
-        3,
-        0,
-        1,
-        0,
-        1,
-        2,
-        3,
-    ]
-    assert [(e.steps, e.success, e.truncated) for e in runner.robot.episodes] == [
-        (4, False, True),
-        (2, True, False),
-        (4, False, True),
-    ]
-    assert episodes_of(ticks[:-1]) == runner.robot.episodes[:-1]
+    assert env.closed
 
 
 def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: Any) -> None:
-    runner = make_runner(seed=3, rate_hz=0, episodes=2, max_steps=4)
+    runner = make_runner(seed=3, rate_hz=0, max_steps=4)
     runner.activate()
     runner.run(max_ticks=8)  # reset, 4 steps, reset, 2 steps
     runner.deactivate()
-    assert env.resets == [3, 4]
-    assert [episode.index for episode in runner.robot.episodes] == [0]
     runner.activate()  # what was broken off is played again, from its reset on, with its own seed
-    assert runner.run().n_ticks == 5
+    assert episodes_of([runner.tick() for _ in range(5)]) == [(1, 4, None, True)]
     assert env.resets == [3, 4, 4]
-    assert [(e.index, e.steps) for e in runner.robot.episodes] == [(0, 4), (1, 4)]
 
 
 @settings(deadline=None)
@@ -197,49 +163,36 @@ def test_stopping_within_an_episode_leaves_no_phantom(make_runner: Make, env: An
     stop_after=st.integers(0, 40),
 )
 def test_every_reset_is_an_episode_that_is_played(
-    make_env: Any,
-    kinematic: RobotDescription,
-    lengths: list[int],
-    max_steps: int | None,
-    stop_after: int,
+    lengths: list[int], max_steps: int | None, stop_after: int
 ) -> None:
     """Whatever ends the episodes, and wherever the run is stopped and taken up again."""
-    robot = make_env()
+    robot = KinematicEnv()
     begun: list[int] = []  # steps of the robot at each reset
 
-    def judge() -> bool:
+    def judge(robot: KinematicEnv) -> bool:
         while len(begun) < len(robot.resets):
             begun.append(len(robot.steps) - 1)
         return len(robot.steps) - begun[-1] >= lengths[robot.resets[-1]]
 
-    runner = sim_runner(
-        lambda: ArmEnvironment(robot, kinematic, judge=judge),
-        rate_hz=0,
-        episodes=len(lengths),
-        max_steps=max_steps,
-    )
-    runner.activate()
-    first = runner.run(max_ticks=stop_after)
-    runner.deactivate()
-    open_ones = len(robot.resets) - len(runner.robot.episodes)
+    runner = sim_runner(world_of(robot, judge), rate_hz=0, max_steps=max_steps)
+    ticks: list[TickResult] = []
+
+    def play(limit: int) -> None:
+        runner.activate()
+        while len(episodes_of(ticks)) < len(lengths) and len(ticks) < limit:
+            ticks.append(runner.tick())
+        runner.deactivate()
+
+    play(stop_after)
+    open_ones = len(robot.resets) - len(episodes_of(ticks))
     assert open_ones in (0, 1)
-    runner.activate()
-    result = runner.run()
-    runner.deactivate()
+    play(1000)
     assert len(robot.resets) == len(lengths) + open_ones
     assert sorted(set(robot.resets)) == list(range(len(lengths)))
-    assert [e.steps for e in runner.robot.episodes] == [min(n, max_steps or n) for n in lengths]
-    assert first.n_ticks + result.n_ticks == len(robot.resets) + len(robot.steps)
-
-
-def test_a_run_that_is_over_resets_nothing_however_often_it_is_run(
-    make_runner: Make, env: Any
-) -> None:
-    runner = make_runner(rate_hz=0, episodes=1, max_steps=2)
-    runner.activate()
-    assert [runner.run().n_ticks for _ in range(3)] == [3, 0, 0]
-    runner.deactivate()
-    assert env.resets == [0]
+    assert [steps for _, steps, *_ in episodes_of(ticks)] == [
+        min(n, max_steps or n) for n in lengths
+    ]
+    assert len(ticks) == len(robot.resets) + len(robot.steps)
 
 
 def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -> None:
@@ -259,7 +212,7 @@ def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -
 def test_an_episode_that_nobody_judges_is_no_success(make_runner: Make) -> None:
     _, ended = play_script(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
     assert isinstance(ended[0].error, ModelError)
-    assert "does not say" in ended[0].error.message
+    assert "nothing judges it" in ended[0].error.message
 
 
 def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
@@ -267,29 +220,18 @@ def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
     ticks, ended = play_script(runner, [Act(joints(0.1))], 2)
     assert ended[0].error is None
     assert [tick.truncated for tick in ticks] == [False, True]
-    assert [(e.steps, e.success, e.truncated) for e in runner.robot.episodes] == [(2, False, True)]
+    assert episodes_of(ticks) == [(0, 2, False, True)]
     runner.robot.begin_episode(41)
     runner.tick()
     assert env.resets == [0, 41]
     assert runner.tick().truncated is False  # the new episode had no skill yet
 
 
-def test_a_world_that_fails_ends_the_goal_and_is_reset(make_runner: Make, env: Any) -> None:
+def test_a_world_that_fails_ends_the_run(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0, seed=5)
-    bad = Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.3, 0.0, 0.0, 0.0, 0.0, 0.1),))
-    _, ended = play_script(runner, [Act(joints(0.1))], 1)
+    play_script(runner, [Act(joints(0.1))], 1)
     env.fails = True
-    runner.end_skill()
-    runner.begin_skill(Scripted(Act(bad)), GOAL, ended.append)
-    failed = runner.tick()
-    assert isinstance(ended[0].error, EnvironmentFailed)
-    assert (failed.action_applied, failed.step_idx) == (False, None)
-    env.fails = False
-    runner.tick()
-    assert env.resets == [5, 5]
-    assert runner.robot.episodes == []
-    env.fails = True
-    with pytest.raises(EnvironmentFailed):  # nobody asked it for anything: it is broken
+    with pytest.raises(EnvironmentFailed, match="the physics blew up"):
         runner.tick()
 
 
@@ -599,18 +541,17 @@ def test_navigating_the_real_simulator_and_filming_it(
 ) -> None:
     import imageio_ffmpeg
 
-    from vram_arbiter.runner.recording.video import VideoRecorder
     from vram_arbiter.runner.sim.robot import sim_runner
+    from vram_arbiter.runner.sim.video import VideoRecorder
     from vram_arbiter.runner.sim.worlds import so101_world
     from vram_arbiter.runner.skills.navigate import Navigate
     from vram_arbiter.schemas.manifest import load_manifest
 
     world = so101_world(None)
-    env, scene = world.arm, world.scene
-    assert env is not None
-    assert scene is not None
+    env, scene = world.arm, world.arm.config
     recorder = VideoRecorder(tmp_path / "episode.mp4", fps=10)
-    runner = sim_runner(world.make, cameras=("front",), seed=1, rate_hz=0, recorder=recorder)
+    runner = sim_runner(world, seed=1, rate_hz=0)
+    runner.robot.video.recorder = recorder
     skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
     ended: list[SkillEnded] = []
     try:
@@ -656,9 +597,8 @@ def test_a_scene_that_takes_long_to_build_misses_no_deadline(
         build(seed)
 
     env.reset = slowly
-    options = {"rate_hz": 10, "episodes": 2, "max_steps": 3, "clock": clock}
+    options = {"rate_hz": 10, "max_steps": 3, "clock": clock}
     runner = make_runner(deadline_policy=DeadlinePolicy.RAISE, **options)
     runner.activate()
-    result = runner.run()
-    assert (result.n_ticks, result.budget_violations) == (8, 0)
-    assert [episode.steps for episode in runner.robot.episodes] == [3, 3]
+    result = runner.run(max_ticks=8)
+    assert (env.resets, result.budget_violations) == ([0, 1], 0)

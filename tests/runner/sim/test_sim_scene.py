@@ -20,6 +20,7 @@ from vram_arbiter.runner.sim.config import (
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.layout import make_layout
 from vram_arbiter.runner.sim.navigate import standoff_pose
+from vram_arbiter.runner.sim.robot import EpisodeVideo
 from vram_arbiter.runner.sim.worlds import so101_world
 from vram_arbiter.schemas.errors import ConfigError, EnvironmentFailed
 
@@ -75,8 +76,9 @@ def test_a_scene_without_an_overview_is_filmed_by_another_camera(tmp_path: Path)
     """Regression: `--video` took the `overview` camera for granted."""
     file = tmp_path / "scene.yaml"
     file.write_text(f"cameras:\n  side: {CAMERA % 'world'}\n", encoding="utf-8")
-    assert (so101_world(file).video_camera, so101_world(file).cameras) == ("side", ())
-    assert so101_world(None).video_camera == "overview"
+    world = so101_world(file)
+    assert (EpisodeVideo(world).camera, world.cameras) == ("side", ())
+    assert EpisodeVideo(so101_world(None)).camera == "overview"
 
 
 def test_a_scene_whose_objects_do_not_fit_is_the_environments_failure() -> None:
