@@ -36,6 +36,10 @@ EXTRA_OF: Mapping[str, str] = {
     "cyclonedds": "ros2",
     "rerun": "viz",
     "mcp": "mcp",
+    "starlette": "observer",
+    "uvicorn": "observer",
+    "prometheus_client": "observer",
+    "opentelemetry": "observer",
 }
 
 

@@ -1,17 +1,16 @@
 """Checks of clashes: several arbiters of one GPU, ports that another program has."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, ok, warning
 from vram_arbiter.clients.cli.doctor.machine import Machine
-from vram_arbiter.clients.cli.doctor.options import Options, flag, options_of
+from vram_arbiter.clients.cli.doctor.options import flag, options_of
 
 PROGRAM: Final = "vram-arbiter"
 MODULE: Final = "vram_arbiter.arbiter"
 LISTEN: Final = "0A"
-PORT_VARIABLE: Final = "OTEL_EXPORTER_PROMETHEUS_PORT"
 
 
 def arbiters(m: Machine) -> Iterator[Finding]:
@@ -31,58 +30,31 @@ def arbiters(m: Machine) -> Iterator[Finding]:
 
 
 def ports(m: Machine) -> Iterator[Finding]:
-    """The daemon has the ports that it was told to serve."""
-    options = options_of(m)
-    wanted = _wanted(m, options)
+    """The observer beside the daemon has the port that it was told to serve."""
+    http = options_of(m).flag("--http")
+    port = http.rpartition(":")[2]
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        yield ok("ports.free", "ports of the daemon: none is configured")
+        return
     table = "".join(m.text(f"/proc/net/{name}") or "" for name in ("tcp", "tcp6"))
-    if wanted and not table:
+    if not table:
         raise CouldNotLook("/proc/net/tcp is not there")
-    clean = True
-    for port, key in wanted.items():
-        owners = {
-            int(words[7])
-            for line in table.splitlines()
-            if len(words := line.split()) > 9
-            and words[3] == LISTEN
-            and words[1].endswith(f":{port:04X}")
-        }
-        if foreign := owners - {m.arbiter.uid}:
-            clean = False
-            users = ", ".join(sorted(m.user_name(uid) for uid in foreign))
-            yield warning(
-                "ports.taken",
-                f"port {port} ({key}) is taken by a program of {users}",
-                _other_port(m, options, port, key),
-            )
-    if clean:
-        said = ", ".join(f"{port} ({key})" for port, key in wanted.items()) or "none is configured"
-        yield ok("ports.free", f"ports of the daemon: {said}")
-
-
-def _wanted(m: Machine, options: Options) -> Mapping[int, str]:
-    """Return the daemon's ports, with the key, flag or variable of each."""
-    given = options.flag("--http")
-    named = {
-        PORT_VARIABLE: m.environ.get(PORT_VARIABLE, ""),
-        "telemetry.prometheus_port": options.key("telemetry", "prometheus_port"),
-        "--http" if given else "http.listen": given or options.key("http", "listen"),
+    owners = {
+        int(words[7])
+        for line in table.splitlines()
+        if len(words := line.split()) > 9
+        and words[3] == LISTEN
+        and words[1].endswith(f":{int(port):04X}")
     }
-    found: dict[int, str] = {}
-    for key, value in named.items():
-        port = value.rpartition(":")[2]
-        if port.isdecimal() and 0 < int(port) < 65536:
-            found[int(port)] = key
-    return found
-
-
-def _other_port(m: Machine, options: Options, port: int, key: str) -> str:
-    """Return the command that moves the daemon to the next port."""
-    if key == PORT_VARIABLE:
-        return f"export {key}={port + 1}"
-    if key == "--http":
-        return f"vram-arbiter --http {options.flag('--http').replace(str(port), str(port + 1))}"
-    change = f"s/\\b{port}\\b/{port + 1}/"
-    return f"{m.sudo}sed -i '{change}' {options.path} && {m.service('restart')}"
+    if foreign := owners - {m.arbiter.uid}:
+        users = ", ".join(sorted(m.user_name(uid) for uid in foreign))
+        yield warning(
+            "ports.taken",
+            f"port {port} (--http) is taken by a program of {users}",
+            f"vram-arbiter --http {http.replace(port, str(int(port) + 1))}",
+        )
+    else:
+        yield ok("ports.free", f"ports of the daemon: {port} (--http)")
 
 
 def _is_arbiter(words: Sequence[str]) -> bool:

@@ -39,7 +39,7 @@ def wanted(site: Site, prefix: Path, group: str) -> Contents:
     files = _files_of_system(site) if site.layout.system else _files_of_user(site)
     files = {path: _adapted(text, prefix, group) for path, text in files.items()}
     settings, shared = site.layout.settings, site.layout.shared
-    for name in ("arbiter.yaml", "hooks.yaml"):
+    for name in ("arbiter.yaml", "observer.yaml"):
         files[settings / f"{name}.example"] = _example(name, prefix)
     for place, text in completions().items():
         files[shared / place] = text

@@ -13,14 +13,21 @@ from vram_arbiter.schemas.errors import ConfigError
 
 ARBITER = "vram-arbiter.service"
 CLIENTS = (
-    "vram-hooks.service",
+    "vram-observer.service",
     "vram-sidecar@.service",
     "vram-runner@.service",
     "vram-reasoner@.service",
     "vram-reasoner.service",
 )
 OF_USER = (ARBITER, "vram-reasoner.service")
-PROGRAMS = ("vram-arbiter", "vramctl", "vram-sidecar", "vram-runner", "vram-reasoner")
+PROGRAMS = (
+    "vram-arbiter",
+    "vramctl",
+    "vram-observer",
+    "vram-sidecar",
+    "vram-runner",
+    "vram-reasoner",
+)
 GROUP = "vram-arbiter"
 OPERATORS = "vram-operators"
 DEVICE_GROUPS = ("video", "render", "dialout")
@@ -53,8 +60,8 @@ SYSTEM = Layout(
         Path("/var/lib/vram-arbiter"),
         Path("/var/lib/vram-runner"),
         Path("/var/lib/vram-reasoner"),
-        Path("/var/lib/vram-hooks"),
-        Path("/var/lib/private/vram-hooks"),  # where that leads: its user exists while it runs
+        Path("/var/lib/vram-observer"),
+        Path("/var/lib/private/vram-observer"),  # where that leads: its user exists while it runs
         Path("/var/cache/vram-sidecar"),
         Path("/var/cache/vram-runner"),
         Path("/run/vram-arbiter"),
@@ -72,7 +79,7 @@ def layout_of_user(environ: Mapping[str, str], home: Path) -> Layout:
 
     settings = folder("XDG_CONFIG_HOME", ".config")
     kept = folder("XDG_STATE_HOME", ".local/state")
-    state = [kept / "vram-arbiter", kept / "vram-hooks"]
+    state = [kept / "vram-arbiter", kept / "vram-observer"]
     if runtime := environ.get("XDG_RUNTIME_DIR"):
         state.append(Path(runtime) / "vram-arbiter")
     return Layout(

@@ -338,11 +338,6 @@ CASES = [
     Case("ports.arbiters", "kill 800", SECOND),
     Case(
         "ports.taken",
-        "sed -i 's/\\b9464\\b/9465/' /etc/vram-arbiter/arbiter.yaml && sudo systemctl restart",
-        {"/etc/vram-arbiter/arbiter.yaml": "telemetry:\n  prometheus_port: 9464\n", **SERVED},
-    ),
-    Case(
-        "ports.taken",
         "vram-arbiter --http 127.0.0.1:9465",
         {f"/proc/{PID}/cmdline": "vram-arbiter\0--http\x00127.0.0.1:9464\0", **SERVED},
     ),

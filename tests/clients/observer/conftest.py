@@ -1,0 +1,19 @@
+"""Fixtures of the observer's tests: an engine whose notes it reads."""
+
+import pytest
+
+from tests.support.busy import busy_driver
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.schemas.defaults import GIB
+
+
+@pytest.fixture(scope="session")
+def busy() -> CoreDriver:
+    """A run of the engine with a bit of everything; read only."""
+    return busy_driver(7)
+
+
+@pytest.fixture
+def driver() -> CoreDriver:
+    """An engine with one simulated GPU of 8 GiB."""
+    return CoreDriver(8 * GIB)
