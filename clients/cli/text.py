@@ -248,7 +248,7 @@ def _footprint_lines(footprint: JsonMap | None) -> list[str]:
 QUIET_KINDS = frozenset(
     {"use_began", "use_ended", "use_yielded", "revoke_acked", "reminded", "unloading"}
 )
-"""Steps that other events sum up; `arbiter/http/static/story.js` has the same list."""
+"""Steps that other events sum up; `clients/observer/page/static/story.js` has the same list."""
 
 
 def is_quiet(event: JsonMap) -> bool:
