@@ -17,7 +17,7 @@ same effects.
 It must not know how effects are performed, nor that a wire exists.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import replace
 from typing import Any
 
@@ -31,14 +31,13 @@ from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.refusals import NoSession, Refused
 from vram_arbiter.arbiter.core.model.state import Core, Turn
-from vram_arbiter.arbiter.core.report import status, usage, why
-from vram_arbiter.arbiter.core.report.status import Figures, PageKey
-from vram_arbiter.arbiter.core.report.usage import GpuUsage
+from vram_arbiter.arbiter.core.report import status, why
+from vram_arbiter.arbiter.core.report.status import PageKey
 from vram_arbiter.arbiter.core.requests import operators, recovery, requests, sessions, uses
 from vram_arbiter.arbiter.core.scheduling import deadlock, grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -241,12 +240,6 @@ class Arbiter:
             page = replace(page, details=shown)
         return page
 
-    def leases(self, ids: Iterable[LeaseId], now: float) -> StatusReply:
-        """Return the status with these leases alone, without tokens."""
-        self._core.now = max(self._core.now, now)
-        host_ram = self._standby.host_ram()
-        return status.status(self._core, host_ram, ProcessKey(0, 0), only=ids)
-
     def why(self, consumer: str, now: float) -> WhyReply:
         """Explain why a consumer is not running."""
         self._core.now = max(self._core.now, now)
@@ -256,14 +249,6 @@ class Arbiter:
         """GPUs that have to be read before their state can be shown (`schedule.stale`)."""
         self._core.now = max(self._core.now, now)
         return schedule.stale(self._core)
-
-    def figures(self) -> Figures:
-        """The present in numbers (`status.figures`)."""
-        return status.figures(self._core)
-
-    def usage(self) -> tuple[GpuUsage, ...]:
-        """How the bytes of each GPU are divided now (`usage.usage`)."""
-        return usage.usage(self._core)
 
     def learnt(self) -> dict[str, dict[str, float]]:
         """Return the learned durations, in the shape of `Settings.learnt`."""

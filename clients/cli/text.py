@@ -28,7 +28,10 @@ _COLUMNS = (
 )
 _RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE"})
 _NOT_SHOWN = frozenset(
-    {"seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token", "traceparent"}
+    (
+        *("seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token"),
+        *("traceparent", "trace_id", "span_id", "parent_id", "trace_flags"),
+    )
 )
 
 

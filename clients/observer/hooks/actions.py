@@ -7,7 +7,6 @@ so a token reaches the named host and no other.
 
 import asyncio
 import contextlib
-import email.utils
 import logging
 import os
 import random
@@ -15,7 +14,6 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
 from pathlib import Path
@@ -137,7 +135,7 @@ async def post(
                 problem = f"answered {reply.status_code}: {printable(reply.text)[:SHOWN_MAX_CHARS]}"
                 if reply.status_code < 500 and reply.status_code not in AGAIN:
                     raise ActionFailed(f"{host} {problem}")
-                wait_s = retry_after_s(reply.headers.get("retry-after", ""), time.time()) or 0.0
+                wait_s = retry_after_s(reply.headers.get("retry-after", ""))
             except (httpx.HTTPError, ConfigError) as error:
                 problem = str(error) or type(error).__name__
             if attempt < hook.attempts:
@@ -147,15 +145,9 @@ async def post(
     raise ActionFailed(f"{host} took none of {hook.attempts} requests: {problem}")
 
 
-def retry_after_s(text: str, now_wall_s: float) -> float | None:
-    """Return the pause that an answer asks for, in seconds or as a date (RFC 9110, 10.2.3)."""
-    if text.strip().isdecimal():
-        return min(float(text), RETRY_AFTER_MAX_S)
-    try:
-        at = email.utils.parsedate_to_datetime(text).timestamp()
-    except (ValueError, TypeError):
-        return None
-    return min(max(0.0, at - now_wall_s), RETRY_AFTER_MAX_S)
+def retry_after_s(text: str) -> float:
+    """Return the pause that an answer asks for in seconds; 0: none."""
+    return min(float(text), RETRY_AFTER_MAX_S) if text.strip().isdecimal() else 0.0
 
 
 def read_headers(path: str) -> Mapping[str, str]:

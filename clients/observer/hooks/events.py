@@ -68,14 +68,7 @@ def environ_of(delivery: Delivery, endpoint: str) -> Mapping[str, str]:
 def sample(hook: Hook, on: str) -> Delivery:
     """Return a made-up event of a kind, for `vram-observer --test-hook`."""
     kind = "unloading" if on == EVICTED else ALIASES.get(on, on)
-    event: JsonMap = {
-        "seq": 0,
-        "at_wall_s": 0.0,
-        "kind": kind,
-        "consumer": hook.consumer.replace("*", "sample"),
-        "lease_id": "L0-0",
-        "gpu": "GPU-0",
-        "asked": True,
-        "reason": "a sample event of `vram-observer --test-hook`",
-    }
+    said = "a sample event of `vram-observer --test-hook`"
+    event: JsonMap = {"seq": 0, "at_wall_s": 0.0, "kind": kind, "asked": True, "reason": said}
+    event = {**event, "consumer": hook.consumer.replace("*", "sample"), "lease_id": "L0-0"}
     return Delivery(hook.name, on, event, f"sample-{hook.name}")

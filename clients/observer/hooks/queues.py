@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 
 FILE_MAX_CHARS: Final = 1 << 27
 SAVE_EVERY_S: Final = 0.2
-STOP_S: Final = 5.0
-"""How long running deliveries may go on at a stop; they are repeated at the next start."""
+SAVE_AGAIN_S: Final = 10.0
+"""After an attempt that failed, such as on a full disk."""
 
 type Act = Callable[[Hook, Delivery], Awaitable[None]]
 
@@ -108,8 +108,6 @@ class Runner:
         self.lines = {hook.name: Line(hook) for hook in hooks}
         self._act = act
         self._changed = asyncio.Event()
-        self._busy: set[asyncio.Task[None]] = set()
-        self._stopping = False
         for delivery in pending:
             if line := self.lines.get(delivery.rule):
                 line.put(delivery)
@@ -131,33 +129,16 @@ class Runner:
         return tuple(one for line in self.lines.values() for one in (*line.running, *line.waiting))
 
     async def run(self) -> None:
-        """Work until canceled; then give running deliveries `STOP_S` to end."""
-        workers = [
-            asyncio.create_task(self._work(line), name=line.hook.name)
-            for line in self.lines.values()
-            for _ in range(line.hook.concurrency)
-        ]
-        try:
-            await asyncio.gather(*map(asyncio.shield, workers))  # a defect in one ends them all
-        finally:
-            self._stopping = True
-            for worker in workers:
-                if worker not in self._busy:
-                    worker.cancel()
-            if self._busy:
-                await asyncio.wait(self._busy, timeout=STOP_S)
-            for worker in workers:
-                worker.cancel()
-            await asyncio.gather(*workers, return_exceptions=True)
+        """Work until canceled. What is cut short then is pending, and repeated at the next
+        start."""
+        async with asyncio.TaskGroup() as group:
+            for line in self.lines.values():
+                for _ in range(line.hook.concurrency):
+                    group.create_task(self._work(line), name=line.hook.name)
 
     async def _work(self, line: Line) -> None:
-        this = asyncio.current_task()
-        assert this is not None
-        while not self._stopping:
-            delivery = await line.take()
-            self._busy.add(this)
-            await self._deliver(line, delivery)
-            self._busy.discard(this)
+        while True:
+            await self._deliver(line, await line.take())
 
     async def _deliver(self, line: Line, delivery: Delivery) -> None:
         what = f"{delivery.rule}: event {delivery.event['seq']} ({delivery.on})"
@@ -172,18 +153,16 @@ class Runner:
 
     async def keep(self, save: Callable[[Saved], None], read: Callable[[], Saved]) -> None:
         """Save what changed, at most every `SAVE_EVERY_S`, until canceled."""
-        failing, saved = "", None
+        saved = None
         while True:
             await self._changed.wait()
             self._changed.clear()
-            now = read()
-            try:
-                if now != saved:
+            if (now := read()) != saved:
+                try:
                     save(now)
-                failing, saved = "", now
-            except OSError as error:
-                if str(error) != failing:
-                    failing = str(error)
+                    saved = now
+                except OSError as error:
                     log.error("what was delivered cannot be saved: %s", error)
-                self._changed.set()
+                    await asyncio.sleep(SAVE_AGAIN_S)
+                    self._changed.set()
             await asyncio.sleep(SAVE_EVERY_S)

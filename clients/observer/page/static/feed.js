@@ -9,6 +9,7 @@ export const USES = new Set(["use_began", "use_ended", "use_yielded"]);
 const PROBLEMS = {
   401: "the token is refused: open /?token=TOKEN once",
   503: "too many pages are open",
+  502: "the arbiter is not reached",
   421: "this name is refused",
   403: "refused",
 };

@@ -1,7 +1,6 @@
 """Commands and webhooks: real processes, and a real HTTP server on loopback."""
 
 import asyncio
-import email.utils
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -196,12 +195,8 @@ def test_a_server_that_is_away_is_asked_again(send: Callable[..., list[float]]) 
     assert "secret" not in str(error.value)
 
 
-def test_a_pause_as_seconds_or_as_a_date() -> None:
-    date = email.utils.formatdate(1030.0, usegmt=True)
-    assert retry_after_s(date, 1000.0) == 30.0
-    assert retry_after_s("86400", 0.0) == 600.0
-    assert retry_after_s("soon", 0.0) is None
-    assert retry_after_s("", 0.0) is None
+def test_a_pause_in_seconds_is_bounded() -> None:
+    assert [retry_after_s(text) for text in ("30", "86400", "soon", "")] == [30.0, 600.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.support.process import ArbiterProcess
+from tests.support.status_page import get, port_of
+from tests.support.waiting import until
 from tests.support.wire import WireClient
 
 if TYPE_CHECKING:
@@ -64,7 +66,9 @@ def shown_arbiter() -> Iterator[ArbiterProcess]:
 @pytest.fixture(scope="module")
 def page(browser: "Chrome", shown_arbiter: ArbiterProcess) -> "Iterator[Page]":
     """The page over a scene: a detector in use, for which a request waits, then its eviction."""
-    shown = Page(browser, f"http://127.0.0.1:{shown_arbiter.arguments[1]}/")
+    port = port_of(shown_arbiter)
+    until(lambda: get(port, "/events", method="HEAD").status == 200)
+    shown = Page(browser, f"http://127.0.0.1:{port}/")
     with WireClient(shown_arbiter.endpoint) as client:
         shown.client = client.hello("scene")
         yield shown
@@ -211,6 +215,7 @@ def test_the_keyboard_reaches_everything_in_order_and_all_has_a_name(page: Page)
             assert "measured" in page.text("output")
         focused.send_keys(Keys.TAB)
     shown = ["aSkip to the leases", "button1 min", "button3 min", "button10 min"]
+    shown += ["button60 min"]
     shown += ["buttoncharged", "buttonreserve", "canvas", "buttonquiesce"]
     shown += ["buttonCharged", "buttonTier", "kind", "consumer", "text"]
     assert order[: len(shown)] == shown
