@@ -34,7 +34,7 @@ from vram_arbiter.schemas.errors import (
     VersionMismatch,
     VramError,
 )
-from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
@@ -332,7 +332,10 @@ class SessionTable:
         reader: ProcessKey | None,
         request: w.Status,
     ) -> None:
-        status = self._decisions.status(reader, request.after, details=request.details)
+        if request.leases:
+            status = self._decisions.leases(map(LeaseId, request.leases))
+        else:
+            status = self._decisions.status(reader, request.after, details=request.details)
         problems = tuple(self._problems())
         self.reply(client, re, replace(status, problems=problems, daemon=self._daemon()))
 

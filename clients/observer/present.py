@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 from vram_arbiter.clients.client import AsyncClient
@@ -15,7 +15,9 @@ log = logging.getLogger(__name__)
 
 ASK_S = 3.0
 """Longest wait for an answer."""
-PAGES_MAX = 5
+SOME_MAX = 100
+WHOLE_S = 2.0
+PAGES_MAX = 10
 """Pages of the status: leases beyond are counted and not listed."""
 
 
@@ -40,28 +42,51 @@ class Present:
         self._client = client
         self._heard = heard
         self._asking = asyncio.Lock()
+        self._whole_at = float("-inf")
         self.newest: Look | None = None
 
-    async def look(self, max_age_s: float = 0.0) -> Look | None:
-        """Return a status that is no older; None: the arbiter is not reached."""
+    async def look(self, max_age_s: float = 0.0, touched: Collection[str] = ()) -> Look | None:
+        """Return a status that is no older; None: the arbiter is not reached.
+
+        `touched`: leases that changed; of many leases the others are asked for every WHOLE_S.
+        """
         wanted_at = time.monotonic() - max_age_s
         async with self._asking:
             if self.newest is None or self.newest.at < wanted_at:
-                self.newest = await self._ask()
+                self.newest = await self._ask(touched)
                 self._heard(self.newest)
             return self.newest
 
-    async def _ask(self) -> Look | None:
+    async def _ask(self, touched: Collection[str]) -> Look | None:
         began = time.monotonic()
+        if not self._client.connected:
+            return None
         try:
             async with asyncio.timeout(ASK_S):
-                found = await self._pages()
+                found = await self._some(touched) or await self._pages()
         except (VramError, TimeoutError) as error:
             log.debug("no status: %s", error)
             return None
         return Look(found, began, time.monotonic() - began)
 
+    async def _some(self, touched: Collection[str]) -> StatusReply | None:
+        """Ask for some leases of many. Return the status with these and the others as they were;
+        None: it is time for all of them."""
+        if self.newest is None or not 0 < len(touched) <= SOME_MAX:
+            return None
+        leases = {lease.lease_id: lease for lease in self.newest.status.leases}
+        if len(leases) <= SOME_MAX or time.monotonic() - self._whole_at > WHOLE_S:
+            return None
+        found = await self._page({"leases": list(touched)})
+        if found.epoch != self.newest.status.epoch:
+            return None
+        for lease_id in touched:
+            leases.pop(lease_id, None)
+        leases |= {lease.lease_id: lease for lease in found.leases}
+        return replace(found, leases=tuple(leases.values()))
+
     async def _pages(self) -> StatusReply:
+        self._whole_at = time.monotonic()
         first = page = await self._page({})
         leases = {lease.lease_id: lease for lease in page.leases}
         for _ in range(PAGES_MAX - 1):

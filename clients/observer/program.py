@@ -38,8 +38,9 @@ GAP_S, QUIET_GAP_S = 0.06, 0.5
 """Shortest time between two looks, with and without an open page."""
 BEAT_S, IDLE_S = 1.0, 15.0
 """Longest time between two looks: each one lets the arbiter read its GPUs."""
-LOAD = 3.0
-"""A look is followed by a pause so many times as long: the arbiter has other work."""
+LOAD = 0.5
+"""A look is followed by a pause so many times as long. The arbiter works for about a quarter of a
+look, so that pages beside many leases take a sixth of its time at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,7 @@ class Observer:
         self._present = Present(self._client, self._heard)
         self._record = UsageRecord()
         self._woken = asyncio.Event()
+        self._touched: set[str] = set()  # leases of events since the last look
         self._feed = Feed(self._client, self._record, self._woken.set)
         self._hooks = Runner(
             config.hooks, lambda hook, one: act(hook, one, options.endpoint), saved.pending
@@ -112,7 +114,8 @@ class Observer:
         connections = server.Connections(loopback=address.loopback)
         access = Access(address, self._config.http.hosts, token)
         scrapes = Scrapes(self._exports, self._present)
-        site = Site(access, self._feed, self._client.history, scrapes, connections)
+        history = self._client.history
+        site = Site(access, self._feed, history, scrapes, connections, self._reached)
         log.info("status page: http://%s", address)
         await server.serve(site.app, listening, connections)
 
@@ -150,6 +153,7 @@ class Observer:
                 self._exports.take(events)
                 self._feed.happened(events)
                 if events:
+                    self._touched.update(one["lease_id"] for one in events if one.get("lease_id"))
                     self._woken.set()
                 if not started and self._cursor.numbering:
                     started = True
@@ -160,7 +164,8 @@ class Observer:
         """Look at the arbiter after each event, and now and then without one."""
         while True:
             self._woken.clear()
-            look = await self._present.look()
+            touched, self._touched = self._touched, set()
+            look = await self._present.look(touched=touched)
             if look is not None:
                 with contextlib.suppress(VramError, TimeoutError):
                     await self._feed.publish(look)
@@ -170,6 +175,9 @@ class Observer:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(BEAT_S if read or look is None else IDLE_S):
                     await self._woken.wait()
+
+    async def _reached(self) -> bool:
+        return await self._present.look(BEAT_S) is not None
 
     def _heard(self, look: Look | None) -> None:
         """The arbiter answered; None: it did not."""

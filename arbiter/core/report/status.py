@@ -3,7 +3,7 @@
 Typed data without words. Reads only. `view` is made for every reply about a lease.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from heapq import merge, nsmallest
@@ -16,7 +16,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
-from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.notes import EvictedLease, SwitchNote
 from vram_arbiter.schemas.wire.replies import StatusReply
@@ -158,15 +158,20 @@ def status(
     reader: ProcessKey | None = None,
     after: PageKey | None = None,
     limit: int | None = None,
+    only: Iterable[LeaseId] | None = None,
 ) -> StatusReply:
-    """Return the status with the leases that follow `after`, at most `limit` of them.
+    """Return the status with the leases that follow `after`, at most `limit` of them; with those of
+    `only` that are not over, if that is given.
 
     A page costs what it holds, however many wait: the queues are sorted already. Tokens are shown
     to `reader`, the process that holds the lease, and to an operator (None): a token is all that is
     needed to mark a use, which keeps a lease from being evicted.
     """
-    leases = list(islice(_listed(core, after or FIRST_PAGE, limit), limit))
-    more = leases and len(leases) == limit
+    if only is None:
+        leases = list(islice(_listed(core, after or FIRST_PAGE, limit), limit))
+    else:
+        leases = [core.leases[one] for one in only if one in core.leases]
+    more = only is None and leases and len(leases) == limit
     return StatusReply(
         epoch=core.settings.epoch,
         phase="serving" if core.serving else "recovering",

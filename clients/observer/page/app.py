@@ -74,11 +74,14 @@ class Site:
         history: History,
         metrics: Metrics,
         connections: Connections,
+        reached: Callable[[], Awaitable[bool]],
     ) -> None:
+        """`reached`: whether the arbiter answers."""
         self._feed = feed
         self._history = history
         self._metrics = metrics
         self._connections = connections
+        self._reached = reached
         routes = [
             Route("/events", self._events),
             Route("/history", self._past),
@@ -89,7 +92,7 @@ class Site:
         self.app: ASGIApp = Starlette(routes=routes, middleware=[guard])
 
     async def _events(self, request: Request) -> Response:
-        if not self._feed.live:
+        if not await self._reached():
             return problem(502, "the arbiter is not reached")
         end = ("", 0) if request.client is None else (request.client.host, request.client.port)
         if not self._connections.may_stream(end):

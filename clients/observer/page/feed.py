@@ -110,8 +110,6 @@ class Feed:
         # what the pages have
         self._rows: dict[str, JsonObject] = {}
         self._usage_number = 0
-        self.live = False
-        """Whether the arbiter answered when it was last asked."""
 
     def join(self, abort: Callable[[], None]) -> Reader:
         reader = Reader(abort, lambda gone: self._readers.pop(gone, None))
@@ -130,14 +128,12 @@ class Feed:
 
     def lost(self) -> None:
         """End all pages: the arbiter is not reached."""
-        self.live = False
         for reader in list(self._readers):
             reader.end()
         self._readers.clear()
 
     async def publish(self, look: Look) -> None:
         """Send a snapshot to new pages, to others what changed. Raises VramError."""
-        self.live = True
         joining = [reader for reader in self._readers if not reader.told]
         others = [reader for reader in self._readers if reader.told]
         if not self._readers:
