@@ -120,7 +120,7 @@ class Observer:
         await server.serve(site.app, listening, connections)
 
     async def _observe(self) -> None:
-        """Read events and status for as long as the program runs, across restarts of the arbiter."""
+        """Read events and status until the program ends, across restarts of the arbiter."""
         await self._connect()
         try:
             async with asyncio.TaskGroup() as group:

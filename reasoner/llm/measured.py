@@ -67,7 +67,7 @@ class Chat:
             noted[names.ATTR_RESPONSE_MODEL] = answer.model
         tracing.note(noted)
         if answer.finish_reason:
-            tracing.note_texts(names.ATTR_FINISH_REASONS, [answer.finish_reason])
+            tracing.note({names.ATTR_FINISH_REASONS: [answer.finish_reason]})
         for kind, tokens in (("input", answer.input_tokens), ("output", answer.output_tokens)):
             labels = self._labels | {names.ATTR_TOKEN_TYPE: kind}
             meters.measure(names.GEN_AI_TOKENS, tokens, labels)

@@ -1,5 +1,5 @@
-"""Configuration of `vram-observer`: where it serves the status page, and hooks: commands and webhooks
-for events of the arbiter's history.
+"""Configuration of `vram-observer`: where it serves the status page; hooks, which are commands and
+webhooks for events of the arbiter's history.
 
 Pure: `load_observer(text, name)` takes the text of a file. `configs/observer.yaml` shows every key.
 """

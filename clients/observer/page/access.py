@@ -66,7 +66,7 @@ class Access:
         self._loopback = address.loopback
         self._hosts = frozenset(name.lower() for name in hosts)
         self._token = token
-        # the cookie proves the token and does not tell it; another observer of this host has its own
+        # the cookie proves the token and does not tell it; each observer of a host has its own
         self._cookie_name = f"vram_arbiter_{address.port}"
         self._cookie = "" if token is None else _mac(token, b"cookie of the status page").hex()
 

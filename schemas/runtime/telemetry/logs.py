@@ -28,7 +28,6 @@ _SEVERITIES = {
     logging.ERROR: (SeverityNumber.ERROR, "ERROR"),
     logging.CRITICAL: (SeverityNumber.FATAL, "FATAL"),
 }
-_STACKTRACE = logging.Formatter()
 
 
 def install(resource: "Resource", exporters: Sequence[Any]) -> Callable[[], object]:
@@ -72,12 +71,11 @@ def converted(record: logging.LogRecord) -> LogRecord:
     attributes: dict[str, str | int] = {
         "code.function.name": record.funcName or "",
         "code.line.number": record.lineno,
-        "thread.name": record.threadName or "",
     }
     if record.exc_info and (error := record.exc_info[1]) is not None:
         attributes[telemetry.ATTR_EXCEPTION_TYPE] = type(error).__qualname__
         attributes[telemetry.ATTR_EXCEPTION_MESSAGE] = str(error)
-        stacktrace = _STACKTRACE.formatException(record.exc_info)
+        stacktrace = logging.Formatter().formatException(record.exc_info)
         attributes[telemetry.ATTR_EXCEPTION_STACKTRACE] = stacktrace
     return LogRecord(
         timestamp=int(record.created * 1e9),

@@ -13,8 +13,6 @@ from opentelemetry.metrics import CallbackOptions, Observation
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 
-PAGE_BYTES = resource.getpagesize()
-
 
 def observe() -> None:
     """Create the instruments. Call it once, after the SDK's provider is set."""
@@ -33,4 +31,4 @@ def _cpu_time(_: CallbackOptions) -> Iterable[Observation]:
 
 def _memory(_: CallbackOptions) -> Iterable[Observation]:
     with open("/proc/self/statm", encoding="ascii") as file:
-        yield Observation(int(file.read().split()[1]) * PAGE_BYTES)
+        yield Observation(int(file.read().split()[1]) * resource.getpagesize())

@@ -30,8 +30,6 @@ type Wanted = Mapping[Signal, Sequence[str]]
 
 SIGNALS: tuple[Signal, ...] = ("traces", "metrics", "logs")
 PROMETHEUS = "prometheus"
-PROMETHEUS_PORT = "9464"
-"""Port that OpenTelemetry's specification gives to a Prometheus endpoint."""
 FLUSH_S = 5.0
 """Longest wait for a collector at a program's end."""
 EXPORT_S = 3.0
@@ -43,9 +41,8 @@ SAY_AGAIN_S = 300.0
 
 def wanted(environ: Mapping[str, str]) -> Wanted:
     """Return what is asked for; import and open nothing. Raises ConfigError."""
-    if environ.get("OTEL_SDK_DISABLED", "").strip().lower() == "true":
-        return dict.fromkeys(SIGNALS, ())
-    return {signal: _exporters(environ, signal) for signal in SIGNALS}
+    off = environ.get("OTEL_SDK_DISABLED", "").strip().lower() == "true"
+    return {signal: () if off else _exporters(environ, signal) for signal in SIGNALS}
 
 
 def _exporters(environ: Mapping[str, str], signal: Signal) -> tuple[str, ...]:
@@ -131,9 +128,8 @@ def set_up(
         try:
             _quieten()
             resource = _resource(service, attributes or {})
-            if (
-                PROMETHEUS in exporters["metrics"]
-            ):  # a missing package is found before a thread runs
+            # first: a missing package is found before a thread runs
+            if PROMETHEUS in exporters["metrics"]:
                 readers = [*readers, *_prometheus(ends, port_required=port_required)]
             tracers = _tracers(exporters["traces"], resource, id_generator, ends)
             meters = _meters(exporters["metrics"], readers, resource, ends)
@@ -145,9 +141,7 @@ def set_up(
                 end()
             if not isinstance(error, ImportError | ValueError):
                 raise
-            absent = isinstance(error, ImportError)
-            said = "is not installed" if absent else "refuses its settings"
-            raise ConfigError(f"OpenTelemetry {said}: {error}", hint=HINT) from error
+            raise ConfigError(f"OpenTelemetry cannot be set up: {error}", hint=HINT) from error
         _installed = Telemetry(ends)
         atexit.register(_installed)
     return _installed
@@ -222,7 +216,7 @@ def _exporter(signal: Signal, name: str) -> Any:
     if not found:
         raise ConfigError(
             f"OTEL_{signal.upper()}_EXPORTER: no exporter {entry!r} is installed",
-            hint="write otlp, prometheus (metrics only) or none, or install 'vram-arbiter[telemetry]'",
+            hint="write otlp, prometheus (metrics only) or none, or install its package",
         )
     return found[0].load()(**options)
 
@@ -240,7 +234,9 @@ def _prometheus(ends: _Ends, *, port_required: bool) -> Sequence[Any]:
     from prometheus_client import CollectorRegistry, start_http_server
 
     host = os.environ.get("OTEL_EXPORTER_PROMETHEUS_HOST", "").strip() or "127.0.0.1"
-    port = os.environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or PROMETHEUS_PORT
+    port = (
+        os.environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or "9464"
+    )  # of the specification
     address = http_address(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
     if not address.loopback:
         raise ConfigError(

@@ -1,5 +1,5 @@
-"""Spans and numbers of leases, from what a real engine says, as the daemon sends it and the observer
-exports it, with the SDK's own recorders."""
+"""Spans and numbers of leases, from what a real engine says, as the daemon sends it and the
+observer exports it, with the SDK's own recorders."""
 
 from dataclasses import replace
 from typing import Any

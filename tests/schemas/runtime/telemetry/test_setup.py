@@ -353,7 +353,8 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
         "from opentelemetry import metrics, trace\n"
         "print(type(trace.get_tracer_provider()).__name__, "
         "type(metrics.get_meter_provider()).__name__)\n"
-        "import threading; print([x.name for x in threading.enumerate() if 'serve_forever' in x.name])\n",
+        "import threading; print([x.name for x in threading.enumerate() if 'serve_forever' in "
+        "x.name])\n",
         {
             "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
             "OTEL_METRICS_EXPORTER": "otlp,prometheus",
@@ -362,7 +363,7 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
         },
     )
     said, providers, servers = result.stdout.splitlines()
-    assert said.startswith("OpenTelemetry refuses its settings: "), result.stderr
+    assert said.startswith("OpenTelemetry cannot be set up: "), result.stderr
     assert (providers, servers) == ("ProxyTracerProvider _ProxyMeterProvider", "[]")
 
 
