@@ -20,8 +20,8 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.runtime import terminal
-from vram_arbiter.schemas.runtime.telemetry import plan as otel
 from vram_arbiter.schemas.runtime.version import add_version, version
+from vram_arbiter.schemas.urls import http_address
 from vram_arbiter.schemas.yamltext import read_text
 
 EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_NO_DISK, EXIT_DEFECT = 2, 3, 4, 5, 70
@@ -47,8 +47,6 @@ environment:
   VRAM_ARBITER_RUNTIME    folder of the sockets and of the simulated GPU (else RUNTIME_DIRECTORY,
                           XDG_RUNTIME_DIR/vram-arbiter, /run/user/UID/vram-arbiter,
                           for root /run/vram-arbiter)
-  OTEL_EXPORTER_OTLP_ENDPOINT, OTEL_METRICS_EXPORTER=prometheus and the other standard OTEL_
-                          variables switch telemetry on (docs/reference/telemetry.md)
 """
 
 
@@ -86,8 +84,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--http",
         metavar="ADDRESS:PORT",
-        help="serve the status page, read-only, e.g. on 127.0.0.1:9870; beyond loopback it needs "
-        "http.token_file",
+        type=loopback,
+        help="start a vram-observer beside the daemon, with status page and /metrics on loopback, "
+        "e.g. 127.0.0.1:9870; it ends with the daemon",
     )
     made.add_argument(
         "--log-format", choices=("human", "json"), help="human (default) or one JSON object a line"
@@ -100,6 +99,20 @@ def parser() -> argparse.ArgumentParser:
     )
     add_version(made)
     return made
+
+
+def loopback(text: str) -> str:
+    """Parse the address of the page. Raises ArgumentTypeError."""
+    try:
+        address = http_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    if not address.loopback:
+        raise argparse.ArgumentTypeError(
+            f"{address} is not a loopback address: write it and a token_file to observer.yaml, and "
+            "start vram-observer"
+        )
+    return str(address)
 
 
 def config_of_service(environ: Mapping[str, str]) -> Path | None:
@@ -122,7 +135,6 @@ def effective_config(flags: argparse.Namespace, file: Path | None) -> ArbiterCon
         ("state", "dir", flags.state_dir, "--state-dir"),
         ("wire", "group", flags.group, "--group"),
         ("wire", "operators_group", flags.operators_group, "--operators-group"),
-        ("http", "listen", flags.http, "--http"),
         ("log", "format", flags.log_format, "--log-format"),
         ("log", "level", flags.log_level, "--log-level"),
     ):
@@ -178,15 +190,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:
-            chosen = config.telemetry
-            otel.check(
-                otel.plan(
-                    os.environ,
-                    endpoint=chosen.endpoint,
-                    prometheus_port=chosen.prometheus_port,
-                    sample_ratio=chosen.sample_ratio,
-                )
-            )
             print(
                 f"{file or 'built-in configuration'}: ok (would serve {places.endpoint}, "
                 f"gpu {config.gpu.source})"
@@ -199,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
 
         async def serve() -> int:
-            return await Daemon(config, os.environ, version(), source).run()
+            return await Daemon(config, os.environ, version(), source, flags.http).run()
 
         close_log = write_in_thread()
         try:

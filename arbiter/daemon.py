@@ -11,14 +11,12 @@ import contextlib
 import gc
 import logging
 import os
+import platform
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, cast
 
-from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import ProcessDied
@@ -30,11 +28,13 @@ from vram_arbiter.arbiter.host.gpu.probe import GpuProbe
 from vram_arbiter.arbiter.host.heartbeat import beat
 from vram_arbiter.arbiter.host.history import CLEAN_END, History
 from vram_arbiter.arbiter.host.journal import Journal
+from vram_arbiter.arbiter.host.observer import Observer
 from vram_arbiter.arbiter.host.prober import Prober, within
-from vram_arbiter.arbiter.host.process import leave_no_zombies, raise_limits
+from vram_arbiter.arbiter.host.process import leave_no_zombies, memory_bytes, raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.arbiter.host.records import record_of
-from vram_arbiter.arbiter.inbox import NO_READER, Inbox, SuspendWatch
+from vram_arbiter.arbiter.inbox import Inbox, SuspendWatch
+from vram_arbiter.arbiter.log import log_event
 from vram_arbiter.arbiter.places import Places, find_places, take_folders
 from vram_arbiter.arbiter.recovery import recover, report, try_records
 from vram_arbiter.arbiter.reload import Reload, Source
@@ -51,15 +51,8 @@ from vram_arbiter.schemas.runtime.folders import LockFile
 from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.systemd import Notifier
-from vram_arbiter.schemas.runtime.telemetry import setup as otel
-from vram_arbiter.schemas.runtime.telemetry.commands import TRACEPARENT_VARIABLE
 from vram_arbiter.schemas.units import format_bytes
-from vram_arbiter.schemas.wire.explained import WhyReply
-from vram_arbiter.schemas.wire.replies import StatusReply
-
-if TYPE_CHECKING:
-    from vram_arbiter.arbiter.host.telemetry.metrics import Picture
-    from vram_arbiter.arbiter.host.telemetry.traced import Traced
+from vram_arbiter.schemas.wire.views import DaemonView
 
 log = logging.getLogger(__name__)
 
@@ -85,23 +78,28 @@ class Daemon:
     _journal: Journal
     _history: History
     _gpus: tuple[GpuInfo, ...]
-    _made_at: float  # monotonic, of the engine
     _engine: Arbiter
     _inbox: Inbox
     _watch: ProcessWatch
     _sessions: SessionTable
     _executor: Executor
     _reload: Reload
-    _traced: "Traced | None"
 
     def __init__(
-        self, config: ArbiterConfig, environ: Mapping[str, str], version: str, source: Source
+        self,
+        config: ArbiterConfig,
+        environ: Mapping[str, str],
+        version: str,
+        source: Source,
+        http: str | None = None,
     ) -> None:
-        """`source`: where SIGHUP reads the configuration again."""
+        """`source`: where SIGHUP reads the configuration again. `http`: where an observer beside
+        the daemon serves the status page."""
         self._config = config
         self._source = source
         self._environ = environ
         self._version = version
+        self._http = http
         self._server = f"vram-arbiter {version}"
         self._exit_code = EXIT_OK
         self._stop = asyncio.Event()
@@ -144,7 +142,6 @@ class Daemon:
         group = operators if members is None else members  # of the socket: it has one
         limits = router_limits(config, raise_limits())
         self._locks = take_folders(places, config, self._environ, group, undo)  # 1
-        self._traced = self._open_telemetry(undo)
         boot = boot_id()
         self._open_files(places, boot, self._locks[0], undo)
         probe = await self._open_engine(places, undo)  # 2
@@ -157,7 +154,6 @@ class Daemon:
             operators_gid=operators,
         )
         self._connect_parts(probe, sessions, undo)  # 3
-        await self._open_page(undo)
         self._tell_past(places)  # 4
         router = Router(places.socket, self._sessions, limits, group)  # 5
         undo.push_async_callback(router.aclose)
@@ -165,6 +161,10 @@ class Daemon:
         router.start(self._loop)
         undo.callback(self._inbox.close)  # while answers leave nothing more is decided
         undo.callback(router.stop_receiving)
+        if self._http is not None:
+            observer = Observer(self._http, places.endpoint)
+            observer.start(self._loop)
+            undo.callback(observer.close)
 
     def _open_files(
         self, places: Places, boot: str, lock: LockFile, undo: contextlib.AsyncExitStack
@@ -185,7 +185,7 @@ class Daemon:
         probe, self._gpus = await self._open_gpus(places)
         settings = core_settings(config, self._gpus, opened)
         try_records(self._journal, settings)
-        self._made_at = made_at = time.monotonic()
+        made_at = time.monotonic()
         self._engine = Arbiter(settings, made_at)
         recorder = None
         if config.record.enabled:
@@ -214,7 +214,7 @@ class Daemon:
     ) -> None:
         """Readings, deaths of processes and sessions post to the inbox; the executor performs what
         comes out of it."""
-        inbox, loop, traced = self._inbox, self._loop, self._traced
+        inbox, loop = self._inbox, self._loop
         prober = Prober(
             probe,
             [gpu.id for gpu in self._gpus],
@@ -230,7 +230,13 @@ class Daemon:
         self._watch = ProcessWatch(loop, start_ticks, self._process_died)
         undo.callback(self._watch.close)
         self._sessions = SessionTable(
-            settings, inbox, self._history.read, self._watch, time.monotonic, self._problems
+            settings,
+            inbox,
+            self._history.read,
+            self._watch,
+            time.monotonic,
+            self._problems,
+            self._view,
         )
         self._executor = Executor(
             self._sessions,
@@ -238,51 +244,11 @@ class Daemon:
             self._history,
             prober.sample,
             inbox.post,
-            telemetry.log_event,
+            log_event,
             self._watch.signal,
             words,
-            None if traced is None else traced.leases,
         )
         inbox.perform, inbox.sample = self._executor.perform, prober.sample
-        if traced is not None:
-            traced.watch(loop, self._picture)
-
-    async def _open_page(self, undo: contextlib.AsyncExitStack) -> None:
-        """Serve the status page, if it is asked for; else nothing of it is imported.
-
-        Raises ConfigError.
-        """
-        if self._config.http.listen is None:
-            return
-        from vram_arbiter.arbiter.http.page import DaemonParts, StatusPage
-
-        inbox, history = self._inbox, self._history
-
-        def worded(status: StatusReply) -> StatusReply:
-            return cast(StatusReply, words.reply(replace(status, problems=tuple(self._problems()))))
-
-        parts = DaemonParts(
-            status=lambda after: worded(inbox.status(NO_READER, after)),
-            leases=lambda ids: worded(inbox.leases(ids)),
-            why=lambda lease: cast(WhyReply, words.reply(inbox.why(lease))),
-            when_read=inbox.when_read,
-            usage=self._engine.usage,
-            history=history.read,
-            last_seq=lambda: history.last_seq,
-            started_at=self._made_at,
-            server=self._server,
-        )
-        page = StatusPage.open(self._config.http, parts)
-        undo.callback(page.close)
-        await page.start()
-        performed = inbox.perform
-
-        def perform(effects: Sequence[Effect]) -> None:
-            performed(effects)
-            page.performed(effects)
-
-        inbox.perform = perform
-        log.info("status page: http://%s", page.address)
 
     def _tell_past(self, places: Places) -> None:
         """Tell history and log what was found, and the engine what the journal remembers."""
@@ -303,29 +269,6 @@ class Daemon:
         }
         say("started", started)
         recover(found, self._inbox, self._watch)
-
-    def _open_telemetry(self, undo: contextlib.AsyncExitStack) -> "Traced | None":
-        """None: it was not asked for, and nothing of it is imported. Raises ConfigError."""
-        chosen = self._config.telemetry
-        installed = otel.set_up(
-            "vram-arbiter",
-            environ=self._environ,
-            endpoint=chosen.endpoint,
-            prometheus_port=chosen.prometheus_port,
-            sample_ratio=chosen.sample_ratio,
-        )
-        if not installed.on:
-            return None
-        undo.callback(installed)
-        if installed.prometheus_port is not None:
-            log.info(
-                "telemetry: Prometheus endpoint on loopback, port %d", installed.prometheus_port
-            )
-        from vram_arbiter.arbiter.host.telemetry.traced import Traced
-
-        traced = Traced(self._environ.get(TRACEPARENT_VARIABLE), self._version)
-        undo.push(lambda _, error, __: traced.close(self._exit_code, error))
-        return traced
 
     async def _open_gpus(self, places: Places) -> tuple[GpuProbe, tuple[GpuInfo, ...]]:
         opening = partial(open_probe, self._config.gpu, places.runtime)
@@ -371,7 +314,7 @@ class Daemon:
 
     def _say(self, kind: str, facts: JsonMap) -> None:
         """A fact of the daemon itself, in its history and its log."""
-        telemetry.log_event(self._history.append(kind, facts))
+        log_event(self._history.append(kind, facts))
 
     async def _keep_learnt_regularly(self) -> None:
         while True:
@@ -398,17 +341,22 @@ class Daemon:
             self._executor.settle,
         )
 
-    def _picture(self) -> "Picture | None":
-        """What telemetry shows of the present; None at the end."""
-        if self._inbox.closed:
-            return None
-        from vram_arbiter.arbiter.host.telemetry.metrics import Picture
-
-        return Picture(
-            self._engine.figures(),
+    def _view(self) -> DaemonView:
+        """What observers are told of the daemon itself."""
+        writes, times = self._executor.writes, os.times()
+        return DaemonView(
+            server=self._server,
+            python=platform.python_version(),
             journal_healthy=not self._journal.problem,
             journal_doubted=self._journal.doubted,
             config_refused=bool(self._reload.problem),
+            journal_writes=writes.count,
+            journal_write_s=writes.seconds,
+            journal_failures=writes.failures,
+            refusals=dict(self._sessions.refused),
+            cpu_user_s=times.user,
+            cpu_system_s=times.system,
+            memory_bytes=memory_bytes(),
         )
 
     def _status_line(self) -> str:

@@ -9,7 +9,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.logging import Form, PrintableFormatter, set_up
@@ -121,22 +121,38 @@ class _Event(dict[str, object]):
         return sentence(self)
 
 
-def log_event(event: JsonMap, trace: Mapping[str, str] | None = None) -> None:
+def log_event(event: JsonMap) -> None:
     """One event of the history as one line of the log; as JSON with `trace_id` and `span_id` of its
     span, if it has one."""
     level = _LEVELS.get(event["kind"], logging.INFO)
     if events_log.isEnabledFor(level):
         said = _Event(event)
-        events_log.log(level, "%s", said, extra={"event": said, "trace": trace})
+        events_log.log(level, "%s", said, extra={"event": said, "trace": _ids(event)})
+
+
+def _ids(event: JsonMap) -> JsonMap:
+    """Return the ids of the span that an event belongs to: the daemon's, else its acquirer's."""
+    if "span_id" in event:
+        return {key: event[key] for key in ("trace_id", "span_id")}
+    parts = str(event.get("traceparent") or "").split("-")
+    return {"trace_id": parts[1], "span_id": parts[2]} if len(parts) == 4 else {}
+
+
+_UNSAID = frozenset(
+    (
+        *("seq", "at_wall_s", "kind", "lease_id", "consumer"),
+        *("trace_id", "span_id", "parent_id", "trace_flags"),
+    )
+)
+"""Fields of an event that its sentence begins with, or that are for programs."""
 
 
 def sentence(event: JsonMap) -> str:
     """`granted L1-4 (detector): reason="fits", needed=4.94 GiB`"""
-    skip = {"seq", "at_wall_s", "kind", "lease_id", "consumer"}
     parts = [
         f"{key.removesuffix('_bytes')}={_value(key, value)}"
         for key, value in event.items()
-        if key not in skip
+        if key not in _UNSAID
     ]
     words = [str(event["kind"]), *(str(event[key]) for key in ("lease_id",) if key in event)]
     if "consumer" in event:

@@ -80,7 +80,7 @@ def main(argv: list[str] | None = None) -> int:
             else command("vram-runner", args.command, serves=args.serves) as running
         ):
             if args.command not in CLIENTS:
-                import_module("vram_arbiter.schemas.runtime.telemetry.process").observe_gpu()
+                import_module("vram_arbiter.runner.gpu_memory").observe_gpu()
             running.code = asyncio.run(args.run(args))
     except VramError as error:
         terminal.complain("vram-runner", error)

@@ -22,7 +22,7 @@ from vram_arbiter.schemas.plain import JsonObject
 ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
     "arbiter": "vram_arbiter.schemas.config.arbiter:ArbiterConfig",
-    "hooks": "vram_arbiter.schemas.config.hooks:HooksConfig",
+    "observer": "vram_arbiter.schemas.config.observer:ObserverConfig",
     "robot": "vram_arbiter.schemas.config.robot:RobotEnvironment",
 }
 """Documents with a single root: name → `module:class`."""

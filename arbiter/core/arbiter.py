@@ -21,16 +21,9 @@ from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.refusals import NoSession, Refused
 from vram_arbiter.arbiter.core.model.state import Core, Turn
-from vram_arbiter.arbiter.core.report import status, usage, why
-from vram_arbiter.arbiter.core.report.status import Figures, PageKey
-from vram_arbiter.arbiter.core.report.usage import GpuUsage
-from vram_arbiter.arbiter.core.requests import (
-    operators,
-    recovery,
-    requests,
-    sessions,
-    uses,
-)
+from vram_arbiter.arbiter.core.report import status, why
+from vram_arbiter.arbiter.core.report.status import PageKey
+from vram_arbiter.arbiter.core.requests import operators, recovery, requests, sessions, uses
 from vram_arbiter.arbiter.core.scheduling import grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
@@ -206,14 +199,6 @@ class Arbiter:
         """GPUs that have to be read before their state can be shown (`schedule.stale`)."""
         self._core.now = max(self._core.now, now)
         return schedule.stale(self._core)
-
-    def figures(self) -> Figures:
-        """The present in numbers (`status.figures`)."""
-        return status.figures(self._core)
-
-    def usage(self) -> tuple[GpuUsage, ...]:
-        """How the bytes of each GPU are divided now (`usage.usage`)."""
-        return usage.usage(self._core)
 
     def learnt(self) -> dict[str, dict[str, float]]:
         """Return the learned durations, in the shape of `Settings.learnt`."""

@@ -9,10 +9,12 @@ are behind the protocols below.
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
+from vram_arbiter.arbiter.host.span_ids import SpanIds
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
@@ -51,16 +53,13 @@ class Chronicle(Protocol):
     def append(self, kind: str, data: JsonMap) -> JsonMap: ...
 
 
-class Traces(Protocol):
-    """`otel.LeaseTelemetry`, where telemetry is on."""
+@dataclass(slots=True)
+class Writes:
+    """Transactions of the journal since the start."""
 
-    def outgoing(self, effects: Sequence[fx.Effect]) -> None: ...
-
-    def revoke(self, body: AnyPush) -> AnyPush: ...
-
-    def observe(self, note: fx.Note, event: JsonMap) -> Mapping[str, str]: ...
-
-    def wrote(self, seconds: float, *, failed: bool) -> None: ...
+    count: int = 0
+    failures: int = 0
+    seconds: float = 0.0
 
 
 class Words(Protocol):
@@ -81,10 +80,10 @@ class Executor:
         history: Chronicle,
         sample: Callable[[GpuId], None],
         post: Callable[[ev.Event], None],
-        log_event: Callable[[JsonMap, Mapping[str, str] | None], None],
+        log_event: Callable[[JsonMap], None],
         signal: Callable[[ProcessKey, str], None],
         words: Words,
-        traces: Traces | None = None,
+        spans: SpanIds | None = None,
     ) -> None:
         self._outbox = outbox
         self._journal = journal
@@ -94,7 +93,8 @@ class Executor:
         self._log_event = log_event
         self._signal = signal
         self._words = words
-        self._traces = traces
+        self._spans = spans or SpanIds()
+        self.writes = Writes()
         self.owed: dict[str, None] = {}
         """Records still to be deleted: the disk was full when they ended. The next write
         does it."""
@@ -107,8 +107,7 @@ class Executor:
         Answers go out first: facts are written down after all answers, and readings are begun last
         of all, since their thread takes the interpreter from this one.
         """
-        if self._traces is not None:
-            self._traces.outgoing(effects)
+        self._spans.outgoing(effects)
         some: Iterable[fx.Effect] = effects
         records = [effect for effect in effects if isinstance(effect, _RECORDS)]
         if records and (failed := self._write(records)):
@@ -122,8 +121,7 @@ class Executor:
                 case fx.Reply():
                     self._outbox.reply(effect.client, effect.request, effect.body)
                 case fx.Push(body=body):
-                    told = body if self._traces is None else self._traces.revoke(body)
-                    self._outbox.push(effect.client, told)
+                    self._outbox.push(effect.client, self._spans.revoke(body))
                 case fx.Sample():
                     samples.append(effect)
                 case fx.Refuse(refusal=refusal):
@@ -132,9 +130,9 @@ class Executor:
                 case fx.Signal():
                     self._signal(effect.process, effect.kind)
         for note in notes:
-            event = self._history.append(note.body.TAG[1], self._words.event(note))
-            span = None if self._traces is None else self._traces.observe(note, event)
-            self._log_event(event, span)
+            told = {**self._words.event(note), **self._spans.of(note)}
+            event = self._history.append(note.body.TAG[1], told)
+            self._log_event(event)
             self._outbox.broadcast(event)
         for sample in samples:
             self._sample(sample.gpu)
@@ -174,8 +172,9 @@ class Executor:
             self._journal.apply(changes)
         except JournalUnavailable as error:
             failure = error
-        if self._traces is not None:
-            self._traces.wrote(time.monotonic() - began, failed=failure is not None)
+        self.writes.count += 1
+        self.writes.seconds += time.monotonic() - began
+        self.writes.failures += failure is not None
         if failure is None:
             self.owed.clear()
             return _NOTHING

@@ -63,6 +63,12 @@ def give_back_freed_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES)
 
 
+def memory_bytes() -> int:
+    """Return the RAM of this process."""
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * resource.getpagesize()
+
+
 def leave_no_zombies() -> None:
     """As the first process of a container, let the kernel reap what ends.
 

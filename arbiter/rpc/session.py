@@ -7,6 +7,7 @@ every limit's breach is a typed reply; no input raises.
 """
 
 import difflib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +34,7 @@ from vram_arbiter.schemas.errors import (
     VersionMismatch,
     VramError,
 )
-from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
@@ -48,6 +49,7 @@ from vram_arbiter.schemas.wire.replies import (
     PrepareReply,
     WelcomeReply,
 )
+from vram_arbiter.schemas.wire.views import DaemonView
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
@@ -97,6 +99,7 @@ class SessionTable:
         watch: Watch,
         clock: Callable[[], float],
         problems: Callable[[], list[str]] = list,
+        daemon: Callable[[], DaemonView | None] = lambda: None,
     ) -> None:
         self._settings = settings
         self._epoch = settings.epoch
@@ -104,6 +107,9 @@ class SessionTable:
         self._history = history
         self._clock = clock
         self._problems = problems
+        self._daemon = daemon
+        self.refused: Counter[str] = Counter()
+        """Refused requests by code, since the start."""
         self._refusals = RefusalLog(clock)
         self._registry = Registry(settings, decisions, watch)
         self._sessions = self._registry.sessions
@@ -259,6 +265,7 @@ class SessionTable:
         request_id: int | None,
         error: ErrorView,
     ) -> None:
+        self.refused[error.code] += 1
         connection.send(codec.refusal(request_id, self._epoch, error))
         peer, name = connection.peer, "" if session is None else session.name
         self._refusals.say(peer.uid, peer.process.pid, name, error.code, error.message)
@@ -325,8 +332,12 @@ class SessionTable:
         reader: ProcessKey | None,
         request: w.Status,
     ) -> None:
-        status = self._decisions.status(reader, request.after, details=request.details)
-        self.reply(client, re, replace(status, problems=tuple(self._problems())))
+        if request.leases:
+            status = self._decisions.leases(map(LeaseId, request.leases))
+        else:
+            status = self._decisions.status(reader, request.after, details=request.details)
+        problems = tuple(self._problems())
+        self.reply(client, re, replace(status, problems=problems, daemon=self._daemon()))
 
     def _subscribe(self, session: Session) -> None:
         subscribers, settings, peer = self._registry.subscribers, self._settings, session.peer

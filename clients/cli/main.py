@@ -72,7 +72,6 @@ COMMANDS: Mapping[str, Command] = {
     "doctor": Command("doctor", "check the installation, the daemon and its GPUs"),
     "install": Command("install", "make the arbiter a service, after showing the plan"),
     "uninstall": Command("install", "remove what `vramctl install` put on this machine"),
-    "hooks": Command("hooks", "run commands and webhooks for events"),
     "mcp": Command("mcp", "serve status, why and history to agents"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
     "demo": Command("demo", "run find, navigate and grab on a simulated arm in 8 GiB"),

@@ -28,7 +28,10 @@ _COLUMNS = (
 )
 _RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE"})
 _NOT_SHOWN = frozenset(
-    {"seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token", "traceparent"}
+    (
+        *("seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token"),
+        *("traceparent", "trace_id", "span_id", "parent_id", "trace_flags"),
+    )
 )
 
 
@@ -251,7 +254,7 @@ def _footprint_lines(footprint: JsonMap | None) -> list[str]:
 
 # -- events
 QUIET_KINDS = frozenset({"use_began", "use_ended", "revoke_acked", "reminded", "unloading"})
-"""Steps that other events sum up; `arbiter/http/static/story.js` has the same list."""
+"""Steps that other events sum up; `clients/observer/page/static/story.js` has the same list."""
 
 
 def is_quiet(event: JsonMap) -> bool:

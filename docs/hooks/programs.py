@@ -7,6 +7,7 @@ from importlib import import_module
 from vram_arbiter.arbiter.__main__ import parser as arbiter_parser
 from vram_arbiter.arbiter.offline.__main__ import parser as event_log_parser
 from vram_arbiter.clients.cli.installation.completion import whole_parser
+from vram_arbiter.clients.observer.__main__ import parser as observer_parser
 from vram_arbiter.reasoner.options import parser as reasoner_parser
 from vram_arbiter.runner.__main__ import parser as runner_parser
 from vram_arbiter.sidecars.__main__ import parser as sidecar_parser
@@ -29,6 +30,7 @@ def parsers() -> Mapping[str, argparse.ArgumentParser]:
     return {
         "vramctl": vramctl(),
         "vram-arbiter": arbiter_parser(),
+        "vram-observer": observer_parser(),
         "vram-sidecar": sidecar_parser(),
         "vram-runner": runner_parser(),
         "vram-reasoner": reasoner_parser(reasoner),

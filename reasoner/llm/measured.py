@@ -10,6 +10,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, cast
 from urllib.parse import urlsplit
 
+from vram_arbiter.reasoner.llm import names
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.reasoner import LlmUsage
@@ -52,33 +53,33 @@ class Chat:
         self.tally.input_tokens += answer.input_tokens
         self.tally.output_tokens += answer.output_tokens
         noted: dict[str, str | int] = {
-            telemetry.ATTR_INPUT_TOKENS: answer.input_tokens,
-            telemetry.ATTR_OUTPUT_TOKENS: answer.output_tokens,
+            names.ATTR_INPUT_TOKENS: answer.input_tokens,
+            names.ATTR_OUTPUT_TOKENS: answer.output_tokens,
         }
         if answer.model:
-            noted[telemetry.ATTR_RESPONSE_MODEL] = answer.model
+            noted[names.ATTR_RESPONSE_MODEL] = answer.model
         tracing.note(noted)
         if answer.finish_reason:
-            tracing.note_texts(telemetry.ATTR_FINISH_REASONS, [answer.finish_reason])
+            tracing.note({names.ATTR_FINISH_REASONS: [answer.finish_reason]})
         for kind, tokens in (("input", answer.input_tokens), ("output", answer.output_tokens)):
-            labels = self.labels | {telemetry.ATTR_TOKEN_TYPE: kind}
-            meters.measure(telemetry.GEN_AI_TOKENS, tokens, labels)
+            labels = self.labels | {names.ATTR_TOKEN_TYPE: kind}
+            meters.measure(names.GEN_AI_TOKENS, tokens, labels)
 
 
 @contextmanager
 def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Chat]:
     """Measure one request, whatever becomes of it."""
     labels = {
-        telemetry.ATTR_CHAT_OPERATION: "chat",
-        telemetry.ATTR_PROVIDER: provider,
-        telemetry.ATTR_REQUEST_MODEL: config.model,
+        names.ATTR_CHAT_OPERATION: "chat",
+        names.ATTR_PROVIDER: provider,
+        names.ATTR_REQUEST_MODEL: config.model,
     }
     address = urlsplit(config.base_url)
     attributes: dict[str, str | int] = {
         **labels,
-        telemetry.ATTR_REQUEST_MAX_TOKENS: config.max_tokens,
-        telemetry.ATTR_SERVER: address.hostname or "",
-        telemetry.ATTR_SERVER_PORT: address.port or (443 if address.scheme == "https" else 80),
+        names.ATTR_REQUEST_MAX_TOKENS: config.max_tokens,
+        names.ATTR_SERVER: address.hostname or "",
+        names.ATTR_SERVER_PORT: address.port or (443 if address.scheme == "https" else 80),
     }
     tally.requests += 1
     began_s = monotonic()
@@ -90,4 +91,4 @@ def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Chat]:
             labels = labels | {telemetry.ATTR_ERROR_TYPE: error.code}
             raise
         finally:
-            meters.measure(telemetry.GEN_AI_DURATION, monotonic() - began_s, labels)
+            meters.measure(names.GEN_AI_DURATION, monotonic() - began_s, labels)

@@ -12,14 +12,13 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.urls import collector_url, http_address
 from vram_arbiter.schemas.yamltext import parse_yaml, validated
 
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 Share = Annotated[float, Field(gt=0, le=1)]
-HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?$")]
 
 
 class _Section(BaseModel):
@@ -248,59 +247,6 @@ class LogConfig(_Section):
     """Lowest level that is written."""
 
 
-class TelemetryConfig(_Section):
-    """Traces and metrics, with the extra `telemetry`. What is set here wins over the OTEL_*
-    variables; nothing set anywhere: off."""
-
-    endpoint: str | None = None
-    """OTLP collector (HTTP, protobuf) for spans and metrics. Null: `OTEL_EXPORTER_OTLP_ENDPOINT`,
-    else none."""
-    prometheus_port: Annotated[int, Field(ge=0, le=65_535)] | None = None
-    """Port of a Prometheus endpoint on 127.0.0.1; 0: any free one, said in the log. Null: none,
-    unless `OTEL_METRICS_EXPORTER` says so."""
-    sample_ratio: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Share of the traces that begin in the daemon; the others are kept where their beginning was.
-    Null: `OTEL_TRACES_SAMPLER_ARG`, else 1."""
-
-    @field_validator("endpoint")
-    @classmethod
-    def _a_collector(cls, value: str | None) -> str | None:
-        return None if value is None else collector_url(value)
-
-
-class HttpConfig(_Section):
-    """The status page: read-only, off by default."""
-
-    listen: str | None = None
-    """Address of the page: `127.0.0.1:9870`, `[::1]:9870`, or a port alone for 127.0.0.1; port 0:
-    any free one, said in the log. Another address than loopback needs `token_file`. Null: no
-    page."""
-    token_file: Annotated[str, Field(pattern="^/")] | None = None
-    """File of mode 0600 with the token that every request has to show. Null: no token, which only
-    loopback may do without."""
-    hosts: Annotated[tuple[HostName, ...], Field(max_length=16)] = ()
-    """Names under which browsers reach the page, beside addresses and localhost. A request under
-    another name is refused (DNS rebinding)."""
-
-    @field_validator("listen")
-    @classmethod
-    def _an_address(cls, value: str | None) -> str | None:
-        return None if value is None else str(http_address(value))
-
-    @model_validator(mode="after")
-    def _token_beyond_loopback(self) -> Self:
-        if self.listen is None or self.token_file is not None:
-            return self
-        address = http_address(self.listen)
-        if not address.loopback:
-            raise ValueError(
-                f"{address} is not a loopback address: the page needs http.token_file there; or "
-                f"listen on 127.0.0.1 and reach it by `ssh -L {address.port}:127.0.0.1:"
-                f"{address.port}`"
-            )
-        return self
-
-
 class ArbiterConfig(_Section):
     """Everything that an operator can set. Sizes may be written `8GiB`, `450MiB`, `5.3GB` or in
     bytes."""
@@ -318,8 +264,6 @@ class ArbiterConfig(_Section):
     wire: WireConfig = WireConfig()
     state: StateConfig = StateConfig()
     log: LogConfig = LogConfig()
-    telemetry: TelemetryConfig = TelemetryConfig()
-    http: HttpConfig = HttpConfig()
 
 
 LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
@@ -335,6 +279,15 @@ LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
 and the heartbeat when they connected, so those two stay as they are."""
 
 
+MOVED: Mapping[str, str] = {
+    "http": "the status page is vram-observer's: write `http:` to observer.yaml, or start "
+    "`vram-arbiter --http 127.0.0.1:9870`",
+    "telemetry": "metrics and traces are vram-observer's: it serves /metrics, and reads the OTEL_ "
+    "variables in observer.env",
+}
+"""Sections that were keys of this file, and where they are now."""
+
+
 def load_config(text: str, name: str) -> ArbiterConfig:
     """Read the text of a configuration file; `name` is how errors call the file.
 
@@ -344,6 +297,9 @@ def load_config(text: str, name: str) -> ArbiterConfig:
     source = parse_yaml(text, name)
     data = source.data
     if isinstance(data, dict):
+        for section, hint in MOVED.items():
+            if section in data:
+                raise ConfigError(f"{name}: `{section}` is not a section any more", hint=hint)
         # `verify:` with all its keys commented out is an empty section, not a mistake
         data = {
             key: {} if value is None and key in ArbiterConfig.model_fields else value

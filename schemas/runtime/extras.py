@@ -35,6 +35,10 @@ EXTRA_OF: Mapping[str, str] = {
     "cyclonedds": "ros2",
     "rerun": "viz",
     "mcp": "mcp",
+    "starlette": "observer",
+    "uvicorn": "observer",
+    "prometheus_client": "observer",
+    "opentelemetry": "observer",
 }
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.explained import LeaseDetail, WhyReply
-from vram_arbiter.schemas.wire.views import GpuView, HostRamView, LeaseView, Totals
+from vram_arbiter.schemas.wire.views import DaemonView, GpuView, HostRamView, LeaseView, Totals
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +122,7 @@ class StatusReply:
     problems: tuple[str, ...]  # what is wrong with the daemon's own files, in words
     next: tuple[int, float, int] | None = None  # there may be more: ask again with this as `after`
     details: tuple[LeaseDetail, ...] = ()  # of each lease of the page, where they are asked for
+    daemon: DaemonView | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -168,10 +168,11 @@ class Oom(OnLease):
 class Status(_Request):
     """The state of everything. Leases come in pages: `after` is the `next` of the page before.
     `details`: with declared and measured bytes, and why each waiter waits; its pages are
-    shorter."""
+    shorter. `leases`: with these alone, as far as they are not over, and without tokens."""
 
     op: Literal["status"]
     details: bool = False
+    leases: Annotated[tuple[LeaseIdText, ...], Field(max_length=d.STATUS_PAGE)] = ()
     after: tuple[Literal[0, 1], Annotated[float, Field(allow_inf_nan=False)], Serial] | None = None
 
 

@@ -1,6 +1,7 @@
 """Leases and GPUs as replies, pushes and `status` show them. Standard library only."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.codes import Block
@@ -95,3 +96,21 @@ class HostRamView:
 
     budget_bytes: int
     parked_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonView:
+    """The daemon itself: its files, its process, and what it counted since its start."""
+
+    server: str  # name and version
+    python: str
+    journal_healthy: bool = True
+    journal_doubted: bool = False  # it may not name every lease
+    config_refused: bool = False  # a changed configuration; the former one is in force
+    journal_writes: int = 0  # transactions
+    journal_write_s: float = 0.0  # all of them together
+    journal_failures: int = 0
+    refusals: Mapping[str, int] = field(default_factory=dict)  # requests of any kind, by code
+    cpu_user_s: float = 0.0
+    cpu_system_s: float = 0.0
+    memory_bytes: int = 0

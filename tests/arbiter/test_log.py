@@ -47,9 +47,16 @@ def test_an_event_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_line_for_programs_names_its_span(capsys: pytest.CaptureFixture[str]) -> None:
     telemetry.set_up_logging("json", "info")
-    telemetry.log_event(EVENT, {"trace_id": "a" * 32, "span_id": "b" * 16})
+    ids = {"trace_id": "a" * 32, "span_id": "b" * 16}
+    telemetry.log_event({**EVENT, **ids})
     line = json.loads(capsys.readouterr().err)
-    assert (line["event"], line["trace_id"], line["span_id"]) == (EVENT, "a" * 32, "b" * 16)
+    assert (line["event"], line["trace_id"], line["span_id"]) == (
+        {**EVENT, **ids}, "a" * 32, "b" * 16,
+    )  # fmt: skip
+    acquirer = f"00-{'c' * 32}-{'d' * 16}-01"
+    telemetry.log_event({**EVENT, "traceparent": acquirer})
+    line = json.loads(capsys.readouterr().err)
+    assert (line["trace_id"], line["span_id"]) == ("c" * 32, "d" * 16), "of its acquirer"
 
 
 def test_frequent_events_are_quiet_and_trouble_is_loud(capsys: pytest.CaptureFixture[str]) -> None:

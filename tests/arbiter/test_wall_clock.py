@@ -12,7 +12,6 @@ ARBITER = Path(__file__).parents[2] / "arbiter"
 READERS = {
     "host/history.py": "dates of events, and which events of earlier runs are old",
     "host/seal.py": "the epoch, which grows past every known one whatever it says",
-    "host/telemetry/spans.py": "dates of spans",
     "eventlog/writer.py": "dates in the event log",
     "eventlog/logfile.py": "names of its files",
     "eventlog/text.py": "dates for people",

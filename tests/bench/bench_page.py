@@ -3,7 +3,6 @@ weighs, and what it costs the daemon at rest, with a page open and under attack.
 
 import http.client
 import json
-import re
 import socket
 import statistics
 import threading
@@ -15,12 +14,12 @@ from pathlib import Path
 from tests.bench.bench_crowd import rss_bytes
 from tests.bench.bench_rest import QUIET_AFTER_S, busy_percent
 from tests.bench.harness import SHIPPED, WIDE, Peer, Suite, arbiter, elapsed_us, in_turns, pause
+from tests.support.observer import ObserverProcess
+from tests.support.process import ArbiterProcess
 
-PAGE = "http:\n  listen: 127.0.0.1:0\n"
 LEASES = 1000
 PER_CONNECTION = 64
-INFO = "log:\n  level: info\n"
-STATIC = Path(__file__).parents[2] / "arbiter" / "http" / "static"
+STATIC = Path(__file__).parents[2] / "clients/observer/page/static"
 
 
 def run(suite: Suite) -> None:
@@ -31,36 +30,34 @@ def run(suite: Suite) -> None:
     attacks(suite)
 
 
-def with_page(config: str) -> str:
-    """A configuration with the page, whose port is in the log."""
-    return config.replace("log:\n  level: error\n", INFO) + PAGE
-
-
-def port_of(log: str) -> int:
-    return int(re.findall(r"status page: http://127\.0\.0\.1:(\d+)", log)[-1])
-
-
 def rest(suite: Suite) -> None:
-    """The daemon at rest: without the page, with it and nobody looking, with a page open."""
-    for name, config in (("without the page", SHIPPED), ("with --http", with_page(SHIPPED))):
-        with arbiter(config) as daemon:
-            if not suite.quick:
-                pause(QUIET_AFTER_S)
-            share = busy_percent(daemon.pid, suite.size(10, 2))
-            memory = rss_bytes(daemon.pid) / 2**20
-            suite.figure(f"memory of the daemon at rest, {name}", memory, "MB", at_most=55.0)
-            suite.figure(f"CPU of the daemon at rest, {name}", share, "% of a core", at_most=0.3)
-            if config == SHIPPED:
-                continue
-            with open_page(port_of(daemon.log)):
+    """The daemon at rest: alone, with an observer and nobody looking, with a page open."""
+    with arbiter(SHIPPED) as daemon:
+        _at_rest(suite, daemon, "without an observer")
+        with ObserverProcess(daemon) as observer:
+            _at_rest(suite, daemon, "with an observer")
+            memory = rss_bytes(observer.pid) / 2**20
+            suite.figure("memory of the observer at rest", memory, "MB")
+            with open_page(observer.port):
                 share = busy_percent(daemon.pid, suite.size(10, 2))
-            suite.figure("CPU of the daemon at rest, one page open", share, "% of a core")
+                own = busy_percent(observer.pid, suite.size(10, 2))
+        suite.figure("CPU of the daemon at rest, one page open", share, "% of a core")
+        suite.figure("CPU of the observer at rest, one page open", own, "% of a core")
+
+
+def _at_rest(suite: Suite, daemon: ArbiterProcess, name: str) -> None:
+    if not suite.quick:
+        pause(QUIET_AFTER_S)
+    share = busy_percent(daemon.pid, suite.size(10, 2))
+    memory = rss_bytes(daemon.pid) / 2**20
+    suite.figure(f"memory of the daemon at rest, {name}", memory, "MB", at_most=55.0)
+    suite.figure(f"CPU of the daemon at rest, {name}", share, "% of a core", at_most=0.3)
 
 
 def updates(suite: Suite) -> None:
     """A thousand leases held; another one comes and goes, and a page hears of it."""
     with ExitStack() as stack:
-        daemon = stack.enter_context(arbiter(with_page(WIDE)))
+        daemon = stack.enter_context(arbiter(WIDE))
         for start in range(0, LEASES, PER_CONNECTION):
             holder = Peer(daemon.endpoint, f"holder{start}").hello()
             stack.callback(holder.close)
@@ -68,7 +65,8 @@ def updates(suite: Suite) -> None:
                 holder.ready(holder.acquire())
         peer = Peer(daemon.endpoint, "seen").hello()
         stack.callback(peer.close)
-        page = stack.enter_context(open_page(port_of(daemon.log)))
+        observer = stack.enter_context(ObserverProcess(daemon))
+        page = stack.enter_context(open_page(observer.port))
         page.heard("snapshot")
         times: list[float] = []
         for number in range(suite.size(100, 20)):
@@ -98,8 +96,8 @@ def attacks(suite: Suite) -> None:
         "snapshots": b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n",
         "pages of the history": b"GET /history HTTP/1.1\r\nHost: localhost\r\n\r\n" * 20,
     }
-    with arbiter(with_page(WIDE)) as daemon:
-        port, peer = port_of(daemon.log), Peer(daemon.endpoint, "calm").hello()
+    with arbiter(WIDE) as daemon, ObserverProcess(daemon) as observer:
+        port, peer = observer.port, Peer(daemon.endpoint, "calm").hello()
 
         def ping() -> float:
             return elapsed_us(lambda: peer.ask("ping"))

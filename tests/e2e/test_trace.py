@@ -26,10 +26,13 @@ pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
 
 from tests.support import promql
 from tests.support.collector import Collector, ReceivedSpan
+from tests.support.observer import ObserverProcess
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.observer import names as own
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.reasoner.llm import names as llm_names
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
@@ -135,7 +138,9 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
             "VRAM_REASONER_LLM_BASE_URL": stack.enter_context(language_model()),
             "VRAM_REASONER_LLM_MODEL": "m",
         }
-        arbiter = make_arbiter().start(collector.environ())
+        arbiter = make_arbiter().start()
+        observer = ObserverProcess(arbiter, environ=collector.environ()).start()
+        stack.callback(observer.stop)
         programs = Programs(arbiter, collector.environ() | llm)
         stack.callback(programs.close)
         try:
@@ -146,6 +151,7 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
         assert codes == [1, 0, 0, 0], (
             "the reasoner's task was broken off, the others ended in order"
         )
+        assert observer.stop() == 0
         assert arbiter.stop() == 0
     judge(Trace(collector.spans()), collector)
 
@@ -262,8 +268,8 @@ def judge(trace: Trace, collector: Collector) -> None:
     assert "execute_rskill" in [plan.attributes[telemetry.ATTR_OUTCOME] for plan in plans]
 
     chats = [chat for plan in plans for chat in trace.below(plan, "chat m")]
-    assert {chat.attributes[telemetry.ATTR_PROVIDER] for chat in chats} == {"openai"}
-    assert 1200 in [chat.attributes.get(telemetry.ATTR_INPUT_TOKENS) for chat in chats]
+    assert {chat.attributes[llm_names.ATTR_PROVIDER] for chat in chats} == {"openai"}
+    assert 1200 in [chat.attributes.get(llm_names.ATTR_INPUT_TOKENS) for chat in chats]
 
     look, _ = trace.below(task, telemetry.SPAN_REASONER_TICK)
     (seen,) = trace.below(look, telemetry.SPAN_TOOL)
@@ -280,15 +286,13 @@ def judge(trace: Trace, collector: Collector) -> None:
     (loading,) = trace.below(load, telemetry.SPAN_SIDECAR_LOAD)
     assert loading.end_ns <= first.start_ns
 
-    (acquire,) = trace.below(load, telemetry.SPAN_ACQUIRE)
+    (acquire,) = trace.below(load, own.SPAN_ACQUIRE)
     assert (acquire.service, acquire.attributes[telemetry.ATTR_CONSUMER]) == (ARBITER, "grab")
-    assert [
-        len(trace.below(acquire, name)) for name in (telemetry.SPAN_QUEUE, telemetry.SPAN_LOAD)
-    ] == [1, 1]
-    (evict,) = trace.below(acquire, telemetry.SPAN_EVICT)
+    assert [len(trace.below(acquire, name)) for name in (own.SPAN_QUEUE, own.SPAN_LOAD)] == [1, 1]
+    (evict,) = trace.below(acquire, own.SPAN_EVICT)
     assert (evict.service, evict.attributes[telemetry.ATTR_CONSUMER]) == (ARBITER, "detector")
-    (verify,) = trace.below(evict, telemetry.SPAN_VERIFY)
-    assert verify.attributes[telemetry.ATTR_VERDICT] in ("verified", "residue")
+    (verify,) = trace.below(evict, own.SPAN_VERIFY)
+    assert verify.attributes[own.ATTR_VERDICT] in ("verified", "residue")
     (unloading,) = trace.below(evict, telemetry.SPAN_SIDECAR_UNLOAD)
     assert unloading.service == DETECTOR, (
         "the holder that has to leave does so in the trace of who needs its room"
@@ -302,9 +306,7 @@ def judge(trace: Trace, collector: Collector) -> None:
         span.service: span.attributes[telemetry.ATTR_EXIT_CODE]
         for span in trace.named(telemetry.SPAN_COMMAND)
     }
-    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0, ARBITER: 0}, (
-        "SIGTERM loses nothing"
-    )
+    assert codes == {REASONER: 1, RUNNER: 0, POLICY: 0, DETECTOR: 0}, "SIGTERM loses nothing"
     others = {
         span.name
         for span in trace.spans
@@ -318,8 +320,8 @@ def judge(trace: Trace, collector: Collector) -> None:
         (POLICY, telemetry.METRIC_SIDECAR_LOAD),
         (POLICY, telemetry.METRIC_SIDECAR_REQUEST),
         (REASONER, telemetry.METRIC_TOOL_CALLS),
-        (REASONER, telemetry.GEN_AI_TOKENS),
-        (ARBITER, telemetry.METRIC_GRANTS),
+        (REASONER, llm_names.GEN_AI_TOKENS),
+        (ARBITER, own.METRIC_GRANTS),
     ):
         assert service in {point.service for point in collector.points(metric)}
     check_dashboard(collector)

@@ -25,7 +25,7 @@ from docs.hooks.programs import parsers, subcommands
 from tests.packaging.test_pages import PAGES, TREE
 from tests.support.deployment import load_robot
 from vram_arbiter.schemas.config.arbiter import load_config
-from vram_arbiter.schemas.config.hooks import load_hooks
+from vram_arbiter.schemas.config.observer import load_observer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.manifest.load import parse_manifest
 
@@ -229,10 +229,9 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"model", "ends"}): lambda text: robot(
         hal={"adapter": "mujoco", "params": yaml.safe_load(text)}
     ),
-    frozenset({"hooks"}): lambda text: load_hooks(text, "page"),
+    frozenset({"hooks"}): lambda text: load_observer(text, "page"),
+    frozenset({"http"}): lambda text: load_observer(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
-    frozenset({"http"}): lambda text: load_config(text, "page"),
-    frozenset({"telemetry"}): lambda text: load_config(text, "page"),
     frozenset({"services"}): yaml.safe_load,  # compose
     frozenset({"scrape_configs"}): yaml.safe_load,  # Prometheus
 }

@@ -31,7 +31,7 @@ UNITS = (
 HOLDERS = UNITS[1:]
 EXPOSURES_MAX = {
     "system/vram-arbiter.service": 1.0,
-    "system/vram-hooks.service": 1.7,  # the network of webhooks
+    "system/vram-observer.service": 1.7,  # the network of page, collector and webhooks
     # the network of a model hub, memory that CUDA compiles into
     "system/vram-sidecar@.service": 2.0,
     "system/vram-runner@.service": 2.3,  # and cameras, motor buses and realtime scheduling
@@ -83,7 +83,7 @@ def installed(tmp_path: Path) -> Path:
 
 # -- what systemd says
 @needs_analyze
-@pytest.mark.parametrize("name", [*UNITS, "vram-hooks.service"])
+@pytest.mark.parametrize("name", [*UNITS, "vram-observer.service"])
 def test_verify_is_silent(installed: Path, name: str) -> None:
     done = analyze("verify", "--man=no", str(installed / "etc/systemd/system" / name))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -207,14 +207,15 @@ def test_other_processes_stay_visible_and_the_gpus_reachable() -> None:
     assert found["Service", "AmbientCapabilities"] == [""], (
         "opt-in means that it is not there by itself"
     )
-    online = settings_of(
-        (SOURCES / "system/vram-arbiter.service.d/telemetry.conf.example").read_text()
-    )
-    assert (online["Service", "IPAddressAllow"], found["Service", "IPAddressDeny"]) == (
-        ["localhost"],
-        ["any"],
-    )
     assert found["Service", "PrivateNetwork"] == ["yes"]
+    assert found["Service", "RestrictAddressFamilies"] == ["AF_UNIX"]
+
+
+def test_the_observer_reaches_loopback_alone() -> None:
+    found = unit("vram-observer.service")
+    assert found["Service", "IPAddressDeny"] == ["any"]
+    assert found["Service", "IPAddressAllow"] == ["localhost"]
+    assert "AF_NETLINK" in found["Service", "RestrictAddressFamilies"][0], "whose a connection is"
 
 
 def test_all_programs_meet_in_one_folder() -> None:

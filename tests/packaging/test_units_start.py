@@ -199,30 +199,27 @@ hooks:
 def test_hooks_run_as_their_page_says(machine: Machine) -> None:
     """They hear of what happened while they were stopped, and may look, not act."""
     copied, started, _ = (step.partition("#")[0] for step in steps("Service", "hooks.md"))
-    assert "start condition" in machine.run(
-        "sh", "-c", f"{started} && systemctl status vram-hooks; true"
-    )
     machine.run("sh", "-c", copied)
-    machine.write("/etc/vram-arbiter/hooks.yaml", HOOKS)
+    machine.write("/etc/vram-arbiter/observer.yaml", HOOKS)
 
     def seen() -> set[str]:
-        lines = machine.run("sh", "-c", "cat /var/lib/vram-hooks/seen 2>/dev/null; true")
+        lines = machine.run("sh", "-c", "cat /var/lib/vram-observer/seen 2>/dev/null; true")
         return {json.loads(line)["consumer"] for line in lines.splitlines()}
 
     def granted_to(name: str) -> None:
         answer_of(
-            lambda: True if name in seen() else None, lambda: machine.log("vram-hooks.service")
+            lambda: True if name in seen() else None, lambda: machine.log("vram-observer.service")
         )
 
     machine.run("sh", "-c", started)
     with held_inside(machine, "led"):
         granted_to("led")
-    machine.run("systemctl", "stop", "vram-hooks")
+    machine.run("systemctl", "stop", "vram-observer")
     with held_inside(machine, "meanwhile"):
-        machine.run("systemctl", "start", "vram-hooks")
+        machine.run("systemctl", "start", "vram-observer")
         granted_to("meanwhile")
-    assert "operators' group may be operator" in machine.read("/var/lib/vram-hooks/no")
-    machine.run("systemctl", "disable", "--now", "vram-hooks")
+    assert "operators' group may be operator" in machine.read("/var/lib/vram-observer/no")
+    machine.run("systemctl", "disable", "--now", "vram-observer")
 
 
 def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:

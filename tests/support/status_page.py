@@ -1,4 +1,4 @@
-"""The status page of a real daemon, read as by a browser: plain HTTP and server-sent events."""
+"""The status page of a real observer, read as by a browser: plain HTTP and server-sent events."""
 
 import contextlib
 import http.client

@@ -1,10 +1,10 @@
-"""Views of leases and GPUs, pages of `status`, the record of a switch, and figures for telemetry.
+"""Views of leases and GPUs, pages of `status`, and the record of a switch.
 
 Typed data without words. Reads only. `view` is made for every reply about a lease.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from heapq import merge, nsmallest
 from itertools import islice
@@ -16,7 +16,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
-from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.notes import EvictedLease, SwitchNote
 from vram_arbiter.schemas.wire.replies import StatusReply
@@ -28,14 +28,6 @@ from vram_arbiter.schemas.wire.views import (
     ProcessView,
     Totals,
 )
-
-RESIDUES = "(residues)"
-"""Stands for bytes that no resident lease has: residues of living processes, debts of leases that
-are over."""
-STOWAWAYS = "(stowaways)"
-"""Stands for processes without a lease."""
-UNATTRIBUTED = "(unattributed)"
-"""Stands for bytes of a reading that no listed process explains."""
 
 MISSING_NAMED = 3
 """Holders that have not reattached and are named; the others are counted."""
@@ -238,69 +230,3 @@ def switch_record(core: Core, lease: Lease) -> SwitchNote:
 
 def _span(start: float | None, end: float | None) -> float:
     return 0.0 if start is None or end is None else max(0.0, end - start) * 1e3
-
-
-# -- figures
-@dataclass(frozen=True, slots=True)
-class GpuFigures:
-    """What one GPU holds. `charged` and `measured` are bytes by consumer.
-
-    `measured` and `used_bytes` are None while the GPU is unknown; the bytes of `measured` add up to
-    `used_bytes`, or to more where the driver's list and its total disagree. A process with leases
-    of several consumers counts once, under their names joined by "+": its bytes cannot be told
-    apart.
-    """
-
-    gpu: GpuId
-    capacity_bytes: int
-    pressure_bytes: int
-    used_bytes: int | None
-    read_at: float | None  # newest successful reading, monotonic seconds
-    charged: Mapping[str, int]
-    measured: Mapping[str, int] | None
-
-
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """The present in numbers, for telemetry."""
-
-    waiters: int
-    oldest_wait_s: float  # 0: no request waits
-    drained: bool
-    gpus: tuple[GpuFigures, ...]
-
-
-def figures(core: Core) -> Figures:
-    """Return the present in numbers. O(residents, waiters and processes)."""
-    gpus = tuple(_figures_of(gpu) for gpu in core.gpus.values())
-    oldest = min((one.request.arrived_at for one in core.waiting.values()), default=core.now)
-    return Figures(len(core.waiting), core.now - oldest, core.drain is not None, gpus)
-
-
-def _figures_of(gpu: Gpu) -> GpuFigures:
-    charged: dict[str, int] = {}
-    consumers: dict[ProcessKey, set[str]] = {}
-    for lease in gpu.residents.values():
-        name = lease.spec.consumer
-        charged[name] = charged.get(name, 0) + gpu.ledger.charge_bytes(lease.id)
-        consumers.setdefault(lease.process, set()).add(name)
-    if rest := gpu.ledger.charged_bytes - sum(charged.values()):
-        charged[RESIDUES] = rest
-    sample, measured = gpu.sample if gpu.failed_at is None else None, dict[str, int]()
-    for use in (sample and sample.processes) or ():
-        if use.used_bytes is None:
-            continue  # the driver lists it and does not say
-        other = RESIDUES if use.process in gpu.ledger.accounts else STOWAWAYS
-        name = "+".join(sorted(consumers.get(use.process, ()))) or other
-        measured[name] = measured.get(name, 0) + use.used_bytes
-    if sample is not None and (rest := sample.used_bytes - sum(measured.values())) > 0:
-        measured[UNATTRIBUTED] = rest
-    return GpuFigures(
-        gpu=gpu.info.id,
-        capacity_bytes=gpu.info.capacity_bytes,
-        pressure_bytes=gpu.ledger.pressure_bytes(),
-        used_bytes=None if sample is None else sample.used_bytes,
-        read_at=None if gpu.sample is None else gpu.sample.taken_at,
-        charged=charged,
-        measured=None if sample is None else measured,
-    )

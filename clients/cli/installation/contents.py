@@ -36,7 +36,7 @@ def wanted(site: Site, prefix: Path, group: str, operators: Sequence[str] = ()) 
     for name in operators:  # a socket has one group, and only its members connect
         files[SYSUSERS] += f"m {name} {group}\nm {name} {OPERATORS}\n"
     settings, shared = site.layout.settings, site.layout.shared
-    for name in ("arbiter.yaml", "hooks.yaml"):
+    for name in ("arbiter.yaml", "observer.yaml"):
         files[settings / f"{name}.example"] = _example(name, prefix)
     for place, text in completions().items():
         files[shared / place] = text

@@ -12,14 +12,21 @@ from vram_arbiter.schemas.errors import ConfigError
 
 ARBITER = "vram-arbiter.service"
 CLIENTS = (
-    "vram-hooks.service",
+    "vram-observer.service",
     "vram-sidecar@.service",
     "vram-runner@.service",
     "vram-reasoner@.service",
     "vram-reasoner.service",
 )
 OF_USER = (ARBITER, "vram-reasoner.service")
-PROGRAMS = ("vram-arbiter", "vramctl", "vram-sidecar", "vram-runner", "vram-reasoner")
+PROGRAMS = (
+    "vram-arbiter",
+    "vramctl",
+    "vram-observer",
+    "vram-sidecar",
+    "vram-runner",
+    "vram-reasoner",
+)
 GROUP = "vram-arbiter"
 OPERATORS = "vram-operators"
 DEVICE_GROUPS = ("video", "render", "dialout")
@@ -52,8 +59,8 @@ SYSTEM = Layout(
     state=tuple(
         Path(folder)
         for folder in (
-            *(f"/var/lib/vram-{name}" for name in ("arbiter", "runner", "reasoner", "hooks")),
-            "/var/lib/private/vram-hooks",  # where that leads: its user exists while it runs
+            *(f"/var/lib/vram-{name}" for name in ("arbiter", "runner", "reasoner", "observer")),
+            "/var/lib/private/vram-observer",  # where that leads: its user exists while it runs
             "/var/cache/vram-sidecar",
             "/var/cache/vram-runner",
             "/run/vram-arbiter",
@@ -75,7 +82,7 @@ def layout_of_user(environ: Mapping[str, str]) -> Layout:
 
     settings = folder("XDG_CONFIG_HOME", ".config")
     kept = folder("XDG_STATE_HOME", ".local/state")
-    state = [kept / "vram-arbiter", kept / "vram-hooks"]
+    state = [kept / "vram-arbiter", kept / "vram-observer"]
     if runtime := environ.get("XDG_RUNTIME_DIR"):
         state.append(Path(runtime) / "vram-arbiter")
     return Layout(

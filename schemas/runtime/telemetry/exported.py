@@ -14,65 +14,42 @@ LABEL_MAX_CHARS = 256
 """Longest label of a metric: each value is a series of its own."""
 ITEMS_MAX = 128
 """Most items of a list or mapping; the rest is omitted."""
-DEPTH_MAX = 4
 
 
 def text(value: str, most: int = TEXT_MAX_CHARS) -> str:
     """Return the text if it can be sent; else escaped (`\\ud800`) and cut with a `…`."""
-    if len(value) <= most and (value.isascii() or _encodable(value)):
-        return value
-    legible = value[:most].encode(errors="backslashreplace").decode()
-    cut = len(value) > most or len(legible) > most
-    return legible[: most - 1] + "…" if cut else legible
+    legible = value[: most + 1].encode(errors="backslashreplace").decode()
+    return legible if len(legible) <= most else legible[: most - 1] + "…"
 
 
-def attribute(value: Any, depth: int = DEPTH_MAX) -> Any:
-    """Return the value if it can be sent: text, number, bool, None, or lists and mappings of these.
-
-    Bytes become text, other types their `str`.
-    """
+def attribute(value: Any) -> Any:
+    """Return the value as it can be sent: text, number, bool, None, or a list of these."""
     match value:
         case None | bool() | float():
             return value
-        case str():
-            return text(value)
-        case int():
-            return value if -(1 << 63) <= value < 1 << 63 else text(_said(value))
+        case int() if -(1 << 63) <= value < 1 << 63:
+            return value
         case bytes():
             return text(value[: TEXT_MAX_CHARS + 1].decode(errors="replace"))
-        case list() | tuple() if depth:
-            items = [attribute(item, depth - 1) for item in value[:ITEMS_MAX]]
-            same = len(items) == len(value) and all(
-                a is b for a, b in zip(items, value, strict=True)
-            )
-            return value if same else items
-        case Mapping() if depth:
-            return attributes(value, depth - 1)
-        case list() | tuple() | Mapping():
-            return "…"
+        case list() | tuple():
+            return [
+                text(str(one)) if isinstance(one, list | tuple) else attribute(one)
+                for one in value[:ITEMS_MAX]
+            ]
         case _:
-            return text(_said(value))
+            return text(str(value))
 
 
-def attributes(values: Mapping[Any, Any], depth: int = DEPTH_MAX) -> Mapping[Any, Any]:
-    """Return the mapping if all of it can be sent, else one that can be."""
-    sent = {
-        text(str(key), LABEL_MAX_CHARS): attribute(value, depth)
-        for key, value in list(values.items())[:ITEMS_MAX]
-    }
-    if len(sent) == len(values) and all(
-        key in values and values[key] is value for key, value in sent.items()
-    ):
-        return values
-    return sent
+def attributes(values: Mapping[Any, Any]) -> Mapping[str, Any]:
+    """Return the mapping as it can be sent."""
+    kept = list(values.items())[:ITEMS_MAX]
+    return {text(str(key), LABEL_MAX_CHARS): attribute(value) for key, value in kept}
 
 
 def labels(values: Mapping[str, str] | None) -> Mapping[str, str] | None:
     """Return a metric's labels: texts of at most `LABEL_MAX_CHARS`."""
-    if values is None or all(
-        value.isascii() and len(value) <= LABEL_MAX_CHARS for value in values.values()
-    ):
-        return values
+    if values is None:
+        return None
     return {key: text(value, LABEL_MAX_CHARS) for key, value in values.items()}
 
 
@@ -88,14 +65,7 @@ class Legible:
         self.force_flush = exporter.force_flush
 
     def export(self, spans: Sequence[Any]) -> Any:
-        return self._exporter.export([span if _fits(span) else _rewritten(span) for span in spans])
-
-
-def _fits(span: Any) -> bool:
-    named = (span, *span.events)
-    texts = (*(one.name for one in named), span.status.description or "")
-    facts = [one.attributes or {} for one in (*named, *span.links)]
-    return all(text(one) is one for one in texts) and all(attributes(one) is one for one in facts)
+        return self._exporter.export([_rewritten(span) for span in spans])
 
 
 def _rewritten(span: Any) -> Any:
@@ -120,19 +90,3 @@ def _rewritten(span: Any) -> Any:
         end_time=span.end_time,
         instrumentation_scope=span.instrumentation_scope,
     )
-
-
-def _encodable(value: str) -> bool:
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def _said(value: object) -> str:
-    try:
-        return str(value)
-    # a foreign type may raise anything; a number of 5,000 digits is refused too
-    except Exception:  # noqa: BLE001
-        return f"a {type(value).__name__}"

@@ -6,12 +6,11 @@ The SDK is imported only where logs are exported.
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from opentelemetry import trace
-from opentelemetry._logs import LogRecord, SeverityNumber
-from opentelemetry.context import Context, get_current
+from opentelemetry._logs import LogRecord, SeverityNumber, set_logger_provider
+from opentelemetry.context import get_current
 
 from vram_arbiter.schemas.runtime.telemetry import exported
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -22,16 +21,6 @@ if TYPE_CHECKING:
 
 OWN = ("opentelemetry", "urllib3", "requests")
 """Loggers of the export itself: a collector that is away must not be told so, again and again."""
-EVENTS = "vram_arbiter"
-"""Namespace of the arbiter's events; the last part is the kind in the history."""
-_EVENT_LABELS = {
-    "consumer": telemetry.ATTR_CONSUMER,
-    "lease_id": telemetry.ATTR_LEASE,
-    "gpu": telemetry.ATTR_GPU,
-    "verdict": telemetry.ATTR_VERDICT,
-    "code": telemetry.ATTR_ERROR_TYPE,
-    "reason": telemetry.ATTR_REASON,
-}
 _SEVERITIES = {
     logging.DEBUG: (SeverityNumber.DEBUG, "DEBUG"),
     logging.INFO: (SeverityNumber.INFO, "INFO"),
@@ -39,7 +28,6 @@ _SEVERITIES = {
     logging.ERROR: (SeverityNumber.ERROR, "ERROR"),
     logging.CRITICAL: (SeverityNumber.FATAL, "FATAL"),
 }
-_STACKTRACE = logging.Formatter()
 
 
 def install(resource: "Resource", exporters: Sequence[Any]) -> Callable[[], object]:
@@ -50,6 +38,7 @@ def install(resource: "Resource", exporters: Sequence[Any]) -> Callable[[], obje
     provider = LoggerProvider(resource=resource, shutdown_on_exit=False)
     for exporter in exporters:
         provider.add_log_record_processor(BatchLogRecordProcessor(exporter))
+    set_logger_provider(provider)
     handler = OtlpHandler(provider)
     logging.getLogger().addHandler(handler)
 
@@ -77,50 +66,23 @@ class OtlpHandler(logging.Handler):
 
 
 def converted(record: logging.LogRecord) -> LogRecord:
-    """Return the record as OpenTelemetry's, with the span that it belongs to."""
+    """Return the record as OpenTelemetry's, with the present span."""
     number, word = _SEVERITIES.get(record.levelno, (SeverityNumber.UNSPECIFIED, record.levelname))
-    name, labels = _event(record)
     attributes: dict[str, str | int] = {
         "code.function.name": record.funcName or "",
         "code.line.number": record.lineno,
-        "thread.name": record.threadName or "",
-        **labels,
     }
     if record.exc_info and (error := record.exc_info[1]) is not None:
         attributes[telemetry.ATTR_EXCEPTION_TYPE] = type(error).__qualname__
         attributes[telemetry.ATTR_EXCEPTION_MESSAGE] = str(error)
-        stacktrace = _STACKTRACE.formatException(record.exc_info)
+        stacktrace = logging.Formatter().formatException(record.exc_info)
         attributes[telemetry.ATTR_EXCEPTION_STACKTRACE] = stacktrace
     return LogRecord(
         timestamp=int(record.created * 1e9),
         observed_timestamp=time.time_ns(),
-        context=_context(record),
+        context=get_current(),
         severity_text=word,
         severity_number=number,
         body=exported.text(record.getMessage()),
         attributes=dict(exported.attributes(attributes)),
-        event_name=name,
     )
-
-
-def _event(record: logging.LogRecord) -> tuple[str | None, dict[str, str]]:
-    """Return the name of the event that a line of the arbiter tells, and its labels."""
-    event = getattr(record, "event", None)
-    if not isinstance(event, Mapping):
-        return None, {}
-    labels = {label: str(event[key]) for key, label in _EVENT_LABELS.items() if key in event}
-    return f"{EVENTS}.{event['kind']}", labels
-
-
-def _context(record: logging.LogRecord) -> Context:
-    """Return the record's own span, named by its ids (the daemon's lines), else the present one."""
-    ids = getattr(record, "trace", None)
-    if not isinstance(ids, dict) or not {"trace_id", "span_id"} <= ids.keys():
-        return get_current()
-    span = trace.SpanContext(
-        int(ids["trace_id"], 16),
-        int(ids["span_id"], 16),
-        is_remote=False,
-        trace_flags=trace.TraceFlags(trace.TraceFlags.SAMPLED),
-    )
-    return trace.set_span_in_context(trace.NonRecordingSpan(span), Context())

@@ -13,7 +13,7 @@ from opentelemetry import metrics
 
 from vram_arbiter.schemas.runtime.telemetry import exported
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.runtime.telemetry.instruments import INSTRUMENTS
+from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 
 Labels = Mapping[str, str]
 

@@ -1,21 +1,19 @@
-"""Names of all spans, span events, metrics and attributes, in one place. Names only: nothing is
-recorded here.
+"""Names of all spans, span events, metrics and attributes, in one place, and the units of metrics.
 
-Recorded by: the arbiter `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner
+Nothing is recorded here. Durations are in seconds and sizes in bytes; Prometheus appends
+`_seconds`, `_bytes` and `_total` to the names. Labels are listed in docs/reference/metrics.md.
+
+Recorded by: the observer `lease.*`, the runner `rskill.*` and the parts of a tick, the reasoner
 `reasoner.*`, a sidecar `sidecar.*`, every command line `cli.command`. One trace runs through all of
 them by the W3C `traceparent` on their sockets.
 """
+
+from typing import NamedTuple
 
 TRACER = "vram-arbiter"
 
 # -- spans
 SPAN_COMMAND = "cli.command"
-
-SPAN_ACQUIRE = "lease.acquire"  # from the request to `ready`; children: what the time went into
-SPAN_QUEUE = "lease.queue"
-SPAN_EVICT = "lease.evict"  # one for each lease that had to leave
-SPAN_VERIFY = "lease.verify"
-SPAN_LOAD = "lease.load"
 
 SPAN_GOAL = "rskill.goal"
 SPAN_ACTIVATE = "rskill.activate"
@@ -42,81 +40,100 @@ EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
 EVENT_ESTOP = "vram.event.estop_requested"
 EVENT_STALE = "vram.event.staleness_latched"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
-EVENT_REVOKE_ACKED = "vram.event.revoke_acked"  # within lease.evict
-EVENT_REVOKE_WITHDRAWN = "vram.event.revoke_withdrawn"
-EVENT_REMINDED = "vram.event.reminded"
-EVENT_DEADLINE_PASSED = "vram.event.deadline_passed"
-EVENT_SIGNALLED = "vram.event.signalled"
-EVENT_UNLOADING = "vram.event.unloading"
-EVENT_VERDICT = "vram.event.verdict"  # within lease.verify: one that allows no grant yet
 EVENT_ANSWER_REJECTED = "vram.event.answer_rejected"  # within reasoner.plan: asked again
-EVENT_DAEMON_STOPPED = "vram.event.daemon_stopped"  # the lease goes on, its span cannot
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
 EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
 
-# -- metrics; units and descriptions are in `instruments`
-METRIC_GRANTS = "vram_arbiter.lease.grants"
-METRIC_DENIALS = "vram_arbiter.lease.denials"
-METRIC_REFUSALS = "vram_arbiter.request.refusals"
-METRIC_WAIT = "vram_arbiter.lease.wait.duration"
-METRIC_WAITERS = "vram_arbiter.lease.waiters"
-METRIC_OLDEST_WAIT = "vram_arbiter.lease.oldest_wait"
-METRIC_EVICTIONS = "vram_arbiter.lease.evictions"
-METRIC_VERDICTS = "vram_arbiter.lease.verdicts"
-METRIC_LOSSES = "vram_arbiter.lease.losses"
-METRIC_OOMS = "vram_arbiter.lease.ooms"
-METRIC_HANDOVER = "vram_arbiter.handover.duration"
-METRIC_CHARGED = "vram_arbiter.gpu.charged"
-METRIC_MEASURED = "vram_arbiter.gpu.measured"  # the sum over consumers is METRIC_USED
-METRIC_USED = "vram_arbiter.gpu.used"
-METRIC_CAPACITY = "vram_arbiter.gpu.capacity"
-METRIC_PRESSURE = "vram_arbiter.gpu.pressure"
-METRIC_READABLE = "vram_arbiter.gpu.readable"
-METRIC_READING_AGE = "vram_arbiter.gpu.reading_age"
-METRIC_DRAINED = "vram_arbiter.drained"
-METRIC_JOURNAL_HEALTHY = "vram_arbiter.journal.healthy"
-METRIC_JOURNAL_DOUBTED = "vram_arbiter.journal.doubted"
-METRIC_JOURNAL_WRITE = "vram_arbiter.journal.write.duration"
-METRIC_JOURNAL_FAILURES = "vram_arbiter.journal.failures"
-METRIC_CONFIG_REFUSED = "vram_arbiter.config.refused"
-METRIC_BUILD = "vram_arbiter.build.info"
-METRIC_TICK = "vram_runner.tick.duration"
-METRIC_INFERENCE = "vram_runner.inference.duration"
-METRIC_CHUNK = "vram_runner.chunk.duration"
-METRIC_PREFETCH = "vram_runner.chunk.prefetches"
-METRIC_STANDING = "vram_runner.chunk.standing_steps"
-METRIC_START_LATE = "vram_runner.tick.start_delay"
-METRIC_DEADLINE_MISSES = "vram_runner.tick.deadline_misses"
-METRIC_HAL_READ = "vram_runner.hal.read.duration"
-METRIC_HAL_SEND = "vram_runner.hal.send.duration"
-METRIC_SENSOR_AGE = "vram_runner.sensor.age"
-METRIC_STALE_READS = "vram_runner.sensor.stale_reads"
-METRIC_WORLD_STALE = "vram_runner.world.stale_states"
-METRIC_ESTOPS = "vram_runner.estops"
-METRIC_SAFETY_VIOLATIONS = "vram_runner.safety.violations"
-METRIC_WITHHELD = "vram_runner.safety.withheld_actions"
-METRIC_LOOKS = "vram_runner.detector.looks"
-METRIC_STALE_DETECTIONS = "vram_runner.detector.stale_answers"
-METRIC_GOALS = "vram_runner.goals"
-METRIC_GPU_MEMORY = "vram_runner.gpu.memory.usage"
-METRIC_TOOL_CALLS = "vram_reasoner.tool_calls"
-METRIC_SIDECAR_LOAD = "vram_sidecar.load.duration"
-METRIC_SIDECAR_REQUEST = "vram_sidecar.request.duration"
-# of every program, by OpenTelemetry's conventions
-METRIC_CPU_TIME = "process.cpu.time"
-METRIC_MEMORY = "process.memory.usage"
+# -- metrics: name, unit and description, as a collector shows them, and bounds of a histogram;
+# those of the arbiter are in `clients.observer.names`
+WAITS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
+TICKS_S = (
+    *(0.0005, 0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.033, 0.04, 0.05),
+    *(0.1, 0.25, 0.5, 1.0, 5.0),
+)
+
+
+class Instrument(NamedTuple):
+    """`bounds`: upper bounds of a histogram's buckets; empty for other kinds."""
+
+    unit: str
+    description: str
+    bounds: tuple[float, ...] = ()
+
+
+INSTRUMENTS: dict[str, Instrument] = {}
+
+
+def metric(name: str, unit: str, description: str, bounds: tuple[float, ...] = ()) -> str:
+    """Describe a metric. Return its name."""
+    INSTRUMENTS[name] = Instrument(unit, description, bounds)
+    return name
+
+
+METRIC_TICK = metric("vram_runner.tick.duration", "s", "One tick of the control loop", TICKS_S)
+METRIC_INFERENCE = metric(
+    "vram_runner.inference.duration", "s", "One question to the active skill", TICKS_S
+)
+METRIC_CHUNK = metric(
+    "vram_runner.chunk.duration", "s", "From the request of a policy's chunk to its answer", WAITS_S
+)
+METRIC_PREFETCH = metric(
+    "vram_runner.chunk.prefetches", "{chunk}", "Chunks that were, or were not, there in time"
+)
+METRIC_STANDING = metric(
+    "vram_runner.chunk.standing_steps", "{step}", "Steps of a motion without an action to play"
+)
+METRIC_START_LATE = metric(
+    "vram_runner.tick.start_delay", "s", "How far behind its slot a goal's tick began", TICKS_S
+)
+METRIC_DEADLINE_MISSES = metric(
+    "vram_runner.tick.deadline_misses", "{tick}", "Ticks longer than their time budget"
+)
+METRIC_HAL_READ = metric(
+    "vram_runner.hal.read.duration", "s", "One reading of the robot's joint state", TICKS_S
+)
+METRIC_HAL_SEND = metric(
+    "vram_runner.hal.send.duration", "s", "One action sent to the motors", TICKS_S
+)
+METRIC_SENSOR_AGE = metric(
+    "vram_runner.sensor.age", "s", "Age of the newest value when a tick reads it", TICKS_S
+)
+METRIC_STALE_READS = metric(
+    "vram_runner.sensor.stale_reads", "{read}", "Reads that gave no fresh value"
+)
+METRIC_WORLD_STALE = metric(
+    "vram_runner.world.stale_states", "{state}", "World states with a stale component"
+)
+METRIC_ESTOPS = metric("vram_runner.estops", "{stop}", "Emergency stops")
+METRIC_SAFETY_VIOLATIONS = metric(
+    "vram_runner.safety.violations", "{violation}", "Reports of the safety gate"
+)
+METRIC_WITHHELD = metric(
+    "vram_runner.safety.withheld_actions", "{action}", "Actions that were not sent to the motors"
+)
+METRIC_LOOKS = metric("vram_runner.detector.looks", "{look}", "Looks of continuous detectors")
+METRIC_STALE_DETECTIONS = metric(
+    "vram_runner.detector.stale_answers", "{answer}", "Detections that became too old"
+)
+METRIC_GOALS = metric("vram_runner.goals", "{goal}", "Goals that ended")
+METRIC_GPU_MEMORY = metric("vram_runner.gpu.memory.usage", "By", "GPU memory of this process")
+METRIC_TOOL_CALLS = metric("vram_reasoner.tool_calls", "{call}", "Tool calls of the reasoner")
+METRIC_SIDECAR_LOAD = metric(
+    "vram_sidecar.load.duration", "s", "One load of a model onto the GPU", WAITS_S
+)
+METRIC_SIDECAR_REQUEST = metric(
+    "vram_sidecar.request.duration", "s", "One request to a sidecar", TICKS_S
+)
+METRIC_CPU_TIME = metric("process.cpu.time", "s", "CPU time of this process")
+METRIC_MEMORY = metric("process.memory.usage", "By", "RAM of this process")
 
 # -- attributes and labels: a closed set, so that no metric's cardinality grows with use
 ATTR_LEASE = "vram.lease_id"  # spans and log records only
 ATTR_CONSUMER = "vram.consumer"
 ATTR_MODEL = "vram.model"
 ATTR_GPU = "vram.gpu"
-ATTR_VERDICT = "vram.verdict"
 ATTR_REASON = "vram.reason"
 ATTR_BYTES = "vram.bytes"  # spans only
-ATTR_BYTES_BEFORE = "vram.bytes_before"  # spans only: the whole GPU when the unloading began
-ATTR_BYTES_AFTER = "vram.bytes_after"  # spans only: and at the verdict
-ATTR_WANTED_BY = "vram.wanted_by"  # spans only: the consumer that needs the room
 ATTR_SKILL = "rskill.id"
 ATTR_REVISION = "rskill.revision"
 ATTR_GOAL = "rskill.goal_id"  # spans only
@@ -130,22 +147,5 @@ ATTR_ERROR_TYPE = "error.type"  # a code of schemas.errors, or an exception's cl
 ATTR_EXCEPTION_TYPE = "exception.type"  # of log records, as OpenTelemetry's conventions say
 ATTR_EXCEPTION_MESSAGE = "exception.message"
 ATTR_EXCEPTION_STACKTRACE = "exception.stacktrace"
-ATTR_VERSION = "version"
-ATTR_PYTHON = "python"
 ATTR_COMMAND = "cli.command"
 ATTR_EXIT_CODE = "process.exit.code"  # spans only
-
-# -- OpenTelemetry's conventions for language models: one span `chat MODEL` a request
-GEN_AI_TOKENS = "gen_ai.client.token.usage"
-GEN_AI_DURATION = "gen_ai.client.operation.duration"
-ATTR_CHAT_OPERATION = "gen_ai.operation.name"
-ATTR_PROVIDER = "gen_ai.provider.name"
-ATTR_REQUEST_MODEL = "gen_ai.request.model"
-ATTR_REQUEST_MAX_TOKENS = "gen_ai.request.max_tokens"  # spans only, as all below but two
-ATTR_RESPONSE_MODEL = "gen_ai.response.model"
-ATTR_FINISH_REASONS = "gen_ai.response.finish_reasons"
-ATTR_INPUT_TOKENS = "gen_ai.usage.input_tokens"
-ATTR_OUTPUT_TOKENS = "gen_ai.usage.output_tokens"
-ATTR_TOKEN_TYPE = "gen_ai.token.type"  # metrics only
-ATTR_SERVER = "server.address"
-ATTR_SERVER_PORT = "server.port"

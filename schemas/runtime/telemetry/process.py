@@ -1,4 +1,4 @@
-"""What this process takes of the machine, as metrics: CPU time, RAM, and memory of each GPU.
+"""What this process takes of the machine, as metrics: CPU time and RAM.
 
 Read when metrics are exported, never in between. Imported only where they are.
 """
@@ -6,15 +6,12 @@ Read when metrics are exported, never in between. Imported only where they are.
 import os
 import resource
 from collections.abc import Iterable
-from functools import cache
 
 from opentelemetry import metrics
 from opentelemetry.metrics import CallbackOptions, Observation
 
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.runtime.telemetry.instruments import INSTRUMENTS
-
-PAGE_BYTES = resource.getpagesize()
+from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 
 
 def observe() -> None:
@@ -26,16 +23,6 @@ def observe() -> None:
     meter.create_observable_up_down_counter(name, [_memory], *INSTRUMENTS[name][:2])
 
 
-def observe_gpu() -> None:
-    """Create the instrument of GPU memory, for a program that renders or decodes on a GPU.
-
-    Not for all: a driver that hangs would hang the export with it. Without an SDK nothing is read.
-    """
-    name = telemetry.METRIC_GPU_MEMORY
-    meter = metrics.get_meter(telemetry.TRACER)
-    meter.create_observable_gauge(name, [_gpu_memory], *INSTRUMENTS[name][:2])
-
-
 def _cpu_time(_: CallbackOptions) -> Iterable[Observation]:
     times = os.times()
     yield Observation(times.user, {telemetry.ATTR_CPU_MODE: "user"})
@@ -44,50 +31,4 @@ def _cpu_time(_: CallbackOptions) -> Iterable[Observation]:
 
 def _memory(_: CallbackOptions) -> Iterable[Observation]:
     with open("/proc/self/statm", encoding="ascii") as file:
-        yield Observation(int(file.read().split()[1]) * PAGE_BYTES)
-
-
-@cache
-def _nvml() -> bool:
-    """Return whether this machine's NVML is open now; it stays so for the life of the process."""
-    import pynvml
-
-    try:
-        pynvml.nvmlInit()
-    except pynvml.NVMLError:
-        return False
-    return True
-
-
-def _gpu_memory(_: CallbackOptions) -> Iterable[Observation]:
-    """Return nothing without NVML, or for a GPU that does not tell what a process holds."""
-    if not _nvml():
-        return []
-    import pynvml
-
-    found = []
-    try:
-        for index in range(pynvml.nvmlDeviceGetCount()):
-            handle = pynvml.nvmlDeviceGetHandleByIndex(index)
-            if (held := _held(handle)) is not None:
-                labels = {telemetry.ATTR_GPU: pynvml.nvmlDeviceGetUUID(handle)}
-                found.append(Observation(held, labels))
-    except pynvml.NVMLError:  # the driver restarts, or the GPU fell off the bus
-        pass
-    return found
-
-
-def _held(handle: object) -> int | None:
-    """Return the bytes of this process on a GPU, computing and rendering; None: not told."""
-    import pynvml
-
-    pid = os.getpid()
-    listed = [
-        *pynvml.nvmlDeviceGetComputeRunningProcesses(handle),
-        *pynvml.nvmlDeviceGetGraphicsRunningProcesses(handle),
-    ]
-    # a process that computes and renders is in both lists, with the same bytes
-    own = [one.usedGpuMemory for one in listed if one.pid == pid]
-    if any(used is None for used in own):
-        return None
-    return max(own, default=0)
+        yield Observation(int(file.read().split()[1]) * resource.getpagesize())

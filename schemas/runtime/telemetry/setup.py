@@ -1,9 +1,9 @@
-"""Installs the OpenTelemetry SDK where the environment or a program's configuration asks for it.
+"""Installs the OpenTelemetry SDK where the environment asks for it.
 
-Nothing of OpenTelemetry is imported, and nothing runs, unless it is asked for (`plan`). Only
-`prometheus` is our own server, which limits what a local process may cost it and listens on
-loopback alone, because it does not authenticate.
-Names of spans and metrics are in `names`, the calls in `spans`.
+Nothing of OpenTelemetry is imported, and nothing runs, unless it is asked for (`wanted`). The SDK
+and its exporters read the OTEL_* variables themselves; read here are those that say whether and
+where to export. Exporters are the installed entry points of the specification's names (`otlp`,
+`console`, ...); Prometheus is served on loopback alone, because it does not authenticate.
 """
 
 import atexit
@@ -15,37 +15,58 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.telemetry import exported
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.runtime.telemetry.plan import (
-    Plan,
-    Signal,
-    entry_point,
-    not_installed,
-    plan,
-)
+from vram_arbiter.schemas.urls import collector_url, http_address
 
 log = logging.getLogger(__name__)
 
+type Signal = Literal["traces", "metrics", "logs"]
+type _Ends = list[Callable[[], object]]
+type Wanted = Mapping[Signal, Sequence[str]]
+"""Names of exporters; all empty: telemetry is off."""
+
+SIGNALS: tuple[Signal, ...] = ("traces", "metrics", "logs")
+PROMETHEUS = "prometheus"
 FLUSH_S = 5.0
 """Longest wait for a collector at a program's end."""
 EXPORT_S = 3.0
 """Time limit of one OTLP export unless a variable sets it; the SDK's 10 s outlast FLUSH_S."""
+HINT = "pip install 'vram-arbiter[telemetry]', or correct the OTEL_ variables that are set"
 SAY_AGAIN_S = 300.0
 """Interval between two complaints about a collector that is away."""
+
+
+def wanted(environ: Mapping[str, str]) -> Wanted:
+    """Return what is asked for; import and open nothing. Raises ConfigError."""
+    off = environ.get("OTEL_SDK_DISABLED", "").strip().lower() == "true"
+    return {signal: () if off else _exporters(environ, signal) for signal in SIGNALS}
+
+
+def _exporters(environ: Mapping[str, str], signal: Signal) -> tuple[str, ...]:
+    """Return the exporters' names. An OTLP endpoint alone asks for `otlp`."""
+    given = environ.get(f"OTEL_{signal.upper()}_EXPORTER", "").lower().split(",")
+    names = tuple(name.strip() for name in given if name.strip())
+    variables = (f"OTEL_EXPORTER_OTLP_{signal.upper()}_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
+    urls = [variable for variable in variables if environ.get(variable, "").strip()]
+    if not names and urls:
+        names = ("otlp",)
+    for variable in urls if "otlp" in names else ():
+        try:
+            collector_url(environ[variable].strip())
+        except ValueError as error:
+            raise ConfigError(f"{variable}: {error}", hint="or unset it") from None
+    return tuple(name for name in names if name != "none")
 
 
 class Telemetry:
     """Result of `set_up`: call it at the program's end to send what is left. `on`: the SDK runs."""
 
-    def __init__(
-        self, ends: Sequence[Callable[[], object]] = (), prometheus_port: int | None = None
-    ) -> None:
+    def __init__(self, ends: Sequence[Callable[[], object]] = ()) -> None:
         self.on = bool(ends)
-        self.prometheus_port = prometheus_port
         self._over = threading.Event()
         # One thread each: an exporter that waits for a silent collector does not look at the clock.
         # Started now: no thread can start while the interpreter ends.
@@ -72,6 +93,7 @@ class Telemetry:
             log.warning("telemetry ended badly: %s", error)
 
 
+_said: dict[str, float] = {}
 _installed: Telemetry | None = None  # the SDK's providers can be set once per process
 
 
@@ -79,105 +101,51 @@ def set_up(
     service: str,
     *,
     environ: Mapping[str, str] = os.environ,
-    endpoint: str | None = None,
-    prometheus_port: int | None = None,
-    sample_ratio: float | None = None,
     attributes: Mapping[str, str] | None = None,
     port_required: bool = True,
+    readers: Sequence[Any] = (),
+    id_generator: Any = None,
 ) -> Telemetry:
     """Install the SDK if it is asked for. Returns what ends it.
 
     Args:
         service: name of the service on every span and metric.
-        endpoint: base URL of an OTLP collector, without /v1/traces; wins over `environ`.
-        prometheus_port: port on loopback; wins over `environ`.
-        sample_ratio: share (0 to 1) of the traces that begin in this process. A trace that began
-            elsewhere is kept if it was kept there.
         attributes: further attributes of the resource.
         port_required: False goes on without Prometheus where its port is taken.
+        readers: readers of metrics, beside those of the environment. They ask for the SDK, too, and
+            for no metrics of this process.
+        id_generator: of spans; None: the SDK's.
 
-    A second call in a process returns the first one's result.
-
-    Raises:
-        ConfigError: the extra `telemetry` is not installed, an exporter is unknown, the SDK refuses
-            a variable, or the port is taken.
+    A second call in a process returns the first one's result. Raises ConfigError: the packages are
+    not installed, an exporter is unknown, the SDK refuses a variable, or the port is taken.
     """
     global _installed
-    planned = plan(
-        environ, endpoint=endpoint, prometheus_port=prometheus_port, sample_ratio=sample_ratio
-    )
-    if not planned.on:
+    exporters = wanted(environ)
+    if not any(exporters.values()) and not readers:
         return Telemetry()
     if _installed is None:
-        _installed = _install(service, planned, attributes or {}, port_required)
+        ends: _Ends = []
+        given = readers
+        try:
+            _quieten()
+            resource = _resource(service, attributes or {})
+            # first: a missing package is found before a thread runs
+            if PROMETHEUS in exporters["metrics"]:
+                readers = [*readers, *_prometheus(ends, port_required=port_required)]
+            tracers = _tracers(exporters["traces"], resource, id_generator, ends)
+            meters = _meters(exporters["metrics"], readers, resource, ends)
+            _install(tracers, meters, exporters["logs"], resource, ends)
+            if meters is not None and not given:
+                import_module("vram_arbiter.schemas.runtime.telemetry.process").observe()
+        except BaseException as error:
+            for end in ends:
+                end()
+            if not isinstance(error, ImportError | ValueError):
+                raise
+            raise ConfigError(f"OpenTelemetry cannot be set up: {error}", hint=HINT) from error
+        _installed = Telemetry(ends)
         atexit.register(_installed)
     return _installed
-
-
-def _install(
-    service: str, planned: Plan, attributes: Mapping[str, str], port_required: bool
-) -> Telemetry:
-    """Install all of `planned`, or nothing."""
-    ends: list[Callable[[], object]] = []
-    try:
-        port = _make(service, planned, attributes, port_required, ends)
-    except BaseException as error:
-        for end in ends:
-            end()
-        if isinstance(error, ImportError):
-            raise not_installed(error) from error
-        if isinstance(error, ValueError):
-            raise ConfigError(
-                f"OpenTelemetry refuses its settings: {error}",
-                hint="see the OTEL_ variables that are set",
-            ) from error
-        raise
-    return Telemetry(ends, port)
-
-
-def _make(
-    service: str,
-    planned: Plan,
-    attributes: Mapping[str, str],
-    port_required: bool,
-    ends: list[Callable[[], object]],
-) -> int | None:
-    """Return Prometheus's port. What was started is in `ends` at once; providers are set last."""
-    from opentelemetry import metrics, trace
-    from opentelemetry.sdk.metrics import MeterProvider
-    from opentelemetry.sdk.trace import TracerProvider
-    from opentelemetry.sdk.trace.export import BatchSpanProcessor
-    from opentelemetry.sdk.trace.sampling import ParentBasedTraceIdRatio
-
-    if planned.prometheus is not None:  # a missing package is found before any thread runs
-        import_module("opentelemetry.exporter.prometheus")
-    _quieten()
-    resource = _resource(service, attributes)
-    tracers = meters = None
-    if planned.traces:
-        exporters = [_exporter("traces", name, planned) for name in planned.traces]
-        sampler = None if planned.ratio is None else ParentBasedTraceIdRatio(planned.ratio)
-        tracers = TracerProvider(sampler=sampler, resource=resource, shutdown_on_exit=False)
-        ends.append(tracers.shutdown)
-        for exporter in exporters:
-            tracers.add_span_processor(BatchSpanProcessor(exported.Legible(exporter)))
-    if planned.logs:
-        from vram_arbiter.schemas.runtime.telemetry import logs
-
-        shippers = [_exporter("logs", name, planned) for name in planned.logs]
-        ends.append(logs.install(resource, shippers))
-    readers, port = _readers(planned, port_required, ends)
-    if readers:
-        meters = MeterProvider(readers, resource=resource, shutdown_on_exit=False)
-        ends.append(meters.shutdown)
-    if tracers is not None:
-        trace.set_tracer_provider(tracers)
-    if meters is not None:
-        from vram_arbiter.schemas.runtime.telemetry import process
-
-        metrics.set_meter_provider(meters)
-        process.observe()
-    return port
 
 
 def _resource(service: str, attributes: Mapping[str, str]) -> Any:
@@ -194,52 +162,103 @@ def _resource(service: str, attributes: Mapping[str, str]) -> Any:
     return Resource(exported.attributes(named.attributes), named.schema_url)
 
 
-def _exporter(signal: Signal, name: str, planned: Plan) -> Any:
-    """Return an exporter by its name in the specification, from the installed entry points."""
-    options: dict[str, object] = {}
-    if name == "otlp":
-        limits = ("OTEL_EXPORTER_OTLP_TIMEOUT", f"OTEL_EXPORTER_OTLP_{signal.upper()}_TIMEOUT")
-        if not any(os.environ.get(limit, "").strip() for limit in limits):
-            options["timeout"] = EXPORT_S
-        if planned.endpoint is not None:
-            options["endpoint"] = f"{planned.endpoint.rstrip('/')}/v1/{signal}"
-    return entry_point(signal, name).load()(**options)
+def _tracers(names: Sequence[str], resource: Any, id_generator: Any, ends: _Ends) -> Any:
+    if not names:
+        return None
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
+    made = TracerProvider(resource=resource, id_generator=id_generator, shutdown_on_exit=False)
+    ends.append(made.shutdown)
+    for exporter in [_exporter("traces", name) for name in names]:
+        made.add_span_processor(BatchSpanProcessor(exported.Legible(exporter)))
+    return made
 
 
-def _readers(
-    planned: Plan, port_required: bool, ends: list[Callable[[], object]]
-) -> tuple[list[Any], int | None]:
-    """Return the readers of metrics and Prometheus's port."""
+def _meters(names: Sequence[str], readers: Sequence[Any], resource: Any, ends: _Ends) -> Any:
+    from opentelemetry.sdk.metrics import MeterProvider
     from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
 
-    exporters = [_exporter("metrics", name, planned) for name in planned.metrics]
-    readers: list[Any] = [PeriodicExportingMetricReader(exporter) for exporter in exporters]
-    if planned.prometheus is None:
-        return readers, None
+    exporters = [_exporter("metrics", name) for name in names if name != PROMETHEUS]
+    every = [*readers, *map(PeriodicExportingMetricReader, exporters)]
+    if not every:
+        return None
+    made = MeterProvider(every, resource=resource, shutdown_on_exit=False)
+    ends.append(made.shutdown)
+    return made
+
+
+def _install(tracers: Any, meters: Any, logs: Sequence[str], resource: Any, ends: _Ends) -> None:
+    """Set the providers, once nothing can fail any more."""
+    from opentelemetry import metrics, trace
+
+    shippers = [_exporter("logs", name) for name in logs]
+    if shippers:
+        handler = import_module("vram_arbiter.schemas.runtime.telemetry.logs")
+        ends.append(handler.install(resource, shippers))
+    if tracers is not None:
+        trace.set_tracer_provider(tracers)
+    if meters is not None:
+        metrics.set_meter_provider(meters)
+
+
+def _exporter(signal: Signal, name: str) -> Any:
+    """Return an exporter by its name in the specification, from the installed entry points."""
+    from importlib.metadata import entry_points
+
+    options: dict[str, object] = {}
+    entry = name
+    if name == "otlp":
+        protocol = _variable("PROTOCOL", signal) or "http/protobuf"
+        entry = f"otlp_proto_{protocol.partition('/')[0]}"
+        if not _variable("TIMEOUT", signal):
+            options["timeout"] = EXPORT_S
+    found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))
+    if not found:
+        raise ConfigError(
+            f"OTEL_{signal.upper()}_EXPORTER: no exporter {entry!r} is installed",
+            hint="write otlp, prometheus (metrics only) or none, or install its package",
+        )
+    return found[0].load()(**options)
+
+
+def _variable(what: str, signal: Signal) -> str:
+    """Return an OTLP setting of the environment, of a signal or of all; "": neither is set."""
+    names = (f"OTEL_EXPORTER_OTLP_{signal.upper()}_{what}", f"OTEL_EXPORTER_OTLP_{what}")
+    return next((found for name in names if (found := os.environ.get(name, "").strip())), "")
+
+
+def _prometheus(ends: _Ends, *, port_required: bool) -> Sequence[Any]:
+    """Serve Prometheus on loopback, and return its reader; none where the port is not needed and
+    is taken."""
     from opentelemetry.exporter.prometheus import PrometheusMetricReader
-    from prometheus_client import CollectorRegistry
+    from prometheus_client import CollectorRegistry, start_http_server
 
-    from vram_arbiter.schemas.runtime.telemetry import scrapes
-
+    host = os.environ.get("OTEL_EXPORTER_PROMETHEUS_HOST", "").strip() or "127.0.0.1"
+    port = (
+        os.environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or "9464"
+    )  # of the specification
+    address = http_address(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
+    if not address.loopback:
+        raise ConfigError(
+            f"OTEL_EXPORTER_PROMETHEUS_HOST: expected a loopback address, got {host}; the endpoint"
+            " does not authenticate",
+            hint="write 127.0.0.1 and let a collector or proxy on this machine forward it",
+        )
     registry = CollectorRegistry()
-    host, wanted = planned.prometheus
     try:
-        server = scrapes.ScrapeServer(host, wanted, scrapes.page_of(registry))
+        server, _ = start_http_server(address.port, address.host, registry)
     except OSError as error:
-        problem = f"no Prometheus endpoint on {host}:{wanted}: {error}"
+        problem = f"no Prometheus endpoint on {address}: {error}"
         if not port_required:
             log.info("%s", problem)
-            return readers, None
+            return ()
         taken = error.errno == errno.EADDRINUSE
         why = "another program has the port" if taken else "its unit may have no network"
-        raise ConfigError(
-            problem,
-            hint=f"{why}; set OTEL_EXPORTER_PROMETHEUS_PORT or the configuration",
-        ) from error
-    ends.append(server.close)
-    server.start()
-    readers.append(PrometheusMetricReader(scope_info_enabled=False, registry=registry))
-    return readers, server.port
+        hint = f"{why}; set OTEL_EXPORTER_PROMETHEUS_PORT"
+        raise ConfigError(problem, hint=hint) from error
+    ends += [server.shutdown, server.server_close]
+    return (PrometheusMetricReader(scope_info_enabled=False, registry=registry),)
 
 
 def _quieten() -> None:
@@ -251,7 +270,7 @@ def _quieten() -> None:
         "opentelemetry.sdk._shared_internal",  # the queue of spans
         "opentelemetry.sdk.metrics._internal.export",
     ):
-        logging.getLogger(name).addFilter(_SeldomFilter())
+        logging.getLogger(name).addFilter(_seldom)
     logging.getLogger("opentelemetry.util.re").addFilter(_without_header)
 
 
@@ -260,16 +279,10 @@ def _without_header(record: logging.LogRecord) -> bool:
     return True
 
 
-class _SeldomFilter(logging.Filter):
+def _seldom(record: logging.LogRecord) -> bool:
     """Pass a complaint once in SAY_AGAIN_S, not with every batch that fails."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._said: dict[str, float] = {}
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        now = time.monotonic()
-        if now - self._said.get(str(record.msg), -SAY_AGAIN_S) < SAY_AGAIN_S:
-            return False
-        self._said[str(record.msg)] = now
-        return True
+    what, now = f"{record.name} {record.msg}", time.monotonic()
+    if now - _said.get(what, -SAY_AGAIN_S) < SAY_AGAIN_S:
+        return False
+    _said[what] = now
+    return True

@@ -18,7 +18,7 @@ from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.traceparent import read as read_traceparent
 
-Attributes = Mapping[str, str | int | float]
+Attributes = Mapping[str, str | int | float | Sequence[str]]
 
 _TRACER = trace.get_tracer(telemetry.TRACER)  # a proxy: it finds the SDK whenever that comes
 _W3C = TraceContextTextMapPropagator()
@@ -170,11 +170,6 @@ def event(name: str, **attributes: str | float) -> None:
 def note(attributes: Attributes) -> None:
     """Add attributes to the present span."""
     trace.get_current_span().set_attributes(dict(attributes))
-
-
-def note_texts(name: str, texts: Sequence[str]) -> None:
-    """Add an attribute that is a list of texts to the present span."""
-    trace.get_current_span().set_attribute(name, list(texts))
 
 
 def _of(traceparent: str) -> Context:

@@ -16,8 +16,8 @@ from vram_arbiter.schemas.errors import JournalUnavailable
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
 from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.errors import ErrorView
-from vram_arbiter.schemas.wire.notes import About, GrantedNote, ReleasedNote
-from vram_arbiter.schemas.wire.pushes import AnyPush, GrantedPush, RevokePush, RevokeWithdrawnPush
+from vram_arbiter.schemas.wire.notes import About, GrantedNote, ReleasedNote, RevokeAskedNote
+from vram_arbiter.schemas.wire.pushes import GrantedPush, RevokeWithdrawnPush
 from vram_arbiter.schemas.wire.replies import AcquireReply, StateReply
 
 A, ONE, GPU = ClientId("aa"), RequestId(1), GpuId("GPU-1")
@@ -70,8 +70,9 @@ class Recorder:
     def post(self, event: ev.Event) -> None:
         self.done.append(("post", event))
 
-    def log_event(self, event: Mapping[str, Any], trace: object) -> None:
+    def log_event(self, event: Mapping[str, Any]) -> None:
         self.done.append(("log", event["kind"]))
+        self.said = event
 
 
 def test_a_signal_goes_to_whoever_watches_the_process() -> None:
@@ -215,39 +216,25 @@ def test_what_is_owed_is_deleted_without_a_further_change() -> None:
     assert recorder.done == [("journal", ("lease:L1-1", None))], "once"
 
 
-def test_telemetry_hears_a_batch_before_it_is_performed_and_names_its_spans() -> None:
+def test_a_revoke_names_the_span_of_its_eviction_as_its_event_does() -> None:
+    """The ids are minted before the push leaves, which is before the fact is written down."""
     recorder = Recorder()
+    lease = LeaseId(REVOKE.lease_id)
+    asked = RevokeAskedNote("policy", LeaseId("L1-9"), 0, "waiter")
+    note = fx.Note(asked, About(lease, "det", GpuId("GPU-0")))
+    given = f"00-{'a' * 32}-{'b' * 16}-01"
+    recorder.executor.perform([fx.Push(A, replace(REVOKE, traceparent=given)), note])
+    push = next(done[2] for done in recorder.done if done[0] == "push")
+    event = recorder.said
+    assert push.traceparent == f"00-{'a' * 32}-{event['span_id']}-01"
+    assert event["trace_id"] == "a" * 32
+    assert event["parent_id"] not in ("b" * 16, event["span_id"]), "the waiter's own span"
 
-    class Traces:
-        def outgoing(self, effects: Sequence[fx.Effect]) -> None:
-            recorder.done.append(("outgoing", len(effects)))
 
-        def revoke(self, body: AnyPush) -> AnyPush:
-            assert isinstance(body, RevokePush)
-            return replace(body, traceparent="mine")
-
-        def observe(self, note: fx.Note, event: Mapping[str, Any]) -> Mapping[str, str]:
-            return {}
-
-        def wrote(self, seconds: float, *, failed: bool) -> None:
-            recorder.done.append(("wrote", seconds >= 0, failed))
-
-    executor = Executor(
-        recorder,
-        recorder,
-        recorder,
-        recorder.sample,
-        recorder.post,
-        recorder.log_event,
-        recorder.signal,
-        words,
-        Traces(),
-    )
-    push = fx.Push(A, REVOKE)
-    executor.perform([fx.JournalPut("lease:L1-1", RECORD), push])
-    assert [done[0] for done in recorder.done] == ["outgoing", "journal", "wrote", "push"]
-    assert recorder.done[2] == ("wrote", True, False)
-    assert recorder.done[-1][2] == replace(REVOKE, traceparent="mine")
+def test_writes_of_the_journal_are_counted() -> None:
+    recorder = Recorder()
+    recorder.executor.perform([fx.JournalPut("lease:L1-1", RECORD)])
     recorder.disk_full = True
-    executor.perform([fx.JournalPut("lease:L1-2", RECORD)])
-    assert ("wrote", True, True) in recorder.done
+    recorder.executor.perform([fx.JournalPut("lease:L1-2", RECORD)])
+    writes = recorder.executor.writes
+    assert (writes.count, writes.failures, writes.seconds >= 0) == (2, 1, True)

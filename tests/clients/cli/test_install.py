@@ -87,7 +87,7 @@ def test_a_plan_is_shown_then_performed_once(
     assert (tree(root), os.stat(root / UNIT).st_ino) == (files, written)
 
 
-@pytest.mark.parametrize("name", ["arbiter", "hooks"])
+@pytest.mark.parametrize("name", ["arbiter", "observer"])
 def test_an_installed_example_names_a_schema_that_is_there(root: Path, name: str) -> None:
     """Regression: it named the clone's by a relative path, and editors found none."""
     assert vramctl(root, "install", "--prefix", "/opt/other", "--yes") == 0

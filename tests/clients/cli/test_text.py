@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-import vram_arbiter.arbiter.http as page
+import vram_arbiter.clients.observer.page as page
 from vram_arbiter.clients.cli import text
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.wire.notes import NOTES

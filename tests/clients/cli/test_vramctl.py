@@ -96,7 +96,7 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
 EVERY_COMMAND = (
     "status", "why", "history", "top",
     "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
-    "hooks", "mcp", "replay", "demo",
+    "mcp", "replay", "demo",
 )  # fmt: skip
 
 
@@ -192,6 +192,7 @@ def test_status_why_history(client: Client, arbiter_daemon: ArbiterProcess, spec
         "problems",
         "host_ram",
         "totals",
+        "daemon",
     }
     assert set(status) == wanted
     assert status["leases"][0]["consumer"] == "detector"

@@ -155,7 +155,7 @@ class SimDaemon:
             _Chronicle(machine, epoch),
             self._sample,
             self._post,
-            lambda event, trace: None,
+            lambda event: None,
             lambda process, kind: clock.say(f"{kind} for {process}"),
             words,
         )

@@ -9,16 +9,15 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pytest
 
 from tests.support.collector import Collector
 from tests.support.paths import ROOT
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime.telemetry import scrapes
-from vram_arbiter.schemas.runtime.telemetry.plan import Plan, plan
-from vram_arbiter.schemas.runtime.telemetry.setup import Telemetry, set_up
+from vram_arbiter.schemas.runtime.telemetry import setup
+from vram_arbiter.schemas.runtime.telemetry.setup import Telemetry, wanted
 
 needs_sdk = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in ("opentelemetry.sdk", "prometheus_client")),
@@ -46,62 +45,41 @@ OTLP = ("otlp",)
 
 
 @pytest.mark.parametrize(
-    ("environ", "wanted"),
+    ("environ", "traces", "metrics", "logs"),
     [
-        ({}, Plan()),
-        ({"OTEL_SERVICE_NAME": "robot", "OTEL_TRACES_SAMPLER": "always_on"}, Plan()),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE + "/"}, Plan(OTLP, OTLP, logs=OTLP)),
-        ({"OTEL_LOGS_EXPORTER": "console"}, Plan(logs=("console",))),
-        ({"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": BASE + "/own"}, Plan(OTLP)),
+        ({}, (), (), ()),
+        ({"OTEL_SERVICE_NAME": "robot", "OTEL_TRACES_SAMPLER": "always_on"}, (), (), ()),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE + "/"}, OTLP, OTLP, OTLP),
+        ({"OTEL_LOGS_EXPORTER": "console"}, (), (), ("console",)),
+        ({"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": BASE + "/own"}, OTLP, (), ()),
         (
             {
                 "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
                 "OTEL_METRICS_EXPORTER": "none",
                 "OTEL_LOGS_EXPORTER": "none",
             },
-            Plan(OTLP),
+            OTLP,
+            (),
+            (),
         ),
-        ({"OTEL_TRACES_EXPORTER": "otlp, console"}, Plan(("otlp", "console"))),
-        ({"OTEL_METRICS_EXPORTER": "prometheus"}, Plan(prometheus=("127.0.0.1", 9464))),
+        ({"OTEL_TRACES_EXPORTER": "otlp, console"}, ("otlp", "console"), (), ()),
+        ({"OTEL_METRICS_EXPORTER": "prometheus"}, (), ("prometheus",), ()),
         (
-            {
-                "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
-                "OTEL_METRICS_EXPORTER": "otlp,prometheus",
-                "OTEL_EXPORTER_PROMETHEUS_HOST": "::1",
-                "OTEL_EXPORTER_PROMETHEUS_PORT": "9500",
-            },
-            Plan(OTLP, OTLP, prometheus=("::1", 9500), logs=OTLP),
+            {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "otlp,prometheus"},
+            OTLP,
+            ("otlp", "prometheus"),
+            OTLP,
         ),
-        (
-            {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "prometheus"},
-            Plan(OTLP, prometheus=("127.0.0.1", 9464), logs=OTLP),
-        ),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_SDK_DISABLED": "True"}, Plan()),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_SDK_DISABLED": "True"}, (), (), ()),
     ],
 )
 def test_the_environment_says_which_exporters_are_wanted(
-    environ: Mapping[str, str], wanted: Plan
+    environ: Mapping[str, str],
+    traces: Sequence[str],
+    metrics: Sequence[str],
+    logs: Sequence[str],
 ) -> None:
-    assert plan(environ) == wanted
-
-
-def test_a_configuration_wins_over_the_environment() -> None:
-    environ = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://other:4318"}
-    got = plan(environ, endpoint=BASE, prometheus_port=0, sample_ratio=0.5)
-    assert got == Plan(OTLP, OTLP, BASE, ("127.0.0.1", 0), 0.5, OTLP)
-
-
-@pytest.mark.parametrize(
-    ("environ", "words"),
-    [
-        ({"OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"}, "expected a loopback address"),
-        ({"OTEL_EXPORTER_PROMETHEUS_HOST": "robot"}, "expected a loopback address"),
-        ({"OTEL_EXPORTER_PROMETHEUS_PORT": "70000"}, "expected a port"),
-    ],
-)
-def test_the_prometheus_endpoint_stays_on_loopback(environ: Mapping[str, str], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        plan({"OTEL_METRICS_EXPORTER": "prometheus", **environ})
+    assert wanted(environ) == {"traces": traces, "metrics": metrics, "logs": logs}
 
 
 @needs_sdk
@@ -116,7 +94,19 @@ def test_the_prometheus_endpoint_stays_on_loopback(environ: Mapping[str, str], w
         ),
         (
             {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_PROTOCOL": "carrier-pigeon"},
-            "expected http/protobuf or grpc",
+            "no exporter 'otlp_proto_carrier-pigeon' is installed",
+        ),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"},
+            "expected a loopback address",
+        ),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "robot"},
+            "expected ADDRESS:PORT",
+        ),
+        (
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": "70000"},
+            "expected ADDRESS:PORT",
         ),
     ],
 )
@@ -252,30 +242,37 @@ def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, ke
         )
 
 
+def free_port() -> str:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return str(taken.getsockname()[1])
+
+
 @needs_sdk
 def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
+    port = free_port()
     result = run_program(
         "import http.client, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.runtime.telemetry import names as n\n"
-        "t = o.set_up('vram-arbiter', prometheus_port=0)\n"
+        "t = o.set_up('vram-runner')\n"
         "from vram_arbiter.schemas.runtime.telemetry import meters\n"
-        "meters.count(n.METRIC_GRANTS, {n.ATTR_CONSUMER: 'detector'}, 2)\n"
-        "meters.measure(n.METRIC_WAIT, 0.3)\n"
-        "c = http.client.HTTPConnection('127.0.0.1', t.prometheus_port, timeout=60)\n"
+        "meters.count(n.METRIC_GOALS, {n.ATTR_SKILL: 'grab'}, 2)\n"
+        "meters.measure(n.METRIC_CHUNK, 0.3)\n"
+        f"c = http.client.HTTPConnection('127.0.0.1', {port}, timeout=60)\n"
         "c.request('GET', '/metrics')\n"
         "print(c.getresponse().read().decode())\n"
         "c.close()\n"
         "t()\n"
-        "try: http.client.HTTPConnection('127.0.0.1', t.prometheus_port, timeout=60).connect()\n"
+        f"try: http.client.HTTPConnection('127.0.0.1', {port}, timeout=60).connect()\n"
         "except ConnectionRefusedError: print('refused')\n",
-        {},
+        {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": port},
     )
     assert (result.returncode, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
-    assert 'vram_arbiter_lease_grants_total{vram_consumer="detector"} 2.0' in lines
-    assert 'vram_arbiter_lease_wait_duration_seconds_bucket{le="0.25"} 0.0' in lines
-    assert 'vram_arbiter_lease_wait_duration_seconds_bucket{le="0.5"} 1.0' in lines
-    assert any('service_name="vram-arbiter"' in line for line in lines)
+    assert 'vram_runner_goals_total{rskill_id="grab"} 2.0' in lines
+    assert 'vram_runner_chunk_duration_seconds_bucket{le="0.25"} 0.0' in lines
+    assert 'vram_runner_chunk_duration_seconds_bucket{le="0.5"} 1.0' in lines
+    assert any('service_name="vram-runner"' in line for line in lines)
     assert lines[-1] == "refused"
 
 
@@ -284,9 +281,16 @@ def test_a_taken_port_is_named() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=f"no Prometheus endpoint on 127.0.0.1:{port}"):
-            set_up("vram-arbiter", environ={}, prometheus_port=port)
+        port = str(taken.getsockname()[1])
+        said = run_program(
+            "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
+            "try: o.set_up('robot')\n"
+            "except Exception as error: print(error)\n"
+            "assert o.set_up('robot', port_required=False) is not None\n",
+            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": port},
+        )
+        assert f"no Prometheus endpoint on 127.0.0.1:{port}" in said.stdout
+        assert said.returncode == 0, said.stderr
 
 
 @needs_sdk
@@ -302,9 +306,11 @@ def test_a_port_that_cannot_be_had_says_why(
     def refused(*arguments: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(scrapes, "ScrapeServer", refused)
+    import prometheus_client
+
+    monkeypatch.setattr(prometheus_client, "start_http_server", refused)
     with pytest.raises(ConfigError) as told:
-        set_up("vram-arbiter", environ={}, prometheus_port=9464)
+        setup._prometheus([], port_required=True)
     assert reason in told.value.hint
 
 
@@ -366,17 +372,22 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
     result = run_program(
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "from vram_arbiter.schemas.errors import ConfigError\n"
-        "try:\n    o.set_up('robot', prometheus_port=0)\n"
+        "try:\n    o.set_up('robot')\n"
         "except ConfigError as error:\n    print(error)\n"
         "from opentelemetry import metrics, trace\n"
         "print(type(trace.get_tracer_provider()).__name__, "
         "type(metrics.get_meter_provider()).__name__)\n"
-        "import threading; print([x.name for x in threading.enumerate() if x.name == "
-        "'prometheus'])\n",
-        {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, **wrong},
+        "import threading; print([x.name for x in threading.enumerate() if 'serve_forever' in "
+        "x.name])\n",
+        {
+            "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
+            "OTEL_METRICS_EXPORTER": "otlp,prometheus",
+            "OTEL_EXPORTER_PROMETHEUS_PORT": free_port(),
+            **wrong,
+        },
     )
     said, providers, servers = result.stdout.splitlines()
-    assert said.startswith("OpenTelemetry refuses its settings: "), result.stderr
+    assert said.startswith("OpenTelemetry cannot be set up: "), result.stderr
     assert (providers, servers) == ("ProxyTracerProvider _ProxyMeterProvider", "[]")
 
 
@@ -404,12 +415,12 @@ def test_no_secret_stands_in_a_message() -> None:
     result = run_program(
         "import logging; logging.basicConfig()\n"
         "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
-        "from vram_arbiter.schemas.config.arbiter import ArbiterConfig\n"
+        "import os\n"
         "from vram_arbiter.schemas.errors import ConfigError\n"
         "t = o.set_up('robot')\n"
         "for url in ('htps://me:geheim@host', 'htps://host/?key=geheim'):\n"
-        "    try:\n        ArbiterConfig.model_validate({'telemetry': {'endpoint': url}})\n"
-        "    except ValueError as error:\n        print([e['msg'] for e in error.errors()])\n"
+        "    try:\n        o.wanted({'OTEL_EXPORTER_OTLP_ENDPOINT': url})\n"
+        "    except ConfigError as error:\n        print(error)\n"
         "t(0.1)\n",
         {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_EXPORTER_OTLP_HEADERS": "geheim"},
     )

@@ -1,1 +1,0 @@
-"""The daemon's log, spans and metrics."""

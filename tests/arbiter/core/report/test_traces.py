@@ -1,0 +1,65 @@
+"""Traces that facts and pushes name."""
+
+from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held, sent_away
+from vram_arbiter.schemas import defaults as d
+
+GIB = d.GIB
+HERS = f"00-{'a' * 32}-{'1' * 16}-01"
+HIS = f"00-{'b' * 32}-{'2' * 16}-01"
+
+
+def test_a_holder_is_asked_in_the_name_of_whoever_waits() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5)
+    assert "traceparent" not in driver.notes("granted")[-1]
+    vlm = driver.consumer("vlm")
+    vlm.traceparent = HERS
+    vlm.acquire(5 * GIB)
+    driver.advance(1.0)
+    assert {push["traceparent"] for push in driver.pushes("revoke")} == {HERS}
+    assert det.traceparent is None
+    assert driver.state(lease) == "revoking"
+
+
+def test_a_waiter_without_a_trace_names_none() -> None:
+    driver = CoreDriver(8 * GIB)
+    held(driver, "det", 5)
+    driver.consumer("vlm").acquire(5 * GIB)
+    assert "traceparent" not in driver.pushes("revoke")[0]
+
+
+def test_a_lease_that_is_called_back_belongs_to_the_caller() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, policy, wanted = sent_away(driver)
+    det.traceparent = HERS
+    det.reacquire(lease)
+    assert driver.notes("queued")[-1]["traceparent"] == HERS
+    assert driver.pushes("revoke", wanted)[0]["traceparent"] == HERS
+    det.cancel(lease)
+    assert policy.traceparent is None
+
+
+def test_one_that_is_called_back_while_it_is_measured_too() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.device.lag_s = 1.0
+    det, lease = held(driver, "det", 5, standby=True)
+    det.traceparent = HIS
+    policy = driver.consumer("policy")
+    wanted = policy.acquire(5 * GIB, wait_timeout_s=60.0)
+    det.unload(lease)
+    assert driver.state(lease) == "verifying"
+    det.reacquire(lease)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    policy.load(wanted)
+    driver.until(lambda: bool(driver.pushes("revoke", wanted)))
+    assert driver.pushes("revoke", wanted)[0]["traceparent"] == HIS
+
+
+def test_a_grant_says_whether_it_was_asked_for() -> None:
+    driver = CoreDriver(8 * GIB)
+    _, lease, policy, wanted = sent_away(driver)
+    assert not any("by_itself" in note for note in driver.notes("granted"))
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading")
+    assert driver.notes("granted")[-1]["by_itself"] is True

@@ -1,0 +1,92 @@
+"""A page that does not read its events, and what pages are told of leases."""
+
+import asyncio
+from dataclasses import replace
+from typing import Any
+
+from tests.support.core_driver import CoreDriver
+from vram_arbiter.clients.observer.page.feed import UNREAD_MAX_BYTES, Feed, Reader
+from vram_arbiter.clients.observer.page.usage import UsageRecord
+from vram_arbiter.clients.observer.present import Look
+from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.wire.explained import WhyReply
+from vram_arbiter.schemas.wire.replies import HistoryReply
+
+CHUNK = bytes(256 * 1024)
+
+
+def test_a_page_that_does_not_read_is_dropped() -> None:
+    """What it has not taken is kept up to UNREAD_MAX_BYTES; then its connection ends."""
+    aborted, left = list[int](), list[Reader]()
+
+    async def drop() -> list[bytes]:
+        reader = Reader(lambda: aborted.append(1), left.append)
+        sent = 0
+        while reader.send(CHUNK):
+            sent += len(CHUNK)
+        assert sent == UNREAD_MAX_BYTES
+        assert aborted == [1]
+        return [chunk async for chunk in reader.chunks()]
+
+    assert asyncio.run(drop()) == []
+    assert len(left) == 1
+
+
+class Arbiter:
+    """Answers as a client does, from an engine."""
+
+    def __init__(self, driver: CoreDriver) -> None:
+        self.driver = driver
+
+    async def why(self, consumer: str) -> WhyReply:
+        return self.driver.arbiter.why(consumer, self.driver.now)
+
+    async def history(self, *_: Any, **__: Any) -> HistoryReply:
+        return HistoryReply((), 0)
+
+
+def test_pages_are_told_what_changed_and_no_more(driver: CoreDriver) -> None:
+    """A lease that only grew older is not sent again; one that is gone is named; a waiter that only
+    moved up has its new place alone."""
+
+    def look() -> Look:
+        return Look(driver.arbiter.status(driver.now), driver.now, 0.0)
+
+    async def story() -> list[Any]:
+        asked: list[int] = []
+        feed = Feed(Arbiter(driver), UsageRecord(), lambda: asked.append(1))
+        det = driver.consumer("det")
+        lease = det.acquire(5 * GIB)
+        det.load(lease)
+        det.use_begin(lease)
+        first = driver.consumer("first")
+        waiter = first.acquire(5 * GIB)
+        second = driver.consumer("second").acquire(5 * GIB)
+        reader = feed.join(lambda: None)
+        await feed.publish(look())
+        driver.advance(0.1)
+        await feed.publish(look())
+        first.cancel(waiter)
+        await feed.publish(look())
+        reader.end()
+        told = []
+        for chunk in list(reader._unread):
+            for event in chunk.decode().split("\n\n")[:-1]:
+                name, _, data = event.partition("\ndata: ")
+                told.append((name.removeprefix("event: "), strictjson.loads(data)))
+        assert asked == [1]
+        changes = [data for name, data in told if name == "change"]
+        snapshot = next(data for name, data in told if name == "snapshot")
+        assert {one["lease_id"] for one in snapshot["leases"]} == {lease, waiter, second}
+        assert changes[0]["status"]["leases"] == []
+        assert changes[1]["gone"] == [waiter]
+        assert changes[1]["moved"] == {second: 1}
+        return told
+
+    assert [name for name, _ in asyncio.run(story())][:2] == ["snapshot", "waits"]
+    assert replace(look_of(driver), at=1.0).origin == 1.0 - look_of(driver).status.uptime_s
+
+
+def look_of(driver: CoreDriver) -> Look:
+    return Look(driver.arbiter.status(driver.now), driver.now, 0.0)
