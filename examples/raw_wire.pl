@@ -7,7 +7,7 @@ use strict;
 use warnings;
 use IO::Socket::UNIX;
 
-my $VERSION = 2;    # of the wire
+my $VERSION = 3;    # of the wire
 my $folder = $ENV{RUNTIME_DIRECTORY} // ($ENV{XDG_RUNTIME_DIR} // '/run') . '/vram-arbiter';
 my $path = ($ENV{VRAM_ARBITER_ENDPOINT} // "$folder/arbiter.sock") =~ s{^ipc://}{}r;
 my $socket = IO::Socket::UNIX->new(Peer => $path) or die "no arbiter at $path: $!\n";

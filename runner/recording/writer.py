@@ -18,6 +18,7 @@ import shutil
 import signal
 import sys
 import warnings
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -196,17 +197,23 @@ def serve(peer: Connection) -> int:
         _answer(peer, {"repaired": repaired, "episodes": episodes, "frames": frames})
         writer = EpisodeWriter(files, said["units"])
         status = "runner_lost"
-        with contextlib.suppress(EOFError, ConnectionError):
-            while status == "runner_lost":
-                kind, *given = peer.recv()
-                if kind == "close":
-                    status = "unfinished"
-                elif kind == "row":
-                    writer.row(*given)
-                else:
-                    _answer(peer, _handled(getattr(writer, kind), given))
+        for kind, *given in _messages(peer):
+            if kind == "close":
+                status = "unfinished"
+                break
+            if kind == "row":
+                writer.row(*given)
+            else:
+                _answer(peer, _handled(getattr(writer, kind), given))
         _handled(writer.end, [{"status": status}])
     return 0
+
+
+def _messages(peer: Connection) -> Iterator[Any]:
+    """Yield what the runner says until it is gone, also in the middle of a message."""
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            yield peer.recv()
 
 
 def _handled(handler: Any, given: list[Any]) -> JsonObject:

@@ -232,6 +232,7 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"hooks"}): lambda text: load_observer(text, "page"),
     frozenset({"http"}): lambda text: load_observer(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
+    frozenset({"revoke"}): lambda text: load_config(text, "page"),
     frozenset({"services"}): yaml.safe_load,  # compose
     frozenset({"scrape_configs"}): yaml.safe_load,  # Prometheus
 }

@@ -19,7 +19,7 @@ from tests.support.waiting import until
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.errors import BadRequest, ModelError, OutOfMemory, WaitTimeout
 from vram_arbiter.schemas.manifest import parse_manifest
-from vram_arbiter.schemas.wire.requests import Footprint
+from vram_arbiter.schemas.wire.spec import Footprint
 from vram_arbiter.sidecars.adapters.base import LEROBOT
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.model_process import ModelProcess

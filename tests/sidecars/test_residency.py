@@ -8,7 +8,7 @@ import pytest
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import Evicted, ModelError, NotPermitted, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
-from vram_arbiter.schemas.wire.requests import Footprint
+from vram_arbiter.schemas.wire.spec import Footprint
 from vram_arbiter.sidecars.gpu_copy import TRANSITIONS
 from vram_arbiter.sidecars.residency import Residency
 from vram_arbiter.sidecars.settings import Settings

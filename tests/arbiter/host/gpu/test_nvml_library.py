@@ -33,11 +33,11 @@ OWN = """
     from opentelemetry.exporter.prometheus import PrometheusMetricReader
     from opentelemetry import metrics
     from prometheus_client import CollectorRegistry, generate_latest
-    from vram_arbiter.schemas.runtime.telemetry import process
+    from vram_arbiter.runner import gpu_memory
     registry = CollectorRegistry()
     reader = PrometheusMetricReader(scope_info_enabled=False, registry=registry)
     metrics.set_meter_provider(MeterProvider([reader]))
-    process.observe_gpu()
+    gpu_memory.observe_gpu()
     said = []
     for mine in (0, 300):
         with open(os.environ["NVML_STUB"], "a") as control:

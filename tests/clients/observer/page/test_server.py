@@ -106,7 +106,7 @@ def test_the_files_and_their_headers(port: int) -> None:
         ("/history?" + "&".join(f"kind={n}" for n in range(200)), "GET", 400),
         ("/history?after=-5&limit=99999999", "GET", 200),
         ("http://127.0.0.1/page.js", "GET", 404),
-        ("//[", "GET", 400),
+        ("//[", "GET", 404),
     ],
 )
 def test_what_is_not_served(port: int, path: str, method: str, status: int) -> None:
