@@ -54,7 +54,7 @@ def bounded(consumer: str, wait_timeout_s: float | None) -> Iterator[float | Non
     except WaitTimeout as ended:
         told = ", ".join(uses)
         raise WouldDeadlock(
-            f"{consumer} waited {WAIT_IN_USE_S:g} s inside {told}, which may keep what it waits for",
+            f"{consumer} waited {WAIT_IN_USE_S:g} s inside {told}, which may keep its room",
             hint="end the use first, acquire beside it, or say `wait_timeout_s`",
             details={"uses": list(uses), "waited": ended.details},
         ) from ended

@@ -209,8 +209,8 @@ def parser() -> argparse.ArgumentParser:
         "--port",
         type=_number(int, 1, 65_535),
         metavar="N",
-        help="also serve the endpoint on 127.0.0.1:N, for clients that need a port and users who may"
-        " open the socket's file",
+        help="also serve the endpoint on 127.0.0.1:N, for clients that need a port and users who"
+        " may open the socket's file",
     )
     add("--arbiter", metavar="EP", help="default: the arbiter's usual endpoint")
     add("--no-arbiter", action="store_true", help="load at once and stay resident, without a lease")
@@ -260,8 +260,8 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--idle-release-s",
         type=_number(float, 0.1, 86_400),
-        help="release a model that no request and no goal has used for this long, so that one on standby "
-        "returns; default: never",
+        help="release a model that no request and no goal has used for this long, so that one on "
+        "standby returns; default: never",
     )
     add(
         "--standby",

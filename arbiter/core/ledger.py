@@ -89,7 +89,7 @@ class GpuLedger:
         return over if over > self._tolerance_bytes else 0
 
     def note_pressure(self) -> PressureNote | None:
-        """Bring `pressed` up to date. Return the note of its begin or end; None: it is as it was."""
+        """Bring `pressed` up to date. Return the note of its begin or end; None: as before."""
         pressure_bytes = self.pressure_bytes()
         if bool(pressure_bytes) == self.pressed:
             return None

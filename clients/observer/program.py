@@ -20,8 +20,8 @@ from vram_arbiter.clients.observer.hooks.actions import act
 from vram_arbiter.clients.observer.hooks.queues import Runner, Saved, StateFile
 from vram_arbiter.clients.observer.page import server
 from vram_arbiter.clients.observer.page.access import Access, read_token
-from vram_arbiter.clients.observer.page.app import Site
-from vram_arbiter.clients.observer.page.feed import Feed
+from vram_arbiter.clients.observer.page.app import StatusSite
+from vram_arbiter.clients.observer.page.feed import PageFeed
 from vram_arbiter.clients.observer.page.usage import UsageRecord
 from vram_arbiter.clients.observer.present import Look, Present
 from vram_arbiter.schemas.config.observer import HttpConfig, ObserverConfig
@@ -74,7 +74,7 @@ class Observer:
         self._record = UsageRecord()
         self._woken = asyncio.Event()
         self._touched: set[str] = set()  # leases of events since the last look
-        self._feed = Feed(self._client, self._record, self._woken.set)
+        self._feed = PageFeed(self._client, self._record, self._woken.set)
         self._hooks = Runner(
             config.hooks, lambda hook, one: act(hook, one, options.endpoint), saved.pending
         )
@@ -115,7 +115,7 @@ class Observer:
         access = Access(address, self._config.http.hosts, token)
         scrapes = Scrapes(self._exports, self._present)
         history = self._client.history
-        site = Site(access, self._feed, history, scrapes, connections, self._reached)
+        site = StatusSite(access, self._feed, history, scrapes, connections, self._reached)
         log.info("status page: http://%s", address)
         await server.serve(site.app, listening, connections)
 

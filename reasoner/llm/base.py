@@ -10,10 +10,10 @@ import asyncio
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Self
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words, conversation
+from vram_arbiter.reasoner.llm.answer import Answer, Call
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import JsonHttp, Pause, without_credentials
 from vram_arbiter.reasoner.llm.measured import Tally, measured
@@ -46,27 +46,6 @@ FINISHING: FunctionTool = {
         },
     },
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """A call as the model wrote it: nothing is checked yet."""
-
-    id: str
-    name: str
-    arguments: str | JsonMap
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """One answer of a model: words, calls, both or neither. `finish_reason` is the API's word."""
-
-    text: str
-    calls: tuple[Call, ...]
-    finish_reason: str = ""
-    model: str = ""
-    input_tokens: int = 0
-    output_tokens: int = 0
 
 
 class LlmPlanner(ABC):

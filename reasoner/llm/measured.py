@@ -7,19 +7,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from time import monotonic
-from typing import TYPE_CHECKING, cast
+from typing import cast
 from urllib.parse import urlsplit
 
 from vram_arbiter.reasoner.llm import names
+from vram_arbiter.reasoner.llm.answer import Answer
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.reasoner import LlmUsage
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-
-if TYPE_CHECKING:
-    from vram_arbiter.reasoner.llm.base import Answer
 
 
 @dataclass(slots=True)
@@ -49,7 +47,7 @@ class Chat:
     tally: Tally
     labels: dict[str, str]
 
-    def answered(self, answer: "Answer") -> None:
+    def answered(self, answer: Answer) -> None:
         self.tally.input_tokens += answer.input_tokens
         self.tally.output_tokens += answer.output_tokens
         noted: dict[str, str | int] = {

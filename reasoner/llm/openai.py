@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from vram_arbiter.reasoner.cascade import Answered, Called, Thought, Turn, Words
-from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner, tokens
+from vram_arbiter.reasoner.llm.answer import Answer, Call
+from vram_arbiter.reasoner.llm.base import LlmPlanner, tokens
 from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.tools import FunctionTool

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.runner.cli.benchmark_report import REPORT, table, write_report
 from vram_arbiter.runner.cli.common import default_skills
 from vram_arbiter.runner.goals.catalogue import read_manifests
 from vram_arbiter.runner.sim.benchmark import Cell, SeedOutcome
@@ -32,8 +33,6 @@ async def evaluate(args: argparse.Namespace) -> int:
 
     Returns: 0 if every episode got a verdict, 1 otherwise. Raises ConfigError, UnknownSkill.
     """
-    from vram_arbiter.runner.cli.benchmark import REPORT, table, write_report
-
     if args.policy or args.task or args.scene or args.record or not args.skill:
         raise ConfigError(
             f"--env {args.env} plays the checkpoints of skills: give --skill, and neither --policy,"

@@ -6,7 +6,7 @@ Must not know other connections: what concerns several is asked of its router.
 import asyncio
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from vram_arbiter.schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
 from vram_arbiter.schemas.runtime.peercred import Peer
@@ -20,9 +20,6 @@ from vram_arbiter.schemas.runtime.zmtp import (
     ZmtpError,
     encode,
 )
-
-if TYPE_CHECKING:
-    from vram_arbiter.schemas.runtime.router import Router
 
 log = logging.getLogger(__name__)
 
@@ -91,12 +88,26 @@ class User:
     out_bytes: int = 0
 
 
+class Server(Protocol):
+    """The server that a connection belongs to (`router.Router`)."""
+
+    limits: Bounds
+    loop: asyncio.AbstractEventLoop
+    handler: Handler
+    receiving: bool
+
+    def admitted(self, connection: "Connection") -> None: ...
+    def readable(self, connection: "Connection") -> None: ...
+    def lost(self, connection: "Connection", reason: str) -> None: ...
+    def complain(self, problem: str) -> None: ...
+
+
 class Connection(asyncio.Protocol):
     """One peer's connection. `serial` is unique within its router; a peer's own ZeroMQ identity is
     ignored.
     """
 
-    def __init__(self, router: "Router", serial: int, peer: Peer, user: User, now: float) -> None:
+    def __init__(self, router: Server, serial: int, peer: Peer, user: User, now: float) -> None:
         self.serial = serial
         self.peer = peer
         self.accepted_at = now

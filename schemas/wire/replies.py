@@ -140,7 +140,8 @@ class HistoryReply:
 
 @dataclass(frozen=True, slots=True)
 class OperatorReply:
-    """Answer to `evict`, `kill`, `pin`, `unpin` and `release_dead`; `lease` is None when it is over."""
+    """Answer to `evict`, `kill`, `pin`, `unpin` and `release_dead`; `lease` is None when it is
+    over."""
 
     state: str
     lease: LeaseView | None = None

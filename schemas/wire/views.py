@@ -11,7 +11,8 @@ from vram_arbiter.schemas.wire.codes import Block
 class BlockView:
     """Why nothing is granted on a GPU.
 
-    `names`: holders that have not reattached, or the consumer that loads; `more` are not named. `text`: the same in words; the engine leaves it empty.
+    `names`: holders that have not reattached, or the consumer that loads; `more` are not named.
+    `text`: the same in words; the engine leaves it empty.
     """
 
     code: Block

@@ -37,7 +37,8 @@ def need_trained(kind: str, source: str) -> None:
     from safetensors import safe_open
 
     with safe_open(Path(source) / WEIGHTS, "pt") as file:
-        if _FLAG in file.keys() and not file.get_tensor(_FLAG).item():  # noqa: SIM118  not a mapping
+        names = file.keys()  # it is not a mapping
+        if _FLAG in names and not file.get_tensor(_FLAG).item():
             raise ModelError(
                 f"{source}: the quantizer of its actions is not trained: `discretized` is false",
                 hint="train past n_vqvae_training_steps",

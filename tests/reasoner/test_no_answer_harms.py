@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from tests.support.core_driver import Consumer, CoreDriver
 from vram_arbiter.arbiter.core.effects import Push, Refuse
 from vram_arbiter.reasoner.cascade import Turn
-from vram_arbiter.reasoner.llm.base import Answer, Call, LlmPlanner
+from vram_arbiter.reasoner.llm.answer import Answer, Call
+from vram_arbiter.reasoner.llm.base import LlmPlanner
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.loop import Result, run_episode
 from vram_arbiter.reasoner.palette import OPERATOR, Palette, Skill

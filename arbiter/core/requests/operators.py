@@ -2,9 +2,9 @@
 up the lease of a dead one, change constants.
 
 Nothing here weakens the rules for holders: an evicted holder is *asked* and finishes what it does,
-and a lease that others use is never given up. Every action is a note with the operator and the reason; a pin
-and a drain are journaled, so they outlive the daemon. The role was checked where the request came
-in.
+and a lease that others use is never given up. Every action is a note with the operator and the
+reason; a pin and a drain are journaled, so they outlive the daemon. The role was checked where the
+request came in.
 """
 
 from collections.abc import Callable, Mapping

@@ -2,7 +2,8 @@
 
 1. begin: `begin_for_lease`, `on_process_died`, `begin_again` set its clock and read at once;
 2. polls: `on_poll_due` reads again, densely at first, and declares it overdue at its deadline;
-3. readings: `on_reading` takes the evidence of each and hands it to `judge`; one on target has to be confirmed by another;
+3. readings: `on_reading` takes the evidence of each and hands it to `judge`; one on target has to
+   be confirmed by another;
 4. verdict: it is noted; a resolved one frees the charge and tells what waits for it.
 
 The bytes stay charged until then. A failed reading means unknown: it frees nothing.

@@ -20,7 +20,12 @@ from vram_arbiter.clients.cli.doctor import (
     leftovers,
 )
 from vram_arbiter.clients.cli.doctor.findings import WRONG, Checks, Report, Severity, examine
-from vram_arbiter.clients.cli.doctor.machine import ask_nvml, this_installation, this_machine
+from vram_arbiter.clients.cli.doctor.machine import (
+    Machine,
+    ask_nvml,
+    this_installation,
+    this_machine,
+)
 from vram_arbiter.clients.cli.replies import NO, OK, UNREACHABLE
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
@@ -34,7 +39,7 @@ DESCRIPTIONS = {
     "one, 3 if the arbiter cannot be reached."
 }
 
-CHECKS: Final[Checks] = (
+CHECKS: Final[Checks[Machine]] = (
     ("installation", installation.origins, ""),
     ("driver", driver.driver, ""),
     ("devices", driver.devices, "the device nodes may be opened"),

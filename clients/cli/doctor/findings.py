@@ -3,10 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, ClassVar, Final
-
-if TYPE_CHECKING:
-    from vram_arbiter.clients.cli.doctor.machine import Machine
+from typing import ClassVar, Final
 
 
 class Severity(StrEnum):
@@ -49,9 +46,8 @@ class CouldNotLook(Exception):
     """A check cannot be done; the text says why."""
 
 
-type Check = Callable[["Machine"], Iterator[Finding]]
-type Checks = Sequence[tuple[str, Check, str]]
-"""(first part of the codes, check, what is said where it finds nothing)"""
+type Checks[M] = Sequence[tuple[str, Callable[[M], Iterator[Finding]], str]]
+"""(first part of the codes, check of a machine, what is said where it finds nothing)"""
 
 
 def ok(code: str, found: str) -> Finding:
@@ -70,7 +66,7 @@ def error(code: str, found: str, fix: str) -> Finding:
     return Finding(code, Severity.ERROR, found, fix)
 
 
-def examine(machine: "Machine", checks: Checks) -> tuple[Finding, ...]:
+def examine[M](machine: M, checks: Checks[M]) -> tuple[Finding, ...]:
     """Run the checks. One that cannot be done leaves a finding that says why, never nothing."""
     found: list[Finding] = []
     for name, check, sound in checks:

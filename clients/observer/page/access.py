@@ -23,7 +23,7 @@ HOW_TO_MAKE = "(umask 077; openssl rand -hex 32 > FILE)"
 
 
 @dataclass(frozen=True, slots=True)
-class Denied:
+class AccessDenied:
     """The answer to a request that may not be served."""
 
     status: int
@@ -70,11 +70,11 @@ class Access:
         self._cookie_name = f"vram_arbiter_{address.port}"
         self._cookie = "" if token is None else _mac(token, b"cookie of the status page").hex()
 
-    def check(self, headers: dict[bytes, bytes]) -> Denied | None:
+    def check(self, headers: dict[bytes, bytes]) -> AccessDenied | None:
         """Return why a request is refused; None: it may be served."""
         host = headers.get(b"host", b"").decode("ascii", errors="replace")
         if not self._known(host):
-            return Denied(
+            return AccessDenied(
                 421,
                 f"this page is not served as {host!r}; ask by address or localhost, or list the "
                 "name in http.hosts",
@@ -84,13 +84,13 @@ class Access:
             f"http://{host}".lower(),
             f"https://{host}".lower(),
         ):
-            return Denied(403, "requests of other origins are refused")
+            return AccessDenied(403, "requests of other origins are refused")
         site, mode = headers.get(b"sec-fetch-site"), headers.get(b"sec-fetch-mode")
         if site in (b"cross-site", b"same-site") and mode != b"navigate":
-            return Denied(403, "requests of other sites are refused")
+            return AccessDenied(403, "requests of other sites are refused")
         if self._token is None or self._proved(headers):
             return None
-        return Denied(
+        return AccessDenied(
             401, "a token is needed: `Authorization: Bearer TOKEN`, or open /?token=TOKEN once"
         )
 

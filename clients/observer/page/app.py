@@ -17,7 +17,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vram_arbiter.clients.observer.page.access import Access
-from vram_arbiter.clients.observer.page.feed import Feed
+from vram_arbiter.clients.observer.page.feed import PageFeed
 from vram_arbiter.clients.observer.page.server import Connections
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
@@ -64,13 +64,13 @@ class Metrics(Protocol):
 type History = Callable[[int, int, tuple[str, ...]], Awaitable[HistoryReply]]
 
 
-class Site:
+class StatusSite:
     """Answers requests; `app` is the ASGI application."""
 
     def __init__(
         self,
         access: Access,
-        feed: Feed,
+        feed: PageFeed,
         history: History,
         metrics: Metrics,
         connections: Connections,

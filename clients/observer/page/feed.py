@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from heapq import nsmallest
 from typing import Protocol
 
-from vram_arbiter.clients.observer.page.messages import Change, Waits
+from vram_arbiter.clients.observer.page.messages import Change, WaitsMessage
 from vram_arbiter.clients.observer.page.usage import UsageRecord
 from vram_arbiter.clients.observer.present import Look
 from vram_arbiter.schemas.codec import to_map
@@ -40,7 +40,7 @@ _RUNNING = ("since_s", "waited_s", "granted_s", "ttl_left_s")
 """Fields of a lease that change with time alone: the page counts on by itself."""
 
 
-class Arbiter(Protocol):
+class Source(Protocol):
     """The part of `AsyncClient` that a feed needs."""
 
     def why(self, consumer: str) -> Awaitable[WhyReply]: ...
@@ -50,10 +50,10 @@ class Arbiter(Protocol):
     ) -> Awaitable[HistoryReply]: ...
 
 
-class Reader:
+class PageReader:
     """An open page: events that it has not taken yet."""
 
-    def __init__(self, abort: Callable[[], None], left: Callable[["Reader"], None]) -> None:
+    def __init__(self, abort: Callable[[], None], left: Callable[["PageReader"], None]) -> None:
         self._abort = abort
         self._left = left
         self._unread: deque[bytes] = deque()
@@ -97,22 +97,22 @@ class _Difference:
     gone: tuple[str, ...]
 
 
-class Feed:
+class PageFeed:
     """`join` of pages; `happened` with new events, then `publish` with a status."""
 
-    def __init__(self, arbiter: Arbiter, record: UsageRecord, asked: Callable[[], None]) -> None:
+    def __init__(self, arbiter: Source, record: UsageRecord, asked: Callable[[], None]) -> None:
         """`asked`: called when a page waits for its snapshot."""
         self._arbiter = arbiter
         self._record = record
         self._asked = asked
-        self._readers: dict[Reader, None] = {}
+        self._readers: dict[PageReader, None] = {}
         self._events: deque[JsonMap] = deque(maxlen=EVENTS_MAX)  # since the last message
         # what the pages have
         self._rows: dict[str, JsonObject] = {}
         self._usage_number = 0
 
-    def join(self, abort: Callable[[], None]) -> Reader:
-        reader = Reader(abort, lambda gone: self._readers.pop(gone, None))
+    def join(self, abort: Callable[[], None]) -> PageReader:
+        reader = PageReader(abort, lambda gone: self._readers.pop(gone, None))
         self._readers[reader] = None
         self._asked()
         return reader
@@ -143,7 +143,7 @@ class Feed:
         events = list(self._events)
         self._events.clear()
         change = self._difference(look.status.leases)
-        waits = _event("waits", Waits(await self._waits(look.status)))
+        waits = _event("waits", WaitsMessage(await self._waits(look.status)))
         number, self._usage_number = self._usage_number, self._record.number
         if joining:  # what comes meanwhile it gets twice, and drops by its number
             snapshot = [*_pages(look.status), waits, *await self._past(look)]
@@ -191,7 +191,7 @@ class Feed:
         reply = await self._arbiter.history(max(0, last_seq - count), count, kinds)
         return replace(reply, events=reply.events[-EVENTS_MAX:])
 
-    def _tell(self, readers: Sequence[Reader], data: bytes) -> None:
+    def _tell(self, readers: Sequence[PageReader], data: bytes) -> None:
         for reader in readers:
             if reader in self._readers and not reader.send(data):
                 self._readers.pop(reader, None)

@@ -22,7 +22,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Waits:
+class WaitsMessage:
     """Why the first requests of the queues wait."""
 
     waits: tuple[Explanation, ...]

@@ -391,7 +391,7 @@ async def test_bytes_of_the_tree_are_its_own_also_when_a_parent_has_ended(
 ADOPTED = """
 import os, subprocess, sys
 
-begin = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', *sys.argv[1:]], close_fds=0)"
+begin = "import subprocess as s, sys; s.Popen([sys.executable, '-c', *sys.argv[1:]], close_fds=0)"
 ended, alive = os.pipe()
 subprocess.run([sys.executable, "-c", begin, *sys.argv[1:]], pass_fds=[alive])
 os.close(alive)

@@ -354,7 +354,8 @@ def test_a_policy_with_a_history_sees_consecutive_steps(
 def test_a_history_has_no_gap_while_the_next_chunk_is_on_its_way(
     tmp_path: Path, run_async: Run
 ) -> None:
-    """With `prefetch_at` rows play meanwhile; each is a control step that lerobot would have seen."""
+    """With `prefetch_at` rows play meanwhile; each is a control step that lerobot would have
+    seen."""
     text = MANIFEST.replace("steps: 7,", "steps: 7, prefetch_at: 2,")
 
     async def play(b: Bench) -> None:

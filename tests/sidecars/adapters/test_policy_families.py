@@ -496,8 +496,8 @@ def test_statistics_that_cannot_convert_are_refused(
 def test_an_action_that_never_moved_is_no_defect(
     checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
 ) -> None:
-    """A joint that stood still in all episodes has a standard deviation of 0, or equal bounds: it is
-    kept there. An observation of it would be divided by almost nothing."""
+    """A joint that stood still in all episodes has a standard deviation of 0, or equal bounds: it
+    is kept there. An observation of it would be divided by almost nothing."""
     import numpy as np
 
     folder = tmp_path / name

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from tests.support.core_driver import CoreDriver
-from vram_arbiter.clients.observer.page.feed import UNREAD_MAX_BYTES, Feed, Reader
+from vram_arbiter.clients.observer.page.feed import UNREAD_MAX_BYTES, PageFeed, PageReader
 from vram_arbiter.clients.observer.page.usage import UsageRecord
 from vram_arbiter.clients.observer.present import Look
 from vram_arbiter.schemas import strictjson
@@ -18,10 +18,10 @@ CHUNK = bytes(256 * 1024)
 
 def test_a_page_that_does_not_read_is_dropped() -> None:
     """What it has not taken is kept up to UNREAD_MAX_BYTES; then its connection ends."""
-    aborted, left = list[int](), list[Reader]()
+    aborted, left = list[int](), list[PageReader]()
 
     async def drop() -> list[bytes]:
-        reader = Reader(lambda: aborted.append(1), left.append)
+        reader = PageReader(lambda: aborted.append(1), left.append)
         sent = 0
         while reader.send(CHUNK):
             sent += len(CHUNK)
@@ -55,7 +55,7 @@ def test_pages_are_told_what_changed_and_no_more(driver: CoreDriver) -> None:
 
     async def story() -> list[Any]:
         asked: list[int] = []
-        feed = Feed(Arbiter(driver), UsageRecord(), lambda: asked.append(1))
+        feed = PageFeed(Arbiter(driver), UsageRecord(), lambda: asked.append(1))
         det = driver.consumer("det")
         lease = det.acquire(5 * GIB)
         det.load(lease)
