@@ -388,6 +388,7 @@ def test_lerobot_eval_plays_a_checkpoint_in_an_environment_of_lerobot(
     monkeypatch.setenv("VRAM_ARBITER_CONFIGS", str(tmp_path / "configs"))
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # lerobot leaves a file there
     argv = [
         *("benchmark", "--env", "point", "--skill", "vram-arbiter/so101-grab", "--no-arbiter"),
         *("--skills", str(manifest), "--episodes", "2", "--out", str(tmp_path / "out"), "--"),
