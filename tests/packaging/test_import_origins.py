@@ -158,7 +158,12 @@ print(json.dumps([
 @pytest.mark.parametrize(
     ("program", "arguments", "code"),
     [
-        ("runner", ["deploy", "--config", "so101-twin", "--dry-run"], 0),
+        pytest.param(
+            "runner",
+            ["deploy", "--config", "so101-twin", "--dry-run"],
+            0,
+            marks=pytest.mark.heavy,
+        ),
         ("sidecars", ["--rskill", "owlv2-base", "--name", "eye", "--device", "none", "--check"], 2),
     ],
 )

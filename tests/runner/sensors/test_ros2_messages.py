@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vram_arbiter.runner.sensors.ros2_dds import parse, written
-from vram_arbiter.runner.sensors.ros2_messages import (
+pytestmark = pytest.mark.heavy
+pytest.importorskip("cyclonedds")
+
+from vram_arbiter.runner.sensors.ros2_dds import parse, written  # noqa: E402
+from vram_arbiter.runner.sensors.ros2_messages import (  # noqa: E402
     Header,
     ImageContent,
     RosCompressedImage,
@@ -19,7 +22,7 @@ from vram_arbiter.runner.sensors.ros2_messages import (
     message_of,
     picture_of,
 )
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.schemas.world import FrameEncoding, SensorFrame  # noqa: E402
 
 stamps = st.integers(0, (2**31 - 1) * 10**9)
 names = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
