@@ -72,10 +72,10 @@ async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, p
     try:
         await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
     finally:
+        inner_writer.close()  # first: a cancellation may come while the copies end
         for copy in copies:
             copy.cancel()
         await asyncio.gather(*copies, return_exceptions=True)
-        inner_writer.close()
 
 
 async def _copy(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
