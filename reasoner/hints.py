@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.net.link import somebody_listens
+from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.runtime.endpoints import sidecar_name
 
@@ -24,7 +24,7 @@ class Hints:
 
     async def follows(self, rskill_id: str) -> None:
         """Tell the arbiter that the model of `rskill_id` is wanted soon. Raises nothing."""
-        if not somebody_listens(self._endpoint):
+        if not is_listening(self._endpoint):
             log.debug("no arbiter to be told that %s follows", rskill_id)
             return
         name = sidecar_name(rskill_id)

@@ -183,7 +183,7 @@ class TaskQueue:
         log.info("task %d: %s: %s", task.number, state, result["reason"])
         over = [task for task in self.tasks if task.ended_at is not None]
         if len(over) > HISTORY_MAX:
-            self.tasks.remove(over[0])
+            self.tasks.remove(min(over, key=lambda one: one.ended_at or ""))
         self._ended(task)
 
 

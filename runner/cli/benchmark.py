@@ -132,6 +132,11 @@ async def run(args: argparse.Namespace) -> int:
         from vram_arbiter.runner.cli.lerobot_eval import evaluate
 
         return await evaluate(args)
+    if args.lerobot_flags:
+        raise ConfigError(
+            f"unexpected {' '.join(args.lerobot_flags)}",
+            hint="words after -- are for lerobot-eval: name an environment of lerobot by --env",
+        )
     async with contextlib.AsyncExitStack() as stack:
         arbiter = None
         if args.skill and not args.no_arbiter:
@@ -227,9 +232,7 @@ def entries_of(args: argparse.Namespace, arbiter: Any) -> list[Entry]:
     from vram_arbiter.runner.skills.sidecar_policy import HUNG_WAITING_MIN_S
 
     if not args.skill and not args.policy:
-        raise ConfigError(
-            "there are no contestants", hint="--skill RSKILL or --policy random, any number of them"
-        )
+        raise ConfigError("expected --skill RSKILL or --policy NAME", hint="any number of them")
     if args.task is not None and args.task not in TASKS:
         raise ConfigError(f"unknown --task {args.task}", hint=" or ".join(TASKS))
     given_task = TASKS[args.task] if args.task is not None else None

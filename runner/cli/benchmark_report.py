@@ -63,7 +63,7 @@ def _row(row: CellSummary) -> tuple[str, ...]:
     return (
         row["world"] + task,
         row["contestant"],
-        "not judged" if rate is None else f"{row['successes']}/{row['judged']} = {rate:.0%}",
+        "no verdict" if rate is None else f"{row['successes']}/{row['judged']} = {rate:.0%}",
         "" if interval is None else f"{interval[0]:.0%} to {interval[1]:.0%}",
         "" if row["mean_steps"] is None else f"{row['mean_steps']:.1f}",
         f"{row['errors']}" + ("" if row["complete"] else f"; not complete: {row['why']}"),

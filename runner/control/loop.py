@@ -132,7 +132,7 @@ class ControlLoop[R: Robot]:
             self.deadline_misses = self.late_actions_withheld = 0
         first = self.tick_idx
         with self.paced() as wait:
-            while not self._finished() and (max_ticks is None or self.tick_idx - first < max_ticks):
+            while not self.stopping and (max_ticks is None or self.tick_idx - first < max_ticks):
                 self.tick()
                 wait()
         return self.result()
@@ -153,9 +153,6 @@ class ControlLoop[R: Robot]:
     @property
     def stopping(self) -> bool:
         return self._stopping.is_set()
-
-    def _finished(self) -> bool:
-        return self.stopping or self.robot.finished
 
     # -- emergency stop
     @property

@@ -79,11 +79,6 @@ class Robot(Protocol):
         """Free everything. Repeatable."""
         ...
 
-    @property
-    def finished(self) -> bool:
-        """Whether the run is over by itself."""
-        ...
-
     # -- one tick
     @property
     def reset_due(self) -> bool:

@@ -125,10 +125,10 @@ def _episode(episodes: list[ParquetRow], frame: int, wanted: int | None) -> Parq
             raise BadRequest(f"episode {wanted} has no frame {frame}", hint=hint)
     if wanted is not None:
         hint = f"there are {len(episodes)}, from 0 on"
-        raise BadRequest(f"there is no episode {wanted}", hint=hint)
+        raise BadRequest(f"unknown episode {wanted}", hint=hint)
     last = max((about["dataset_to_index"] for about in episodes), default=0) - 1
     hint = f"0 to {last}" if last >= 0 else "nothing is recorded yet"
-    raise BadRequest(f"there is no frame {frame}", hint=hint)
+    raise BadRequest(f"unknown frame {frame}", hint=hint)
 
 
 def _recorded(root: Path, info: dict[str, Any], about: ParquetRow, row: ParquetRow) -> Recorded:

@@ -46,6 +46,7 @@ QUEUE_BYTES = 96 << 20
 PATIENCE_S = 10.0  # without a rate nothing is late: the loop may wait so long for room
 START_S = 180.0  # the writer imports torch; a minute on a busy machine
 CLOSE_S = 120.0
+LOOK_S = 1.0  # between two looks at a writer that has nothing to do
 ANSWER_S = 60.0  # of a writer that may be closing an episode's files
 REASONS_KEPT = 8
 PACKAGES = ("lerobot", "datasets", "pyarrow", "pandas", "av")
@@ -63,6 +64,12 @@ class Marked(TypedDict):
 
 
 @dataclass(frozen=True, slots=True)
+class _Tick:
+    tick: GoalTick
+    size: int  # bytes of its pictures
+
+
+@dataclass(frozen=True, slots=True)
 class _End:
     goal: Goal
     ended: SkillEnded | None
@@ -71,10 +78,36 @@ class _End:
 
 @dataclass(frozen=True, slots=True)
 class _Ask:
-    """A message whose answer somebody waits for."""
+    """A message to the writer, and the future of its answer."""
 
     message: tuple[Any, ...]
     answer: Future[JsonObject] = field(default_factory=Future)
+
+
+class _Room:
+    """Room of the queue for ticks; an empty one takes any."""
+
+    def __init__(self) -> None:
+        self._ticks = self._bytes = 0
+        self._changed = threading.Condition()
+
+    def take(self, size: int, wait_s: float) -> bool:
+        """Take a place, waiting for one as long as that. Return whether there was one."""
+
+        def free() -> bool:
+            fits = self._ticks < QUEUE_TICKS and self._bytes + size <= QUEUE_BYTES
+            return fits or not self._ticks
+
+        with self._changed:
+            if not self._changed.wait_for(free, wait_s):
+                return False
+            self._ticks, self._bytes = self._ticks + 1, self._bytes + size
+        return True
+
+    def give(self, size: int) -> None:
+        with self._changed:
+            self._ticks, self._bytes = self._ticks - 1, self._bytes - size
+            self._changed.notify()
 
 
 class DatasetRecorder:
@@ -82,8 +115,9 @@ class DatasetRecorder:
 
     Everything else may be read at any time. `lerobot` records by lerobot's names and units, with
     its columns only. `patient` waits for room instead of dropping; only where no tick has a
-    deadline. `on_lost` is called, on any thread, when nothing more can be recorded, after the goal
-    that runs.
+    deadline. `strict` is for what is played for the recording alone: a goal that cannot be recorded
+    is a loss. `on_lost` is called, on any thread, when nothing more can be recorded, after the goal
+    that runs; after a loss of a strict recording at once.
     """
 
     def __init__(
@@ -95,6 +129,7 @@ class DatasetRecorder:
         robot: str,
         lerobot: LerobotUnits | None = None,
         patient: bool = False,
+        strict: bool = False,
         on_lost: Callable[[], None] = lambda: None,
     ) -> None:
         self.root = root.absolute()
@@ -106,9 +141,10 @@ class DatasetRecorder:
         self._robot = robot if lerobot is None else lerobot.robot_type
         self._lerobot = lerobot
         self._wait_s = PATIENCE_S if patient else 0.0
+        self._strict = strict
         self._on_lost = on_lost
-        self._queue: queue.SimpleQueue[GoalTick | _End | _Ask | None] = queue.SimpleQueue()
-        self._room: threading.Semaphore | None = None  # ticks that the queue still takes
+        self._queue: queue.SimpleQueue[_Tick | _End | _Ask | None] = queue.SimpleQueue()
+        self._room = _Room()
         self._changing = threading.Lock()  # guards `lost`, `_closing` and `_goal_runs`
         self._goal_runs = False
         self._closing = False
@@ -152,8 +188,9 @@ class DatasetRecorder:
                 raise InternalError(f"the dataset's writer did not come up within {START_S:.0f} s")
             self._ready(self._answered())
         except (VramError, OSError, EOFError) as error:
+            aborted = self._aborted
             self.abort()
-            if self._aborted and not isinstance(error, VramError):
+            if aborted and not isinstance(error, VramError):
                 raise Cancelled("the recording was to end before it had begun") from error
             raise self._typed(error) from error
         self._feeding.start()
@@ -236,15 +273,11 @@ class DatasetRecorder:
     def tick(self, tick: GoalTick) -> None:
         """See `runner.protocols.TickSink`."""
         self._goal_runs = True
-        if self._room is None:
-            frames = (tick.world.image_frames or {}).values()
-            size = sum(len(frame.data or b"") for frame in frames)
-            self._room = threading.Semaphore(max(1, min(QUEUE_TICKS, QUEUE_BYTES // max(1, size))))
         if self._closing or self.lost is not None:
             return
-        wait_s = self._wait_s
-        if self._room.acquire(blocking=wait_s > 0, timeout=wait_s or None):
-            self._queue.put(tick)
+        size = sum(len(frame.data or b"") for frame in (tick.world.image_frames or {}).values())
+        if self._room.take(size, self._wait_s):
+            self._queue.put(_Tick(tick, size))
             return
         self.counts.dropped += 1
         self._dropped_now += 1
@@ -268,15 +301,15 @@ class DatasetRecorder:
     # -- the queue's other end
     def _feed(self) -> None:
         reasons: Counter[str] = Counter()  # of this goal's ticks that are no rows
-        while (item := self._queue.get()) is not None:
+        while (item := self._next()) is not None:
             try:
                 match item:
-                    case GoalTick():
-                        self._feed_tick(item, reasons)
+                    case _Tick():
+                        self._feed_tick(item.tick, reasons)
                     case _End():
-                        self._writer.send(("end", self._note(item, reasons)))
+                        note, reasons = self._note(item, reasons), Counter()
+                        self._writer.send(("end", note))
                         self._conclude(item.goal.goal_id, self._answered())
-                        reasons = Counter()
                     case _Ask():
                         self._writer.send(item.message)
                         item.answer.set_result(self._answered())
@@ -285,6 +318,8 @@ class DatasetRecorder:
                     item.answer.set_exception(error)
                 else:
                     self.counts.lose(error)
+                    if self._strict:
+                        self._on_lost()
             except (OSError, EOFError) as error:
                 if isinstance(item, _Ask):
                     item.answer.set_exception(self._typed(error))
@@ -292,6 +327,20 @@ class DatasetRecorder:
         with contextlib.suppress(OSError):  # it is gone already
             self._writer.send(("close",))
         self._writer.close()
+
+    def _next(self) -> _Tick | _End | _Ask | None:
+        """Return what is to be done next; None: the recording is over. Also without work a writer that
+        dies is noticed."""
+        while True:
+            try:
+                item = self._queue.get(timeout=LOOK_S)
+            except queue.Empty:
+                if self._process.poll() is not None:
+                    self._lose(self._typed(EOFError()))
+                continue
+            if isinstance(item, _Tick):
+                self._room.give(item.size)
+            return item
 
     def _answered(self) -> JsonObject:
         """Return the writer's answer. Raises what it says, EOFError when it is gone."""
@@ -311,9 +360,6 @@ class DatasetRecorder:
                 self.counts.incomplete[str(error)] += 1
         else:
             self._writer.send(("row", row))
-        finally:
-            if self._room is not None:
-                self._room.release()
 
     @staticmethod
     def _note(end: _End, reasons: Counter[str]) -> commit.EpisodeNote:

@@ -77,6 +77,7 @@ class EpisodeWriter:
             self._add(row)
         except Exception as error:
             log.exception("goal %s is not recorded", row.goal_id)
+            self._left_none = True
             self._failure = (
                 error
                 if isinstance(error, VramError)
@@ -104,7 +105,7 @@ class EpisodeWriter:
         """
         goal, last, failure = self._goal, self._last, self._failure
         self._goal = self._last = self._failure = None
-        self._left_none = self._left_none or goal is not None or failure is not None
+        self._left_none = True  # until the goal has become an episode
         try:
             if failure is not None:
                 raise failure
@@ -178,7 +179,8 @@ class EpisodeWriter:
 
 
 def serve(peer: Connection) -> int:
-    """Write until the runner ends or disappears. Returns 0 if everything that came is finished."""
+    """Write until the runner ends or disappears. Returns 0 if everything that came is finished, 1 if
+    not, 2 if it cannot begin."""
     said = peer.recv()
     root = Path(said["root"])
     with contextlib.ExitStack() as stack:
@@ -205,7 +207,10 @@ def serve(peer: Connection) -> int:
                 writer.row(*given)
             else:
                 _answer(peer, _handled(getattr(writer, kind), given))
-        _handled(writer.end, [{"status": status}])
+        said = _handled(writer.end, [{"status": status}])
+        if "error" in said:
+            log.error("the last episode is not recorded: %s", said["error"]["message"])
+            return 1
     return 0
 
 

@@ -64,7 +64,6 @@ class HardwareRobot:
     read together.
     """
 
-    finished = False
     reset_due = False
 
     def __init__(

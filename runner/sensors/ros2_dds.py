@@ -77,8 +77,8 @@ def parse[M](message: type[M], cdr: bytes) -> M:
         raise ValueError("the message is in an encoding other than plain CDR")
     try:
         read: M = message.__idl__.deserialize(cdr)  # type: ignore[attr-defined]
-    except Exception as error:  # Cyclone has no error of its own for a message that is none
-        raise ValueError(f"the message ends too early, or is none: {error}") from error
+    except Exception as error:  # whatever Cyclone's parser hits
+        raise ValueError(f"the message cannot be read: {error}") from error
     return read
 
 

@@ -158,7 +158,7 @@ class RosImageReader(SlotReader):
 
     # -- on the camera's thread
     def _dds_failed(self, feed: Feed, problem: str) -> None:
-        feed.end(f"DDS failed: {problem}")
+        feed.end(f"its reader failed: {problem}")
 
     def _attend(self, feed: Feed, reader: Any) -> None:
         """Handle what has come since the last time: changes of publishers, then pictures."""

@@ -68,8 +68,11 @@ class RosImage(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):  # type: igno
     data: bytes
 
 
+_COMPRESSED = "sensor_msgs.msg.dds_.CompressedImage_"
+
+
 @dataclass
-class RosCompressedImage(IdlStruct, typename="sensor_msgs.msg.dds_.CompressedImage_"):  # type: ignore[call-arg, misc]
+class RosCompressedImage(IdlStruct, typename=_COMPRESSED):  # type: ignore[call-arg, misc]
     header: Header
     format: str
     data: bytes

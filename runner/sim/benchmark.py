@@ -107,6 +107,7 @@ class Cell:
     def summary(self) -> CellSummary:
         """Sums, as they go into the report."""
         ran = [played for played in self.episodes if played.success is not None]
+        stepped = [played for played in ran if played.steps]  # lerobot-eval does not tell them
         successes = sum(played.success is True for played in ran)
         return {
             "world": self.world,
@@ -121,8 +122,10 @@ class Cell:
             "errors": len(self.episodes) - len(ran),
             "success_rate": successes / len(ran) if ran else None,
             "interval_95": wilson(successes, len(ran)),
-            "mean_steps": fmean(one.steps for one in ran) if ran else None,
-            "mean_standing_steps": fmean(one.standing_steps for one in ran) if ran else None,
+            "mean_steps": fmean(one.steps for one in stepped) if stepped else None,
+            "mean_standing_steps": fmean(one.standing_steps for one in stepped)
+            if stepped
+            else None,
         }
 
 

@@ -54,8 +54,6 @@ class SimRobot:
     itself was not done).
     """
 
-    finished = False
-
     def __init__(
         self,
         env: ArmEnvironment,

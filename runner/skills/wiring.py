@@ -195,12 +195,12 @@ def _model(
         return None, []
     path = ("action_contract",) if solving else ("state_contract",)
     try:
+        importlib.import_module("scipy.spatial.transform")  # no tick has the time for it
         if solving:
             importlib.import_module("mink")
         return ArmModel(robot), []
-    except ImportError:
-        return None, [
-            Problem(path, "cartesian commands need mink: pip install 'vram-arbiter[runner]'")
-        ]
+    except ImportError as error:
+        what = f"frames need mink and SciPy ({error}): pip install 'vram-arbiter[runner]'"
+        return None, [Problem(path, what)]
     except ConfigError as error:
         return None, [Problem(path, error.message)]

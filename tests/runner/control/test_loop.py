@@ -40,7 +40,7 @@ class Desk:
     world: Any = WorldState(
         stamp_ns=0, joint_state=JointState(stamp_ns=0, name=("a",), position=(0.0,))
     )
-    finished = reset_due = False
+    reset_due = False
 
     def __init__(self, clock: Any, apply_s: float) -> None:
         self.clock, self.apply_s = clock, apply_s

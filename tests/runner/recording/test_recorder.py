@@ -357,9 +357,9 @@ def test_a_state_or_an_action_of_one_number_is_replayed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("frame", "episode", "said"),
     [
-        (15, None, "there is no frame 15 .0 to 14"),
+        (15, None, "unknown frame 15 .0 to 14"),
         (4, 1, "episode 1 has no frame 4 .0 to 3"),
-        (0, 4, "there is no episode 4 .there are 4"),
+        (0, 4, "unknown episode 4 .there are 4"),
     ],
 )
 def test_a_frame_that_is_not_there_is_said(
