@@ -12,12 +12,12 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from statistics import median_low
+from itertools import accumulate, pairwise
 
 from vram_arbiter.clients.calibration.gpu import Gpu
 from vram_arbiter.clients.foreign.program import adopt_orphans, is_below
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import CalibrationFailed, VramError
+from vram_arbiter.schemas.errors import CalibrationFailed, ProbeFailed, VramError
 from vram_arbiter.schemas.sizes import format_bytes
 
 CONTEXT = (sys.executable, "-m", "vram_arbiter.clients.calibration.context")
@@ -27,7 +27,8 @@ LAST_PART = 0.25
 """Share of a program's time on the GPU, at its end, in which it is taken to do its work."""
 
 type Series = Sequence[tuple[float, int]]
-"""(monotonic time of the reading's end, bytes of the program)"""
+"""(monotonic time of the reading's end, bytes of the program); of equal ones in a row the first and
+the last"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ class Record:
     context_bytes: int = 0
     baseline_bytes: int = 0
     series: list[tuple[float, int]] = field(default_factory=list)
+    _readings: int = 0
     _error: VramError | None = None
     _over: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
@@ -99,6 +101,7 @@ class Record:
             await process.wait()
         await self._gone()
         self.series[:] = self.series[-1:]
+        self._readings = 0
 
     async def end(self) -> None:
         """Wait until the program's bytes are at rest after its end. Raises CalibrationFailed."""
@@ -117,7 +120,7 @@ class Record:
     def readings_hz(self) -> float:
         """Readings per second, as they were really made."""
         span_s = self.series[-1][0] - self.series[0][0]
-        return (len(self.series) - 1) / span_s if span_s > 0 else 0.0
+        return self._readings / span_s if span_s > 0 else 0.0
 
     def _run(self) -> None:
         while not self._over.wait(1 / self.rate_hz):
@@ -126,12 +129,18 @@ class Record:
             except VramError as error:
                 self._error = error
                 return
-            self.series.append((time.monotonic(), count))
+            add(self.series, time.monotonic(), count)
+            self._readings += 1
 
     def _own(self) -> int:
         reading = self.gpu.read()
         if not self.listed:
             return max(0, reading.used_bytes - self.baseline_bytes)
+        if reading.processes is None and self.context_bytes:
+            raise ProbeFailed(
+                "the driver stopped to list processes in the middle of the measurement",
+                hint="see nvidia-smi and dmesg",
+            )
         own = (reading.processes or {}).items()
         return sum(count for pid, count in own if is_below(pid, os.getpid()))
 
@@ -165,6 +174,14 @@ class Record:
             )
 
 
+def add(series: list[tuple[float, int]], at_s: float, count: int) -> None:
+    """Add a reading: a program may run for days, and most of them are equal."""
+    if len(series) > 1 and series[-2][1] == series[-1][1] == count:
+        series[-1] = (at_s, count)
+    else:
+        series.append((at_s, count))
+
+
 def of_life(series: Series, context: int, after_exit: int) -> Figures | None:
     """Return the figures of a program that ran from its start to its end; None: no bytes were seen.
 
@@ -175,9 +192,22 @@ def of_life(series: Series, context: int, after_exit: int) -> Figures | None:
     if not shown:
         return None
     (from_s, _), (to_s, _) = shown[0], shown[-1]
-    late = [count for at_s, count in shown if at_s >= to_s - (to_s - from_s) * LAST_PART]
+    begin_s = to_s - (to_s - from_s) * LAST_PART
+    late = {shown[-1][1]: 0.0}  # seconds by bytes
+    for (at_s, count), (next_s, _) in pairwise(series):
+        if count > REST_BYTES and begin_s < next_s <= to_s:
+            late[count] = late.get(count, 0.0) + next_s - max(at_s, begin_s)
     peak = max(count for _, count in shown)
-    return Figures(context, peak, median_low(late), max(late), None, after_exit)
+    return Figures(context, peak, _median(late), max(late), None, after_exit)
+
+
+def _median(seconds: Mapping[int, float]) -> int:
+    """Return the bytes that were not exceeded for half of the time."""
+    ordered = sorted(seconds)
+    sums = list(accumulate(seconds[count] for count in ordered))
+    return next(
+        count for count, so_far in zip(ordered, sums, strict=True) if so_far >= sums[-1] / 2
+    )
 
 
 def of_marks(

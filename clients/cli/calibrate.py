@@ -29,7 +29,7 @@ from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.foreign.run_spec import RunSpec
 from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
-from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError
+from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, from_wire
 from vram_arbiter.schemas.manifest import ManifestError, load_manifest
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
@@ -125,7 +125,8 @@ def run(args: argparse.Namespace) -> int:
         return int(code)
     figures = None if code else record.figures(told)
     if figures is None:
-        how = f"exit code {code}" if code < 128 else signal.Signals(code - 128).name
+        ended_by = {128 + one: one.name for one in signal.Signals}
+        how = ended_by.get(code, f"exit code {code}")
         raise CalibrationFailed(
             f"{key} ended with {how}" if code else f"no bytes of {key} were seen on {gpu.name}",
             hint="let it run to its end, or use --seconds"
@@ -220,9 +221,12 @@ async def _measure(args: argparse.Namespace, record: Record, command: list[str],
 
 
 def _room(gpu: Gpu, endpoint: str | None) -> int:
-    """Return the bytes that a lease alone on the GPU can have now. Raises ConfigError,
-    ArbiterUnreachable."""
-    for view in ask("status", {}, endpoint).get("gpus", ()):
+    """Return the bytes that a lease alone on the GPU can have now. Raises ConfigError, and what the
+    arbiter answers."""
+    reply = ask("status", {}, endpoint)
+    if not reply.get("ok"):
+        raise from_wire(reply["error"])
+    for view in reply["gpus"]:
         if view["gpu"] == gpu.uuid:
             kept = sum(process["residue_bytes"] or 0 for process in view["processes"])
             taken = view["reserve_bytes"] + view["stowaway_bytes"] + kept
