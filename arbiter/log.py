@@ -15,20 +15,17 @@ from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.logging import Form, PrintableFormatter, set_up
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.units import format_bytes
+from vram_arbiter.schemas.wire.notes import WARNING_KINDS
 
 events_log = logging.getLogger("arbiter.events")
 refusals_log = logging.getLogger("arbiter.refusals")
 
-_WARNINGS = (
-    "probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed",
-    "journal_put_aside", "record_stopped", "config_refused",
-)  # fmt: skip
 _DETAILS = (
     "use_began", "use_ended", "reminded", "revoke_acked", "probe_ok",
     "refused",  # `RefusalLog` says it, with the client's name and user
 )  # fmt: skip
 _LEVELS = {
-    **dict.fromkeys(_WARNINGS, logging.WARNING),
+    **dict.fromkeys(WARNING_KINDS, logging.WARNING),
     **dict.fromkeys(_DETAILS, logging.DEBUG),
 }
 LINES_MAX = 10_000

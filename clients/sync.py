@@ -12,6 +12,7 @@ and revocations are answered whatever the program does. Any thread may call. A c
 survive a fork. Every class has the methods of its async twin; a test compares them.
 """
 
+import asyncio
 import os
 import warnings
 import weakref
@@ -19,7 +20,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequen
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-from threading import Thread, current_thread, main_thread
+from threading import Thread, main_thread
 from types import TracebackType
 from typing import Any, Concatenate, Self
 
@@ -101,10 +102,12 @@ class _Portal:
         )
         if not main_thread().is_alive():
             return  # the program ends, and its leases with it: no handler could run any more
-        if current_thread() is self._thread:  # which must not wait for itself
-            Thread(target=self.leave, args=(connection,)).start()
-        else:
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
             self.leave(connection)
+        else:  # a thread with a loop must not wait: it may be this client's, or another one's
+            Thread(target=self.leave, args=(connection,)).start()
 
     def call[T](self, work: Callable[..., Awaitable[T]], *arguments: Any, **named: Any) -> T:
         """Run `work` in the background thread and wait for it. Ctrl-C cancels it there too."""

@@ -113,9 +113,16 @@ def read_config(path: Path | None, http: str | None) -> ObserverConfig:
 
 
 def _check_hooks(hooks: Sequence[Hook], path: Path) -> None:
+    from httpx import URL, InvalidURL
+
     from vram_arbiter.clients.observer.hooks.actions import read_headers
 
     for hook in hooks:
+        if hook.webhook is not None:
+            try:
+                URL(hook.webhook)
+            except InvalidURL as error:
+                raise ConfigError(f"{path}: {hook.name}: {error}", hint="see `webhook`") from error
         if hook.command is not None:
             _check_program(hook.command[0], f"{path}: {hook.name}")
         if hook.headers_file is not None:
@@ -189,8 +196,8 @@ def _run(args: argparse.Namespace) -> int:
             f"the observer's packages are not installed: {error}",
             hint="pip install 'vram-arbiter[observer]'",
         ) from error
-    for noisy in ("uvicorn", "httpx"):
-        logging.getLogger(noisy).setLevel(logging.WARNING)
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+    logging.getLogger("uvicorn").setLevel(logging.ERROR)  # it warns of every malformed request
     options = Options(config, endpoint, args.state or state_path(os.environ), args.ends_with)
 
     async def observe() -> None:

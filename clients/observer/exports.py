@@ -20,6 +20,7 @@ from vram_arbiter.clients.observer.present import Look, Present
 from vram_arbiter.clients.observer.spans import NotedIds, Spans, context_of
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.telemetry import exported, names, setup
+from vram_arbiter.schemas.wire.notes import WARNING_KINDS
 
 log = logging.getLogger(__name__)
 
@@ -29,12 +30,6 @@ EVENTS = "vram_arbiter"
 """Namespace of the events; the last part is the kind in the history."""
 FRESH_S = 1.0
 """A reader of /metrics gets a status that is no older."""
-_WARNINGS = frozenset(
-    (
-        *("probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed"),
-        *("journal_put_aside", "record_stopped", "config_refused"),
-    )
-)
 _LABELS = {
     "consumer": names.ATTR_CONSUMER,
     "lease_id": names.ATTR_LEASE,
@@ -91,9 +86,9 @@ class Scrapes:
 def record_of(event: JsonMap) -> LogRecord:
     """Return an event as a log record, with the span that it belongs to."""
     labels = {label: str(event[key]) for key, label in _LABELS.items() if key in event}
-    who = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
-    words = " ".join((event["kind"], who, str(event.get("reason") or "")))
-    warns = event["kind"] in _WARNINGS
+    subject = " ".join(str(event[key]) for key in ("consumer", "lease_id") if event.get(key))
+    words = " ".join((event["kind"], subject, str(event.get("reason") or "")))
+    warns = event["kind"] in WARNING_KINDS
     return LogRecord(
         timestamp=int(event["at_wall_s"] * 1e9),
         observed_timestamp=time.time_ns(),

@@ -23,7 +23,7 @@ from vram_arbiter.clients.observer.page.access import Access, read_token
 from vram_arbiter.clients.observer.page.app import StatusSite
 from vram_arbiter.clients.observer.page.feed import PageFeed
 from vram_arbiter.clients.observer.page.usage import UsageRecord
-from vram_arbiter.clients.observer.present import Look, Present
+from vram_arbiter.clients.observer.present import ASK_S, Look, Present
 from vram_arbiter.schemas.config.observer import HttpConfig, ObserverConfig
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.runtime.systemd import Notifier
@@ -93,7 +93,10 @@ class Observer:
                 task.cancel()
             ended = await asyncio.gather(*tasks, return_exceptions=True)
             if self._state is not None:
-                self._state.save(self._saved())
+                try:
+                    self._state.save(self._saved())
+                except OSError as fault:
+                    log.error("what was delivered cannot be saved: %s", fault)
             self._exports.close()
         for error in ended:
             if isinstance(error, Exception):
@@ -115,7 +118,7 @@ class Observer:
         access = Access(address, self._config.http.hosts, token)
         scrapes = Scrapes(self._exports, self._present)
         history = self._client.history
-        site = StatusSite(access, self._feed, history, scrapes, connections, self._reached)
+        site = StatusSite(access, self._feed, history, scrapes.text, connections, self._reached)
         log.info("status page: http://%s", address)
         await server.serve(site.app, listening, connections)
 
@@ -167,8 +170,11 @@ class Observer:
             touched, self._touched = self._touched, set()
             look = await self._present.look(touched=touched)
             if look is not None:
-                with contextlib.suppress(VramError, TimeoutError):
-                    await self._feed.publish(look)
+                try:
+                    async with asyncio.timeout(ASK_S):
+                        await self._feed.publish(look)
+                except (VramError, TimeoutError):
+                    self._feed.lost()  # pages that missed something begin anew
             read = self._feed.read
             gap_s = max(GAP_S if read else QUIET_GAP_S, LOAD * (look.took_s if look else 0.0))
             await asyncio.sleep(gap_s)

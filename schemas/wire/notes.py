@@ -453,6 +453,14 @@ type AnyNote = (
 NOTES: Final[Mapping[str, type]] = {cls.TAG[1]: cls for cls in get_args(AnyNote.__value__)}
 """Every note of the engine by its kind."""
 
+WARNING_KINDS: Final = frozenset(
+    (
+        *("probe_failed", "pressure", "stowaway", "oom", "lost", "expired", "deadline_passed"),
+        *("journal_put_aside", "record_stopped", "config_refused"),
+    )
+)
+"""Kinds of events that logs show as warnings."""
+
 DAEMON_KINDS: Final = (
     "started",
     "stopped",

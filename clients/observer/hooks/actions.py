@@ -1,7 +1,7 @@
 """What a rule starts: a command (`command`), or a POST that is repeated where that helps.
 
-Redirects and proxies of the environment are not followed,
-so a token reaches the named host and no other.
+Redirects and proxies of the environment are not followed, so a token reaches the named host and no
+other. Of an answer the beginning is read, and the time limit is that of the whole exchange.
 """
 
 import asyncio
@@ -62,26 +62,30 @@ async def run(
 async def post(
     hook: Hook,
     delivery: Delivery,
-    transport: httpx.AsyncBaseTransport | None = None,
     sleep: Sleep = asyncio.sleep,
 ) -> None:
     """Send one event until it is taken. Raises ActionFailed."""
     host, problem = _host(hook), ""
-    async with httpx.AsyncClient(
-        transport=transport, trust_env=False, timeout=hook.timeout_s
-    ) as client:
+    async with httpx.AsyncClient(trust_env=False, timeout=hook.timeout_s) as client:
         for attempt in range(1, hook.attempts + 1):
             wait_s = 0.0
             try:
                 headers = _headers(hook, delivery)
-                reply = await client.post(str(hook.webhook), content=delivery.body, headers=headers)
-                if reply.is_success:
-                    return
-                problem = f"answered {reply.status_code}: {printable(reply.text)[:SHOWN_MAX_CHARS]}"
+                async with (
+                    asyncio.timeout(hook.timeout_s),
+                    client.stream(
+                        "POST", str(hook.webhook), content=delivery.body, headers=headers
+                    ) as reply,
+                ):
+                    if reply.is_success:
+                        return
+                    began = await anext(reply.aiter_bytes(SHOWN_MAX_CHARS), b"")
+                said = printable(began.decode(errors="replace"))
+                problem = f"answered {reply.status_code}: {said}"
                 if reply.status_code < 500 and reply.status_code not in AGAIN:
                     raise ActionFailed(f"{host} {problem}")
                 wait_s = retry_after_s(reply.headers.get("retry-after", ""))
-            except (httpx.HTTPError, ConfigError) as error:
+            except (httpx.HTTPError, httpx.InvalidURL, TimeoutError, ConfigError) as error:
                 problem = str(error) or type(error).__name__
             if attempt < hook.attempts:
                 pause_s = min(PAUSE_MAX_S, PAUSE_S * 2 ** (attempt - 1)) * random.uniform(0.5, 1.0)
@@ -100,16 +104,19 @@ def read_headers(path: str) -> Mapping[str, str]:
     try:
         with Path(path).open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode
-            text = file.read(HEADERS_MAX_BYTES).decode("ascii")
+            text = file.read(HEADERS_MAX_BYTES + 1).decode("ascii")
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {error}", hint="name a readable ASCII file") from error
     if stat.S_ISREG(mode) and mode & stat.S_IROTH:
         raise ConfigError(f"{path} may be read by every user", hint=f"chmod o-r {path}")
+    if len(text) > HEADERS_MAX_BYTES:
+        raise ConfigError(f"{path} has more than {HEADERS_MAX_BYTES} bytes", hint="shorten it")
     found = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, value = line.partition(":")
         if line.strip() and not line.startswith("#"):
-            if not colon or not name.replace("-", "").replace("_", "").isalnum():
+            plain = name.replace("-", "").replace("_", "").isalnum() and value.strip().isprintable()
+            if not colon or not plain:
                 raise ConfigError(f"{path}:{number}: expected `Name: value`")
             found[name] = value.strip()
     return found

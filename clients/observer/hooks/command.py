@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 OUTPUT_MAX_BYTES: Final = 4096
 """Of one run; what is more is read and dropped."""
 MARK: Final = "VRAM_ARBITER_HOOK_RUN"
+READS_MAX: Final = 32
+"""After the end: a process of another user may go on writing."""
 ROUNDS: Final = 3
 """A process may fork while its kin are looked for."""
 _runs = itertools.count()
@@ -56,7 +58,7 @@ async def run_command(
     finally:
         os.close(writing)
     loop = asyncio.get_running_loop()
-    loop.add_reader(reading, _read, reading, output)
+    loop.add_reader(reading, _arrived, loop, reading, output)
     pidfd = os.pidfd_open(child.pid)
     late = False
     try:
@@ -69,8 +71,9 @@ async def run_command(
         code = child.wait()
         _end_marked(f"{MARK}={mark}".encode())
         loop.remove_reader(reading)
-        while _read(reading, output):
-            pass
+        for _ in range(READS_MAX):
+            if not _read(reading, output):
+                break
         os.close(reading)
         os.close(pidfd)
         if output:
@@ -103,6 +106,11 @@ def _start(
         os.close(given)
 
 
+def _arrived(loop: asyncio.AbstractEventLoop, pipe: int, output: bytearray) -> None:
+    if not _read(pipe, output):
+        loop.remove_reader(pipe)  # at its end it would be readable for ever
+
+
 def _read(pipe: int, output: bytearray) -> bool:
     """Take what has come. Return False at the end, and where nothing has."""
     try:
@@ -116,20 +124,22 @@ def _read(pipe: int, output: bytearray) -> bool:
 def _end_marked(mark: bytes) -> None:
     """Kill the processes of one run, in whatever session they are."""
     for _ in range(ROUNDS):
-        for entry in procfs.PROC.iterdir():
-            if entry.name.isdecimal():
-                with contextlib.suppress(OSError):  # it has ended, or is another user's
-                    _end_if_marked(int(entry.name), mark)
+        pids = [int(entry.name) for entry in procfs.PROC.iterdir() if entry.name.isdecimal()]
+        ended = [pid for pid in pids if _end_if_marked(pid, mark)]
+        if not ended:
+            break
 
 
-def _end_if_marked(pid: int, mark: bytes) -> None:
-    pidfd = os.pidfd_open(pid)
-    try:
+def _end_if_marked(pid: int, mark: bytes) -> bool:
+    """Return whether a process had the mark; one that has ended, or is another user's, has not."""
+    with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+        pidfd = os.pidfd_open(pid)
+        stack.callback(os.close, pidfd)
         # read after the pidfd names the process
         if mark in (procfs.PROC / str(pid) / "environ").read_bytes().split(b"\0"):
             signal.pidfd_send_signal(pidfd, signal.SIGKILL)
-    finally:
-        os.close(pidfd)
+            return True
+    return False
 
 
 async def _ended(pidfd: int, timeout_s: float) -> bool:

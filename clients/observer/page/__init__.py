@@ -1,1 +1,1 @@
-"""The status page: one read-only page for a browser, its live events, and who may read it."""
+"""The status page: one read-only page for a browser, its live events, and access of clients."""

@@ -1,4 +1,4 @@
-"""Who may read the page: names it is asked for by, foreign origins, and the token.
+"""Access of clients to the page: names it is asked for by, foreign origins, and the token.
 
 Loopback needs no token, but any page in a browser of this machine can send requests there. So a
 request has to name the server by an address or a known name (a rebound DNS name is neither), and
@@ -43,7 +43,10 @@ def read_token(path: Path) -> str:
             hint=f"make one: {HOW_TO_MAKE}",
         ) from error
     mode = stat.S_IMODE(found.st_mode)
-    if mode & 0o077 or found.st_uid not in (0, os.getuid()):
+    # of a credential the group's bits are the mask of systemd's access list
+    given = os.environ.get("CREDENTIALS_DIRECTORY")
+    others = 0o037 if given and path.parent == Path(given) else 0o077
+    if mode & others or found.st_uid not in (0, os.getuid()):
         raise ConfigError(
             f"http.token_file: {path} has mode {mode:04o} and owner {found.st_uid}: other users "
             "may read it",

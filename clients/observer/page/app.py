@@ -7,7 +7,6 @@ No source but this server, nothing inline, and never in a frame.
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Protocol
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -53,14 +52,8 @@ HISTORY_MAX = 200
 SEQ_MAX = 1 << 53
 
 
-class Metrics(Protocol):
-    """The page of Prometheus."""
-
-    async def text(self, accept: str) -> tuple[bytes, str]:
-        """Return metrics as of now, and their content type."""
-        ...
-
-
+type Metrics = Callable[[str], Awaitable[tuple[bytes, str]]]
+"""Given what a reader accepts, metrics as of now and their content type."""
 type History = Callable[[int, int, tuple[str, ...]], Awaitable[HistoryReply]]
 
 
@@ -123,7 +116,7 @@ class StatusSite:
         return Response(body, media_type="application/json")
 
     async def _numbers(self, request: Request) -> Response:
-        body, kind = await self._metrics.text(request.headers.get("accept", ""))
+        body, kind = await self._metrics(request.headers.get("accept", ""))
         return Response(body, headers={"Content-Type": kind})
 
 

@@ -40,7 +40,7 @@ _RUNNING = ("since_s", "waited_s", "granted_s", "ttl_left_s")
 """Fields of a lease that change with time alone: the page counts on by itself."""
 
 
-class Source(Protocol):
+class PageSource(Protocol):
     """The part of `AsyncClient` that a feed needs."""
 
     def why(self, consumer: str) -> Awaitable[WhyReply]: ...
@@ -100,7 +100,7 @@ class _Difference:
 class PageFeed:
     """`join` of pages; `happened` with new events, then `publish` with a status."""
 
-    def __init__(self, arbiter: Source, record: UsageRecord, asked: Callable[[], None]) -> None:
+    def __init__(self, arbiter: PageSource, record: UsageRecord, asked: Callable[[], None]) -> None:
         """`asked`: called when a page waits for its snapshot."""
         self._arbiter = arbiter
         self._record = record
@@ -110,6 +110,7 @@ class PageFeed:
         # what the pages have
         self._rows: dict[str, JsonObject] = {}
         self._usage_number = 0
+        self._epoch: int | None = None
 
     def join(self, abort: Callable[[], None]) -> PageReader:
         reader = PageReader(abort, lambda gone: self._readers.pop(gone, None))
@@ -134,6 +135,11 @@ class PageFeed:
 
     async def publish(self, look: Look) -> None:
         """Send a snapshot to new pages, to others what changed. Raises VramError."""
+        if look.status.epoch != self._epoch:  # the times of another start are none of its time
+            self._epoch = look.status.epoch
+            for reader in [reader for reader in self._readers if reader.told]:
+                reader.end()
+                self._readers.pop(reader, None)
         joining = [reader for reader in self._readers if not reader.told]
         others = [reader for reader in self._readers if reader.told]
         if not self._readers:

@@ -59,7 +59,3 @@ class Owners:
         if _HEADER.unpack_from(answer)[1] != _SOCK_DIAG_BY_FAMILY or len(answer) < _UID_AT + 4:
             return None
         return int(struct.unpack_from("=I", answer, _UID_AT)[0])
-
-    def close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()

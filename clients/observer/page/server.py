@@ -117,7 +117,7 @@ async def serve(app: ASGIApp, listening: socket.socket, connections: Connections
     """Serve until canceled."""
 
     class Limited(H11Protocol):
-        """A connection that is counted, and ends without a request."""
+        """A connection that is counted, and ends without a request or with half of one."""
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
@@ -131,8 +131,11 @@ async def serve(app: ASGIApp, listening: socket.socket, connections: Connections
             super().connection_lost(exc)
 
         def _silent(self) -> None:
-            if self.cycle is None:
+            between = self.cycle is None or self.cycle.response_complete
+            if between and self.timeout_keep_alive_task is None:  # a head has begun, or none came
                 self.transport.abort()
+            else:
+                self._first = self.loop.call_later(IDLE_S, self._silent)
 
     config = uvicorn.Config(
         app,
@@ -143,6 +146,7 @@ async def serve(app: ASGIApp, listening: socket.socket, connections: Connections
         access_log=False,
         server_header=False,
         proxy_headers=False,
+        backlog=BACKLOG,
         timeout_keep_alive=IDLE_S,
         timeout_graceful_shutdown=STOP_S,
         h11_max_incomplete_event_size=HEAD_MAX_BYTES,

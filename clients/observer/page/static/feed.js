@@ -1,4 +1,4 @@
-// The live state: what the daemon sent last, merged, and how old it is.
+// The live state: what the observer sent last, merged, and how old it is.
 
 const STALE_MS = 4000,
   RETRY_MS = [500, 1000, 2000, 5000],
