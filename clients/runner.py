@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, Self, cast
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.estop import Stopped, stop
-from vram_arbiter.clients.net.link import somebody_listens
+from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.net.rpc_client import RpcClient
 from vram_arbiter.schemas.errors import (
     BadState,
@@ -204,7 +204,7 @@ class RunnerClient:
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + self._connect_timeout_s
         while not self._rpc.proven:  # in slices: a socket may vanish while its runner ends
-            if not somebody_listens(self.endpoint):
+            if not is_listening(self.endpoint):
                 raise self._lost("it has ended")
             try:
                 await self._exchange("ping", {}, RESULT_POLL_S)

@@ -40,7 +40,7 @@ from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.runtime import procfs
-from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
+from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.units import parse_bytes
 from vram_arbiter.schemas.urls import HttpAddress, http_address
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="no robot: three stand-in programs take turns on a simulated GPU, in 20 s at most and "
+        help="no robot: three stand-in programs take turns on a simulated GPU, in about 20 s and "
         "with the base install; no other option applies",
     )
     parser.add_argument(
@@ -101,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--http",
         metavar="ADDRESS:PORT",
         type=_address,
-        help="serve the arbiter's status page meanwhile, e.g. on 9870",
+        help="serve a status page of the arbiter meanwhile, e.g. on 9870",
     )
     parser.add_argument(
         "--out",
@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> int:
             "off"
         )
     if args.http is not None and not arbiter:
-        args.parser.error("the status page is the arbiter's; leave --http or --arbiter off out")
+        args.parser.error("the status page shows an arbiter: leave out --http or --arbiter off")
     packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
     need("the demo", *packages, extra="all")
     out: Path = args.out
@@ -164,7 +164,12 @@ async def _demo(
     try:
         programs = Programs(
             out / "logs",
-            {RUNTIME_VARIABLE: str(runtime), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"},
+            {
+                RUNTIME_VARIABLE: str(runtime),
+                ENDPOINT_VARIABLE: f"ipc://{runtime}/arbiter.sock",  # not the machine's own
+                "HF_HUB_OFFLINE": "1",
+                "OMP_NUM_THREADS": "1",
+            },
         )
         try:
             return await _episode(

@@ -18,7 +18,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ArbiterUnreachable
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
+from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.printable import printable
 
 STAND_INS: Final = {"detector": "5.3GB", "scene-vlm": "3.3GB", "grab": "4.3GB"}
@@ -34,9 +34,13 @@ def run() -> int:
 async def _demo() -> int:
     runtime = Path(tempfile.mkdtemp(prefix="vram-demo-"))  # short, for the paths of its sockets
     folder = runtime / "fakegpu"
-    environ = {RUNTIME_VARIABLE: str(runtime), fakegpu.FOLDER_VARIABLE: str(folder)}
-    programs = Programs(runtime, environ)
     endpoint = f"ipc://{runtime}/arbiter.sock"
+    environ = {
+        RUNTIME_VARIABLE: str(runtime),
+        ENDPOINT_VARIABLE: endpoint,  # not the machine's own arbiter
+        fakegpu.FOLDER_VARIABLE: str(folder),
+    }
+    programs = Programs(runtime, environ)
     try:
         print("starting the arbiter on a simulated GPU of 8 GiB, and three programs")
         await programs.start("arbiter", "arbiter", "--gpu", "fake:8GiB")

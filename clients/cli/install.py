@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     if args.command_name == "install":
         return _install(args, site, before)
     if before is None:
-        print(f"nothing is installed: there is no {site.at(site.record)}")
+        print(f"nothing is installed: not found: {site.at(site.record)}")
         return OK
     steps = removal(site, before, purge=args.purge)
     if (code := _confirm(args, steps)) is not None:

@@ -147,7 +147,7 @@ def _overview(argv: Sequence[str]) -> int:
         parser.print_help(sys.stderr)
         return USAGE
     if close := difflib.get_close_matches(argv[0], COMMANDS, n=1):
-        parser.error(f"there is no command {argv[0]!r}; did you mean {close[0]}?")
+        parser.error(f"unknown command {argv[0]!r}; did you mean {close[0]}?")
     parser.parse_args(argv)
     return OK
 

@@ -10,7 +10,8 @@ from vram_arbiter.clients.net.request import ask
 DESCRIPTIONS = {
     "evict": "Revoke a lease. A use in flight finishes first; a pinned lease is refused. With "
     "--kill end the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again; "
-    "refused while it and another process are in the middle of a use. Operators only.",
+    "refused while another process uses one of its leases, or it uses one of another process. "
+    "Operators only.",
     "pin": "Protect a lease from eviction until it is unpinned. Operators only.",
     "unpin": "Undo an operator's pin. Operators only.",
     "drain": "Grant nothing new until `vramctl resume`; holders keep their leases. Outlives the "

@@ -254,7 +254,11 @@ async def run_alone(spec: RunSpec) -> int:
     assert spec.record is not None, "nothing else is done without a lease"
     await spec.record.begin()
     environ = {**os.environ, **spec.environ}
-    program = await ForeignProgram.start(path, spec.command[1:], environ, STDERR)
+    try:
+        program = await ForeignProgram.start(path, spec.command[1:], environ, STDERR)
+    except OSError as error:
+        say(f"{path}: {error.strerror}")
+        return NOT_STARTED
     with Forwarding(lambda number: None) as signals:
         signals.to(program)
         try:

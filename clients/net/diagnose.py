@@ -30,7 +30,7 @@ def obstacle(endpoint: str) -> tuple[str, str] | None:
         try:
             probe.connect(path)
         except FileNotFoundError:
-            return f"no arbiter at {endpoint}: there is no such socket", START
+            return f"no arbiter at {endpoint}: the socket does not exist", START
         except PermissionError:
             return f"{endpoint} may not be used by uid {os.geteuid()}: permission denied", _who_may(
                 path

@@ -173,7 +173,7 @@ def _address(endpoint: str, program: Program) -> str | bytes:
     return b"ipc://" + os.fsencode(socket_path(endpoint))  # bytes: a path need not be text
 
 
-def somebody_listens(endpoint: str) -> bool:
+def is_listening(endpoint: str) -> bool:
     """Return False for a socket that is missing or that no process serves, True where only an
     exchange can tell.
     """

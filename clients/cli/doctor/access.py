@@ -1,4 +1,4 @@
-"""Checks of the way to the arbiter: its socket, who serves it, and who may use it."""
+"""Checks of the way to the arbiter: its socket, the user that serves it, and the users that may use it."""
 
 import os
 import stat

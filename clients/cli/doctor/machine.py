@@ -214,7 +214,7 @@ def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
 
 
 def ask_arbiter(endpoint: str) -> Arbiter:
-    """Ask the arbiter, and the kernel who it is."""
+    """Ask the arbiter, and the kernel for its pid and uid."""
     try:
         status = request.ask("status", {}, endpoint)
         pid, uid = _listener(endpoint)

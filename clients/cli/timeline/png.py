@@ -77,7 +77,8 @@ def _chart(axes: Any, story: Story, gpu: GpuStory, colors: Mapping[str, str]) ->
         if gpu.capacity_bytes:
             axes.axhline(level / GIB, color="#1c1c1e", lw=0.8, ls=style)
     _evicted(axes, story, gpu)
-    oom = [mark.at_s - begin for mark in story.marks if mark.kind == "oom"]
+    here = [mark for mark in story.marks if mark.gpu in (gpu.gpu, None)]
+    oom = [mark.at_s - begin for mark in here if mark.kind == "oom"]
     axes.plot(oom, [gpu.capacity_bytes / GIB] * len(oom), "x", color=_RED, mew=2.5)
     axes.set_ylim(bottom=0.0)
     axes.margins(y=0.2)

@@ -196,7 +196,7 @@ def test_3_for_a_daemon_that_is_dead_or_stopped(arbiter_daemon: ArbiterProcess) 
     for action, dead in vramctl_at_once(as_json, environ=environ):
         assert typed(dead) == "arbiter_unreachable", action
     (arbiter_daemon.runtime / "arbiter.sock").unlink()
-    assert "there is no such socket" in one_line(vramctl("resume", environ=environ))
+    assert "the socket does not exist" in one_line(vramctl("resume", environ=environ))
     (arbiter_daemon.runtime / "arbiter.sock").write_text("")
     assert "is not a socket" in one_line(vramctl("resume", environ=environ))
     assert "Linux allows 107" in one_line(

@@ -340,7 +340,7 @@ def test_the_command_writes_what_its_ending_says(switched: ArbiterProcess, tmp_p
         (("-o", "a.json", "--last", "1h", "--since", "1h"), 2, "not allowed with"),
         (("-o", f"{tmp_path}/no/a.json"), 2, "cannot be written: No such file"),
         (("-o", "a.json", "--event-log", f"{tmp_path}"), 1, "no event log here"),
-        (("-o", "a.json", "--endpoint", f"ipc://{tmp_path}/s"), 3, "no such socket"),
+        (("-o", "a.json", "--endpoint", f"ipc://{tmp_path}/s"), 3, "the socket does not exist"),
     ):
         done = vramctl("timeline", *arguments, environ=environ)
         assert done.returncode == code, done.stderr
