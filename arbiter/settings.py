@@ -16,7 +16,7 @@ from vram_arbiter.schemas.runtime.connection import Bounds
 from vram_arbiter.schemas.units import format_bytes
 
 DESCRIPTOR_RESERVE = 192
-"""For the daemon's own files: journal, history, event log, readings, telemetry, status page."""
+"""For the daemon's own files: journal, history, event log, readings."""
 TOKEN_SECRET_BYTES = 16
 PARK_SHARE = 2
 """Of the host RAM that is available at start, one part in so many may keep parked weights."""

@@ -267,14 +267,13 @@ class OutOfMemory(TransientError):
 
 
 class SidecarUnavailable(TransientError):
-    """A sidecar cannot be started or reached: `details.exit_code`, `log`."""
+    """A sidecar cannot be started or reached: `details.endpoint`."""
 
     code = "sidecar_unavailable"
 
 
 class CalibrationFailed(OperatorError):
-    """A footprint could not be measured: `details.exit_code`, `log` of a program that ended
-    early."""
+    """A footprint could not be measured: `details.exit_code` of a program that failed."""
 
     code = "calibration_failed"
 

@@ -213,7 +213,7 @@ class Evict(ByHandOn):
 
 class Kill(ByHandOn):
     """End the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again. Refused
-    while it and another process are in the middle of a use of each other's leases."""
+    while another process uses one of its leases, or it uses one of another process."""
 
     op: Literal["kill"]
 

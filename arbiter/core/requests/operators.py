@@ -107,8 +107,8 @@ def _dismiss(core: Core, lease: Lease, order: Order) -> None:
 def kill(core: Core, lease: Lease, order: Order) -> None:
     """End the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again.
 
-    Its lease is lost with it, and its bytes are measured gone as ever. Refused while its process
-    and another one are in the middle of a use of each other's leases: a robot may be moving.
+    Its lease is lost with it, and its bytes are measured gone as ever. Refused while another
+    process uses one of its leases, or it uses one of another process: a robot may be moving.
     """
     if lease.state not in EXPIRING:
         raise _impractical(lease, Impractical.NOT_HELD)

@@ -4,6 +4,6 @@
 
 - `schedule`: when to read, and what follows. `begin_for_lease`, `begin_again`, `on_process_died`,
   `on_reading`, `on_probe_failed`, `on_probe_due`, `on_poll_due`, `stale`.
-- `judge`: what a reading says, and the verdict. `impossible`, `take`, `note_pressure`,
-  `others_since`, `judge`.
+- `evidence`: whose bytes a reading shows. `impossible`, `take`.
+- `judge`: the verdict. `others_since`, `judge`.
 """
