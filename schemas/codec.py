@@ -51,13 +51,13 @@ def from_map[T](cls: type[T], data: object, *, strict: bool = False) -> T:
 
 
 def encoders(*classes: type) -> Mapping[type, Callable[[Any], JsonObject]]:
-    """Make the encoders of dataclasses now, so that no first message waits for them."""
+    """Return the encoders of dataclasses."""
     return {cls: _encoder(cls) for cls in classes}
 
 
 # -- values → maps
 type _Row = tuple[str, object, _Convert | None]
-"""Key, default (MISSING: it is always said) and conversion of one field."""
+"""Key, default (MISSING: the field is always written) and conversion of one field."""
 
 
 @cache
@@ -84,14 +84,15 @@ def _encoder(cls: Any) -> Callable[[Any], JsonObject]:
 
 
 def _fill(table: list[_Row], cls: Any) -> list[_Row]:
-    hints = get_type_hints(cls)
+    """Fill the table of an encoder, at once: another thread may use it."""
+    hints, rows, whole = get_type_hints(cls), [], getattr(cls, "WHOLE", False)
     for field in fields(cls):
         part = field.metadata.get("part")
-        default: object = MISSING if getattr(cls, "WHOLE", False) else field.default
-        if default is MISSING and field.default_factory is not MISSING:
-            default = field.default_factory()
+        made = MISSING if field.default_factory is MISSING else field.default_factory()
+        default = MISSING if whole else made if field.default is MISSING else field.default
         convert = attrgetter(part) if part else _encoding(hints[field.name])
-        table.append((part or field.name, default, convert))
+        rows.append((part or field.name, default, convert))
+    table[:] = rows
     return table
 
 
@@ -159,10 +160,12 @@ def _decoder(cls: Any, strict: bool) -> _Convert:
 def _rows(
     table: list[tuple[str, _Convert | None, bool]], cls: Any, strict: bool
 ) -> list[tuple[str, _Convert | None, bool]]:
-    """Fill the table of a decoder: key, conversion, and whether a map must have it."""
+    """Fill the table of a decoder, at once: key, conversion, and whether a map must have it."""
     hints = get_type_hints(cls)
-    for field in fields(cls):
-        table.append((field.name, _decoding(hints[field.name], strict), _is_required(field)))
+    table[:] = [
+        (field.name, _decoding(hints[field.name], strict), _is_required(field))
+        for field in fields(cls)
+    ]
     return table
 
 

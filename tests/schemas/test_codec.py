@@ -1,14 +1,16 @@
 """The codec of wire, journal and log: what is written, what is read back, and what is refused."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_type_hints
 
 import pytest
 
+from vram_arbiter.schemas import codec
 from vram_arbiter.schemas.codec import CodecError, from_map, to_map
 from vram_arbiter.schemas.ids import LeaseId, Token
+from vram_arbiter.schemas.wire.errors import ErrorView
 
 
 class Color(StrEnum):
@@ -89,6 +91,38 @@ def test_a_client_ignores_what_only_a_newer_arbiter_knows() -> None:
 def test_what_does_not_fit_is_named(damaged: Any, problem: str) -> None:
     with pytest.raises(CodecError, match=problem):
         from_map(Everything, damaged)
+
+
+def test_a_class_that_is_written_whole_says_its_empty_map_too() -> None:
+    """Regression: `details` of an error was left out where it was empty, so that a program of
+    another language found no such key."""
+    assert to_map(ErrorView("x")) == {"code": "x", "message": "", "hint": "", "details": {}}
+
+
+@pytest.mark.parametrize("converted", [to_map, lambda plain: from_map(Everything, plain)])
+def test_a_thread_never_meets_half_a_table(
+    monkeypatch: pytest.MonkeyPatch, converted: Callable[[Any], Any]
+) -> None:
+    """Regression: a second thread used the table of a class while the first one filled it, and
+    left out the fields that were not there yet. Here the second comes in the middle."""
+    value: Any = FULL if converted is to_map else to_map(FULL)
+    codec._encoder.cache_clear()
+    codec._decoder.cache_clear()
+    inner: list[Any] = []
+
+    def hints(cls: type) -> dict[str, Any]:
+        found = get_type_hints(cls)
+        return Nosy(found) if cls is Everything and not inner else found
+
+    class Nosy(dict[str, Any]):
+        def __getitem__(self, key: str) -> Any:
+            if key == "color" and not inner:
+                inner.append(None)
+                inner[:] = [converted(value)]
+            return super().__getitem__(key)
+
+    monkeypatch.setattr(codec, "get_type_hints", hints)
+    assert converted(value) == inner[0] == converted(value)
 
 
 def test_only_dataclasses_have_a_plain_form() -> None:
