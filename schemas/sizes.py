@@ -21,23 +21,24 @@ def parse_bytes(text: str | int) -> int:
     if isinstance(text, bool) or not isinstance(text, int | str):
         raise ValueError(f"a size is a number of bytes or a text such as 8GiB, not {text!r}")
     if isinstance(text, int):
-        if text < 0:
-            raise ValueError(f"a size cannot be negative: {text}")
-        return text
+        return _bounded(text, str(text))
     match = _SIZE.fullmatch(text)
     if match is None or match[2].lower() not in _UNITS:
         raise ValueError(
             f"not a size: {text!r}; write bytes or 8GiB (1024-based), 5.3GB (1000-based), 450MiB"
         )
-    size = float(match[1]) * _UNITS[match[2].lower()]
-    if size >= MAX_BYTES:
-        raise ValueError(f"no machine has so much: {text[:SHOWN_CHARS]}")
+    return _bounded(float(match[1]) * _UNITS[match[2].lower()], text)
+
+
+def _bounded(size: float, text: str) -> int:
+    if not 0 <= size < MAX_BYTES:
+        raise ValueError(f"expected a size of 0 to 8 EiB, got {text[:SHOWN_CHARS]}")
     return round(size)
 
 
 def parse_need(text: str) -> int:
-    """Read what a person needs, `5GiB` or `5.3GB`: a bare number is rarely meant as bytes, and
-    nothing needs no lease. Raises ValueError."""
+    """Read the size of a lease, `5GiB` or `5.3GB`. Raises ValueError, also for a number without a
+    unit, which is rarely meant as bytes, and for 0."""
     size = parse_bytes(text)
     if text.strip()[-1].isdecimal() or not size:
         raise ValueError(f"expected a size with its unit, such as 5GiB or 450MiB, got {text!r}")
