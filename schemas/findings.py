@@ -169,7 +169,11 @@ def _said(finding: JsonMap, path: Path, model: type[BaseModel]) -> str:
         return f"{_shown(value)} is not one of {context['expected']}" + (
             did_you_mean(str(value), words) if difflib.get_close_matches(str(value), words) else ""
         )
-    text = re.sub(r", unable to .*| or instance of \w+| after validation", "", finding["msg"])
+    text = re.sub(
+        r", unable to .*|, got a number .*| or instance of \w+| after validation",
+        "",
+        finding["msg"],
+    )
     text = re.sub(r"^(Value error|Assertion failed), ", "", text)
     wanted = text.removeprefix("Input should be ")
     if wanted != text:

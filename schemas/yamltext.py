@@ -3,15 +3,15 @@ ConfigError with every place.
 
 Only YAML's plain types are read: maps with single values as keys, lists, strings, numbers,
 booleans, null, dates. Size of the file, nesting, number of values (aliases expanded) and length of
-a number are bounded, so that no file ends in a traceback, a full memory or a hang. A key given
-twice is an error instead of the last one winning. PyYAML's nodes carry the lines; other loaders do,
-too, but bound nothing, so that the walk below would be the same.
+a number are bounded, so that no file ends in a traceback, a full memory or a hang. A key is the
+text that stands in the file (`on`, `7`, not a truth value or a number), and one given twice is an
+error. PyYAML's nodes carry the lines; other loaders do, too, but would need the same bounds.
 """
 
 import os
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -88,8 +88,10 @@ def read_text(path: FilePath, *, hint: str = "", trusted: bool = False) -> str:
 
 
 def check_owner(path: FilePath, opened: int) -> None:
-    """Raises ConfigError for a file that another user but root may have written. The open file is
-    looked at: its path may name another one by now."""
+    """Raise ConfigError for a file that a user other than this one and root may have written.
+
+    `opened` is its descriptor, because the path may name another file by now.
+    """
     found = os.fstat(opened)
     if found.st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
         raise ConfigError(
@@ -155,9 +157,11 @@ class _Loader(yaml.SafeLoader):
         mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
         _check_limits(self._depth - 1, self._nodes, mark)
         try:
-            return super().compose_node(parent, index)
+            node = super().compose_node(parent, index)
         finally:
             self._depth -= 1
+        is_key = isinstance(parent, yaml.MappingNode) and index is None
+        return _text_key(node) if is_key and isinstance(node, yaml.ScalarNode) else node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
@@ -204,10 +208,11 @@ class _Walk:
             if not isinstance(key, yaml.ScalarNode):
                 self._say(key, path, "a key must be a single value, not a list or a map")
                 continue
-            inner = (*path, str(key.value))
+            inner = (*path, key.value)
             if key.value in seen:
                 self._say(key, inner, f"key given twice; first in line {seen[key.value]}")
-            seen.setdefault(key.value, key.start_mark.line + 1)
+                continue
+            seen[key.value] = key.start_mark.line + 1
             self.visit(key, inner, key)
             self.visit(value, inner, key)
 
@@ -223,6 +228,13 @@ class _Walk:
     def _say(self, node: yaml.Node, path: Path, problem: str) -> None:
         place = node.start_mark.line + 1, node.start_mark.column + 1
         self.problems.setdefault(place, Mistake(place[0], dotted(path), problem, place[1]))
+
+
+def _text_key(key: yaml.ScalarNode) -> yaml.ScalarNode:
+    """Return a key as the text that stands in the file."""
+    if key.tag not in _TAGS - {f"{_TAG}merge"}:
+        return key
+    return yaml.ScalarNode(f"{_TAG}str", key.value, key.start_mark, key.end_mark)
 
 
 def _check_limits(depth: int, values: int, mark: Any, how: str = "") -> None:
@@ -260,6 +272,19 @@ def config_error(name: str, problems: list[Mistake]) -> ConfigError:
             ],
         },
     )
+
+
+def without_empty(model: type[BaseModel], source: YamlText) -> YamlText:
+    """Return a document without its empty sections: `verify:` with all its keys commented out is
+    no mistake. An empty key that `model` does not know stays, and is one."""
+    if not isinstance(source.data, dict):
+        return source
+    given = {
+        key: value
+        for key, value in source.data.items()
+        if value is not None or key not in model.model_fields
+    }
+    return replace(source, data=given)
 
 
 def validated[M: BaseModel](model: type[M], source: YamlText) -> M:

@@ -6,16 +6,20 @@ No key is required: an empty file is the default configuration.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.yamltext import parse_yaml, validated
+from vram_arbiter.schemas.yamltext import (
+    Mistake,
+    config_error,
+    parse_yaml,
+    validated,
+    without_empty,
+)
 
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -295,14 +299,12 @@ def load_config(text: str, name: str) -> ArbiterConfig:
     unknown key; did you mean timeout_s?`
     """
     source = parse_yaml(text, name)
-    data = source.data
-    if isinstance(data, dict):
-        for section, hint in MOVED.items():
-            if section in data:
-                raise ConfigError(f"{name}: `{section}` is not a section any more", hint=hint)
-        # `verify:` with all its keys commented out is an empty section, not a mistake
-        data = {
-            key: {} if value is None and key in ArbiterConfig.model_fields else value
-            for key, value in data.items()
-        }
-    return validated(ArbiterConfig, replace(source, data=data))
+    given = source.data if isinstance(source.data, dict) else {}
+    moved = [
+        Mistake(source.line((section,)), section, f"is not a section any more: {place}")
+        for section, place in MOVED.items()
+        if section in given
+    ]
+    if moved:
+        raise config_error(name, sorted(moved, key=lambda found: found.line))
+    return validated(ArbiterConfig, without_empty(ArbiterConfig, source))

@@ -6,7 +6,6 @@ Pure: `load_observer(text, name)` takes the text of a file. `configs/observer.ya
 
 import ipaddress
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, Final, Self
 from urllib.parse import urlsplit
 
@@ -22,7 +21,7 @@ from pydantic import (
 from vram_arbiter.schemas.findings import did_you_mean
 from vram_arbiter.schemas.urls import http_address, webhook_url
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
-from vram_arbiter.schemas.yamltext import parse_yaml, validated
+from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
 
 EVICTED: Final = "evicted"
 ALIASES: Final[Mapping[str, str]] = {"revoked": "revoke_asked", "verdict": "verified"}
@@ -153,16 +152,7 @@ class ObserverConfig(_Section):
 
 def load_observer(text: str, name: str) -> ObserverConfig:
     """Read the text of a configuration file. Raises ConfigError with every mistake and its line."""
-    source = parse_yaml(text, name)
-    if isinstance(source.data, dict):
-        # `http:` with all its keys commented out is an empty section, not a mistake
-        given = {key: value for key, value in source.data.items() if value is not None}
-        source = replace(source, data=given)
-    hooks = source.data.get("hooks") if isinstance(source.data, dict) else None
-    for hook in hooks if isinstance(hooks, list) else ():
-        if isinstance(hook, dict) and True in hook:
-            hook["on"] = hook.pop(True)  # YAML 1.1 reads the key `on` as a truth value
-    return validated(ObserverConfig, source)
+    return validated(ObserverConfig, without_empty(ObserverConfig, parse_yaml(text, name)))
 
 
 def _is_private(url: str) -> bool:

@@ -61,6 +61,7 @@ class Robots(RootModel[dict[str, Robot]]):
         ({"spares": "x"}, "spares: must be a list, not 'x'"),
         ({"name": 5}, "name: must be a valid string, not 5; put it in quotes"),
         ({"tag": "x"}, "tag: must be a valid integer, not 'x'"),
+        ({"tag": 1.5}, "tag: must be a valid integer, not 1.5"),
         ({"low": -2}, "low: is below -1"),
         ([], "must be a mapping of fields, not []"),
     ],

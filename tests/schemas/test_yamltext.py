@@ -29,6 +29,14 @@ LAUGHS = "a: &a {x: 1, y: 2}\n" + "".join(
 )
 
 
+TWICE = "".join(
+    f"a{n}: &a{n} {{x: {value}, x: {value}}}\n"
+    for n, value in enumerate(["1", *[f"*a{n}" for n in range(60)]])
+)
+"""Each level names the one before under one key twice; read again each time, it took 2**60
+steps."""
+
+
 def said(content: str | bytes) -> str:
     with pytest.raises(ConfigError) as raised:
         parse_yaml(content, "x.yaml")
@@ -98,8 +106,15 @@ def test_the_limits_leave_room_for_what_people_write() -> None:
     text = "base: &base {rate: 2, when: 2026-01-02}\nhere: {<<: *base, rate: 3}\n~: .inf\n7: 0x1f\n"
     found = parse_yaml("\ufeff".encode() + text.encode(), "x")
     assert found.data["here"]["rate"] == 3
-    assert found.data[7] == 31
     assert found.line(("here", "rate")) == 2
+
+
+def test_a_key_is_the_text_that_stands_in_the_file() -> None:
+    """Regression: `on:` was a truth value, and `7:` a number whose mistakes had no line."""
+    found = parse_yaml("on: 1\n7: 0x1f\n~: 2\n2026-01-02: &n 5\n*n : 4", "x")
+    texts = {"on": 1, "7": 31, "~": 2, "2026-01-02": 5, "5": 4}
+    assert found.data == texts
+    assert [found.line((key,)) for key in texts][:4] == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(
@@ -152,13 +167,15 @@ def test_no_text_raises_anything_but_a_typed_error(text: str) -> None:
 
 
 def test_a_hostile_text_of_full_size_ends_soon() -> None:
-    """Quadratic work would need hours; the limit is generous towards busy machines."""
+    """Quadratic work would need hours; the limit is generous towards busy machines. Regression: a
+    value under a repeated key was walked again, which hung on nested aliases."""
     began = time.process_time()
     for text in (
         "[" * TEXT_MAX_BYTES,
         "a: 1" + ":5" * 500_000,
         "a: '" + "x" * 1_000_000,
         "1" * TEXT_MAX_BYTES,
+        TWICE,
     ):
         said(text)
     assert time.process_time() - began < 60

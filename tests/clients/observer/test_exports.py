@@ -305,5 +305,5 @@ def test_sections_that_moved_are_refused_with_their_new_place(
     refused = make_arbiter(config=f"{section}: {{}}\n")
     with pytest.raises(RuntimeError, match="ended with 2"):
         refused.start()
-    assert f"`{section}` is not a section any more" in refused.log
+    assert f":1: {section}: is not a section any more" in refused.log
     assert "vram-observer" in refused.log

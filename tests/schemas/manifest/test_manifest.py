@@ -261,7 +261,6 @@ def test_error_is_typed_and_carries_plain_data() -> None:
         "rskill.yaml:2:5: not valid YAML: while parsing a flow sequence expected ',' or ']'"),
         ("kind: !!python/object:os.system x",
         "rskill.yaml:1:7: kind: the tag !!python/object:os.system is not read here"),
-        ("1: x\nkind: vlm", "rskill.yaml:1: name: is missing"),
         ("name: 2024-99-99",
         "rskill.yaml:1:7: not valid YAML: '2024-99-99' cannot be read as timestamp: month must be "
         "in 1..12"),
@@ -270,6 +269,13 @@ def test_error_is_typed_and_carries_plain_data() -> None:
 )  # fmt: skip
 def test_unreadable_texts_are_refused_clearly(content: str | bytes, expected: str) -> None:
     assert findings(content)[0].startswith(expected)
+
+
+@pytest.mark.parametrize("key", ["1", "on", "~"])
+def test_a_key_that_is_no_word_is_an_unknown_key_with_its_line(key: str) -> None:
+    (found,) = findings(f"{sample('vlm')}\n{key}: x")
+    line = len(sample("vlm").splitlines()) + 2
+    assert found.startswith(f"rskill.yaml:{line}: {key}: unknown key")
 
 
 def test_duplicate_keys_are_refused_with_both_lines() -> None:

@@ -42,11 +42,7 @@ def test_an_editor_accepts_the_example_and_marks_mistakes() -> None:
     first = re.match(r"# yaml-language-server: \$schema=(\S+)\n", text)
     assert first
     reader = Draft202012Validator(json.loads((CONFIGS / first[1]).read_text()))
-    read = parse_yaml(text, "observer.yaml").data["hooks"]
-    # editors read YAML 1.2, where `on` is a name and no truth value
-    example = {
-        "hooks": [{"on" if key is True else key: rule[key] for key in rule} for rule in read]
-    }
+    example = {"hooks": parse_yaml(text, "observer.yaml").data["hooks"]}
     assert list(reader.iter_errors(example)) == []
     for mistake in ({"on": "evictd"}, {"on": ["evictd"]}, {"on": []}, {"timeout_s": 0}):
         wrong = {"hooks": [example["hooks"][0] | mistake]}
@@ -75,6 +71,13 @@ def test_a_mistake_is_named(text: str, problem: str) -> None:
     with pytest.raises(ConfigError) as error:
         rules(text)
     assert problem in str(error.value)
+
+
+def test_an_empty_section_is_its_default_and_an_unknown_one_is_refused() -> None:
+    """Regression: `hoks:` with nothing below it was accepted, and no rule ran."""
+    assert load_observer("http:\nhooks:\n", "observer.yaml") == ObserverConfig()
+    with pytest.raises(ConfigError, match=r"observer\.yaml:2: hoks: unknown key"):
+        load_observer("http:\nhoks:\n", "observer.yaml")
 
 
 def test_the_key_on_is_no_truth_value() -> None:
