@@ -392,7 +392,6 @@ class TickResult(_Frozen):
     deadline_missed: bool = False
     step_idx: Index | None = None
     episode_idx: Index | None = None
-    reward: Finite | None = None
     terminated: bool | None = None
     truncated: bool | None = None
     success: bool | None = None

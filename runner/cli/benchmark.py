@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.output_paths import check_output
-from vram_arbiter.runner.cli.benchmark_report import REPORT, table, write_report
+from vram_arbiter.runner.cli.benchmark_report import MAX_STEPS, REPORT, table, write_report
 from vram_arbiter.runner.cli.common import (
     add_license_flag,
     add_trace_flag,
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from vram_arbiter.runner.sim.tasks import Task
 
 SO101 = "so101"
-MAX_STEPS = 600  # of an episode, 20 s, where --max-steps does not say
 
 
 def add_parser(
@@ -178,7 +177,7 @@ async def _play(entry: Entry, args: argparse.Namespace, stopping: asyncio.Event)
     try:
         async with contextlib.AsyncExitStack() as stack:
             rate_hz = bench.runner.rate_hz
-            dataset = await record_sim(args, bench.runner, rate_hz, bench.stop, stack)
+            dataset = await record_sim(args, bench.runner, rate_hz, bench.stop, stack, strict=True)
             cell = await bench.run(entry.skill(), seeds)
     finally:
         watching.cancel()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vram_arbiter.runner.sim.benchmark import Cell, CellSummary
 
 REPORT = "benchmark.json"
+MAX_STEPS = 600  # of an episode, 20 s, where --max-steps does not say
 COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "errors")
 
 

@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vram_arbiter.clients.cli.arguments import at_least
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
-from vram_arbiter.runner.cli.numbers import positive, share
+from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
@@ -32,7 +33,7 @@ AS_FAST_AS_POSSIBLE_HZ = 30.0  # simulated rate when nothing is paced
 
 def add_trace_flag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--trace-ticks", type=share, default=1.0, metavar="RATIO",
+        "--trace-ticks", type=at_least(0.0, 1.0), default=1.0, metavar="RATIO",
         help="share of a goal's ticks that telemetry records after its first action;"
         " goals are always recorded",
     )  # fmt: skip

@@ -21,6 +21,5 @@ def _number[N: (int, float)](
 
 positive = _number(float, lambda value: 0 < value < inf, "positive")
 not_negative = _number(float, lambda value: 0 <= value < inf, "0 or more")
-share = _number(float, lambda value: 0 <= value <= 1, "between 0 and 1")
 positive_int = _number(int, lambda value: value >= 1, "1 or more")
 not_negative_int = _number(int, lambda value: value >= 0, "0 or more")

@@ -42,8 +42,10 @@ async def record_sim(
     rate_hz: float,
     on_lost: Callable[[], None],
     stack: contextlib.AsyncExitStack,
+    *,
+    strict: bool = False,
 ) -> DatasetRecorder | None:
-    """Record a simulated robot as the flags ask for; None: they do not."""
+    """Record a simulated robot as the flags ask for, see `record_into`; None: they do not."""
     if args.record is None:
         if args.record_format != "full":
             raise ConfigError("--record-format is for --record DIR")
@@ -52,7 +54,9 @@ async def record_sim(
     from vram_arbiter.runner.sim.worlds import ROBOT
 
     units = lerobot_units_of(so101(simulated=True)) if args.record_format == "lerobot" else None
-    return await record_into(args.record, runner, on_lost, stack, rate_hz, ROBOT, units)
+    return await record_into(
+        args.record, runner, on_lost, stack, rate_hz, ROBOT, units, strict=strict
+    )
 
 
 async def record_into(
@@ -63,11 +67,14 @@ async def record_into(
     rate_hz: float,
     robot: str,
     lerobot: LerobotUnits | None,
+    *,
+    strict: bool = False,
 ) -> DatasetRecorder:
     """Record the runner's goals, from before its control thread starts until after it has ended.
 
     Args: `rate_hz` 0 records as fast as possible; `lerobot`: by lerobot's names and units, with its
-    columns only. `on_lost` is called on the event loop when nothing more can be recorded. Raises
+    columns only; `strict`: it is played for the recording alone. `on_lost` is called on the event
+    loop when nothing more can be recorded, or after the first loss of a strict recording. Raises
     ConfigError for a folder, a rate or a dataset that does not fit, AlreadyRunning when another
     program records there.
     """
@@ -86,6 +93,7 @@ async def record_into(
         robot=robot,
         lerobot=lerobot,
         patient=rate_hz == 0,
+        strict=strict,
         on_lost=lost,
     )
     log.info("starting the dataset's writer")

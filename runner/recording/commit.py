@@ -148,8 +148,9 @@ def undo(root: Path) -> None:
 
 
 def opened(root: Path) -> Record | None:
-    """Return the folder before the episode that is being written, or was cut off; None: all that
-    there is, is finished. Raises ConfigError when it cannot be read.
+    """Return the record of the episode that is being written or was cut off; None without one.
+
+    Raises ConfigError when it cannot be read.
     """
     path = root / FOLDER / OPEN
     try:

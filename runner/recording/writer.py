@@ -271,7 +271,7 @@ def main(argv: list[str]) -> int:
     """Run the writer; the socket's file descriptor is the only argument."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
-    # progress bars are off, as they shall be
+    # it warns that the progress bars are off, which the runner asked for
     warnings.filterwarnings("ignore", module="datasets.utils.tqdm")
     logs.set_up("vram-runner", "WARNING", "human", "%(asctime)s dataset %(levelname)s %(message)s")
     with Connection(int(argv[0])) as peer:

@@ -20,6 +20,7 @@ from statistics import fmean
 from typing import Any, Final, TypedDict
 
 from vram_arbiter.runner.protocols import Goal, GoalParams, Skill, SkillEnded
+from vram_arbiter.runner.sim.config import CONTROL_HZ
 from vram_arbiter.runner.sim.robot import VIDEO_EVERY, SimRunner
 from vram_arbiter.runner.sim.video import VideoRecorder
 from vram_arbiter.schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
@@ -30,7 +31,6 @@ log = logging.getLogger(__name__)
 
 Z_95: Final = 1.959964  # the normal distribution's 97.5 % point
 ERRORS_IN_A_ROW_MAX: Final = 3  # a missing sidecar will not be there for the next seed either
-VIDEO_HZ: Final = 30.0
 
 Told = tuple[str, GoalParams]
 """Prompt and parameters of a goal."""
@@ -291,7 +291,7 @@ class Benchmark:
         if self._videos is None:
             return None
         name = f"{file_name(self._world)}_{file_name(contestant)}_{seed}.mp4"
-        return VideoRecorder(self._videos / name, fps=VIDEO_HZ / VIDEO_EVERY, wait=True)
+        return VideoRecorder(self._videos / name, fps=CONTROL_HZ / VIDEO_EVERY, wait=True)
 
 
 def file_name(text: str) -> str:

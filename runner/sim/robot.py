@@ -31,7 +31,6 @@ from vram_arbiter.schemas.errors import (
     GoalRejected,
     InternalError,
     LimitExceeded,
-    ModelError,
     VramError,
 )
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -177,13 +176,11 @@ class SimRobot:
         return applied
 
     def _end_with_episode(self) -> SkillEnded:
-        """Return how a goal ends that loses its world. Without a verdict it is not a success."""
+        """Return how a goal ends that loses its world."""
         success = self.env.success
         story = {"episode": self.episode_idx, "steps": self._steps, "success": success}
         error: VramError | None = None
-        if success is None:
-            error = ModelError(f"the episode is over after {self._steps} steps; nothing judges it")
-        elif not success:
+        if not success:
             problem = f"the episode was cut off after {self._steps} steps without success"
             error = LimitExceeded(problem, details={"limit": "episode"})
         return SkillEnded(story, error)

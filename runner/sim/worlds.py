@@ -21,7 +21,6 @@ from vram_arbiter.runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandI
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 
-SO101: Final = "so101"
 ROBOT: Final = "so101-mobile"
 OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
 

@@ -26,7 +26,7 @@ def numbers(matrix: Any, rotation: Rotation) -> tuple[float, ...]:
 
 
 def matrix_of(values: Sequence[float], rotation: Rotation) -> Any:
-    """Return the rotation matrix of `values`. Raises ModelError for numbers that are none."""
+    """Return the rotation matrix of `values`. Raises ModelError if they are not an orientation."""
     import numpy as np
 
     match rotation:

@@ -151,10 +151,19 @@ def _written(pose: Pose3, rotation: Rotation | None) -> list[float]:
 # -- resolving
 def needs_frames(contract: StateContract | None) -> bool:
     """Return whether a state contract speaks of frames."""
+    return _has(contract, "ee_pose")
+
+
+def reads_poses(contract: StateContract | None) -> bool:
+    """Return whether a state contract has a pose, of a frame or of the base."""
+    return _has(contract, "ee_pose", BASE_POSE)
+
+
+def _has(contract: StateContract | None, *kinds: str) -> bool:
     if contract is None:
         return False
     if contract.parts is not None:
-        return any(part.kind == "ee_pose" for part in contract.parts)
+        return any(part.kind in kinds for part in contract.parts)
     return contract.layout in LAYOUTS
 
 

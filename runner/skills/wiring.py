@@ -7,18 +7,17 @@ fit.
 from __future__ import annotations
 
 import importlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from vram_arbiter.runner.protocols import Joint, RobotDescription
+from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.skills.action_contract import needs_frames as actions_need_frames
 from vram_arbiter.runner.skills.action_contract import plan_actions
 from vram_arbiter.runner.skills.actions import ActionPlan
 from vram_arbiter.runner.skills.kinematics import ArmModel
-from vram_arbiter.runner.skills.states import StatePlan, plan_state
+from vram_arbiter.runner.skills.states import StatePlan, plan_state, reads_poses
 from vram_arbiter.runner.skills.states import needs_frames as state_needs_frames
 from vram_arbiter.schemas.control import JOINT_MODES
 from vram_arbiter.schemas.errors import ConfigError
@@ -88,17 +87,13 @@ class Wiring:
 
 def wire_up(
     manifest: RSkillManifest,
-    robot: RobotDescription | tuple[str, ...],
+    robot: RobotDescription,
     rest: Mapping[str, float] | None,
 ) -> Wiring:
-    """Read the manifest. `robot` may be its joints' names alone.
+    """Read the manifest.
 
     Raises ManifestError with a finding for each part that this robot cannot do or tell.
     """
-    if isinstance(robot, tuple):
-        robot = RobotDescription(
-            "this world", tuple(Joint(name, -math.inf, math.inf, math.inf) for name in robot), {}
-        )
     problems = manifest.not_executable()
     cameras = _cameras(manifest)
     order, found = _joint_order(manifest, robot)
@@ -190,12 +185,14 @@ def _model(
     manifest: RSkillManifest, robot: RobotDescription
 ) -> tuple[ArmModel | None, list[Problem]]:
     """Return the robot's model if a contract speaks of frames and there is one."""
-    solving = actions_need_frames(manifest)
-    if not robot.model or not (solving or state_needs_frames(manifest.state_contract)):
+    solving, state = actions_need_frames(manifest), manifest.state_contract
+    if not (solving or reads_poses(state)):
         return None, []
     path = ("action_contract",) if solving else ("state_contract",)
     try:
         importlib.import_module("scipy.spatial.transform")  # no tick has the time for it
+        if not robot.model or not (solving or state_needs_frames(state)):
+            return None, []
         if solving:
             importlib.import_module("mink")
         return ArmModel(robot), []

@@ -16,7 +16,7 @@ EXTRA_OF: Mapping[str, str] = {
     "PIL": "sidecars",
     "diffusers": "sidecars",
     "num2words": "sidecars",
-    "scipy": "sidecars",
+    "scipy": "runner or sidecars",
     "tree": "sidecars",
     "peft": "wall-x",
     "qwen_vl_utils": "wall-x",
@@ -50,9 +50,10 @@ def need(what: str, *packages: str, extra: str) -> None:
 
 
 def not_installed(what: str, missing: list[str], extra: str) -> ConfigError:
+    packages = " or ".join(f"'vram-arbiter[{one}]'" for one in extra.split(" or "))
     return ConfigError(
         f"{what} needs {', '.join(missing)}, which this installation does not have",
-        hint=f"pip install 'vram-arbiter[{extra}]'",
+        hint=f"pip install {packages}",
     )
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import robot_of
 from tests.support.fakegpu_check import check_log
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
@@ -502,11 +503,11 @@ async def called_back(stage: Stage) -> None:
     episode_programs.sidecar(
         "policy", POLICY_BYTES, "--standby", "--min-residency-s", "0", name="spare"
     )
-    joints = tuple(JOINTS.strip("[]").split(", "))
+    robot = robot_of(*JOINTS.strip("[]").split(", "))
     where = f"ipc://{episode_programs.runtime}/spare.sock"
     async with PolicyClient(where, connect_timeout_s=BOOT_S) as sidecar:
         skill = SidecarPolicy(
-            manifest, wire_up(manifest, joints, None), sidecar, stage.arbiter, period_s=0.1
+            manifest, wire_up(manifest, robot, None), sidecar, stage.arbiter, period_s=0.1
         )
         goal = Goal("g", SKILL, prompt="hold still", deadline_s=DEADLINE_S)
         await skill.start(goal)

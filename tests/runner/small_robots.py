@@ -3,10 +3,11 @@ bus can fail, a skill that nods.
 """
 
 import asyncio
+import math
 from collections.abc import Callable
 
 from vram_arbiter.runner.control.clock import Clock
-from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
+from vram_arbiter.runner.protocols import Act, Done, Goal, Joint, RobotDescription, StepOutcome
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.sensors import Feed, SlotReader
@@ -15,6 +16,12 @@ from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import RobotFault
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import Action, FrameEncoding, JointState, SensorFrame, WorldState
+
+
+def robot_of(*joints: str) -> RobotDescription:
+    """A robot of which only the names of its joints are known."""
+    free = tuple(Joint(name, -math.inf, math.inf, math.inf) for name in joints)
+    return RobotDescription("this world", free, {})
 
 
 class FedCamera(SlotReader):

@@ -30,6 +30,7 @@ from tests.support.waiting import until
 from vram_arbiter.runner import __main__ as program
 from vram_arbiter.runner.cli.replay import as_text
 from vram_arbiter.runner.recording import commit
+from vram_arbiter.runner.recording import recorder as recorder_module
 from vram_arbiter.runner.recording.columns import features_of, row_of, whole_rate
 from vram_arbiter.runner.recording.lerobot_files import LerobotFiles
 from vram_arbiter.runner.recording.reader import read_frame
@@ -192,7 +193,8 @@ def test_a_run_says_what_it_recorded_and_what_not(recorded: Recorded) -> None:
 def test_a_killed_writer_ends_the_recording_after_the_goal_that_runs(
     tmp_path: Path, runs: bool
 ) -> None:
-    """Regression: the robot went on for the rest of the day, and nothing was recorded."""
+    """Regression: the robot went on for the rest of the day, and nothing was recorded; between
+    goals the loss was noticed in the next one."""
     root, lost = tmp_path / "set", threading.Event()
     made = recorder(root, on_lost=lost.set)
     made.start()
@@ -207,12 +209,7 @@ def test_a_killed_writer_ends_the_recording_after_the_goal_that_runs(
         made.tick(tick(1, of=SECOND))
         return made.lost
 
-    if runs:
-        until(goes_on, WAIT_S)
-    else:
-        made.tick(tick(1, of=SECOND))
-        made.goal_ended(SECOND, DONE)
-    until(lambda: made.lost is not None, WAIT_S)
+    until(goes_on if runs else lambda: made.lost is not None, WAIT_S)
     if runs:
         assert not lost.is_set()
         made.tick(tick(2, of=SECOND))  # the robot goes on to the goal's end
@@ -413,3 +410,40 @@ def test_a_slow_writer_costs_ticks_never_time(tmp_path: Path) -> None:
         made.tick(tick(index))
     assert made.counts.dropped == 5
     assert "5 ticks were dropped" in made.counts.summary()
+
+
+def test_the_queue_counts_the_bytes_of_each_tick(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the first tick's bytes were taken for those of all others; after a first tick
+    without pictures the queue took any number of bytes.
+    """
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 5 * WIDTH * HEIGHT * 3)
+    made = recorder(tmp_path / "set")
+    made.tick(tick(0, frames={}))
+    for index in range(1, 9):
+        made.tick(tick(index))
+    assert made.counts.dropped == 3
+
+
+def test_a_strict_recording_ends_with_its_first_loss(tmp_path: Path) -> None:
+    """Regression: a benchmark played all of its episodes for a dataset that took none."""
+    lost = threading.Event()
+    made = recorder(tmp_path / "set", strict=True, on_lost=lost.set)
+    made.start()
+    odd = {"front": picture("front", 1, width=15, height=15, data=bytes(15 * 15 * 3))}
+    record_goal(made, FIRST, DONE, 2, frames=odd)
+    assert lost.wait(WAIT_S)
+    made.close()
+    assert "a video needs even numbers" in str(made.counts.error)
+
+
+def test_an_episode_that_cannot_be_ended_at_the_close_is_a_loss(tmp_path: Path) -> None:
+    """Regression: the writer logged it, and the runner called the recording complete."""
+    made = recorder(tmp_path / "set", cameras=())
+    made.start()
+    (tmp_path / "set/data/chunk-000/file-000.parquet").mkdir(parents=True)
+    for index in range(2):
+        made.tick(tick(index, frames={}))
+    made.close()
+    assert "(status 1)" in str(made.counts.error)

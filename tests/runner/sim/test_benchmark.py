@@ -21,13 +21,18 @@ from hypothesis import strategies as st
 from tests.runner.conftest import KinematicEnv, world_of
 from tests.runner.manual_clock import ManualClock
 from vram_arbiter.runner.__main__ import main
+from vram_arbiter.runner.cli import lerobot_eval
 from vram_arbiter.runner.cli.benchmark import add_parser, entries_of
+from vram_arbiter.runner.cli.lerobot_eval import cells_of, flags_of, lease_of
 from vram_arbiter.runner.protocols import ChunkStart, Hold
 from vram_arbiter.runner.recording.reader import read_frame
 from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, file_name, wilson
+from vram_arbiter.runner.sim.config import SceneConfig
 from vram_arbiter.runner.sim.policies import PolicySkill, policy_of
 from vram_arbiter.runner.sim.robot import sim_runner
-from vram_arbiter.schemas.errors import SidecarUnavailable, UnknownSkill
+from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable, UnknownSkill
+from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 HERE = Path(__file__).parents[1]
@@ -253,6 +258,21 @@ def test_the_expert_in_our_own_scene_is_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
+@pytest.mark.timeout(600)
+def test_a_benchmark_ends_with_the_first_episode_that_is_not_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Regression: all episodes were played for a dataset that took none of them."""
+    scene, larger = tmp_path / "scene.yaml", SceneConfig().model_dump(mode="json")
+    larger["cameras"]["wrist"]["width_px"] = 161  # no video has it
+    scene.write_text(json.dumps(larger), encoding="utf-8")
+    flags = ["--scene", str(scene), "--max-steps", "2", "--episodes", "1000000", "--no-videos"]
+    recorded = ["--record", str(tmp_path / "set"), "--out", str(tmp_path)]
+    assert main(["benchmark", "--policy", "random", *flags, *recorded]) == 2
+    assert "a video needs even numbers" in capsys.readouterr().err
+
+
+@pytest.mark.heavy
 def test_a_skill_in_our_own_scene(tmp_path: Path) -> None:
     common = ["benchmark", "--no-arbiter", "--no-videos", "--out", str(tmp_path)]
     assert main([*common, "--skill", "vram-arbiter/so101-navigate", "--episodes", "2"]) == 0
@@ -267,7 +287,7 @@ def test_a_skill_in_our_own_scene(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        ([], "there are no contestants"),
+        ([], "expected --skill RSKILL or --policy NAME"),
         (["--policy", "clever"], "clever"),
         (["--policy", "scripted:no_such_module"], "no_such_module"),
         (["--policy", "scripted:none.py"], "none.py"),
@@ -373,19 +393,35 @@ def test_a_signal_ends_it_with_a_report_of_what_was_played(tmp_path: Path) -> No
 
 
 # -- environments of lerobot
+def grab_of(folder: Path, weights: str) -> Path:
+    """Write the shipped grab's manifest with other weights."""
+    grab = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
+    manifest = folder / "rskill.yaml"
+    manifest.write_text(grab.replace("local://models/so101-grab", weights), encoding="utf-8")
+    return manifest
+
+
 @pytest.mark.heavy
 @pytest.mark.timeout(600)
-def test_lerobot_eval_plays_a_checkpoint_in_an_environment_of_lerobot(
+def test_lerobot_eval_plays_a_pinned_checkpoint_in_an_environment_of_lerobot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """lerobot's own program, with an environment and a small policy that it knows by a plugin."""
+    """lerobot's own program, with an environment and a small policy that it knows by a plugin.
+
+    Regression: lerobot-eval was given the revision as a flag, and read configuration and processors
+    of the newest one.
+    """
     pytest.importorskip("lerobot.policies", reason="needs the sidecars extra")
-    checkpoint = tmp_path / "configs" / "models" / "point"
-    make_point_policy(checkpoint)
-    grab = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
-    manifest = tmp_path / "rskill.yaml"
-    manifest.write_text(grab.replace("models/so101-grab", "models/point"), encoding="utf-8")
-    monkeypatch.setenv("VRAM_ARBITER_CONFIGS", str(tmp_path / "configs"))
+    from huggingface_hub import constants
+
+    cached, commit = tmp_path / "hub/models--lab--point", "0123456789" * 4
+    make_point_policy(cached / "snapshots" / commit)
+    (cached / "refs").mkdir()
+    (cached / "refs/v1").write_text(commit, encoding="utf-8")
+    manifest = grab_of(tmp_path, "hf://lab/point@v1")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # lerobot leaves a file there
@@ -426,25 +462,82 @@ def make_point_policy(folder: Path) -> None:
     after.save_pretrained(folder)
 
 
-@pytest.mark.heavy
-def test_lerobot_eval_runs_under_a_lease_of_the_declared_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from vram_arbiter.runner.cli.lerobot_eval import _lease, flags_of
-    from vram_arbiter.schemas.manifest import load_manifest
-
-    monkeypatch.setenv("VRAM_ARBITER_CONFIGS", str(tmp_path))
-    libero = load_manifest(ROOT / "configs/rskills/libero-pi05-nf4/rskill.yaml")
+def lerobot_args(*more: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     parser = add_parser(parser.add_subparsers())
-    args = parser.parse_args(["--env", "libero", "--seed", "7", "--", "--env.task=libero_10"])
-    flags = flags_of(libero, args, tmp_path / "out")
-    assert flags[:2] == [
-        "--policy.path=lerobot/pi05_libero_finetuned_v044",
-        "--policy.pretrained_revision=8e174154ef5f6c60a8da12ae99c303d8963138c1",
-    ]
+    return parser.parse_args(["--env", "libero", "--seed", "7", *more])
+
+
+def test_lerobot_eval_runs_under_a_lease_of_the_unquantized_bytes(tmp_path: Path) -> None:
+    """Regression: the lease had the bytes of the quantized weights; lerobot-eval loads the
+    checkpoint as it is.
+    """
+    libero = load_manifest(ROOT / "configs/rskills/libero-pi05-nf4/rskill.yaml")
+    args = lerobot_args("--", "--env.task=libero_10")
+    flags = flags_of("lerobot/pi05", args, tmp_path / "out")
+    assert flags[0] == "--policy.path=lerobot/pi05"
     assert {"--env.type=libero", "--seed=7", "--env.task=libero_10"} <= set(flags)
-    lease = _lease(libero, args)
-    assert lease[-5:-3] == ["--vram", f"{libero.declared_vram_gb:g}GB"]
+    sizes = {Dtype.INT4: 4.0, Dtype.BF16: 9.0, Dtype.FP32: 17.5}
+    lease = lease_of(libero.model_copy(update={"min_vram_gb": sizes}), args)
+    assert lease[-5:-3] == ["--vram", "17.5GB"]
     assert lease[-1] == "--"
     assert os.path.exists(lease[0])
+    with pytest.raises(ConfigError, match="does not declare min_vram_gb of fp32, fp16 or bf16"):
+        lease_of(libero.model_copy(update={"min_vram_gb": {Dtype.INT4: 4.0}}), args)
+
+
+def test_each_task_of_lerobots_environment_is_a_cell_with_the_same_seeds(tmp_path: Path) -> None:
+    """Regression: the seeds were counted on through all tasks, whose rates were one."""
+    libero = load_manifest(ROOT / "configs/rskills/libero-pi05-nf4/rskill.yaml")
+    told = [
+        {"task_group": "libero_10", "task_id": n, "metrics": {"successes": [True, n == 1]}}
+        for n in range(2)
+    ]
+    (tmp_path / "eval_info.json").write_text(json.dumps({"per_task": told}), encoding="utf-8")
+    cells = cells_of(libero, lerobot_args(), tmp_path, 0)
+    played = [(c.task, c.complete, [(e.seed, e.success) for e in c.episodes]) for c in cells]
+    assert played == [
+        ("libero_10/0", True, [(7, True), (8, False)]),
+        ("libero_10/1", True, [(7, True), (8, True)]),
+    ]
+    (cell,) = cells_of(libero, lerobot_args(), tmp_path / "none", 1)
+    assert (cell.complete, cell.why) == (False, "lerobot-eval ended with 1")
+
+
+def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> list[str]:
+    """Put a program in the place of lerobot-eval; return the command that starts it by main()."""
+    program = folder / "lerobot-eval"
+    program.write_text(f"#!{sys.executable}\n{code}\n", encoding="utf-8")
+    program.chmod(0o755)
+    monkeypatch.setattr(lerobot_eval.shutil, "which", lambda name, path: str(program))
+    manifest = grab_of(folder, "local://models/so101-grab")
+    return [
+        *("benchmark", "--env", "point", "--skill", "vram-arbiter/so101-grab", "--no-arbiter"),
+        *("--skills", str(manifest), "--out", str(folder / "out")),
+    ]
+
+
+def test_the_result_of_an_earlier_run_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: a run that ended without a result had the rates of the one before."""
+    argv = stand_in(tmp_path, monkeypatch, "")
+    earlier = tmp_path / "out/point_vram-arbiter-so101-grab/eval_info.json"
+    earlier.parent.mkdir(parents=True)
+    told = {"task_group": "point", "task_id": 0, "metrics": {"successes": [True]}}
+    earlier.write_text(json.dumps({"per_task": [told]}), encoding="utf-8")
+    assert main(argv) == 1
+    (cell,) = report(tmp_path / "out")["cells"]
+    assert (cell["played"], cell["complete"]) == (0, False)
+
+
+def test_a_signal_ends_lerobot_eval_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: lerobot-eval went on, with its GPU memory, when the runner was told to end."""
+    argv = stand_in(
+        tmp_path,
+        monkeypatch,
+        "import os, signal, time; os.kill(os.getppid(), signal.SIGTERM); time.sleep(600)",
+    )
+    assert main(argv) == 1
+    (cell,) = report(tmp_path / "out")["cells"]
+    assert cell["why"] == f"lerobot-eval ended with {-signal.SIGTERM}"

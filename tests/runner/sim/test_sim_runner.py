@@ -209,12 +209,6 @@ def test_a_skill_loses_the_world_with_its_episode(make_runner: Make, env: Any) -
     assert env.resets == [0, 1]
 
 
-def test_an_episode_that_nobody_judges_is_no_success(make_runner: Make) -> None:
-    _, ended = play_script(make_runner(rate_hz=0, max_steps=2), [Act(joints(0.1))] * 9, 2)
-    assert isinstance(ended[0].error, ModelError)
-    assert "nothing judges it" in ended[0].error.message
-
-
 def test_an_episode_may_end_with_its_skill(make_runner: Make, env: Any) -> None:
     runner = make_runner(rate_hz=0, ends_with_skill=True, judge=lambda e: len(e.steps) > 99)
     ticks, ended = play_script(runner, [Act(joints(0.1))], 2)

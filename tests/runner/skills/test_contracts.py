@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera
+from tests.runner.small_robots import FedCamera, robot_of
 from tests.support.deployment import load_robot
 from tests.support.paths import ROOT
 from vram_arbiter.runner.protocols import Goal, MobileBase, RobotDescription, SkillEnded
@@ -620,7 +620,7 @@ def test_numbers_that_are_no_orientation_are_a_model_error(
 
 
 # -- what a robot cannot do
-def findings(manifest: RSkillManifest, robot: RobotDescription | tuple[str, ...]) -> list[str]:
+def findings(manifest: RSkillManifest, robot: RobotDescription) -> list[str]:
     with pytest.raises(ManifestError) as caught:
         wire_up(manifest, robot, None)
     return [str(problem) for problem in caught.value.problems]
@@ -759,14 +759,14 @@ def test_a_world_without_frames_ranges_or_a_base_says_so() -> None:
         " gripper_convention: percent_open}}]\n"
         "action_contract: {dim: 2, joint_units: range_m100_100}\n"
     )
-    names = ("a", "b")
-    assert findings(manifest, names)[0] == (
+    robot = robot_of("a", "b")
+    assert findings(manifest, robot)[0] == (
         "action_contract: range_m100_100: the range of a is not known"
     )
     moving = slots(
         3, "range: [0, 2], control_mode: cartesian_delta, ee: hand, frame: base", more=SCALE3
     )
-    assert findings(moving, names) == [
+    assert findings(moving, robot) == [
         "action_contract.slots[0].control_mode: cartesian_delta needs a model of this world for"
         " its kinematics; there is none"
     ]
@@ -787,8 +787,22 @@ def test_cartesian_commands_without_the_solver_are_refused(
 ) -> None:
     monkeypatch.setitem(sys.modules, "mink", None)
     assert findings(tool_skill("panda_link0"), panda.robot) == [
-        "action_contract: cartesian commands need mink: pip install 'vram-arbiter[runner]'"
+        "action_contract: frames need mink and SciPy (import of mink halted; None in sys.modules):"
+        " pip install 'vram-arbiter[runner]'"
     ]
+
+
+def test_a_state_of_the_base_alone_needs_scipy_before_the_first_tick(
+    monkeypatch: pytest.MonkeyPatch, panda: Bench
+) -> None:
+    """Regression: where only the base's pose was read, SciPy was imported, or missing, in a tick."""
+    monkeypatch.setitem(sys.modules, "scipy.spatial.transform", None)
+    based = skill(
+        JOINTS + "state_contract:\n  parts:\n"
+        "    - {kind: base_pose, frame: odom, rotation: quat_xyzw}\n"
+    )
+    (said,) = findings(based, panda.robot)
+    assert said.startswith("state_contract: frames need mink and SciPy")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import robot_of
 from tests.sidecars.adapters import policies
 from tests.sidecars.adapters.policies import DIM, FRONT, SIDE_PX, STATE, TASK, WRIST
 from tests.sidecars.adapters.test_policy_families import SEED, lerobots_own, manifest_text
@@ -79,7 +80,7 @@ def test_a_goal_plays_what_lerobots_loop_plays(
         adapter.prepare()
         adapter.load("cpu")
         adapter.place("cpu")
-        wiring = wire_up(manifest, JOINTS, None)
+        wiring = wire_up(manifest, robot_of(*JOINTS), None)
         client: Any = Served(adapter)
         skill = SidecarPolicy(manifest, wiring, client, None, period_s=1 / 30, wait_s=60.0)
         random = np.random.default_rng(1)

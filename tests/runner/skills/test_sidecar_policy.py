@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import robot_of
 from tests.support.field_server import FieldServer
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
@@ -205,7 +206,7 @@ class Bench:
         self.sidecar, self.arbiter = Sidecar(), arbiter
         self.client = PolicyClient(endpoint, timeout_s=60.0)
         options.setdefault("wait_s", 60.0)
-        wiring: Wiring = wire_up(manifest, JOINTS, REST)
+        wiring: Wiring = wire_up(manifest, robot_of(*JOINTS), REST)
         self.skill = SidecarPolicy(
             manifest, wiring, self.client, arbiter, period_s=1 / 30, **options
         )
@@ -621,12 +622,12 @@ def test_a_manifest_that_does_not_fit_the_robot_is_refused(
     manifest: RSkillManifest, change: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(ManifestInvalid, match=said):
-        wire_up(manifest.model_copy(update=change), JOINTS, REST)
+        wire_up(manifest.model_copy(update=change), robot_of(*JOINTS), REST)
 
 
 def test_a_manifest_for_another_arm_is_refused(manifest: RSkillManifest) -> None:
     with pytest.raises(ManifestInvalid, match="commands 2 joints"):
-        wire_up(manifest, ("a", "b", "c"), REST)
+        wire_up(manifest, robot_of("a", "b", "c"), REST)
 
 
 def test_views_are_cropped_and_averaged_as_trained(
@@ -733,7 +734,7 @@ def test_a_chunk_that_is_asked_for_too_late_loads_nothing(
     async def play(b: Bench) -> None:
         b.skill = SidecarPolicy(
             b.skill.manifest,
-            wire_up(b.skill.manifest, JOINTS, REST),
+            wire_up(b.skill.manifest, robot_of(*JOINTS), REST),
             b.client,
             b.arbiter,
             period_s=1 / 30,
