@@ -17,10 +17,9 @@ from typing import Any
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, invariants, standby
 from vram_arbiter.arbiter.core.effects import Effect
-from vram_arbiter.arbiter.core.inspection import Inspection
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.refusals import NoSession, Refused
-from vram_arbiter.arbiter.core.model.state import Core, Turn
+from vram_arbiter.arbiter.core.model.state import Core, Inspection, Turn
 from vram_arbiter.arbiter.core.report import status, why
 from vram_arbiter.arbiter.core.report.status import PageKey
 from vram_arbiter.arbiter.core.requests import operators, recovery, requests, sessions, uses
@@ -91,7 +90,7 @@ _DUE: Mapping[str, Callable[[Core, str], None]] = {
     "probe": schedule.on_probe_due,
     "users": uses.on_users_due,
     "away": standby.on_away_due,
-    "recover": recovery.account_for,
+    "recover": Core.account_for,
     "plan": grants.on_plan_due,
     "return": grants.on_plan_due,
 }
@@ -161,7 +160,7 @@ class Arbiter:
     # -- questions
     def inspect(self) -> Inspection:
         """Return a read-only view of the records, for tests and offline tools."""
-        return Inspection.of(self._core)
+        return self._core.inspect()
 
     def next_deadline(self) -> float | None:
         """When a tick is due (monotonic seconds); None: nothing is planned."""
@@ -198,7 +197,8 @@ class Arbiter:
     def stale(self, now: float) -> list[GpuId]:
         """GPUs that have to be read before their state can be shown (`schedule.stale`)."""
         self._core.now = max(self._core.now, now)
-        return schedule.stale(self._core)
+        core = self._core
+        return schedule.stale(core.gpus.values(), core.now - core.settings.sample_max_age_s)
 
     def learnt(self) -> dict[str, dict[str, float]]:
         """Return the learned durations, in the shape of `Settings.learnt`."""

@@ -1,12 +1,13 @@
 """Eviction ladder of a revoked holder.
 
-| step      | when                                                   | what                            |
-| --------- | ------------------------------------------------------ | ------------------------------- |
-| push      | at once, then every `revoke_resend_s` while the holder | `revoke`                        |
-|           | has not acknowledged, or is at its safe point          |                                 |
-| remind    | `revoke_remind_s` after the first push                 | a note                          |
-| deadline  | `revoke_deadline_s` after it, and again so long after  | a note; the bytes are not       |
-|           | the unloading began                                    | counted on                      |
+| step      | when                                                   | what
+| | --------- | ------------------------------------------------------ |
+------------------------------- | | push      | at once, then every `revoke_resend_s` while the
+holder | `revoke`                        | |           | has not acknowledged, or is at its safe
+point          |                                 | | remind    | `revoke_remind_s` after the first
+push                 | a note                          | | deadline  | `revoke_deadline_s` after it,
+and again so long after  | a note; the bytes are not       | |           | the unloading began
+| counted on                      |
 
 A holder unloads by itself, at its safe point: `unloading` is refused before that. The engine waits;
 ending a stuck holder is a person's order (`operators.kill`). A revoke is for someone: when nothing
@@ -17,9 +18,12 @@ withdraw revokes that nothing wants (`is_wanted`); `deny` ends a wait with an er
 serves the timer.
 """
 
+from collections.abc import Container
+
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Why
 from vram_arbiter.schemas.wire.errors import Refusal
@@ -79,12 +83,12 @@ def ask(
 
 
 # -- withdrawn
-def is_wanted(core: Core, gpu: Gpu, eviction: Eviction) -> bool:
+def is_wanted(waiting: Container[LeaseId | None], gpu: Gpu, eviction: Eviction) -> bool:
     """Return whether anything wants the room of a revoked holder: its waiter waits, the GPU is
     under pressure, or an operator ordered it."""
     match eviction.why.cause:
         case "waiter":
-            return eviction.wanted_by in core.waiting
+            return eviction.wanted_by in waiting
         case "pressure":
             return gpu.ledger.pressed
         case _:
@@ -96,7 +100,7 @@ def take_back(core: Core, gpu: Gpu) -> None:
     wants their room any more; `settle` has to follow."""
     for holder in gpu.in_state(LeaseState.REVOKING):
         asked = holder.departure.eviction
-        if asked is None or is_wanted(core, gpu, asked):
+        if asked is None or is_wanted(core.waiting, gpu, asked):
             continue
         core.turn.taken_back.setdefault(holder.id, asked)
         holder.departure.eviction = None
@@ -147,23 +151,23 @@ def push_revoke(core: Core, holder: Lease, *, extra: bool = False) -> None:
             order=why.order,
             priority=None if waiter is None else waiter.spec.priority,
             uses=len(holder.uses),
-            park=core.can_park(holder),
+            park=holder.id in core.host_ram.booked,
             traceparent=eviction.traceparent or "",
         ),
     )
     if not extra:
         eviction.next_push_at = core.now + core.settings.revoke_resend_s
-        _plan_step(core, holder, eviction)
+        core.timers.set_first(("revoke", holder.id), _next_steps(holder, eviction, core.settings))
 
 
-def _plan_step(core: Core, holder: Lease, eviction: Eviction) -> None:
-    times = [] if eviction.overdue else [eviction.asked_at + core.settings.revoke_deadline_s]
+def _next_steps(holder: Lease, eviction: Eviction, settings: Settings) -> list[float]:
+    """Return the instants of the ladder that are still to come."""
+    times = [] if eviction.overdue else [eviction.asked_at + settings.revoke_deadline_s]
     if not eviction.reminded:
-        times.append(eviction.asked_at + core.settings.revoke_remind_s)
+        times.append(eviction.asked_at + settings.revoke_remind_s)
     if eviction.acked_at is None or not holder.uses:
         times.append(eviction.next_push_at)
-    if times:
-        core.timers.set(("revoke", holder.id), min(times))
+    return times
 
 
 def on_ladder_due(core: Core, lease_id: str) -> None:
@@ -190,7 +194,7 @@ def on_ladder_due(core: Core, lease_id: str) -> None:
     if not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s:
         eviction.overdue = True
         _pass_deadline(core, holder, eviction)
-    _plan_step(core, holder, eviction)
+    core.timers.set_first(("revoke", holder.id), _next_steps(holder, eviction, core.settings))
 
 
 def _pass_deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
@@ -199,8 +203,8 @@ def _pass_deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None
     core.note(DeadlinePassedNote(len(holder.uses), consumer), holder)
     core.wake(core.gpu_of(holder))
     waiter = None if wanted_by is None else core.waiting.get(wanted_by)
-    for gpu_id in () if waiter is None else waiter.request.gpus:
-        core.wake(core.gpus[gpu_id])  # it may be served on another GPU now
+    if waiter is not None:
+        core.wake_candidates(waiter)  # it may be served on another GPU now
 
 
 def deny(core: Core, waiter: Lease, refusal: Refusal) -> None:

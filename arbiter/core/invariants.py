@@ -15,10 +15,13 @@ grow with the number of leases. The tests' drivers also check everything
   7. a holder is revoked for someone: a waiter, pressure or an operator
 """
 
+from collections.abc import Container
+
 from vram_arbiter.arbiter.core.eviction import is_wanted
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState
-from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.model.state import Core, Timers
+from vram_arbiter.schemas.ids import LeaseId
 
 _UNUSED = (LeaseState.LOADING, LeaseState.UNLOADING, LeaseState.VERIFYING)
 """States of a resident without uses."""
@@ -40,10 +43,10 @@ def check(core: Core) -> None:
             _check_grant(gpu)
         _check_gpu(gpu)
         if (head := gpu.queue.head) is not None:
-            _check_head(core, gpu, head)
+            _check_head(gpu, head, core.waiting, core.timers)
         for lease in gpu.residents.by_state[LeaseState.REVOKING].values():
             asked = lease.departure.eviction
-            if asked is None or not is_wanted(core, gpu, asked):
+            if asked is None or not is_wanted(core.waiting, gpu, asked):
                 raise InvariantViolation(7, f"{lease.id} is revoked, and nothing wants its bytes")
     for token, _ in core.turn.granted:
         if token <= core.last_token:
@@ -53,15 +56,10 @@ def check(core: Core) -> None:
     waiting = len(core.waiting)
     if queued < waiting or (len(core.gpus) == 1 and queued != waiting):
         raise InvariantViolation(6, f"{waiting} leases wait, {queued} are in queues")
-    _check_away(core)
-
-
-def _check_away(core: Core) -> None:
-    """Leases that are away have no GPU and do not wait; what is parked fits."""
-    ram = core.host_ram
-    fitted = sum(count for lease, count in ram.booked.items() if lease not in ram.found)
-    if fitted > ram.budget_bytes:
-        raise InvariantViolation(4, f"{fitted} bytes are parked, budget {ram.budget_bytes}")
+    if (fitted := core.host_ram.fitted_bytes()) > core.host_ram.budget_bytes:
+        raise InvariantViolation(
+            4, f"{fitted} bytes are parked, budget {core.host_ram.budget_bytes}"
+        )
     for lease in core.away.values():
         if lease.state not in AWAY or lease.id not in core.leases:
             raise InvariantViolation(4, f"{lease.id} is {lease.state}, yet it counts as away")
@@ -124,12 +122,12 @@ def _check_gpu(gpu: Gpu) -> None:
             raise InvariantViolation(4, f"the bytes of {lease_id} are charged for ever")
 
 
-def _check_head(core: Core, gpu: Gpu, head: Lease) -> None:
-    if head.id not in core.waiting:
+def _check_head(gpu: Gpu, head: Lease, waiting: Container[LeaseId], timers: Timers) -> None:
+    if head.id not in waiting:
         raise InvariantViolation(
             6, f"{head.id} is {head.state}, yet it is the head of {gpu.info.id}"
         )
-    if head.request.wait_timeout_s is not None and ("wait", head.id) not in core.timers:
+    if head.request.wait_timeout_s is not None and ("wait", head.id) not in timers:
         raise InvariantViolation(6, f"{head.id} has a bound and no timer")
-    if ("probe", gpu.info.id) not in core.timers:
+    if ("probe", gpu.info.id) not in timers:
         raise InvariantViolation(6, f"no reading of {gpu.info.id} is planned, and {head.id} waits")

@@ -58,7 +58,7 @@ class GpuLedger:
     """All bytes of one GPU. Every method that changes something takes `now`."""
 
     def __init__(self, info: GpuInfo, tolerance_bytes: int) -> None:
-        self._tolerance_bytes = tolerance_bytes
+        self.tolerance_bytes = tolerance_bytes
         self.info = info
         self.budget_bytes = info.capacity_bytes - info.reserve_bytes
         self.accounts: dict[ProcessKey, Account] = {}
@@ -86,7 +86,7 @@ class GpuLedger:
         """Return by how much everything together exceeds the budget; less than the tolerance is no
         pressure."""
         over = self._held_bytes + self.stowaway_bytes - self.budget_bytes
-        return over if over > self._tolerance_bytes else 0
+        return over if over > self.tolerance_bytes else 0
 
     def note_pressure(self) -> PressureNote | None:
         """Bring `pressed` up to date. Return the note of its begin or end; None: as before."""
@@ -95,8 +95,27 @@ class GpuLedger:
             return None
         self.pressed = bool(pressure_bytes)
         over = [(a.process, a.held_bytes - a.charged_bytes) for a in self.accounts.values()]
-        holders = tuple(OverHolder(p.pid, n) for p, n in over if n > self._tolerance_bytes)
+        holders = tuple(OverHolder(p.pid, n) for p, n in over if n > self.tolerance_bytes)
         return PressureNote(self.info.id, pressure_bytes, self.stowaway_bytes, holders)
+
+    def impossible(self, reading: MemorySampled) -> str:
+        """Say why a reading cannot be true; "" if it can. Nonsense means unknown, never free."""
+        used, total, info = reading.used_bytes, reading.total_bytes, self.info
+        if info.total_bytes and abs(total - info.total_bytes) > self.tolerance_bytes:
+            return (
+                f"impossible reading: {total} bytes of memory, {info.total_bytes} at the start; "
+                "if that is so now, restart the arbiter"
+            )
+        if total < info.capacity_bytes - self.tolerance_bytes:
+            told = f"{total} bytes of memory, {info.capacity_bytes} are leased out"
+            return f"impossible reading: {told}"
+        if not 0 <= used <= total + self.tolerance_bytes:
+            return f"impossible reading: {used} of {total} bytes are used"
+        for use in reading.processes or ():
+            if not 0 <= use.held_bytes <= total + self.tolerance_bytes:
+                told = f"process {use.process.pid} holds {use.held_bytes} of {total} bytes"
+                return f"impossible reading: {told}"
+        return ""
 
     def unlisted_bytes(self, reading: MemorySampled) -> int | None:
         """Return the most that processes outside the list hold together; None: it cannot tell.
@@ -170,6 +189,23 @@ class GpuLedger:
         if not dead:
             held = max(held, account.retained_floor_bytes, *going.values())
         return held, total - account.held_bytes + held
+
+    def leftover_bytes(self, account: Account, reading: MemorySampled, *, gone: bool) -> int:
+        """Return the most that a reading leaves a process without leases of its retained bytes.
+
+        `gone`: its process has no connection, so that a list that omits it may say that nothing is
+        left.
+        """
+        process, least_bytes = account.process, account.retained_floor_bytes
+        held_bytes = account.measured_bytes
+        if bytes_of(reading, process) is None:  # listed without its bytes
+            return max(least_bytes, reading.used_bytes)
+        if gone and not held_bytes:
+            least_bytes = 0
+        if bytes_of(reading, process, omitted=None) is None:  # not listed
+            unlisted_bytes = self.unlisted_bytes(reading)
+            held_bytes = account.retained_bytes if unlisted_bytes is None else unlisted_bytes
+        return max(least_bytes, held_bytes)
 
     # -- changing
     def charge(
@@ -341,6 +377,10 @@ class HostRam:
     def taken_bytes(self) -> int:
         """Return what is booked for all leases together."""
         return sum(self.booked.values())
+
+    def fitted_bytes(self) -> int:
+        """Return what is booked because it fitted."""
+        return sum(count for lease, count in self.booked.items() if lease not in self.found)
 
     def fits(self, lease: LeaseId, count: int) -> bool:
         """Return whether bytes fit in place of what is booked for the lease already."""

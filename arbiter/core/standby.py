@@ -16,10 +16,10 @@ it, and waits in the queues like any other.
 Its ends: `dismiss` by an operator, `give_up` by its holder, `end`.
 """
 
+from collections.abc import Mapping
 from functools import partial
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import learning
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, NONCES_MAX, Departure, Lease, LeaseState
@@ -42,25 +42,19 @@ def go_away(core: Core, lease: Lease, to: LeaseState, verdict: str) -> None:
     core.wake(gpu)
     lease.departure = Departure()
     lease.gpu = lease.observed.reported_bytes = request.id = None
-    request.gpus = tuple(gpu.info.id for gpu in admission.selected(core, lease.spec))
+    request.gpus = tuple(gpu.info.id for gpu in admission.selected(core.gpus, lease.spec))
     request.evicted = []
     request.answered = True
-    request.load_peak_bytes, request.steady_bytes = learning.expected_bytes(core, lease.spec)
+    request.load_peak_bytes, request.steady_bytes = core.footprints.expected_bytes(lease.spec)
     standby.since = core.now
     core.record_lease(lease)
-    wake(core, lease)
+    core.wake_candidates(lease)
     note = ParkedNote if to is LeaseState.PARKED else StandbyNote
     parked_bytes = core.host_ram.booked.get(lease.id, 0)
     core.note(note(standby.left_for, parked_bytes, standby.comes_back), lease)
     if standby.recalled_at is not None:
         asked_at, standby.recalled_at = standby.recalled_at, None
         _queue(core, lease, lease.client, None, asked_at)
-
-
-def wake(core: Core, lease: Lease) -> None:
-    """Serve the GPUs that a lease may be granted on."""
-    for gpu_id in lease.request.gpus:
-        core.wake(core.gpus[gpu_id])
 
 
 # -- ends ------------------------------------------------------------------------------------------
@@ -137,8 +131,8 @@ def call_back(
 ) -> None:
     """Queue a lease that is away, as it is asked for now. Raises Refused."""
     client, request = core.clients[event.client], lease.request
-    load_peak, steady = learning.expected_bytes(core, spec)
-    gpus = admission.places(core, spec, load_peak)
+    load_peak, steady = core.footprints.expected_bytes(spec)
+    gpus = admission.places(core.gpus, spec, load_peak)
     admission.check_waiters(core, client, spec.priority)
     request.load_peak_bytes, request.steady_bytes = load_peak, steady
     if isinstance(event, ev.AcquireRequested) and event.nonce != request.nonce:
@@ -178,7 +172,7 @@ def _queue(
 
 
 # -- coming back by itself -------------------------------------------------------------------------
-def first_to_return(core: Core, gpu: Gpu) -> Lease | None:
+def first_to_return(away: Mapping[LeaseId, Lease], gpu: Gpu) -> Lease | None:
     """Return the lease that comes back next to a GPU for which nothing waits; None: none fits.
 
     By priority, then in the order of their leaving. One that does not fit yet keeps its turn:
@@ -186,7 +180,7 @@ def first_to_return(core: Core, gpu: Gpu) -> Lease | None:
     """
     ahead: Lease | None = None
     spare_bytes = 0
-    for lease in _by_turn(core, gpu):
+    for lease in _by_turn(away, gpu):
         if ahead is not None and (
             ahead.spec.exclusive or admission.added_bytes(gpu, lease) > spare_bytes
         ):
@@ -214,11 +208,11 @@ def left_for_is_here(gpu: Gpu, lease: Lease) -> bool:
     )
 
 
-def _by_turn(core: Core, gpu: Gpu) -> list[Lease]:
+def _by_turn(away: Mapping[LeaseId, Lease], gpu: Gpu) -> list[Lease]:
     """Return the leases that may return to a GPU, the first to do so first."""
     found = [
         lease
-        for lease in core.away.values()
+        for lease in away.values()
         if lease.standby.comes_back
         and lease.attached
         and gpu.info.id in lease.request.gpus

@@ -83,7 +83,6 @@ class Executor:
         log_event: Callable[[JsonMap], None],
         signal: Callable[[ProcessKey, str], None],
         words: Words,
-        spans: SpanIds | None = None,
     ) -> None:
         self._outbox = outbox
         self._journal = journal
@@ -93,7 +92,7 @@ class Executor:
         self._log_event = log_event
         self._signal = signal
         self._words = words
-        self._spans = spans or SpanIds()
+        self._spans = SpanIds()
         self.writes = Writes()
         self.owed: dict[str, None] = {}
         """Records still to be deleted: the disk was full when they ended. The next write

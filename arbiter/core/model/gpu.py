@@ -150,10 +150,10 @@ class WaitQueue:
         """Return the place of a request; 1 is the head."""
         return bisect_left(self._ranks, self.rank(lease)) + 1
 
-    def ahead_of(self, lease: Lease) -> LeaseId | None:
+    def ahead_of(self, lease: Lease) -> Lease | None:
         """Return the request directly before this one."""
         index = self.position(lease) - 2
-        return self.by_arrival[self._ranks[index][1]].id if index >= 0 else None
+        return self.by_arrival[self._ranks[index][1]] if index >= 0 else None
 
     def after(self, rank: Rank) -> Iterator[Lease]:
         """Yield the requests behind a rank, whether or not a request has it now."""
@@ -253,6 +253,10 @@ class Gpu:
         """Return its leases in these states, in the order in which they came to them."""
         by_state = self.residents.by_state
         return [lease for state in states for lease in by_state[state].values()]
+
+    def leaving(self) -> list[Lease]:
+        """Return its leaving leases, oldest grant first."""
+        return [lease for lease in self.residents.values() if lease.state in LEAVING]
 
     def shown_bytes(self, process: ProcessKey) -> int | None:
         """Return the bytes of a process by the newest reading, 0 where that omits it; None: it

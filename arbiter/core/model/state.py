@@ -7,10 +7,13 @@ uses, waits, the end of a lease, and the journal.
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields
 from hashlib import blake2b
 from heapq import heapify, heappop, heappush
 from math import inf
+from types import MappingProxyType
+from typing import Any, Final
 
 from vram_arbiter.arbiter.core.effects import (
     Effect,
@@ -22,9 +25,10 @@ from vram_arbiter.arbiter.core.effects import (
     Reply,
     Sample,
 )
+from vram_arbiter.arbiter.core.events import DOUBT_KEY
+from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.ledger import GpuLedger, HostRam
 from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
-from vram_arbiter.arbiter.core.model.learned import Costs, Footprints
 from vram_arbiter.arbiter.core.model.lease import AWAY, Eviction, Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
 from vram_arbiter.arbiter.core.settings import Settings
@@ -40,6 +44,10 @@ TOKEN_STEP_BYTES = 4
 """Tokens are apart by up to 2^32: 2^31 grants of one epoch stay below 2^63."""
 TIMERS_SLACK = 256
 """Entries of cleared timers that stay in the heap however few are set."""
+
+EMPTY_JOURNAL: Final = LeaseId("journal")
+"""Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL
+and the fence grace."""
 
 type TimerKey = tuple[str, str]
 """(kind, subject), e.g. ("ttl", "L3-17")."""
@@ -96,6 +104,11 @@ class Timers(dict[TimerKey, float]):
         if before is None or at < before:
             heappush(self._heap, (at, key))
 
+    def set_first(self, key: TimerKey, times: Collection[float]) -> None:
+        """Set a deadline to the first of these times, if there is one."""
+        if times:
+            self.set(key, min(times))
+
     def cancel(self, key: TimerKey) -> None:
         """Forget a deadline, if it is set."""
         self.pop(key, None)
@@ -146,6 +159,26 @@ class Turn:
     """Revokes that nothing wanted any more, by holder; some are decided again, others withdrawn."""
 
 
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """Read-only view of the engine's tables, for tests and offline tools: they change with the next
+    event, and no decision reads it."""
+
+    gpus: Mapping[GpuId, Gpu]
+    leases: Mapping[LeaseId, Lease]
+    waiting: Mapping[LeaseId, Lease]
+    away: Mapping[LeaseId, Lease]
+    ended: Mapping[LeaseId, Ended]
+    nonces: Mapping[tuple[ProcessKey, str], LeaseId]
+    clients: Mapping[ClientId, Client]
+    users: Mapping[ProcessKey, Mapping[tuple[LeaseId, UseId], Lease]]
+    host_ram: HostRam
+    costs: Costs
+    refusals: Mapping[ProcessKey, Refusals]
+    footprints: Footprints
+    timers: Timers
+
+
 class Core:
     """State plus the effects of the event being handled."""
 
@@ -188,7 +221,7 @@ class Core:
         self.serving = True
         self.recovering: set[LeaseId] = set()
         # what was learned
-        self.footprints = Footprints()
+        self.footprints = Footprints(max(gpu.ledger.budget_bytes for gpu in self.gpus.values()))
         self.footprints.restore(settings.footprints)
         self.costs = Costs(settings.learnt, settings.thrash_window_s)
         for gpu in self.gpus.values():
@@ -263,6 +296,11 @@ class Core:
         for."""
         self.turn.dirty[gpu.info.index] = self.turn.touched[gpu.info.index] = gpu
 
+    def wake_candidates(self, lease: Lease) -> None:
+        """Serve the queues of every GPU that a request may be granted on."""
+        for gpu_id in lease.request.gpus:
+            self.wake(self.gpus[gpu_id])
+
     def join(self, client: Client) -> None:
         """A connection begins."""
         self.clients[client.id] = client
@@ -316,13 +354,6 @@ class Core:
         if to is LeaseState.HELD or (to is LeaseState.VERIFYING and not lease.standby.parks):
             self.host_ram.free(lease.id)  # its weights are on the GPU, or nowhere
 
-    def can_park(self, lease: Lease) -> bool:
-        """Return whether host RAM is booked for a revoked lease, or has room for another."""
-        if lease.departure.eviction is not None:
-            return lease.id in self.host_ram.booked
-        count = lease.spec.park_bytes
-        return count > 0 and self.host_ram.fits(lease.id, count)
-
     def enqueue(self, lease: Lease) -> None:
         """A request waits in the queue of every candidate GPU."""
         request = lease.request
@@ -374,6 +405,22 @@ class Core:
             _, oldest = self.ended.popitem(last=False)
             for nonce in (oldest.nonce, *oldest.earlier_nonces):
                 self.nonces.pop((oldest.process, nonce), None)
+
+    def inspect(self) -> Inspection:
+        tables: Any = {field.name: getattr(self, field.name) for field in fields(Inspection)}
+        shown: Any = {
+            name: MappingProxyType(table) if isinstance(table, dict) else table
+            for name, table in tables.items()
+        }
+        return Inspection(**shown)
+
+    def account_for(self, lease_id: str) -> None:
+        """Wait for one lease less before the first grant, or (EMPTY_JOURNAL) no longer for holders
+        that the journal does not name."""
+        if lease_id in self.recovering:
+            self.recovering.remove(LeaseId(lease_id))
+            if lease_id == EMPTY_JOURNAL:
+                self.forget(DOUBT_KEY)
 
     def record_lease(self, lease: Lease, *, debt: bool = False, gates: bool = False) -> None:
         """Write a lease that is resident (or its debt) or away to the journal. `gates`: it is a

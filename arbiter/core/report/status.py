@@ -3,7 +3,7 @@
 Typed data without words. Reads only. `view` is made for every reply about a lease.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from heapq import merge, nsmallest
@@ -16,7 +16,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.notes import EvictedLease, SwitchNote
 from vram_arbiter.schemas.wire.replies import StatusReply
@@ -45,12 +45,11 @@ def view(core: Core, lease: Lease) -> LeaseView:
     charge_bytes = 0 if lease.state in AWAY else request.load_peak_bytes  # that will be charged
     drift_bytes, ttl_left_s = 0, None
     if lease.gpu is not None:
-        gpu = core.gpus[lease.gpu]
-        charge_bytes = gpu.ledger.charge_bytes(lease.id)
+        charge_bytes = core.gpus[lease.gpu].ledger.charge_bytes(lease.id)
         if lease.state in EXPIRING:
             ttl_left_s = max(0.0, lease.expires_at - core.now)
         if lease.state is not LeaseState.LOADING:
-            drift_bytes = learning.drift_bytes(core, gpu, lease)
+            drift_bytes = learning.drift_bytes(core.gpus, lease)
     return LeaseView(
         lease_id=lease.id,
         token=lease.token,
@@ -67,7 +66,7 @@ def view(core: Core, lease: Lease) -> LeaseView:
         since_s=core.now - lease.since,
         waited_s=(core.now if queued else lease.granted_at) - request.arrived_at,
         granted_s=None if lease.token is None else core.now - lease.held_from,
-        position=position(core, lease) if queued else None,
+        position=position(core.gpus, lease) if queued else None,
         ttl_left_s=ttl_left_s,
         pinned="" if lease.pinned is None else str(lease.pinned),
         drift_bytes=drift_bytes,
@@ -76,9 +75,9 @@ def view(core: Core, lease: Lease) -> LeaseView:
     )
 
 
-def position(core: Core, lease: Lease) -> int:
+def position(gpus: Mapping[GpuId, Gpu], lease: Lease) -> int:
     """Return the best place of a request in a queue."""
-    return min([core.gpus[gpu_id].queue.position(lease) for gpu_id in lease.request.gpus])
+    return min([gpus[gpu_id].queue.position(lease) for gpu_id in lease.request.gpus])
 
 
 def gpu_view(core: Core, gpu: Gpu) -> GpuView:
@@ -161,7 +160,7 @@ def status(
     needed to mark a use, which keeps a lease from being evicted.
     """
     if only is None:
-        leases = list(islice(_listed(core, after or FIRST_PAGE, limit), limit))
+        leases = list(islice(_listed(core.leases, core.gpus, after or FIRST_PAGE, limit), limit))
     else:
         leases = [core.leases[one] for one in only if one in core.leases]
     more = only is None and leases and len(leases) == limit
@@ -180,28 +179,33 @@ def status(
         host_ram=HostRamView(core.host_ram.budget_bytes, core.host_ram.taken_bytes()),
         drained="" if core.drain is None else str(core.drain),
         problems=(),
-        next=_page_key(core, leases[-1]) if more else None,
+        next=_page_key(core.gpus, leases[-1]) if more else None,
     )
 
 
-def _page_key(core: Core, lease: Lease) -> PageKey:
+def _page_key(gpus: Mapping[GpuId, Gpu], lease: Lease) -> PageKey:
     if lease.state is not LeaseState.QUEUED:
         return (0, 0.0, lease.request.arrival)
-    return (1, *core.gpus[lease.request.gpus[0]].queue.rank(lease))
+    return (1, *gpus[lease.request.gpus[0]].queue.rank(lease))
 
 
-def _listed(core: Core, after: PageKey, limit: int | None) -> Iterator[Lease]:
+def _listed(
+    leases: Mapping[LeaseId, Lease],
+    gpus: Mapping[GpuId, Gpu],
+    after: PageKey,
+    limit: int | None,
+) -> Iterator[Lease]:
     """Yield leases with bytes or away by arrival, then the waiters in the order of the queues.
 
     Each once.
     """
-    key = partial(_page_key, core)
+    key = partial(_page_key, gpus)
     if after[0] == 0:
-        granted = [one for one in core.leases.values() if one.state is not LeaseState.QUEUED]
+        granted = [one for one in leases.values() if one.state is not LeaseState.QUEUED]
         rest = [one for one in granted if key(one) > after]
         yield from nsmallest(len(rest) if limit is None else limit, rest, key=key)
     rank = after[1:] if after[0] else (-inf, 0)
-    queued = [gpu.queue.after(rank) for gpu in core.gpus.values()]
+    queued = [gpu.queue.after(rank) for gpu in gpus.values()]
     last: Lease | None = None
     for lease in merge(*queued, key=key):
         if lease is not last:  # else it waits for several GPUs
@@ -210,7 +214,7 @@ def _listed(core: Core, after: PageKey, limit: int | None) -> Iterator[Lease]:
 
 
 # -- switch
-def switch_record(core: Core, lease: Lease) -> SwitchNote:
+def switch_record(lease: Lease, now: float) -> SwitchNote:
     """Milliseconds of a grant from the acquire to `ready`, split by phase; of several victims the
     slowest counts."""
     gone = lease.request.evicted
@@ -223,8 +227,8 @@ def switch_record(core: Core, lease: Lease) -> SwitchNote:
         drain_ms=max((_span(e.asked_at, e.unloading_at) for e in gone), default=0.0),
         unload_ms=max((_span(e.unloading_at, e.released_at) for e in gone), default=0.0),
         verify_ms=max((_span(e.released_at, e.verdict_at) for e in gone), default=0.0),
-        load_ms=(core.now - lease.granted_at) * 1e3,
-        total_ms=(core.now - lease.request.arrived_at) * 1e3,
+        load_ms=(now - lease.granted_at) * 1e3,
+        total_ms=(now - lease.request.arrived_at) * 1e3,
     )
 
 

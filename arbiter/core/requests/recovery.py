@@ -12,7 +12,7 @@ not count until holders and readings say it again.
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import eviction, learning, standby
+from vram_arbiter.arbiter.core import eviction
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
@@ -23,22 +23,19 @@ from vram_arbiter.arbiter.core.model.records import (
     ResidueRecord,
 )
 from vram_arbiter.arbiter.core.model.refusals import Refused
-from vram_arbiter.arbiter.core.model.state import Client, Core, Ended
+from vram_arbiter.arbiter.core.model.state import EMPTY_JOURNAL, Client, Core, Ended
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.requests import uses
 from vram_arbiter.arbiter.core.requests.requests import become_held, keep, over, released
 from vram_arbiter.arbiter.core.scheduling import admission
+from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification.schedule import begin_again, begin_for_lease
 from vram_arbiter.schemas import defaults
-from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.notes import ReattachedNote, RecoveredNote, ResumedNote, ServingNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
-
-EMPTY_JOURNAL = LeaseId("journal")
-"""Stands for the holders that an empty, lost or doubted journal does not name; given up after a TTL
-and the fence grace."""
 
 
 # -- restoring
@@ -58,7 +55,7 @@ def on_recovered(core: Core, event: ev.Recovered) -> None:
                 core.drain = Order(record.by, record.reason)
             case LeaseRecord() if record.state in AWAY:
                 # in doubt it may have been granted again since: its holder tells
-                if doubt is None and admission.selected(core, record.spec):
+                if doubt is None and admission.selected(core.gpus, record.spec):
                     _restore(core, record, Why.RECOVERED)
                 else:
                     core.forget(key)
@@ -67,19 +64,20 @@ def on_recovered(core: Core, event: ev.Recovered) -> None:
             case LeaseRecord():
                 _restore(core, record, Why.RECOVERED)
             case ResidueRecord():
-                _restore_residue(core, key, record)
+                if not _restore_residue(core.gpus[GpuId(record.gpu)], record, core.now):
+                    # stale leases fill the GPU: nothing else would take the record out
+                    core.forget(key)
     if not held or doubt is not None:
         core.recovering.add(EMPTY_JOURNAL)
-        await_unnamed(core)
+        core.timers.set(("recover", EMPTY_JOURNAL), _unnamed_until(core.settings, core.now))
     why = "" if doubt is None else doubt.why
     core.note(RecoveredNote(tuple(sorted(core.recovering)), held, why))
 
 
-def await_unnamed(core: Core) -> None:
-    """Give holders that the journal does not name their time from now on. A process with bytes that
-    stays silent is a stowaway then."""
-    grace_s = defaults.LEASE_TTL_S + core.settings.fence_grace_s
-    core.timers.set(("recover", EMPTY_JOURNAL), core.now + grace_s)
+def _unnamed_until(settings: Settings, now: float) -> float:
+    """Return until when holders that the journal does not name have their time. A process with
+    bytes that stays silent is a stowaway then."""
+    return now + defaults.LEASE_TTL_S + settings.fence_grace_s
 
 
 def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
@@ -94,7 +92,7 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
     lease, grace_s = _found(core, record, why), core.settings.fence_grace_s
     gpu = None if lease.gpu is None else core.gpus[lease.gpu]
     if gpu is not None:
-        _charge(core, gpu, lease, record.charge_bytes)  # 1
+        _charge(gpu, lease, record.charge_bytes, core.now)  # 1
     if gpu is not None and record.state == "debt":  # 2
         fenced_at = core.now + lease.spec.ttl_s + grace_s
         begin_for_lease(core, gpu, lease, alive=True, grace_s=grace_s, fenced_at=fenced_at)
@@ -122,7 +120,10 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
 
 def _found(core: Core, record: LeaseRecord, why: Why) -> Lease:
     """Return the lease of a record, known by its nonce; it is not charged yet."""
-    spec, gpus = record.spec, tuple(gpu.info.id for gpu in admission.selected(core, record.spec))
+    spec, gpus = (
+        record.spec,
+        tuple(gpu.info.id for gpu in admission.selected(core.gpus, record.spec)),
+    )
     request = Request(
         nonce=record.nonce,
         arrived_at=core.now,
@@ -136,15 +137,15 @@ def _found(core: Core, record: LeaseRecord, why: Why) -> Lease:
     return lease
 
 
-def _charge(core: Core, gpu: Gpu, lease: Lease, charge_bytes: int) -> None:
+def _charge(gpu: Gpu, lease: Lease, charge_bytes: int, now: float) -> None:
     """Charge what is there anyway. What the budget does not hold was never approved: it is
     pressure."""
     approved_bytes = min(charge_bytes, _room_bytes(gpu))
-    gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, core.now)
+    gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, now)
     gpu.pending_free.give_up(
-        lease.process, max(0, lease.request.load_peak_bytes - charge_bytes), core.now
+        lease.process, max(0, lease.request.load_peak_bytes - charge_bytes), now
     )
-    gpu.changed_at = core.now
+    gpu.changed_at = now
 
 
 def _room_bytes(gpu: Gpu) -> int:
@@ -153,16 +154,15 @@ def _room_bytes(gpu: Gpu) -> int:
     return max(0, gpu.ledger.budget_bytes - gpu.ledger.approved_bytes)
 
 
-def _restore_residue(core: Core, key: str, record: ResidueRecord) -> None:
-    """Charge what a process keeps, within what it is charged for its leases."""
-    gpu, process = core.gpus[GpuId(record.gpu)], ProcessKey(record.pid, record.start_ticks)
+def _restore_residue(gpu: Gpu, record: ResidueRecord, now: float) -> int:
+    """Charge what a process keeps, within what it is charged for its leases. Return the bytes."""
+    process = ProcessKey(record.pid, record.start_ticks)
     account = gpu.ledger.accounts.get(process)
     own_bytes = 0 if account is None else account.approved_bytes
     residue_bytes = min(record.residue_bytes, _room_bytes(gpu) + own_bytes)
     floor_bytes = residue_bytes if record.floor_bytes is None else record.floor_bytes
-    gpu.ledger.retain(process, residue_bytes, core.now, min(floor_bytes, residue_bytes))
-    if not residue_bytes:  # stale leases fill the GPU: nothing else would take the record out
-        core.forget(key)
+    gpu.ledger.retain(process, residue_bytes, now, min(floor_bytes, residue_bytes))
+    return residue_bytes
 
 
 # -- reattaching
@@ -194,7 +194,10 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
             raise over(core, item.lease)
         lease = _adopt(core, client, item)
     elif lease.token != item.token:
-        _settle_token(core, lease, client, item)
+        in_doubt = EMPTY_JOURNAL in core.recovering and item.token.epoch < core.settings.epoch
+        if _knows_newer(lease, client, item, in_doubt=in_doubt):
+            lease.token = item.token
+            core.record_lease(lease)
     elif lease.process != client.process:
         raise Refused(no.NotHolder(item.lease, lease.process.pid))
     core.hand_to(lease, client.id)  # 2
@@ -212,7 +215,7 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     if lease.gpu is not None:
         _restore_uses(core, lease, client, item)
     keep(core, lease)  # 4
-    account_for(core, lease.id)
+    core.account_for(lease.id)
     core.note(ReattachedNote(len(lease.uses), lease.state), lease)
     return lease
 
@@ -221,7 +224,7 @@ def _reattach_away(core: Core, lease: Lease, item: ev.ReattachedLease) -> None:
     """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
     if lease.state in AWAY:
         core.timers.cancel(("away", lease.id))
-        standby.wake(core, lease)
+        core.wake_candidates(lease)
     elif lease.token != item.token:
         core.push(lease, GrantedPush(status.view(core, lease)))
     elif lease.state in EXPIRING:
@@ -232,20 +235,17 @@ def _reattach_away(core: Core, lease: Lease, item: ev.ReattachedLease) -> None:
         released(core, lease, exiting=False, why=Why.LET_GO_BEFORE)
 
 
-def _settle_token(core: Core, lease: Lease, client: Client, item: ev.ReattachedLease) -> None:
-    """Settle that a holder knows its lease by another token. Raises Refused.
+def _knows_newer(lease: Lease, client: Client, item: ev.ReattachedLease, *, in_doubt: bool) -> bool:
+    """Return whether a holder that knows its lease by another token is right. Raises Refused.
 
     Either a journal in doubt has lost the last grant, and the holder is right; or the lease came
     back from standby while its holder was away, and the holder knows the token before.
     """
     if lease.process == client.process and lease.token is not None:
-        in_doubt = EMPTY_JOURNAL in core.recovering
-        if in_doubt and lease.token < item.token and item.token.epoch < core.settings.epoch:
-            lease.token = item.token
-            core.record_lease(lease)
-            return
+        if in_doubt and lease.token < item.token:
+            return True
         if item.state in AWAY and lease.state is LeaseState.LOADING and item.token < lease.token:
-            return
+            return False
     raise Refused(no.WrongToken(item.lease, str(item.token)))
 
 
@@ -280,12 +280,12 @@ def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     """
     if core.serving or item.token.epoch >= core.settings.epoch:
         raise Refused(no.Lost(item.lease, Why.UNKNOWN))
-    gpus, spec = admission.selected(core, item.spec), item.spec
+    gpus, spec = admission.selected(core.gpus, item.spec), item.spec
     if not gpus:
         raise Refused(no.UnknownGpu(spec.gpu, tuple(core.gpus)))
     # the journal that knew its GPU is lost: it is where most of the process's bytes are seen
     gpu = max(gpus, key=lambda gpu: (gpu.shown_bytes(client.process) or 0, -gpu.info.index))
-    peak, steady = learning.expected_bytes(core, spec)
+    peak, steady = core.footprints.expected_bytes(spec)
     charge = steady if item.state == "held" else peak
     if item.state == "held" and item.measured_bytes is not None:
         charge = max(item.measured_bytes, spec.footprint.residue_bytes)
@@ -313,15 +313,6 @@ def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
 
 
 # -- end of a recovery
-def account_for(core: Core, lease_id: str) -> None:
-    """Wait for one lease less, or (EMPTY_JOURNAL) no longer for holders that the journal does not
-    name."""
-    if lease_id in core.recovering:
-        core.recovering.remove(LeaseId(lease_id))
-        if lease_id == EMPTY_JOURNAL:
-            core.forget(ev.DOUBT_KEY)
-
-
 def account_for_the_empty(core: Core, gpu: Gpu, sample: ev.MemorySampled) -> None:
     """Wait for no holder on a GPU that is read as good as empty.
 
@@ -333,9 +324,9 @@ def account_for_the_empty(core: Core, gpu: Gpu, sample: ev.MemorySampled) -> Non
     if sample.taken_at < core.started_at or sample.used_bytes > noise_bytes:
         return
     for lease_id in gpu.residents:
-        account_for(core, lease_id)
+        core.account_for(lease_id)
     if all(g.sample is not None and g.sample.used_bytes <= noise_bytes for g in core.gpus.values()):
-        account_for(core, EMPTY_JOURNAL)
+        core.account_for(EMPTY_JOURNAL)
 
 
 def serve(core: Core) -> None:
@@ -360,7 +351,7 @@ def on_resumed(core: Core, event: ev.Resumed) -> None:
         if ("users", lease.id) in core.timers:
             uses.await_users(core, lease)
     if ("recover", EMPTY_JOURNAL) in core.timers:
-        await_unnamed(core)
+        core.timers.set(("recover", EMPTY_JOURNAL), _unnamed_until(core.settings, core.now))
     for gpu in core.gpus.values():
         gpu.before_sleep = gpu.sample or gpu.before_sleep
         gpu.sample = None

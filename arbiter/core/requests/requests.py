@@ -7,9 +7,8 @@ process. Uses (`uses`) are open to any client that knows the exact token.
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, learning, standby
-from vram_arbiter.arbiter.core.learning import check_load
+from vram_arbiter.arbiter.core.learning import check_load, newest
 from vram_arbiter.arbiter.core.model import refusals as no
-from vram_arbiter.arbiter.core.model.learned import newest
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
 from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
 from vram_arbiter.arbiter.core.model.state import Client, Core, Refusals
@@ -113,13 +112,13 @@ def acquire(core: Core, event: ev.AcquireRequested) -> None:
     if known is not None:  # 2
         _answer_again(core, event, known)
         return
-    load_peak, steady = learning.expected_bytes(core, spec)  # 3
-    gpus = admission.places(core, spec, load_peak)
+    load_peak, steady = core.footprints.expected_bytes(spec)  # 3
+    gpus = admission.places(core.gpus, spec, load_peak)
     admission.check_waiters(core, client, spec.priority)  # 4
     owned, most = len(core.of_client.get(client.id, ())), core.settings.leases_per_client_max
     admission.check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
     if core.costs.failures:  # 5
-        check_load(core, spec, load_peak, gpus)
+        check_load(core.costs, [core.gpus[gpu] for gpu in gpus], spec, load_peak, core.now)
     core.enqueue(_new_lease(core, event, client, load_peak, steady, gpus))  # 6
 
 
@@ -206,7 +205,7 @@ def answer_queued(core: Core) -> None:
             continue
         request.answered = True
         view = status.view(core, lease)
-        ahead = ahead_of(core, lease) if view.position and view.position > 1 else ""
+        ahead = ahead_of(core.gpus, lease) if view.position and view.position > 1 else ""
         gpu = core.gpus[request.planned_gpu or request.gpus[0]]
         block = None if ahead else status.block_view(core, gpu)
         core.note(QueuedNote(view.position, request.reason, ahead, block), lease)
@@ -297,7 +296,7 @@ def ready(core: Core, event: ev.ReadyReported) -> None:
         load_ms=(core.now - lease.granted_at) * 1e3,
     )
     core.note(loaded, lease)
-    core.note(status.switch_record(core, lease), lease)
+    core.note(status.switch_record(lease, core.now), lease)
 
 
 def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
@@ -306,7 +305,8 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     core.move(lease, LeaseState.HELD, Why.READY)
     lease.ready_at = lease.uses.last_at = core.now
     lease.observed.reported_bytes = measured_bytes
-    learning.on_ready(core, lease, measured_bytes)
+    for drift in learning.on_ready(core.footprints, gpu, lease, measured_bytes):
+        core.note(drift, lease)
     core.costs.failures.pop(learning.model_name(lease.spec), None)
     steady = request.steady_bytes
     if measured_bytes is not None:

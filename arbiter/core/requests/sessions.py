@@ -15,7 +15,6 @@ from vram_arbiter.arbiter.core.learning import model_name
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core
-from vram_arbiter.arbiter.core.requests.recovery import account_for
 from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, released
 from vram_arbiter.arbiter.core.requests.uses import end_use
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease, on_process_died
@@ -103,7 +102,7 @@ def on_died(core: Core, event: ev.ProcessDied) -> None:
             end_use(core, lease, use, Why.PROCESS_DIED)
         if lease.process != process:
             continue
-        account_for(core, lease.id)
+        core.account_for(lease.id)
         refusal = no.Lost(lease.id, Why.PROCESS_DIED, process.pid)
         if lease.state is LeaseState.QUEUED:
             cancel_waiter(core, lease, Why.PROCESS_DIED)

@@ -55,32 +55,30 @@ def check_shares(
 
 
 # -- which GPUs
-def selected(core: Core, spec: LeaseSpec) -> list[Gpu]:
+def selected(gpus: Mapping[GpuId, Gpu], spec: LeaseSpec) -> list[Gpu]:
     """Return the GPUs that a selector names: `any`, a UUID or an index."""
-    return [
-        gpu for gpu in core.gpus.values() if spec.gpu in ("any", gpu.info.id, str(gpu.info.index))
-    ]
+    return [gpu for gpu in gpus.values() if spec.gpu in ("any", gpu.info.id, str(gpu.info.index))]
 
 
-def places(core: Core, spec: LeaseSpec, load_peak: int) -> tuple[GpuId, ...]:
+def places(gpus: Mapping[GpuId, Gpu], spec: LeaseSpec, load_peak: int) -> tuple[GpuId, ...]:
     """Return the candidate GPUs of a request. Raises Refused if none could ever hold it.
 
     Pinned holders do not count: they end one day, and the request may wait as long as its timeout
     allows.
     """
-    gpus = selected(core, spec)
-    if not gpus:
-        raise Refused(no.UnknownGpu(spec.gpu, tuple(gpu.info.id for gpu in core.gpus.values())))
-    able = [gpu.info.id for gpu in gpus if load_peak <= gpu.ledger.budget_bytes]
+    named = selected(gpus, spec)
+    if not named:
+        raise Refused(no.UnknownGpu(spec.gpu, tuple(gpus)))
+    able = [gpu.info.id for gpu in named if load_peak <= gpu.ledger.budget_bytes]
     if able:
         return tuple(able)
-    largest = max(gpus, key=lambda gpu: (gpu.ledger.budget_bytes, -gpu.info.index))
+    largest = max(named, key=lambda gpu: (gpu.ledger.budget_bytes, -gpu.info.index))
     info = largest.info
     sizes = (load_peak, spec.footprint.load_peak_bytes, info.capacity_bytes, info.reserve_bytes)
     raise Refused(no.TooLarge(spec.consumer, *sizes))
 
 
-def front(core: Core, gpu: Gpu) -> Lease | None:
+def front(gpus: Mapping[GpuId, Gpu], gpu: Gpu) -> Lease | None:
     """Return the request that a GPU serves: its head, or the first for which no other GPU is being
     emptied.
 
@@ -94,7 +92,7 @@ def front(core: Core, gpu: Gpu) -> Lease | None:
         there = lease.request.planned_gpu
         if there is None or there == gpu.info.id:
             return lease
-        asked = [one for one in core.gpus[there].evictions if one.wanted_by == lease.id]
+        asked = [one for one in gpus[there].evictions if one.wanted_by == lease.id]
         if all(one.verdict or one.overdue for one in asked):
             return lease
     return None
@@ -200,18 +198,16 @@ def spare_unplanned_bytes(
 
 
 # -- the reading's gate
-def measured_room_bytes(core: Core, gpu: Gpu) -> int | None:
+def measured_room_bytes(gpu: Gpu, oldest: float) -> int | None:
     """Return free bytes by the newest reading, less the leases that it cannot have seen; None: no
-    reading is young enough.
+    reading that began at `oldest` or later can tell.
 
     A lease that became ready since counts with its load peak: what it freed at the end of its load
     may not be back yet. A lease that was granted and lost since may still be there, with its load
     peak too.
     """
     sample = gpu.sample
-    if sample is None or gpu.failed_at is not None:
-        return None
-    if core.now - sample.taken_at > core.settings.sample_max_age_s:
+    if sample is None or gpu.failed_at is not None or sample.taken_at < oldest:
         return None
     for debt in gpu.verifications.values():
         unseen = debt.lease not in gpu.residents and debt.confirmed_at > sample.taken_at

@@ -16,15 +16,16 @@ Per GPU, in this order (the numbers stand in `_serve`):
      beside it on the day that they are gone, and may be revoked itself
 """
 
+from collections.abc import Sequence
 from itertools import islice
-from typing import Literal
 
 from vram_arbiter.arbiter.core import eviction, standby
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import Eviction, Lease, LeaseState, Standby
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Standby
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
-from vram_arbiter.arbiter.core.scheduling import admission, victims
+from vram_arbiter.arbiter.core.scheduling import admission
+from vram_arbiter.arbiter.core.scheduling.victims import Choice, in_use
 from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
 from vram_arbiter.schemas.wire.notes import GrantedNote
@@ -39,7 +40,10 @@ def schedule(core: Core) -> None:
     dirty, last = core.turn.dirty, -1
     while dirty:
         for gpu in dirty.values():  # first: a choice among GPUs must not count on room of such
-            _prepare(core, gpu)
+            if (note := gpu.ledger.note_pressure()) is not None:
+                core.note(note)
+            gpu.blocked = admission.blocked(core, gpu)
+            eviction.take_back(core, gpu)  # 0
         last = min([index for index in dirty if index > last] or dirty)
         _serve(core, dirty.pop(last))
     eviction.settle(core)
@@ -50,13 +54,6 @@ def on_plan_due(core: Core, gpu_id: str) -> None:
     enough.
     """
     core.wake(core.gpus[GpuId(gpu_id)])
-
-
-def _prepare(core: Core, gpu: Gpu) -> None:
-    if (note := gpu.ledger.note_pressure()) is not None:
-        core.note(note)
-    gpu.blocked = admission.blocked(core, gpu)
-    eviction.take_back(core, gpu)  # 0
 
 
 def _serve(core: Core, gpu: Gpu) -> None:
@@ -71,7 +68,7 @@ def _serve(core: Core, gpu: Gpu) -> None:
         if core.away:
             _bring_back(core, gpu)
         return
-    head = admission.front(core, gpu)
+    head = admission.front(core.gpus, gpu)
     if head is None:
         return
     if admission.fits(gpu, head):  # 4
@@ -79,7 +76,7 @@ def _serve(core: Core, gpu: Gpu) -> None:
         return
     planned = _make_room(core, gpu, head)  # 5
     if len(gpu.queue.by_arrival) > 1:  # 6
-        later = choose_later(core, gpu, head, planned=planned)
+        later = choose_later(gpu, head, planned=planned)
         if later is not None:
             grant_if_measured(core, gpu, later)
 
@@ -88,13 +85,14 @@ def _relieve(core: Core, gpu: Gpu) -> None:
     leaving = admission.leaving(gpu)
     over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
     if over > 0:
-        for victim in victims.choose_relief(core, gpu, leaving, over):
+        choice = Choice.of(core)
+        for victim in choice.relief(gpu, leaving, over):
             eviction.ask(core, gpu, victim, None)
-        victims.wake_when_evictable(core, gpu, None)
+        core.timers.set_first(("plan", gpu.info.id), choice.ask_times(gpu, None))
 
 
 def _bring_back(core: Core, gpu: Gpu) -> None:
-    lease = standby.first_to_return(core, gpu)
+    lease = standby.first_to_return(core.away, gpu)
     if lease is None:
         return
     due_at = standby.quiet_at(gpu, lease)
@@ -107,12 +105,13 @@ def _bring_back(core: Core, gpu: Gpu) -> None:
 def _take_over(core: Core, gpu: Gpu) -> None:
     """Keep holders revoked whose revoke was taken back, if the request to serve would choose them
     once the GPU grants again."""
-    head, leaving = admission.front(core, gpu), admission.leaving(gpu)
+    head, leaving = admission.front(core.gpus, gpu), admission.leaving(gpu)
     if head is None or admission.fits(gpu, head, leaving):
         return
-    plan = victims.choose_victims(core, gpu, head, leaving) or ()
+    choice = Choice.of(core)
+    plan = choice.victims(gpu, head, leaving) or ()
     again = [one for one in plan if one.id in core.turn.taken_back]
-    if again and (len(head.request.gpus) == 1 or victims.is_best_place(core, gpu, head, plan)):
+    if again and _is_best_place(core, choice, gpu, head, plan):
         head.request.planned_gpu = gpu.info.id
         for holder in again:
             eviction.ask(core, gpu, holder, head)
@@ -129,13 +128,14 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     if gpu.verifications and admission.residue_under_measurement(gpu):
         request.reason = Wait.RESIDUE
         return False
-    plan = victims.choose_victims(core, gpu, head, leaving)
+    choice = Choice.of(core)
+    plan = choice.victims(gpu, head, leaving)
     if plan is None:
         request.reason = Wait.NO_VICTIM
         if not settle_for_less(core, head):
-            victims.wake_when_evictable(core, gpu, head)
+            core.timers.set_first(("plan", gpu.info.id), choice.ask_times(gpu, head))
         return False
-    if len(request.gpus) > 1 and not victims.is_best_place(core, gpu, head, plan):
+    if not _is_best_place(core, choice, gpu, head, plan):
         return False
     request.reason, request.planned_gpu = Wait.MAKING_ROOM, gpu.info.id
     for victim in plan:
@@ -169,33 +169,58 @@ def settle_for_less(core: Core, lease: Lease) -> bool:
     return True
 
 
+def _is_best_place(
+    core: Core, choice: Choice, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]
+) -> bool:
+    """Return whether emptying this GPU is the cheapest of its candidates. Wakes a better one."""
+    if len(waiter.request.gpus) == 1:
+        return True
+    best, best_cost = gpu, _place_cost(gpu, plan)
+    for gpu_id in waiter.request.gpus:
+        other = core.gpus[gpu_id]
+        if other is gpu or other.queue.head is not waiter:
+            continue
+        going, block = admission.leaving(other), admission.blocked(core, other)
+        if block is Block.LOADING and not other.ledger.pressed:
+            (load,) = other.residents.by_state[LeaseState.LOADING].values()
+            load_ends_by = load.granted_at + core.settings.revoke_deadline_s
+            if load_ends_by > core.now and admission.fits(other, waiter, going):
+                core.timers.set(("plan", gpu.info.id), load_ends_by)
+                return False  # it is the next there, once the load has ended
+        if block is not None:
+            continue
+        if admission.fits(other, waiter, going):
+            return False  # room comes there anyway
+        rival = choice.victims(other, waiter, going)
+        if rival is not None and _place_cost(other, rival) < best_cost:
+            best, best_cost = other, _place_cost(other, rival)
+    if best is not gpu:
+        core.wake(best)
+    return best is gpu
+
+
+def _place_cost(gpu: Gpu, plan: Sequence[Lease]) -> tuple[int, ...]:
+    highest = max([one.spec.priority for one in plan], default=0)
+    steady_bytes = sum(one.request.steady_bytes for one in plan)
+    return (in_use(plan), highest, len(plan), steady_bytes, gpu.info.index)
+
+
 # -- granting
 def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
-    """Grant a lease that fits by the ledger, once a reading shows its bytes as free too."""
-    wait = measured_wait(core, gpu, lease)
-    if wait is None:
-        grant(core, gpu, lease)
-        return
-    lease.request.reason = wait
-    if wait is Wait.NOT_FREE:
-        gpu.blocked = Block.NOT_FREE
-
-
-def measured_wait(
-    core: Core, gpu: Gpu, lease: Lease
-) -> Literal[Wait.READING, Wait.NOT_FREE] | None:
-    """Return what a lease that fits by the ledger waits for; None: a reading shows its bytes free.
+    """Grant a lease that fits by the ledger, once a reading shows its bytes as free too.
 
     A reading that is too old, or began before the last grant, `ready` or verdict, cannot deny: a
     newer one is asked for.
     """
-    room = admission.measured_room_bytes(core, gpu)
+    oldest = core.now - core.settings.sample_max_age_s
+    room = admission.measured_room_bytes(gpu, oldest)
     if room is not None and room >= admission.measured_need_bytes(gpu, lease):
-        return None
-    if room is not None and gpu.sample is not None and gpu.sample.taken_at >= gpu.changed_at:
-        return Wait.NOT_FREE
-    core.want_sample(gpu, max(gpu.changed_at, core.now - core.settings.sample_max_age_s))
-    return Wait.READING
+        grant(core, gpu, lease)
+    elif room is not None and gpu.sample is not None and gpu.sample.taken_at >= gpu.changed_at:
+        lease.request.reason, gpu.blocked = Wait.NOT_FREE, Block.NOT_FREE
+    else:
+        lease.request.reason = Wait.READING
+        core.want_sample(gpu, max(gpu.changed_at, oldest))
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
@@ -204,7 +229,10 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     The record goes to the journal before the holder hears of it.
     """
     request = lease.request
-    request.evicted = _take_evictions(core, gpu, lease)
+    # the list of the GPU is brought up to date at the end of the pass (`eviction.settle`)
+    request.evicted = [e for e in gpu.evictions if e.wanted_by == lease.id and e.verdict]
+    for made_room in request.evicted:
+        core.costs.switched(made_room.consumer, lease.spec.consumer, core.now)
     core.dequeue(lease)
     by_itself = lease.state is not LeaseState.QUEUED
     if by_itself:  # it has not waited
@@ -240,17 +268,8 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     core.note(note, lease)
 
 
-def _take_evictions(core: Core, gpu: Gpu, lease: Lease) -> list[Eviction]:
-    """Return the evictions that were asked for a lease and came to a verdict: they made its room.
-    The list of the GPU is brought up to date at the end of the pass (`eviction.settle`)."""
-    made_room = [one for one in gpu.evictions if one.wanted_by == lease.id and one.verdict]
-    for one in made_room:
-        core.costs.switched(one.consumer, lease.spec.consumer, core.now)
-    return made_room
-
-
 # -- backfill
-def choose_later(core: Core, gpu: Gpu, head: Lease, *, planned: bool) -> Lease | None:
+def choose_later(gpu: Gpu, head: Lease, *, planned: bool) -> Lease | None:
     """Return the first request behind the queue's first that fits, evicts no holder and cannot
     delay `head`; None: there is none.
 

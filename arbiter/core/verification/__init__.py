@@ -4,6 +4,5 @@
 
 - `schedule`: when to read, and what follows. `begin_for_lease`, `begin_again`, `on_process_died`,
   `on_reading`, `on_probe_failed`, `on_probe_due`, `on_poll_due`, `stale`.
-- `evidence`: whose bytes a reading shows. `impossible`, `take`.
 - `judge`: the verdict. `others_since`, `judge`.
 """

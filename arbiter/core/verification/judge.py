@@ -141,7 +141,6 @@ class _Case:
     verification: Verification
     ledger: GpuLedger
     reading: MemorySampled
-    tolerance_bytes: int
     allowed_bytes: int  # the most that the process may still hold
     held_bytes: int | None  # what the reading shows of the process; None: it cannot tell
     limit_bytes: int  # what is above it is too much for the process
@@ -165,17 +164,18 @@ def judge(
     ledger: GpuLedger,
     reading: MemorySampled,
     others: Others,
-    tolerance_bytes: int,
 ) -> Judgement | None:
     """Judge a reading that began after the release. Return None where it says nothing yet."""
-    case = _compare(verification, ledger, reading, others, tolerance_bytes)
+    case = _compare(verification, ledger, reading, others)
     held = case.held_bytes
-    if (held is not None and held > case.limit_bytes) or case.missing_bytes() > tolerance_bytes:
+    if (
+        held is not None and held > case.limit_bytes
+    ) or case.missing_bytes() > ledger.tolerance_bytes:
         return _late(case) if verification.overdue else None
     if reading.taken_at < verification.not_before:
         return None
     last = verification.last_used_bytes
-    agrees = last is not None and abs(reading.used_bytes - last) <= tolerance_bytes
+    agrees = last is not None and abs(reading.used_bytes - last) <= ledger.tolerance_bytes
     return Judgement(Verdict.VERIFIED, agrees, verification.retained_bytes)
 
 
@@ -184,7 +184,6 @@ def _compare(
     ledger: GpuLedger,
     reading: MemorySampled,
     others: Others,
-    tolerance_bytes: int,
 ) -> _Case:
     """Compute the bounds. Neither allows for loads in progress, whose bytes may not be there."""
     process, baseline, used_bytes = verification.process, verification.baseline, reading.used_bytes
@@ -195,9 +194,7 @@ def _compare(
     ledger_bound = total_bytes + ledger.driver_bytes - others.loading_bytes
     if ledger.stowaway_bytes and not verification.overdue:
         returning_bytes = others.left_bytes - allowed_bytes
-        ledger_bound -= _doubtful_bytes(
-            verification, ledger, reading, returning_bytes, tolerance_bytes
-        )
+        ledger_bound -= _doubtful_bytes(verification, ledger, reading, returning_bytes)
     # 3. delta bound: the baseline's total less what the process must have freed
     over_baseline = None
     held_before = None if baseline is None else bytes_of(baseline, process, omitted=None)
@@ -210,10 +207,9 @@ def _compare(
         verification,
         ledger,
         reading,
-        tolerance_bytes,
         allowed_bytes,
         bytes_of(reading, process),
-        allowed_bytes + tolerance_bytes,
+        allowed_bytes + ledger.tolerance_bytes,
         used_bytes - ledger_bound,
         over_baseline,
     )
@@ -224,7 +220,6 @@ def _doubtful_bytes(
     ledger: GpuLedger,
     reading: MemorySampled,
     returning_bytes: int,
-    tolerance_bytes: int,
 ) -> int:
     """Return unattributed bytes in the ledger that may have left in place of the lease's.
 
@@ -241,7 +236,7 @@ def _doubtful_bytes(
         return unseen_bytes
     expected_bytes = _may_hold_bytes(verification, ledger, baseline) + returning_bytes
     excess_bytes = baseline.used_bytes - reading.used_bytes - expected_bytes
-    doubtful = tolerance_bytes < excess_bytes < unattributed_bytes - tolerance_bytes
+    doubtful = ledger.tolerance_bytes < excess_bytes < unattributed_bytes - ledger.tolerance_bytes
     return unseen_bytes + (unattributed_bytes if doubtful else 0)
 
 
@@ -275,7 +270,7 @@ def _late(case: _Case) -> Judgement:
             return _residue(case, stays)
     # a driver may omit a dying process before it has freed its memory
     dying = not verification.alive and reading.taken_at < verification.deadline_at + DYING_S
-    resolved = not dying or missing <= case.tolerance_bytes
+    resolved = not dying or missing <= case.ledger.tolerance_bytes
     return Judgement(Verdict.CONTESTED, resolved, verification.retained_bytes, _grown(case))
 
 
@@ -287,7 +282,7 @@ def _late_by_total(case: _Case) -> Judgement:
     if verification.alive:
         return _residue(case, case.allowed_bytes + case.missing_bytes())
     # a dead process frees everything: if the ledger explains the total, the rest is of others
-    return Judgement(Verdict.CONTESTED, case.over_ledger_bytes <= case.tolerance_bytes, 0)
+    return Judgement(Verdict.CONTESTED, case.over_ledger_bytes <= case.ledger.tolerance_bytes, 0)
 
 
 def _residue(case: _Case, stays_bytes: int, culprits: tuple[Culprit, ...] = ()) -> Judgement:

@@ -2,25 +2,33 @@
 
 1. begin: `begin_for_lease`, `on_process_died`, `begin_again` set its clock and read at once;
 2. polls: `on_poll_due` reads again, densely at first, and declares it overdue at its deadline;
-3. readings: `on_reading` takes the evidence of each and hands it to `judge`; one on target has to
-   be confirmed by another;
+3. readings: `on_reading` takes the evidence of each (stowaways, retained bytes, pressure, never a
+   charge) and hands it to `judge`; one on target has to be confirmed by another;
 4. verdict: it is noted; a resolved one frees the charge and tells what waits for it.
 
 The bytes stay charged until then. A failed reading means unknown: it frees nothing.
 """
+
+from collections.abc import Iterable
 
 from vram_arbiter.arbiter.core import learning, standby
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
 from vram_arbiter.arbiter.core.ledger import bytes_of
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Verdict, Verification
-from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.arbiter.core.verification.evidence import impossible, take
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Verdict, Verification
+from vram_arbiter.arbiter.core.model.state import Core, Timers
+from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification.judge import Judgement, judge, others_since
 from vram_arbiter.schemas.defaults import VERIFY_READING_SHARE
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
-from vram_arbiter.schemas.wire.notes import About, ProbeFailedNote, ProbeOkNote, VerifiedNote
+from vram_arbiter.schemas.wire.notes import (
+    About,
+    ProbeFailedNote,
+    ProbeOkNote,
+    StowawayNote,
+    VerifiedNote,
+)
 
 
 # -- 1. begin --------------------------------------------------------------------------------------
@@ -34,10 +42,16 @@ def begin_for_lease(
         grace_s: Seconds without a verdict: a lost holder may still be loading.
         fenced_at: When the holder has fenced itself, in monotonic seconds.
     """
-    baseline = lease.departure.baseline or _last_shown(core, gpu, lease.process, alive=alive)
-    learning.on_leaving(core, lease)
+    baseline = lease.departure.baseline or gpu.sample or gpu.before_sleep
+    shown_in = gpu.ledger.accounts[lease.process].shown_in
+    dead = lease.departure.baseline is None and not alive
+    if dead and shown_in and core.now - shown_in.taken_at <= core.settings.verify_timeout_s:
+        # a death may be heard after a reading that shows the bytes as those of a child
+        baseline = shown_in
+    for drift in learning.on_leaving(core.footprints, gpu, lease):
+        core.note(drift, lease)
     vanishes = lease.departure.exiting or not alive
-    verification = Verification(
+    gpu.verifications[lease.id] = Verification(
         key=lease.id,
         process=lease.process,
         lease=lease.id,
@@ -53,20 +67,7 @@ def begin_for_lease(
         vanishes=vanishes,
         exclusive=lease.spec.exclusive,
     )
-    _start_clock(core, gpu, verification)
-
-
-def _last_shown(core: Core, gpu: Gpu, process: ProcessKey, *, alive: bool) -> MemorySampled | None:
-    """Return the newest reading in which the bytes of a process were still there.
-
-    The death of a process may be heard after a reading that shows its bytes as those of a child
-    that outlives it.
-    """
-    shown_in = gpu.ledger.accounts[process].shown_in
-    recent = shown_in and core.now - shown_in.taken_at <= core.settings.verify_timeout_s
-    if recent and not alive:
-        return shown_in
-    return gpu.sample or gpu.before_sleep
+    _start_clock(core, gpu, gpu.verifications[lease.id])
 
 
 def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
@@ -85,7 +86,7 @@ def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
     if account.charges or key in gpu.verifications:
         return
     baseline = gpu.sample or gpu.before_sleep
-    retained = Verification(
+    retained = gpu.verifications[key] = Verification(
         key=key,
         process=process,
         lease=None,
@@ -113,7 +114,6 @@ def begin_again(core: Core, gpu: Gpu) -> None:
 def _start_clock(core: Core, gpu: Gpu, verification: Verification) -> None:
     """Begin polls and deadline, or begin them anew: time without readings says nothing of the
     memory's return."""
-    gpu.verifications[verification.key] = verification
     core.turn.touched[gpu.info.index] = gpu
     verification.paced_from = max(core.now, verification.not_before)
     verification.deadline_at = verification.paced_from + core.settings.verify_timeout_s
@@ -127,15 +127,15 @@ def _read_soon(core: Core, gpu: Gpu, verification: Verification) -> None:
     core.want_sample(gpu, core.now)
     soon = core.now + core.settings.verify_confirm_s
     verification.next_poll_at = max(soon, verification.paced_from)
-    _set_poll(core, gpu)
+    _set_poll(core.timers, gpu)
 
 
-def _set_poll(core: Core, gpu: Gpu) -> None:
+def _set_poll(timers: Timers, gpu: Gpu) -> None:
     timer = ("verify", gpu.info.id)
     if gpu.verifications:
-        core.timers.set(timer, min([v.next_poll_at for v in gpu.verifications.values()]))
+        timers.set(timer, min([v.next_poll_at for v in gpu.verifications.values()]))
     else:
-        core.timers.cancel(timer)
+        timers.cancel(timer)
 
 
 # -- 2. polls --------------------------------------------------------------------------------------
@@ -149,29 +149,32 @@ def on_poll_due(core: Core, gpu_id: str) -> None:
             core.wake(gpu)
             if verification.last_used_bytes is None:
                 _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
-        verification.next_poll_at = _next_poll_at(core, gpu, verification)
+        usual_s = core.costs.learnt_s(verification.consumer, "verify_s") or 0.0
+        verification.next_poll_at = _next_poll_at(
+            verification, core.settings, core.now, usual_s, gpu.reading_s
+        )
     core.want_sample(gpu, max([verification.confirmed_at for verification in due]))
-    _set_poll(core, gpu)
+    _set_poll(core.timers, gpu)
 
 
-def _next_poll_at(core: Core, gpu: Gpu, verification: Verification) -> float:
+def _next_poll_at(
+    verification: Verification, settings: Settings, now: float, usual_s: float, reading_s: float
+) -> float:
     """Return the time of the next poll: dense while memory usually returns, then rarer.
 
-    Polls stay dense longer for a consumer that is known to take longer, and are rarer on a GPU that
-    is slow to read.
+    Polls stay dense longer for a consumer that is known to take longer (`usual_s`), and are rarer
+    on a GPU that is slow to read.
     """
-    settings = core.settings
     pauses = settings.verify_poll_s
     if verification.overdue:
-        return core.now + settings.verify_slow_poll_s
-    waited_s = core.now - verification.paced_from
-    usual_s = 1.5 * (core.costs.learnt_s(verification.consumer, "verify_s") or 0.0)
+        return now + settings.verify_slow_poll_s
+    waited_s = now - verification.paced_from
     rungs = zip(pauses, settings.verify_poll_until_s, strict=False)
     pause = next(
-        (pause for pause, until_s in rungs if waited_s < max(until_s, usual_s)), pauses[-1]
+        (pause for pause, until_s in rungs if waited_s < max(until_s, 1.5 * usual_s)), pauses[-1]
     )
-    pause = max(pause, min(gpu.reading_s / VERIFY_READING_SHARE, settings.verify_slow_poll_s))
-    return min(core.now + pause, max(verification.deadline_at, core.now + pauses[0]))
+    pause = max(pause, min(reading_s / VERIFY_READING_SHARE, settings.verify_slow_poll_s))
+    return min(now + pause, max(verification.deadline_at, now + pauses[0]))
 
 
 def on_probe_due(core: Core, gpu_id: str) -> None:
@@ -182,12 +185,11 @@ def on_probe_due(core: Core, gpu_id: str) -> None:
     core.wake(gpu)  # the last reading may be too old to carry a grant
 
 
-def stale(core: Core) -> list[GpuId]:
+def stale(gpus: Iterable[Gpu], oldest: float) -> list[GpuId]:
     """Return the GPUs whose newest reading, good or failed, is too old to gate a grant."""
-    oldest = core.now - core.settings.sample_max_age_s
     return [
         gpu.info.id
-        for gpu in core.gpus.values()
+        for gpu in gpus
         if (gpu.sample is None or gpu.sample.taken_at < oldest)
         and (gpu.failed_at is None or gpu.failed_at < oldest)
     ]
@@ -202,8 +204,7 @@ def on_reading(core: Core, reading: MemorySampled) -> None:
         return
     if gpu.sample is not None and reading.taken_at < gpu.sample.taken_at:
         return
-    problem = impossible(gpu, reading, core.settings.verify_tolerance_bytes)
-    if problem:
+    if problem := gpu.ledger.impossible(reading):
         on_probe_failed(core, ProbeFailed(reading.gpu, reading.taken_at, problem))
         return
     # the probe answers, perhaps after an outage
@@ -214,13 +215,53 @@ def on_reading(core: Core, reading: MemorySampled) -> None:
     if answers_again:
         gpu.failed_at, gpu.failure = None, ""
         core.note(ProbeOkNote(gpu.info.id))
-    take(core, gpu, reading)
+    _take_evidence(core, gpu, reading)
     for verification in list(gpu.verifications.values()):
         if reading.taken_at > verification.confirmed_at:
             if answers_again or verification.verdict is Verdict.STALE:
                 _start_clock(core, gpu, verification)
             _weigh(core, gpu, verification, reading)
     core.wake(gpu)
+
+
+def _take_evidence(core: Core, gpu: Gpu, reading: MemorySampled) -> None:
+    """Make a reading the newest of its GPU, and take its evidence into the ledger."""
+    ledger, known = gpu.ledger, gpu.ledger.stowaways
+    tolerance_bytes = ledger.tolerance_bytes
+    # 1. what processes gave up since the reading before; those that leave are measured anyway
+    verified = {verification.process for verification in gpu.verifications.values()}
+    unloading = {lease.process for lease in gpu.in_state(LeaseState.UNLOADING)}
+    gpu.pending_free.watch(gpu.sample, reading, verified | unloading, ledger.charged_to)
+    # 2. the newest reading
+    gpu.sample = reading
+    gpu.residents.seen(reading.taken_at)
+    moving = gpu.verifications or gpu.in_state(LeaseState.LOADING, *LEAVING)
+    ledger.observe(
+        reading,
+        quiet=not moving and reading.taken_at > gpu.changed_at,
+        pending_bytes=gpu.pending_free.since(reading.taken_at - core.settings.verify_timeout_s),
+    )
+    if reading.processes is None:
+        return
+    # 3. bytes per process: footprints, stowaways that are new or have grown, retained bytes
+    for drift, lease in learning.on_evidence(gpu, core.now):
+        core.note(drift, lease)
+    for use in ledger.stowaways.values():
+        before = known.get(use.process)
+        if before is None or use.held_bytes > before.held_bytes + tolerance_bytes:
+            core.note(StowawayNote(gpu.info.id, use.process.pid, use.name, use.held_bytes))
+    for account in list(ledger.accounts.values()):
+        if account.charges or account.process in verified:
+            continue
+        lives = account.process in core.connected or not core.serving
+        least_bytes = max(account.measured_bytes, account.retained_floor_bytes if lives else 0)
+        shows_less = least_bytes + tolerance_bytes < account.retained_bytes
+        if shows_less and reading.taken_at > account.changed_at:
+            gone = account.process not in core.connected and core.serving
+            retained_bytes = ledger.leftover_bytes(account, reading, gone=gone)
+            if retained_bytes + tolerance_bytes < account.retained_bytes:
+                ledger.retain(account.process, retained_bytes, core.now)
+                core.record_residue(gpu, account.process, retained_bytes)
 
 
 def on_probe_failed(core: Core, event: ProbeFailed) -> None:
@@ -239,7 +280,7 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, reading: MemorySamp
     """Judge by a reading that counts, and do what follows."""
     settings = core.settings
     others = others_since(gpu, verification, reading, settings.verify_timeout_s)
-    judgement = judge(verification, gpu.ledger, reading, others, settings.verify_tolerance_bytes)
+    judgement = judge(verification, gpu.ledger, reading, others)
     verification.last_used_bytes = reading.used_bytes
     on_target = judgement is not None and judgement.verdict is Verdict.VERIFIED
     if others.loading_bytes and not on_target:
@@ -249,7 +290,7 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, reading: MemorySamp
     elif judgement is not None and on_target and not judgement.resolved:
         confirm_at = reading.taken_at + settings.verify_confirm_s
         verification.next_poll_at = max(core.now, confirm_at)
-        _set_poll(core, gpu)
+        _set_poll(core.timers, gpu)
     elif judgement is not None:
         _announce(core, gpu, verification, judgement, reading)
         if judgement.resolved:
@@ -288,7 +329,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
     """Free the charge except for retained bytes, and tell everything that waits for it."""
     # 1. the bytes
     del gpu.verifications[verification.key]
-    _set_poll(core, gpu)
+    _set_poll(core.timers, gpu)
     gpu.changed_at = core.now
     core.wake(gpu)
     process, lease_id = verification.process, verification.lease
@@ -299,7 +340,7 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         gpu.ledger.retain(process, 0, core.now)
         core.record_residue(gpu, process, 0)
         return
-    learning.on_verdict(core, gpu, verification)
+    learning.on_verdict(core.footprints, core.costs, gpu, verification, core.now)
     retained_bytes = gpu.ledger.drop(
         lease_id, judgement.residue_bytes, verification.retained_bytes, core.now
     )
@@ -311,8 +352,8 @@ def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgem
         if eviction.lease == lease_id:
             eviction.verdict, eviction.verdict_at = str(judgement.verdict), core.now
             waiter = core.waiting.get(eviction.wanted_by) if eviction.wanted_by else None
-            for gpu_id in () if waiter is None else waiter.request.gpus:
-                core.wake(core.gpus[gpu_id])  # the waiter may fit on another GPU
+            if waiter is not None:
+                core.wake_candidates(waiter)  # it may fit on another GPU
     # 3. the lease
     lease = core.leases.get(lease_id)
     if lease is not None and lease.state is LeaseState.VERIFYING:

@@ -7,7 +7,7 @@ from typing import Any
 from tests.support.core_driver import CoreDriver
 from tests.support.engine_state import state_of
 from tests.support.scenes import held
-from vram_arbiter.arbiter.core.model.learned import CONSUMERS_REMEMBERED
+from vram_arbiter.arbiter.core.learning import CONSUMERS_REMEMBERED
 from vram_arbiter.arbiter.core.model.lease import NONCES_MAX
 from vram_arbiter.arbiter.core.model.state import ENDED_REMEMBERED
 from vram_arbiter.schemas import defaults as d

@@ -398,7 +398,7 @@ class Leases(RuleBasedStateMachine):
         head = gpu.queue.head
         if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
             return
-        room = admission.measured_room_bytes(core, gpu)
+        room = admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s)
         assert not (
             admission.fits(gpu, head)
             and room is not None

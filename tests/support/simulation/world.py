@@ -309,7 +309,7 @@ class World:
             head = gpu.queue.head
             if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
                 continue
-            room = admission.measured_room_bytes(core, gpu)
+            room = admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s)
             if (
                 admission.fits(gpu, head)
                 and room is not None

@@ -1,6 +1,6 @@
 """What was measured of a model, and what of it counts for the next request."""
 
-from vram_arbiter.arbiter.core.model.learned import (
+from vram_arbiter.arbiter.core.learning import (
     HISTORY_MAX,
     MODELS_MAX,
     OOM_LOADS,
@@ -9,12 +9,12 @@ from vram_arbiter.arbiter.core.model.learned import (
 
 
 def test_few_measurements_count_by_their_maximum_and_many_by_their_95th_percentile() -> None:
-    prints = Footprints()
+    prints = Footprints(1 << 60)
     assert prints.p95_bytes("det m", "load_peak") == 0, "never seen"
     for count in (5, 7, 6):
         prints.measured("det m", "load_peak", count)
     assert (prints.p95_bytes("det m", "load_peak"), prints.p95_bytes("det m", "steady")) == (7, 0)
-    prints = Footprints()
+    prints = Footprints(1 << 60)
     for count in [1000, *range(1, 20)]:
         prints.measured("det m", "steady", count)
     assert prints.p95_bytes("det m", "steady") == 19, "one outlier in twenty no longer counts"
@@ -22,7 +22,7 @@ def test_few_measurements_count_by_their_maximum_and_many_by_their_95th_percenti
 
 
 def test_only_the_last_measurements_count() -> None:
-    prints = Footprints()
+    prints = Footprints(1 << 60)
     for _ in range(HISTORY_MAX):
         prints.measured("det m", "residue", 9)
     for _ in range(HISTORY_MAX):
@@ -31,7 +31,7 @@ def test_only_the_last_measurements_count() -> None:
 
 
 def test_an_out_of_memory_outweighs_many_loads_before_and_is_forgotten_in_the_end() -> None:
-    prints = Footprints()
+    prints = Footprints(1 << 60)
     for _ in range(HISTORY_MAX):
         prints.measured("det m", "load_peak", 5)
     prints.out_of_memory("det m", 9)
@@ -45,7 +45,7 @@ def test_an_out_of_memory_outweighs_many_loads_before_and_is_forgotten_in_the_en
 
 
 def test_what_is_kept_says_the_same_after_a_restart() -> None:
-    prints, again = Footprints(), Footprints()
+    prints, again = Footprints(1 << 60), Footprints(1 << 60)
     prints.measured("det m", "load_peak", 5)
     prints.measured("det m", "steady", 4)
     prints.out_of_memory("det m", 9)
@@ -61,7 +61,7 @@ def test_what_is_kept_says_the_same_after_a_restart() -> None:
 
 
 def test_what_is_not_understood_is_left_out() -> None:
-    prints = Footprints()
+    prints = Footprints(1 << 60)
     prints.restore(
         {
             "a": {"load_peak": 5, "steady": ["x", -1, 3], "oom": [1], "more": [1]},
@@ -72,7 +72,7 @@ def test_what_is_not_understood_is_left_out() -> None:
 
 
 def test_models_that_nobody_loads_any_more_are_forgotten() -> None:
-    prints = Footprints()
+    prints = Footprints(1 << 60)
     prints.measured("old m", "steady", 1)
     for number in range(MODELS_MAX - 1):
         prints.measured(f"m{number}", "steady", 1)

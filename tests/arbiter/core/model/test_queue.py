@@ -47,7 +47,7 @@ def test_ageing_bounds_the_wait_behind_higher_priorities() -> None:
     queue.add(waiter(3, 60.0, priority=60))
     assert arrivals(queue) == [2, 1, 3]
     assert queue.position(old) == 2
-    assert queue.ahead_of(old) == "L1-2"
+    assert queue.ahead_of(old) is queue.by_arrival[2]
     head = queue.head
     assert head is not None
     assert queue.ahead_of(head) is None

@@ -8,7 +8,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
 from tests.support.scenes import held
-from vram_arbiter.arbiter.core.scheduling import victims
+from vram_arbiter.arbiter.core.scheduling.victims import Choice
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 
@@ -142,7 +142,7 @@ def test_two_that_throw_each_other_out_stay_for_what_a_switch_costs() -> None:
     assert blocker["condition"] == "thrashing"
     core = state_of(pair.driver.arbiter)
     held = core.leases[pair.lease]
-    expected = victims.residency_ends_at(core, held, core.leases[wanted]) - held.ready_at
+    expected = Choice.of(core).residency_ends_at(held, core.leases[wanted]) - held.ready_at
     assert pair.switch(wanted) == pytest.approx(expected, abs=0.2)
     assert 3.0 < expected <= 8.0
 

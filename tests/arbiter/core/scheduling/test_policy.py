@@ -218,12 +218,12 @@ def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
     driver = CoreDriver(8 * GIB, start=False)
     core = state_of(driver.arbiter)
     gpu = next(iter(core.gpus.values()))
-    assert admission.measured_room_bytes(core, gpu) is None
+    assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) is None
     assert admission.blocked(core, gpu) == Block.UNREAD
     driver.advance(0.01)
-    assert admission.measured_room_bytes(core, gpu) == 8 * GIB
+    assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) == 8 * GIB
     core.now += 5.0
-    assert admission.measured_room_bytes(core, gpu) is None
+    assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) is None
 
 
 def test_the_measured_need_is_less_by_what_the_process_holds() -> None:
