@@ -1,6 +1,7 @@
 """`vramctl calibrate`: from readings to figures, from figures to the footprint file, and programs
 under observation on a simulated GPU."""
 
+import ctypes
 import json
 import os
 import re
@@ -22,10 +23,11 @@ from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration import entry as entries
 from vram_arbiter.clients.calibration import model
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading, fake_gpu, nvml_gpu, open_gpu
-from vram_arbiter.clients.calibration.record import Figures, Record, of_life, of_marks
+from vram_arbiter.clients.calibration.record import Figures, Record, add, of_life, of_marks
+from vram_arbiter.clients.cli import calibrate as calibrate_module
 from vram_arbiter.clients.cli.calibrate import MODEL, source_of
 from vram_arbiter.clients.cli.main import run_main
-from vram_arbiter.clients.cli.run import run_alone
+from vram_arbiter.clients.cli.run import NOT_STARTED, run_alone
 from vram_arbiter.clients.foreign.run_spec import RunSpec
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas import fakegpu
@@ -39,6 +41,7 @@ MIB, GIB = 2**20, 2**30
 QUICK: dict[str, Any] = {"rate_hz": 200.0, "rest_s": 0.05}
 FLAGS = ("--rate", "200", "--rest", "0.05")
 PATIENCE_S = 60.0
+PR_SET_CHILD_SUBREAPER = 36
 
 
 def series_of(*levels: tuple[float, int]) -> list[tuple[float, int]]:
@@ -60,6 +63,27 @@ def test_the_figures_of_a_life() -> None:
         retained=None,
         after_exit=0,
     )
+
+
+def test_the_median_of_a_life_is_that_of_its_time() -> None:
+    """Equal readings are kept as two: a long plateau counted as two, and short ones that differ by
+    their number."""
+    levels = [(0.0, 0), (0.01, 1500), (10.0, 1500)]
+    levels += [(10.0 + at / 100, 1600 + at) for at in range(1, 50)] + [(10.5, 0)]
+    series: list[tuple[float, int]] = []
+    for at_s, size in levels:
+        add(series, at_s, size * MIB)
+    found = of_life(series, 300 * MIB, 0)
+    assert found is not None
+    assert (found.steady, found.load_peak) == (1500 * MIB, 1649 * MIB)
+
+
+def test_of_equal_readings_the_first_and_the_last_are_kept() -> None:
+    """A program may run for days."""
+    series: list[tuple[float, int]] = []
+    for at_s, size in enumerate((0, 7, 7, 7, 7, 0, 0, 0)):
+        add(series, at_s, size)
+    assert series == [(0, 0), (1, 7), (4, 7), (5, 0), (7, 0)]
 
 
 def test_a_program_that_stays_until_the_last_reading_has_figures() -> None:
@@ -345,7 +369,10 @@ async def recorded(record: Record, *command: str, limit_s: float | None = None) 
         list(command), "test", 1, "any", 40, None, True, "priority", 5.0,
         environ=record.gpu.environ, limit_s=limit_s, record=record,
     )  # fmt: skip
-    return await run_alone(spec)
+    try:
+        return await run_alone(spec)
+    finally:
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)  # orphans of other tests
 
 
 def hide(fake_folder: Path) -> None:
@@ -406,6 +433,19 @@ async def test_a_server_is_ended_after_its_time(gpu: Gpu) -> None:
     record = Record(gpu, **QUICK)
     assert await recorded(record, "sleep", "600", limit_s=0.2) == 0
     assert record.figures({}) is None
+
+
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_a_program_that_cannot_be_started(
+    gpu: Gpu, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It was a traceback."""
+    program = tmp_path / "program"
+    program.write_text("#!/no/such/interpreter\n")
+    program.chmod(0o755)
+    assert await recorded(Record(gpu, **QUICK), str(program)) == NOT_STARTED
+    assert f"{program}: No such file or directory" in capfd.readouterr().err
 
 
 @pytest.mark.e2e
@@ -561,6 +601,19 @@ while not Path(sys.argv[2], "up").exists():
 with Client("robot", endpoint=sys.argv[1]) as client, client.lease(vram="1GiB", priority=60):
     print("granted", flush=True)
 """
+
+
+@pytest.mark.e2e
+def test_what_the_arbiter_refuses_is_said(
+    calibrate: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Each refusal was \"the arbiter does not lease this GPU\"."""
+    refusal = {"ok": False, "error": {"code": "limit_exceeded", "message": "too many requests"}}
+    monkeypatch.setattr(calibrate_module, "ask", lambda *_, **__: refusal)
+    assert calibrate("--", "true") == 1
+    assert "too many requests" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
