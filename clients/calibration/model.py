@@ -15,7 +15,6 @@ import time
 import zlib
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
-from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +45,17 @@ type Ask = Callable[[], Coroutine[Any, Any, object]]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is loaded and asked. `pictures`: a folder, "" for noise; `prompt`: "" for the
-    manifest's."""
+    """What is loaded and asked."""
 
     rskill: str
     sidecar: Sequence[str]  # its command
     requests: int
     rest_s: float
     marks: str
-    pictures: str = ""
-    prompt: str = ""
 
 
-def check(manifest: RSkillManifest, pictures: Path | None) -> None:
-    """Raises ConfigError for a model that cannot be asked, and for pictures that it cannot take."""
+def check(manifest: RSkillManifest) -> None:
+    """Raises ConfigError for a model that cannot be asked."""
     if manifest.kind not in CLIENTS:
         raise ConfigError(
             f"{manifest.name} is of kind {manifest.kind.value}, which no sidecar serves",
@@ -67,13 +63,6 @@ def check(manifest: RSkillManifest, pictures: Path | None) -> None:
         )
     if manifest.kind is Kind.VLA:
         need(f"a request to {manifest.name}", "numpy", extra="sidecars")
-        if pictures is not None:
-            raise ConfigError(
-                "--pictures is for detectors, scene VLMs and reward models",
-                hint="leave it out: a policy is asked with noise of its cameras' sizes",
-            )
-    elif pictures is not None:
-        pictures_of(str(pictures))
 
 
 async def run(plan: Plan) -> dict[str, float]:
@@ -99,7 +88,7 @@ async def _work(plan: Plan, endpoint: str) -> dict[str, float]:
     manifest, marks = load_manifest(Path(plan.rskill)), {"requests": float(plan.requests)}
     kind = CLIENTS[manifest.kind]
     async with kind(endpoint, timeout_s=LOAD_S, connect_timeout_s=LOAD_S) as client:
-        ask = asking(client, manifest, plan)
+        ask = asking(client, manifest)
         await client.load()
         await asyncio.sleep(plan.rest_s)
         marks["asked"] = time.monotonic()
@@ -113,23 +102,21 @@ async def _work(plan: Plan, endpoint: str) -> dict[str, float]:
     return marks
 
 
-def asking(client: SidecarClient, manifest: RSkillManifest, plan: Plan) -> Ask:
-    """Return what makes one request at each call."""
-    task = plan.prompt or manifest.default_prompt or manifest.description
+def asking(client: SidecarClient, manifest: RSkillManifest) -> Ask:
+    """Return what makes one request at each call, with noise and the manifest's words."""
+    task = manifest.default_prompt or manifest.description
     if isinstance(client, PolicyClient):
         observation, policy = observation_of(manifest, task), client
         return lambda: policy.get_action(observation)
-    shown = cycle(pictures_of(plan.pictures))
+    shown = noise_png()
     match client:
         case DetectorClient() as detector:
             labels = manifest.detector.labels if manifest.detector else ()
-            query = plan.prompt or ", ".join(labels) or "object"
-            return lambda: detector.detect(next(shown), query)
+            return lambda: detector.detect(shown, ", ".join(labels) or "object")
         case RewardClient() as reward:
-            return lambda: reward.score(list(islice(shown, REWARD_PICTURES)), task)
+            return lambda: reward.score([shown] * REWARD_PICTURES, task)
         case SceneVlmClient() as vlm:
-            question = plan.prompt or "Describe everything in the picture."
-            return lambda: vlm.query(next(shown), question)
+            return lambda: vlm.query(shown, "Describe everything in the picture.")
     raise AssertionError(f"no request is known for {type(client).__name__}")
 
 
@@ -148,23 +135,6 @@ def observation_of(manifest: RSkillManifest, task: str) -> Message:
             size = (sensor.min_height or POLICY_SIDE, sensor.min_width or POLICY_SIDE, 3)
             observation[sensor.vla_feature_key] = rng.integers(0, 256, size, dtype=np.uint8)
     return observation
-
-
-def pictures_of(folder: str) -> Sequence[bytes]:
-    """Return the pictures in a folder, one of noise for none. Raises ConfigError."""
-    if not folder:
-        return [noise_png()]
-    try:
-        found = sorted(Path(folder).iterdir())
-        pictures = [
-            path.read_bytes() for path in found if path.suffix.lower() in (".png", ".jpg", ".jpeg")
-        ]
-    except OSError as error:
-        problem = f"--pictures {folder} cannot be read: {error.strerror}"
-        raise ConfigError(problem, hint="name a folder of JPEG or PNG files") from error
-    if not pictures:
-        raise ConfigError(f"--pictures {folder} holds no picture", hint="expected .png or .jpg")
-    return pictures
 
 
 def noise_png(side: int = SIDE) -> bytes:

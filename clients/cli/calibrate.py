@@ -2,7 +2,7 @@
 on a GPU, as an entry of the footprint file.
 
 Beside a running arbiter the program has an exclusive lease of the whole GPU: no other model is
-resident meanwhile. A request of a robot goes first: it ends the program, and nothing is written.
+resident meanwhile. A request of a robot goes first: it ends the program.
 """
 
 import argparse
@@ -33,7 +33,6 @@ from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, from_wir
 from vram_arbiter.schemas.manifest import ManifestError, load_manifest
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
-from vram_arbiter.schemas.yamltext import read_yaml
 
 DESCRIPTIONS = {
     "calibrate": "Measure what a model needs on a GPU: vramctl calibrate MANIFEST loads it in a "
@@ -70,11 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         help="requests to the model; 0: no inference peak (default: %(default)s)",
     )  # fmt: skip
     add(
-        "--pictures", type=Path, metavar="DIR",
-        help="PNG and JPEG files for the requests (default: noise)",
-    )  # fmt: skip
-    add("--prompt", help="task, question or objects of the requests (default: the manifest's)")
-    add(
         "--seconds", type=arguments.at_least(1.0), metavar="S",
         help="end COMMAND after this time, for a server (default: it ends by itself)",
     )  # fmt: skip
@@ -90,8 +84,6 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         "--rest", type=arguments.at_least(0.05, 60.0), default=2.0, metavar="S",
         help="bytes are at rest when unchanged for this long (default: %(default)s)",
     )  # fmt: skip
-    add("--write", type=Path, metavar="FILE", help="write the entry to this footprint file")
-    add("--configs", type=Path, metavar="DIR", help="folder of shipped skills and models")
     add(
         "--allow-noncommercial", action="store_true",
         help="measure a model whose license does not allow commercial use",
@@ -108,11 +100,9 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 def run(args: argparse.Namespace) -> int:
     if bool(args.manifest) == bool(args.program):
         args.parser.error("expected either MANIFEST or `-- COMMAND`")
-    configs = args.configs or configs_folder(os.environ)
+    configs = configs_folder(os.environ)
     rskill = shipped(Path(args.manifest), "rskills", configs) if args.manifest else None
     key = _key_of_program(args) if rskill is None else _key_of_model(args, rskill)
-    if args.write is not None:
-        check_writable(args.write, key, model=rskill is not None)
     gpu = open_gpu(args.device)
     record, command = Record(gpu, args.rate, args.rest), list(args.program)
     with tempfile.TemporaryDirectory(prefix="vc") as folder:
@@ -136,8 +126,6 @@ def run(args: argparse.Namespace) -> int:
         )
     requests = args.requests if rskill is not None else 0
     entry = entries.entry_of(figures, source_of(record, requests, datetime.now(UTC)))
-    if args.write is not None:
-        entries.write(args.write, key, entry)
     _print(args, record, key, figures, entry)
     return OK
 
@@ -157,7 +145,7 @@ def _key_of_model(args: argparse.Namespace, rskill: Path) -> str:
         manifest = load_manifest(rskill)
     except ManifestError as error:
         raise ConfigError(str(error)) from error
-    model.check(manifest, args.pictures)
+    model.check(manifest)
     return f"{manifest.name}/{manifest.quantization.dtype}"
 
 
@@ -172,26 +160,7 @@ def _plan(
         sidecar.append("--allow-noncommercial")
     if not gpu.device.startswith("fake:"):
         sidecar += ["--footprint", "0B,0B,0B"]  # its own bytes, without ballast
-    pictures = "" if args.pictures is None else str(args.pictures)
-    return model.Plan(
-        str(rskill), sidecar, args.requests, args.rest, str(marks), pictures, args.prompt or ""
-    )
-
-
-def check_writable(path: Path, key: str, *, model: bool) -> None:
-    """Raise ConfigError before anything is measured, where the entry could not be written."""
-    if not path.parent.is_dir():
-        raise ConfigError(f"--write {path}: {path.parent} is not a directory")
-    found = read_yaml(path).data if path.exists() else {}
-    for name in {key, key.rpartition("/")[0]} if model else {key}:
-        old = found.get(name) if isinstance(found, dict) else None
-        if isinstance(old, dict) and old.get("stands_for"):
-            raise ConfigError(
-                f"--write {path}: {name} stands for {old['stands_for']}: its bytes are another "
-                "model's",
-                hint=f"calibrate {old['stands_for']}, or write to another file",
-            )
-    entries.merged(path, key, {"source": "a trial"})
+    return model.Plan(str(rskill), sidecar, args.requests, args.rest, str(marks))
 
 
 def source_of(record: Record, requests: int, now: datetime) -> str:
@@ -251,7 +220,6 @@ def _print(
             "by_process": record.listed,
             "bytes": figures,
             "entry": dict(entry),
-            "written": None if args.write is None else str(args.write),
         }
         print(json.dumps(answer, indent=2))
         return
@@ -262,5 +230,3 @@ def _print(
     ]
     print("\n".join(text.table(["FIGURE", "BYTES", "MEANING"], rows)))
     print(f"\n{entries.text_of(key, entry)}", end="")
-    if args.write is not None:
-        print(f"\nwritten to {args.write}")

@@ -9,6 +9,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -17,10 +18,10 @@ from vram_arbiter.clients.cli.installation.contents import SYSUSERS, TMPFILES, w
 from vram_arbiter.clients.cli.installation.environment import check_environment
 from vram_arbiter.clients.cli.installation.files import Files, Installed, Step, load
 from vram_arbiter.clients.cli.installation.machine import (
-    account_removals,
     check_systemd,
     command,
     exists,
+    is_active,
     known_units,
     missing_accounts,
     systemctl,
@@ -45,9 +46,10 @@ DESCRIPTIONS = {
     "install": "Make the arbiter a service of this machine, or of your user with --user-units: "
     "units, users, groups, folders, links to the programs, shell completion. Shows the plan and "
     "asks first. Repeating it, or an upgrade, changes only what differs; a file that was changed "
-    "by hand is kept, with the new text beside it as FILE.new.",
+    "by hand is kept.",
     "uninstall": "Remove what `vramctl install` put on this machine, after showing the plan. Files "
-    "that were changed by hand stay, and so do state, settings and users, unless --purge.",
+    "that were changed by hand stay, and so do state and settings, unless --purge. Users and "
+    "groups stay in any case.",
 }
 NO_START: Final = (
     "see `journalctl -u vram-arbiter -n 20`; without a GPU write "
@@ -78,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     else:
         add(
             "--purge", action="store_true",
-            help="also remove state, caches, settings, users, and files that were changed by hand",
+            help="also remove state, caches, settings, and files that were changed by hand",
         )  # fmt: skip
     add("--user-units", action="store_true", help="the calling user's systemd; needs no root")
     add(
@@ -107,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
         return code
     _perform(steps)
     kept = "" if args.purge else f"; `{before.prefix}/bin/vramctl uninstall --purge` removes state"
+    if site.live and site.layout.system:
+        kept += "; users and groups stay, with their members"
     print(f"next: the programs stay in {before.prefix}{kept}")
     return OK
 
@@ -141,8 +145,9 @@ def _install(args: argparse.Namespace, site: Site, before: Installed | None) -> 
     finally:
         if record != before:
             Files(site, record).store()
-    if site.live and changing and before is not None and before.started:
-        user = "" if site.layout.system else "--user "
+    system = site.layout.system
+    if site.live and changing and before is not None and is_active(ARBITER, system=system):
+        user = "" if system else "--user "
         print(f"next: systemctl {user}restart vram-arbiter (holders keep their leases)")
     return OK
 
@@ -179,14 +184,9 @@ def installation(site: Site, record: Installed) -> list[Step]:
     changed = [step.what for step in steps if step.changes]
     if layout.system:
         missing = missing_accounts(texts[SYSUSERS])
-
-        def create() -> None:
-            record.accounts += missing
-            command("systemd-sysusers", str(SYSUSERS))
-
-        says = ", ".join(["users and groups", *(f"{kind} {name}" for kind, name in missing)])
-        new = bool(missing) or str(SYSUSERS) in changed
-        steps.append(Step("create" if new else "same", says, perform=create if new else None))
+        if missing or str(SYSUSERS) in changed:
+            made = _running("systemd-sysusers", str(SYSUSERS))
+            steps.append(replace(made, detail=[f"{kind} {name}" for kind, name in missing]))
         if not RUNTIME.is_dir():
             steps.append(_running("systemd-tmpfiles", "--create", str(TMPFILES)))
     if any(what.startswith(str(layout.units)) for what in changed):
@@ -206,7 +206,7 @@ def installation(site: Site, record: Installed) -> list[Step]:
 
 
 def removal(site: Site, record: Installed, *, purge: bool) -> list[Step]:
-    """Return the steps of a removal. `purge`: state, settings, users and changed files too."""
+    """Return the steps of a removal. `purge`: state, settings and changed files too."""
     files, layout = Files(site, record), site.layout
     steps = _stops(site, record) if site.live else []
     steps += files.remove(purge=purge)
@@ -219,8 +219,6 @@ def removal(site: Site, record: Installed, *, purge: bool) -> list[Step]:
         steps.append(_running(*systemctl("daemon-reload", system=layout.system)))
     if purge:
         steps += _trees(site, layout.state)
-        # after the state: a folder must not belong to a user id that is given away again
-        steps += account_removals(record) if site.live else []
         # last, with the record: what failed can be tried again
         steps += _trees(site, [layout.settings])
 
@@ -232,7 +230,7 @@ def removal(site: Site, record: Installed, *, purge: bool) -> list[Step]:
             site.at(site.record).unlink(missing_ok=True)
         files.remove_folders()
 
-    keeps = not purge and bool(record.accounts or record.operators)
+    keeps = not purge and site.live and layout.system
     what = f"{site.record}, for --purge" if keeps else str(site.record)
     return [*steps, Step("same" if keeps else "remove", what, perform=end)]
 

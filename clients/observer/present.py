@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.replies import StatusReply
 
 log = logging.getLogger(__name__)
@@ -17,8 +16,6 @@ ASK_S = 3.0
 """Longest wait for an answer."""
 SOME_MAX = 100
 WHOLE_S = 2.0
-PAGES_MAX = 10
-"""Pages of the status: leases beyond are counted and not listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +60,7 @@ class Present:
             return None
         try:
             async with asyncio.timeout(ASK_S):
-                found = await self._some(touched) or await self._pages()
+                found = await self._some(touched) or await self._all()
         except (VramError, TimeoutError) as error:
             log.debug("no status: %s", error)
             return None
@@ -77,7 +74,8 @@ class Present:
         leases = {lease.lease_id: lease for lease in self.newest.status.leases}
         if len(leases) <= SOME_MAX or time.monotonic() - self._whole_at > WHOLE_S:
             return None
-        found = await self._page({"leases": list(touched)})
+        found = await self._client.ask("status", {"leases": list(touched)}, timeout_s=ASK_S)
+        assert isinstance(found, StatusReply)
         if found.epoch != self.newest.status.epoch:
             return None
         for lease_id in touched:
@@ -85,18 +83,6 @@ class Present:
         leases |= {lease.lease_id: lease for lease in found.leases}
         return replace(found, leases=tuple(leases.values()))
 
-    async def _pages(self) -> StatusReply:
+    async def _all(self) -> StatusReply:
         self._whole_at = time.monotonic()
-        first = page = await self._page({})
-        leases = {lease.lease_id: lease for lease in page.leases}
-        for _ in range(PAGES_MAX - 1):
-            if page.next is None:
-                break
-            page = await self._page({"after": page.next})
-            leases |= {lease.lease_id: lease for lease in page.leases}
-        return replace(first, leases=tuple(leases.values()), next=None)
-
-    async def _page(self, fields: JsonMap) -> StatusReply:
-        reply = await self._client.ask("status", fields, timeout_s=ASK_S)
-        assert isinstance(reply, StatusReply)
-        return reply
+        return await self._client.status()

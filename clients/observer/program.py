@@ -23,7 +23,7 @@ from vram_arbiter.clients.observer.page.access import Access, read_token
 from vram_arbiter.clients.observer.page.app import StatusSite
 from vram_arbiter.clients.observer.page.feed import PageFeed
 from vram_arbiter.clients.observer.page.usage import UsageRecord
-from vram_arbiter.clients.observer.present import ASK_S, Look, Present
+from vram_arbiter.clients.observer.present import Look, Present
 from vram_arbiter.schemas.config.observer import HttpConfig, ObserverConfig
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.runtime.systemd import Notifier
@@ -170,11 +170,7 @@ class Observer:
             touched, self._touched = self._touched, set()
             look = await self._present.look(touched=touched)
             if look is not None:
-                try:
-                    async with asyncio.timeout(ASK_S):
-                        await self._feed.publish(look)
-                except (VramError, TimeoutError):
-                    self._feed.lost()  # pages that missed something begin anew
+                await self._feed.publish(look)
             read = self._feed.read
             gap_s = max(GAP_S if read else QUIET_GAP_S, LOAD * (look.took_s if look else 0.0))
             await asyncio.sleep(gap_s)

@@ -34,9 +34,9 @@ from vram_arbiter.schemas.runtime.version import version
 
 DESCRIPTIONS = {
     "doctor": "Examine installation, driver, socket, permissions, clocks, cgroups, suspend, "
-    "leftovers, a second arbiter, units, and what the arbiter says of itself and its GPUs. Each finding names "
-    "a command that resolves it; nothing is changed. Exits 0 without a warning or error, 1 with "
-    "one, 3 if the arbiter cannot be reached."
+    "leftovers, a second arbiter, units, and what the arbiter says of itself and its GPUs. Each "
+    "finding names a command that resolves it; nothing is changed. Exits 0 without a warning or "
+    "error, 1 with one, 3 if the arbiter cannot be reached."
 }
 
 CHECKS: Final[Checks[Machine]] = (

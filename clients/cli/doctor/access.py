@@ -1,4 +1,4 @@
-"""Checks of the way to the arbiter: its socket, the user that serves it, and the users that may use it."""
+"""Checks of the way to the arbiter: its socket, the user that serves it, users with access."""
 
 import os
 import stat

@@ -22,13 +22,13 @@ from vram_arbiter.clients.cli.installation.site import GROUP, LINK, Site
 from vram_arbiter.schemas.errors import ConfigError
 
 QUIET: Final = ("same", "gone", "keep")
-"""Words of steps after which the machine is as before; a new text beside a file is no change."""
+"""Words of steps after which the machine is as before."""
 
 
 class Installed(BaseModel):
     """The file `installed.json`: what was put on the machine."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="ignore")  # earlier versions noted more
 
     version: str = ""
     prefix: Path = Path("/")
@@ -38,8 +38,6 @@ class Installed(BaseModel):
     """Path → SHA-256 of what was written, not of what is there now."""
     folders: list[Path] = []
     """Made for a file; removed if they are empty."""
-    accounts: list[tuple[str, str]] = []
-    """("user" or "group", name), made by systemd-sysusers."""
     started: bool = False
     """The arbiter was enabled and started, once."""
 
@@ -94,8 +92,7 @@ class Files:
     def install(self, wanted: Mapping[Path, str]) -> list[Step]:
         """Return the steps that bring the machine's files to what is wanted."""
         steps = [self._file(path, text) for path, text in wanted.items()]
-        offered = {_beside(path) for path in wanted if self._edited(path, wanted[path])}
-        obsolete = [path for path in self.record.files if path not in offered.union(wanted)]
+        obsolete = [path for path in self.record.files if path not in wanted]
         return [*steps, *(self._removal(path, purge=False) for path in obsolete)]
 
     def remove(self, *, purge: bool) -> list[Step]:
@@ -112,26 +109,17 @@ class Files:
             with contextlib.suppress(OSError):
                 self.site.at(folder).rmdir()
 
-    def _edited(self, path: Path, text: str) -> bool:
-        there = self.site.read(path)
-        return there not in (None, text) and self.record.files.get(path) != _digest(str(there))
-
     def _file(self, path: Path, text: str) -> Step:
         there = self.site.read(path)
-        changes = [] if there is None else _diff(there, text)
         put = partial(self._put, path, text)
         if there is None:
             return Step("new", str(path), perform=put)
         if there == text:
             return Step("same", str(path), perform=partial(self._note, path, text))
-        if not self._edited(path, text):
+        changes = _diff(there, text)
+        if self.record.files.get(path) == _digest(there):
             return Step("replace", str(path), changes, put)
-        if self.record.files.get(path) == _digest(text) or text.startswith(LINK):
-            return Step("keep", f"{path}: changed by hand")
-        # offered once: not again after the file beside it was moved or removed
-        beside = _beside(path)
-        says = f"{path}: changed by hand; the new text goes to {beside.name}"
-        return Step("keep", says, changes, partial(self._put, beside, text, path))
+        return Step("keep", f"{path}: changed by hand; remove it to get this version", changes)
 
     def _removal(self, path: Path, *, purge: bool) -> Step:
         there = self.site.read(path)
@@ -142,10 +130,9 @@ class Files:
         forget = partial(self.record.files.pop, path, None)
         return Step("keep", f"{path}: changed by hand", perform=forget)
 
-    def _put(self, path: Path, text: str, *also: Path) -> None:
+    def _put(self, path: Path, text: str) -> None:
         self._write(path, text)
-        for noted in (path, *also):
-            self._note(noted, text)
+        self._note(path, text)
 
     def _write(self, path: Path, text: str) -> None:
         for folder in reversed(path.parents):
@@ -170,10 +157,6 @@ class Files:
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()
-
-
-def _beside(path: Path) -> Path:
-    return path.with_name(f"{path.name}.new")
 
 
 def _diff(before: str, after: str) -> list[str]:

@@ -7,11 +7,8 @@ import re
 import subprocess
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 
-from vram_arbiter.clients.cli.installation.files import Installed, Step
-from vram_arbiter.clients.cli.installation.site import DEVICE_GROUPS
 from vram_arbiter.schemas.errors import ConfigError, InstallFailed
 
 COMMAND_S = 150.0
@@ -61,6 +58,12 @@ def known_units(patterns: Sequence[str], wants: Path, *, system: bool) -> list[s
     return sorted(name for name in names if any(fnmatchcase(name, one) for one in patterns))
 
 
+def is_active(unit: str, *, system: bool) -> bool:
+    """Return whether a unit runs."""
+    argv = systemctl("is-active", "--quiet", unit, system=system)
+    return subprocess.run(argv, timeout=COMMAND_S, check=False).returncode == 0
+
+
 def missing_accounts(snippet: str) -> list[tuple[str, str]]:
     """Return the users and groups of a sysusers.d snippet that the machine has not."""
     users = [("user", name) for name in re.findall(r"^u (\S+)", snippet, re.MULTILINE)]
@@ -76,29 +79,3 @@ def exists(kind: str, name: str) -> bool:
     except KeyError:
         return False
     return True
-
-
-def account_removals(record: Installed) -> list[Step]:
-    """Return the steps that remove what systemd-sysusers made; a group of devices that has got
-    members stays."""
-    steps = []
-    for kind, name in record.accounts:
-        members = _members(name) if kind == "group" and name in DEVICE_GROUPS else []
-        if members:
-            steps.append(Step("keep", f"group {name}: {', '.join(members)} belong to it"))
-        elif exists(kind, name):
-            steps.append(Step("remove", f"{kind} {name}", perform=partial(_remove, kind, name)))
-    return steps
-
-
-def _members(group: str) -> list[str]:
-    if not exists("group", group):
-        return []
-    found = grp.getgrnam(group)
-    first = [user.pw_name for user in pwd.getpwall() if user.pw_gid == found.gr_gid]
-    return sorted({*found.gr_mem, *first})
-
-
-def _remove(kind: str, name: str) -> None:
-    if exists(kind, name):  # userdel removes a group of the user's name
-        command(f"{kind}del", name)

@@ -29,10 +29,6 @@ PROGRAMS = (
 )
 GROUP = "vram-arbiter"
 OPERATORS = "vram-operators"
-DEVICE_GROUPS = ("video", "render", "dialout")
-"""Groups of the snippet that other programs use as well: a removal leaves those that were there
-before, and those that have members."""
-LINKS_MAX = 40
 LINK = "-> "
 """Begins the text of a link; its target follows."""
 
@@ -103,29 +99,19 @@ class Site:
     root: Path = Path("/")
 
     def at(self, path: Path) -> Path:
-        """Return where a path of the installed machine is on this one.
-
-        Links on the way lead where they would lead there: followed by this machine's kernel, an
-        absolute one would lead out of the folder. The last name is not followed.
-        Raises ConfigError for too many links.
-        """
-        if self.live:
-            return path
-        place, names, links = self.root, [*path.parts[1:]], 0
-        while len(names) > 1:
-            name = names.pop(0)
-            if name == "..":
-                place = self.root if place == self.root else place.parent
-                continue
-            place /= name
-            if place.is_symlink():
-                links += 1
-                if links > LINKS_MAX:
-                    raise ConfigError(f"{place}: too many links")
-                target = place.readlink()
-                place = self.root if target.is_absolute() else place.parent
-                names[:0] = [part for part in target.parts if part != "/"]
-        return place.joinpath(*names)
+        """Return where a path of the installed machine is on this one. The last name is not
+        followed. Raises ConfigError for a link on the way that leads out of the folder: this
+        machine's kernel follows it."""
+        place = self.root / path.relative_to("/")
+        if place == self.root:
+            return place
+        folder = place.parent.resolve()
+        if not folder.is_relative_to(self.root.resolve()):
+            raise ConfigError(
+                f"{place.parent} leads to {folder}, out of {self.root}",
+                hint="make the link a relative one, or mount the image and install inside it",
+            )
+        return folder / place.name
 
     def folder(self, path: Path) -> Path:
         """Return where a folder of the installed machine is on this one, also through a link."""

@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final
+from urllib.parse import urlsplit
 
 import httpx
 
@@ -79,7 +80,7 @@ async def post(
                 ):
                     if reply.is_success:
                         return
-                    began = await anext(reply.aiter_bytes(SHOWN_MAX_CHARS), b"")
+                    began = await anext(reply.aiter_raw(SHOWN_MAX_CHARS), b"")
                 said = printable(began.decode(errors="replace"))
                 problem = f"answered {reply.status_code}: {said}"
                 if reply.status_code < 500 and reply.status_code not in AGAIN:
@@ -124,6 +125,7 @@ def read_headers(path: str) -> Mapping[str, str]:
 
 def _headers(hook: Hook, delivery: Delivery) -> Mapping[str, str]:
     own = {
+        "Accept-Encoding": "identity",  # an answer is shown as it comes
         "Content-Type": "application/json",
         "User-Agent": f"vram-arbiter/{version()}",
         "Idempotency-Key": delivery.key,
@@ -135,5 +137,5 @@ def _headers(hook: Hook, delivery: Delivery) -> Mapping[str, str]:
 
 def _host(hook: Hook) -> str:
     """Return the server of a webhook, for logs: path and query may be secret."""
-    scheme, _, rest = str(hook.webhook).partition("://")
-    return f"{scheme}://{rest.partition('/')[0]}"
+    parts = urlsplit(str(hook.webhook))
+    return f"{parts.scheme}://{parts.netloc}"

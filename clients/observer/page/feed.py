@@ -15,8 +15,9 @@ from typing import Protocol
 
 from vram_arbiter.clients.observer.page.messages import Change, WaitsMessage
 from vram_arbiter.clients.observer.page.usage import UsageRecord
-from vram_arbiter.clients.observer.present import Look
+from vram_arbiter.clients.observer.present import ASK_S, Look
 from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.wire.explained import Explanation, WhyReply
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
@@ -128,13 +129,21 @@ class PageFeed:
             self._events.extend(events)
 
     def lost(self) -> None:
-        """End all pages: the arbiter is not reached."""
+        """End all pages: they connect again, and begin anew."""
         for reader in list(self._readers):
             reader.end()
         self._readers.clear()
 
     async def publish(self, look: Look) -> None:
-        """Send a snapshot to new pages, to others what changed. Raises VramError."""
+        """Send a snapshot to new pages, to others what changed. Where the arbiter does not answer
+        in time all pages begin anew, as they missed something."""
+        try:
+            async with asyncio.timeout(ASK_S):
+                await self._publish(look)
+        except (VramError, TimeoutError):
+            self.lost()
+
+    async def _publish(self, look: Look) -> None:
         if look.status.epoch != self._epoch:  # the times of another start are none of its time
             self._epoch = look.status.epoch
             for reader in [reader for reader in self._readers if reader.told]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from vram_arbiter.clients.cli import install
 from vram_arbiter.clients.cli.installation import completion as completing
 from vram_arbiter.clients.cli.installation import environment, machine
 from vram_arbiter.clients.cli.installation.site import PROGRAMS
@@ -109,32 +110,22 @@ def test_the_plan_needs_a_yes(root: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert (root / UNIT).exists()
 
 
-def test_a_changed_file_is_kept_and_the_new_text_offered_once(
+def test_a_changed_file_is_kept_and_the_difference_shown(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The next version is stood in for by another prefix, which changes every unit."""
-    new = root / f"{SIDECAR}.new"
     assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
     (root / SIDECAR).write_text("# the operator's\n")
-    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
-    assert not new.exists(), "the product has no new text"
-
     capsys.readouterr()
     assert vramctl(root, "install", "--prefix", "/opt/two", "--yes") == 0
     said = capsys.readouterr().out
-    assert f"keep    /{SIDECAR}: changed by hand; the new text goes to {new.name}" in said
+    assert f"keep    /{SIDECAR}: changed by hand; remove it to get this version" in said
+    assert "+ExecStart=/opt/two/bin/vram-sidecar" in said
     assert "+ExecStart=/opt/two/bin/vram-arbiter --group" in said
     assert (root / SIDECAR).read_text() == "# the operator's\n"
-    assert "/opt/two/bin/vram-sidecar" in new.read_text()
-
-    offered = new.read_text()
-    new.unlink()
-    assert vramctl(root, "install", "--prefix", "/opt/two") == 0
-    assert not new.exists(), "refused once"
-    assert vramctl(root, "install", "--prefix", "/opt/three", "--yes") == 0
-    (root / SIDECAR).write_text(offered.replace("/opt/two", "/opt/three"))
-    assert vramctl(root, "install", "--prefix", "/opt/three", "--yes") == 0
-    assert not new.exists(), "taken over: no longer needed"
+    (root / SIDECAR).unlink()
+    assert vramctl(root, "install", "--prefix", "/opt/two", "--yes") == 0
+    assert "/opt/two/bin/vram-sidecar" in (root / SIDECAR).read_text()
 
 
 def test_links_below_the_folder_do_not_lead_out_of_it(
@@ -143,24 +134,49 @@ def test_links_below_the_folder_do_not_lead_out_of_it(
     """Regression: an absolute link of an image was followed by this machine's kernel, and units
     were written into the machine that builds the image."""
     outside = tmp_path / "outside"
-    inside = root / outside.relative_to("/")
-    for folder in (outside, inside, root / "etc", root / "usr", root / "data"):
+    for folder in (outside, root / "etc", root / "usr", root / "data"):
         folder.mkdir(parents=True)
+    (root / "usr/local").symlink_to("../data")
     (root / "etc/systemd").symlink_to(outside)
-    (root / "usr/local").symlink_to("../../../../data")
-    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 2
+    assert f"leads to {outside}/system, out of {root}" in capsys.readouterr().err
     assert list(outside.iterdir()) == []
-    assert (inside / "system/vram-arbiter.service").is_file()
+    (root / "etc/systemd").unlink()
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
     assert (root / "data/bin/vramctl").is_symlink()
     assert vramctl(root, "install", "--prefix", "/opt/one") == 0
     assert "nothing to change" in capsys.readouterr().out
     assert vramctl(root, "uninstall", "--purge", "--yes") == 0
-    assert [name for name in tree(root) if not name.startswith(("etc/systemd", "usr/local"))] == []
+    assert [name for name in tree(root) if not name.startswith("usr/local")] == []
 
-    (root / "etc/systemd").unlink()
-    (root / "etc/systemd").symlink_to("/etc/systemd")
-    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 2
-    assert "too many links" in capsys.readouterr().err
+
+@pytest.mark.parametrize("running", [True, False])
+def test_a_restart_is_told_of_for_an_arbiter_that_runs(
+    running: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """It was told of for a stopped one as well, which it would have started."""
+    monkeypatch.setattr("vram_arbiter.clients.cli.installation.contents.completions", lambda: SHORT)
+    monkeypatch.setattr(os, "getuid", lambda: 1000)
+    monkeypatch.setattr(machine, "_BOOTED", tmp_path)
+    monkeypatch.setattr(install, "check_environment", lambda *_, **__: None)
+    systemctl = tmp_path / "bin/systemctl"
+    systemctl.parent.mkdir()
+    systemctl.write_text(f"#!/bin/sh\ncase $* in *is-active*) {str(running).lower()};; esac\n")
+    systemctl.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{systemctl.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
+    for name in ("CONFIG", "STATE", "DATA"):
+        monkeypatch.delenv(f"XDG_{name}_HOME", raising=False)
+    words = ["install", "--user-units", "--yes", "--prefix"]
+    assert run_main([*words, "/opt/one"]) == 0
+    assert "next: systemctl" not in capsys.readouterr().out, "it has just been started"
+    assert run_main([*words, "/opt/two"]) == 0
+    told = "next: systemctl --user restart vram-arbiter" in capsys.readouterr().out
+    assert told is running
 
 
 def test_a_link_and_a_file_of_others_stay(root: Path) -> None:

@@ -17,7 +17,7 @@ from vram_arbiter.clients.cli.timeline import chart, collect
 from vram_arbiter.clients.cli.timeline.collect import BadEventLog, EmptyTimeline, Range
 from vram_arbiter.clients.cli.timeline.command import write
 from vram_arbiter.clients.cli.timeline.reader import Reader
-from vram_arbiter.clients.cli.timeline.story import Story, within
+from vram_arbiter.clients.cli.timeline.story import GpuStory, Mark, Story, within
 from vram_arbiter.clients.cli.timeline.trace import trace
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
@@ -319,6 +319,26 @@ def test_the_png_is_drawn(printed: Story, tmp_path: Path) -> None:
         write(path, story)
         assert path.read_bytes().startswith(b"\x89PNG")
         assert path.stat().st_size > 5000
+
+
+@pytest.mark.heavy
+def test_out_of_memory_is_marked_on_its_own_gpu(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each GPU showed those of all."""
+    axes = pytest.importorskip("matplotlib.axes", reason="needs the runner extra").Axes
+    marked: list[tuple[float, float]] = []
+    real = axes.plot
+
+    def plot(self: Any, xs: list[float], ys: list[float], *rest: Any, **named: Any) -> Any:
+        marked.extend(zip(xs, ys, strict=True))
+        return real(self, xs, ys, *rest, **named)
+
+    monkeypatch.setattr(axes, "plot", plot)
+    gpus = GpuStory("GPU-1", "one", 8 * GIB), GpuStory("GPU-2", "two", 16 * GIB)
+    marks = Mark(5.0, "oom", "", "GPU-2"), Mark(6.0, "stopped", "", "GPU-2")
+    write(tmp_path / "a.png", Story(0.0, 10.0, gpus, (), (), marks))
+    assert marked == [(5.0, 16.0)]
 
 
 # -- the command

@@ -1,6 +1,8 @@
 """Commands and webhooks: real processes, and a real HTTP server on loopback."""
 
 import asyncio
+import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -73,6 +75,44 @@ def test_what_it_leaves_in_a_session_of_its_own_ends_too(tmp_path: Path) -> None
     left = f"setsid sh -c 'echo $$ > {tmp_path}/pid; exec sleep 600' &"
     run(f"{left} until [ -s {tmp_path}/pid ]; do sleep 0.01; done")
     until(lambda: gone(tmp_path / "pid"))
+
+
+def test_all_that_it_leaves_is_ended(tmp_path: Path) -> None:
+    """The search goes on behind the first process with the mark."""
+    left = f"setsid sh -c 'echo $$ > {tmp_path}/$0; exec sleep 600' $one &"
+    wait = f"until [ -s {tmp_path}/$one ]; do sleep 0.01; done"
+    run(f"for one in a b c; do {left} {wait}; done")
+    until(lambda: all(gone(tmp_path / one) for one in "abc"))
+
+
+def test_a_run_that_leaves_nothing_is_searched_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of /proc was read three times after each command."""
+    opened: list[int] = []
+    real = os.pidfd_open
+
+    def counting(pid: int, flags: int = 0) -> int:
+        opened.append(pid)
+        return real(pid, flags)
+
+    monkeypatch.setattr(os, "pidfd_open", counting)
+    run("true")
+    assert opened.count(os.getpid()) == 1
+
+
+def test_a_command_that_closes_its_output_costs_no_time_of_the_observer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At its end the pipe was readable for ever, and the loop turned until the command ended."""
+    ends, real = [0], os.read
+
+    def counting(descriptor: int, most: int) -> bytes:
+        came = real(descriptor, most)
+        ends[0] += not came
+        return came
+
+    monkeypatch.setattr(os, "read", counting)
+    run("exec >&- 2>&-; sleep 0.3")
+    assert ends[0] < 10, "not once a turn of the loop"
 
 
 def test_the_output_of_a_command_is_bounded_and_escaped(caplog: pytest.LogCaptureFixture) -> None:
@@ -211,6 +251,50 @@ def test_a_server_that_is_away_is_asked_again(send: Callable[..., list[float]]) 
     assert "secret" not in str(error.value)
 
 
+@pytest.mark.parametrize("url", ["http://[v1.x]/secret", "http://999.1.1.1/?token=secret"])
+def test_a_url_that_names_no_host_fails_and_is_not_raised_as_another_error(
+    send: Callable[..., list[float]], url: str
+) -> None:
+    """The client's own error ended the observer."""
+    with pytest.raises(ActionFailed, match="took none of 1 requests: Invalid IPv") as error:
+        send(webhook=url, attempts=1)
+    assert "secret" not in str(error.value)
+
+
+@pytest.mark.parametrize("told", [b"HTTP/1.1 500 No\r\n\r\n", b""], ids=["endless", "silent"])
+def test_the_whole_exchange_with_a_webhook_is_bounded(told: bytes) -> None:
+    """An answer that went on byte by byte was read for ever: the limit was that of each byte."""
+
+    async def story() -> None:
+        ended = asyncio.Event()
+
+        async def drip(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(told)
+            with contextlib.suppress(ConnectionError):
+                while told and not ended.is_set():
+                    writer.write(b"x")
+                    await writer.drain()
+                    await asyncio.sleep(0.05)
+            await ended.wait()
+            writer.close()
+
+        server = await asyncio.start_server(drip, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        wanted = {"webhook": f"http://127.0.0.1:{port}/", "attempts": 1, "timeout_s": 0.3}
+        hook = Hook.model_validate({"name": "h", "on": "granted", **wanted})
+        try:
+            with pytest.raises(ActionFailed, match=r"took none of 1 requests: \w*Time"):
+                async with asyncio.timeout(30.0):
+                    await post(hook, DELIVERY)
+        finally:
+            ended.set()
+            server.close()
+            await server.wait_closed()
+
+    asyncio.run(story())
+
+
 def test_a_pause_in_seconds_is_bounded() -> None:
     assert [retry_after_s(text) for text in ("30", "86400", "soon", "")] == [30.0, 600.0, 0.0, 0.0]
 
@@ -220,6 +304,8 @@ def test_a_pause_in_seconds_is_bounded() -> None:
     [
         ("A: b\n", 0o644, "may be read by every user"),
         ("A b\n", 0o600, r":1: expected `Name: value`"),
+        ("A: b\nB: \x1bc\n", 0o600, r":2: expected `Name: value`"),
+        ("A: b\n" * 4000, 0o600, "has more than 16384 bytes"),  # they were cut, and sent so
     ],
 )
 def test_headers_that_are_refused(text: str, mode: int, problem: str, tmp_path: Path) -> None:

@@ -72,6 +72,27 @@ def test_token_files_that_are_taken(tmp_path: Path) -> None:
         assert read_token(file) == TOKEN
 
 
+@pytest.mark.parametrize(
+    ("mode", "beside", "taken"),
+    [(0o440, False, True), (0o444, False, False), (0o460, False, False), (0o440, True, False)],
+)
+def test_a_credential_of_systemd_may_be_read_by_its_group(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, beside: bool, taken: bool
+) -> None:
+    """systemd gives mode 0440 and an access list; such a token was refused."""
+    given = tmp_path / "given"
+    given.mkdir()
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(given))
+    file = (tmp_path if beside else given) / "token"
+    file.write_text(TOKEN)
+    file.chmod(mode)
+    if taken:
+        assert read_token(file) == TOKEN
+    else:
+        with pytest.raises(ConfigError, match=f"has mode {mode:04o}"):
+            read_token(file)
+
+
 def request_with(access: Access, host: str = "127.0.0.1:9870", **headers: str) -> int:
     """The status that a request gets; 200 where it is served."""
     named = {name.replace("_", "-").encode(): value.encode() for name, value in headers.items()}

@@ -4,7 +4,10 @@ import asyncio
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from tests.support.core_driver import CoreDriver
+from vram_arbiter.clients.observer.page import feed as feed_module
 from vram_arbiter.clients.observer.page.feed import UNREAD_MAX_BYTES, PageFeed, PageReader
 from vram_arbiter.clients.observer.page.usage import UsageRecord
 from vram_arbiter.clients.observer.present import Look
@@ -86,6 +89,49 @@ def test_pages_are_told_what_changed_and_no_more(driver: CoreDriver) -> None:
 
     assert [name for name, _ in asyncio.run(story())][:2] == ["snapshot", "waits"]
     assert replace(look_of(driver), at=1.0).origin == 1.0 - look_of(driver).status.uptime_s
+
+
+class Silent(Arbiter):
+    """Does not answer."""
+
+    async def history(self, *_: Any, **__: Any) -> HistoryReply:
+        return await asyncio.get_running_loop().create_future()
+
+
+def test_pages_begin_anew_where_the_arbiter_is_too_slow(
+    driver: CoreDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Events and changes that were taken for a message are in no later one."""
+    monkeypatch.setattr(feed_module, "ASK_S", 0.05)
+
+    async def story() -> list[bytes]:
+        feed = PageFeed(Silent(driver), UsageRecord(), lambda: None)
+        reader = feed.join(lambda: None)
+        await feed.publish(look_of(driver))
+        assert not feed.read
+        return [chunk async for chunk in reader.chunks()]
+
+    assert asyncio.run(story()) == []
+
+
+def test_a_page_ends_with_the_start_of_the_daemon_that_it_was_told_of(driver: CoreDriver) -> None:
+    """Times of a page count from the daemon's start: after a restart they were wrong by hours."""
+
+    async def story() -> None:
+        feed = PageFeed(Arbiter(driver), UsageRecord(), lambda: None)
+        first = look_of(driver)
+        told = feed.join(lambda: None)
+        await feed.publish(first)
+        assert told.told
+        joining = feed.join(lambda: None)
+        restarted = replace(first.status, epoch=first.status.epoch + 1)
+        await feed.publish(replace(first, status=restarted))
+        chunks = [chunk async for chunk in told.chunks()]
+        assert len(chunks) <= 1, "nothing of the next start"
+        assert feed.read
+        assert joining.told
+
+    asyncio.run(story())
 
 
 def look_of(driver: CoreDriver) -> Look:

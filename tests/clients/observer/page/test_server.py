@@ -1,5 +1,6 @@
 """The status page of a real observer over raw HTTP: what it serves, to whom, what it withstands."""
 
+import asyncio
 import contextlib
 import os
 import re
@@ -7,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,20 @@ from tests.support.process import ArbiterProcess, vramctl
 from tests.support.status_page import REPLY_S, EventStream, get, raw
 from tests.support.waiting import until
 from tests.support.wire import WireClient
+from vram_arbiter.clients.observer.page import server
 from vram_arbiter.clients.observer.page.server import (
     CONNECTIONS_PER_PEER,
     HEAD_MAX_BYTES,
     STREAMS_PER_PEER,
 )
 from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.urls import HttpAddress
 
 pytestmark = pytest.mark.e2e
 MIB = 1 << 20
 NAME = "<script>alert(1)</script>"
+WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+HALF = b"GET / HTTP/1.1\r\nHost: "
 RUNNING = {"since_s", "waited_s", "granted_s", "ttl_left_s", "uptime_s", "sample_age_s"}
 """Seconds that run on between two answers."""
 
@@ -245,6 +250,43 @@ def test_a_peer_that_does_not_read_its_answers_costs_no_memory(
                 greedy.sendall(request * 1000)
         assert get(port).status == 200
         assert rss_kib(observer.pid) - before < 8 * 1024
+
+
+@pytest.mark.parametrize(
+    "sent", [(b"",), (HALF,), (WHOLE, HALF)], ids=["silent", "half", "half of the second"]
+)
+def test_a_connection_ends_without_a_whole_request(
+    monkeypatch: pytest.MonkeyPatch, sent: Sequence[bytes]
+) -> None:
+    """Half of a request behind an answered one kept a connection for ever."""
+    monkeypatch.setattr(server, "REQUEST_S", 0.2)
+    monkeypatch.setattr(server, "IDLE_S", 0.2)
+
+    async def answer(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 204, "headers": []})
+        await send({"type": "http.response.body"})
+
+    async def story() -> bytes:
+        listening = server.bound(HttpAddress("127.0.0.1", 0))
+        connections = server.Connections(loopback=True)
+        serving = asyncio.create_task(server.serve(answer, listening, connections))
+        reader, writer = await asyncio.open_connection(*listening.getsockname())
+        writer.write(sent[0])
+        for part in sent[1:]:
+            assert b"204 No Content" in await reader.readuntil(b"\r\n\r\n")
+            writer.write(part)
+        told = b""
+        with contextlib.suppress(ConnectionError):
+            async with asyncio.timeout(REPLY_S):
+                while came := await reader.read(1000):
+                    told += came
+        writer.close()
+        serving.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await serving
+        return told
+
+    assert asyncio.run(story()) == b""
 
 
 def test_the_token_of_a_page(tmp_path: Path, serving_arbiter: ArbiterProcess) -> None:
