@@ -108,12 +108,10 @@ def _bad(what: str, error: VramError) -> Finding:
     return Finding(what, False, str(error), retry=isinstance(error, NoGpu))
 
 
-def _checked[**P](
-    what: str, says: str, need: Callable[P, None], *given: P.args, **named: P.kwargs
-) -> Finding:
-    """Return what a check says that raises its refusal."""
+def _checked[*A](what: str, says: str, need: Callable[[*A], None], *given: *A) -> Finding:
+    """Return the finding of a check that raises its refusal."""
     try:
-        need(*given, **named)
+        need(*given)
     except VramError as error:
         return _bad(what, error)
     return Finding(what, True, says)

@@ -15,9 +15,10 @@ _FLAGS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def import_policies(without: Sequence[Literal["diffusers", "peft"]]) -> None:
-    """Import the code of all of lerobot's policies, as if some packages were not installed.
+    """Import the code of all of lerobot's policies, as if the packages `without` were not installed.
 
-    The others import bitsandbytes, which comes first: alone it initializes CUDA.
+    The other packages import bitsandbytes, which is imported first, without a GPU: it would
+    initialize CUDA.
     """
     from lerobot.utils import import_utils
 

@@ -170,8 +170,10 @@ def parse(message: Message, model_ops: frozenset[str]) -> Call:
         limit_s = (call.data or {}).get("timeout_s")
         return LoadOp(op="load", timeout_s=limit_s, token=call.token, traceparent=call.traceparent)
     except ValidationError as error:
+        # a `load` of the endpoint family has its time limit in `data`
+        below = "data." if family == "endpoint" and error.title == LoadOp.__name__ else ""
         fields = [
-            _field(problem, family)
+            below + _field(problem, family)
             for problem in error.errors(include_input=False, include_url=False)
         ]
         raise BadRequest(

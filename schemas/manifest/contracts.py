@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator, model_validator
 
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, ControlMode
-from vram_arbiter.schemas.findings import misplaced, raise_if, wrong
+from vram_arbiter.schemas.findings import Problem, misplaced, raise_if
 from vram_arbiter.schemas.manifest.vocabulary import (
     DetectorEngine,
     DetectorMode,
@@ -199,17 +199,14 @@ class RewardContract(ManifestBlock):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        low, high = self.progress_range
+        (low, high), problems = self.progress_range, []
         if not high > low:
-            raise wrong(
-                f"must be [low, high] with high > low, not [{low}, {high}]", "progress_range"
-            )
-        if self.check_floor > self.success_threshold:
-            raise wrong(
-                f"must not exceed success_threshold ({self.success_threshold}), not "
-                f"{self.check_floor}",
-                "check_floor",
-            )
+            said = f"must be [low, high] with high > low, not [{low}, {high}]"
+            problems.append(Problem(("progress_range",), said))
+        if self.check_floor > (most := self.success_threshold):
+            said = f"must not exceed success_threshold ({most}), not {self.check_floor}"
+            problems.append(Problem(("check_floor",), said))
+        raise_if(problems)
         return self
 
 

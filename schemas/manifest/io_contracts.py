@@ -122,15 +122,18 @@ class StateContract(ManifestBlock):
     @model_validator(mode="after")
     def _check(self) -> Self:
         needed, layout = TASK_SPACE_LAYOUTS.get(self.layout or "", ()), f"layout {self.layout!r}"
+        said: list[tuple[tuple[str, ...], str]] = []
         if self.parts is not None and self.layout is not None:
-            raise wrong("is not allowed beside layout: give one of them", "parts")
-        if needed and self.bindings is None:
-            raise wrong(f"is required for {layout}, with {' and '.join(needed)}", "bindings")
-        lacking = [field for field in needed if not getattr(self.bindings, field)]
-        raise_if([Problem(("bindings", field), f"is required for {layout}") for field in lacking])
-        of_joints = self.layout is None or self.layout in JOINT_SPACE_LAYOUTS
-        if self.bindings is not None and of_joints:
-            raise wrong(f"is not allowed for {layout}: joint values need no source", "bindings")
+            said.append((("parts",), "is not allowed beside layout: give one of them"))
+        if self.bindings is None and needed:
+            said.append((("bindings",), f"is required for {layout}, with {' and '.join(needed)}"))
+        elif self.bindings is not None:
+            lacking = [field for field in needed if not getattr(self.bindings, field)]
+            said += [(("bindings", field), f"is required for {layout}") for field in lacking]
+            if self.layout is None or self.layout in JOINT_SPACE_LAYOUTS:
+                problem = f"is not allowed for {layout}: joint values need no source"
+                said.append((("bindings",), problem))
+        raise_if([Problem(path, problem) for path, problem in said])
         return self
 
 

@@ -161,8 +161,8 @@ class LockFile:
             os.close(fd)
 
     def keep(self) -> bool:
-        """Lock the file again where it was deleted or replaced: it keeps no second server away any
-        more. Return whether it was. Raises as `acquire`: AlreadyRunning where one is there."""
+        """Lock the file again where it was deleted or replaced, because a second server could lock
+        the new one. Return whether it was. Raises as `acquire`: AlreadyRunning where one has."""
         assert self._fd is not None, "keep before acquire"
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(self._fd), self.path.lstat()):

@@ -89,7 +89,7 @@ class Observations:
         import numpy as np
         import torch
 
-        pixels = pixels_of(name, np.asarray(decode(value)) if isinstance(value, bytes) else value)
+        pixels = pixels_of(name, value)
         rules = self._rules
         if rules is not None and rules.flip_180:
             pixels = pixels[::-1, ::-1]
@@ -157,13 +157,15 @@ def observation_of(call: EndpointCall) -> JsonMap:
 
 
 def pixels_of(name: str, value: Any) -> "NDArray[Any]":
-    """Return a picture, uint8 (H, W, 3). Raises BadRequest."""
+    """Return a picture, uint8 (H, W, 3), decoded from PNG or JPEG. Raises BadRequest."""
     import numpy as np
 
+    if isinstance(value, bytes):
+        return np.asarray(decode(value))
     if getattr(value, "dtype", None) == np.uint8 and value.ndim == 3 and value.shape[2] == 3:
         return value
     raise BadRequest(
-        f"{name} must be uint8 (H, W, 3) or PNG bytes, not {_shape(value)}",
+        f"{name} must be uint8 (H, W, 3), PNG or JPEG, not {_shape(value)}",
         hint="send the camera's picture",
     )
 

@@ -1,6 +1,7 @@
 """The port in front of a sidecar's socket: what passes, and who is refused."""
 
 import asyncio
+import gc
 import os
 import pwd
 import socket
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.sidecars.port import CONNECTIONS_MAX, on_port
+from vram_arbiter.sidecars.port import CONNECTIONS_MAX, _pass_on, on_port
 
 BYTES = bytes(range(256)) * 4096  # more than one read
 
@@ -52,6 +53,47 @@ def test_bytes_pass_both_ways_and_a_hang_up_too(tmp_path):
         writer.close()
 
     asyncio.run(asyncio.wait_for(story(), 60))
+
+
+def test_a_cancellation_at_any_moment_closes_the_inner_connection(tmp_path):
+    """Regression: a cancellation that came while the copies ended left the socket behind the port
+    open until the collector ran."""
+
+    async def ends(steps: int):
+        """Cancel `_pass_on` so many steps after it can see the client's end."""
+        came, ended = asyncio.Event(), asyncio.Event()
+
+        async def serve(reader, writer):
+            came.set()
+            await reader.read()
+            ended.set()
+
+        path = tmp_path / f"{steps}"
+        served = await asyncio.start_unix_server(serve, path)
+        ours, theirs = socket.socketpair()
+        reader, writer = await asyncio.open_connection(sock=theirs)
+        passing = asyncio.create_task(_pass_on(reader, writer, path))
+        await came.wait()
+        ours.close()
+        while not reader.at_eof():
+            await asyncio.sleep(0)
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        passing.cancel()
+        await asyncio.wait([passing])
+        await asyncio.wait_for(ended.wait(), 30)
+        served.close()
+        writer.close()
+
+    async def story():
+        for steps in range(31):
+            await ends(steps)
+
+    gc.disable()
+    try:
+        asyncio.run(story())
+    finally:
+        gc.enable()
 
 
 AS_USER = """

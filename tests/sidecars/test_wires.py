@@ -124,7 +124,11 @@ def test_both_families_reach_the_host():
         ),
         ({"op": "load", "timeout_s": -1}, "bad_request", "timeout_s"),
         ({"op": "load", "timeout_s": float("inf")}, "bad_request", "timeout_s"),
-        ({"endpoint": "load", "data": {"timeout_s": "soon"}}, "bad_request", "timeout_s"),
+        (
+            {"endpoint": "load", "data": {"timeout_s": "soon"}},
+            "bad_request",
+            "load: data.timeout_s: ",
+        ),
         ({"endpoint": "get_action", "data": [1]}, "bad_request", "data"),
         ({"op": "ping", "id": 1, "token": 7}, "bad_request", "token"),
         (

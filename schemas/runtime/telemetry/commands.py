@@ -35,7 +35,6 @@ def command(
     name: str,
     *,
     serves: bool = False,
-    environ: Mapping[str, str] = os.environ,
     attributes: Mapping[str, str] | None = None,
     flush_s: float = otel.FLUSH_S,
 ) -> Iterator[Command]:
@@ -48,7 +47,7 @@ def command(
     """
     running = Command()
     # the port of a machine-wide variable is a server's; a command asks nothing of it
-    installed = otel.set_up(program, environ=environ, attributes=attributes, port_required=serves)
+    installed = otel.set_up(program, attributes=attributes, port_required=serves)
     if not installed.on:
         yield running
         return
@@ -59,7 +58,7 @@ def command(
     if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
     span = tracing.begin(
-        telemetry.SPAN_COMMAND, environ.get(TRACEPARENT_VARIABLE), {telemetry.ATTR_COMMAND: name}
+        telemetry.SPAN_COMMAND, os.environ.get(TRACEPARENT_VARIABLE), {telemetry.ATTR_COMMAND: name}
     )
     try:
         with nullcontext() if serves else tracing.inside(span):

@@ -56,7 +56,8 @@ def labels(values: Mapping[str, str] | None) -> Mapping[str, str] | None:
 class Legible:
     """Exporter of spans that passes only values that can be sent to the SDK's exporter.
 
-    That one would omit a whole batch for one bad text.
+    That one would omit a whole batch for one bad text. The counts of what the SDK dropped from a
+    span are not passed on.
     """
 
     def __init__(self, exporter: Any) -> None:

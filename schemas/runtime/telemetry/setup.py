@@ -31,6 +31,8 @@ type Wanted = Mapping[Signal, Sequence[str]]
 
 SIGNALS: tuple[Signal, ...] = ("traces", "metrics", "logs")
 PROMETHEUS = "prometheus"
+OTLP_ENTRIES = {"http/protobuf": "otlp_proto_http", "grpc": "otlp_proto_grpc"}
+"""Entry points of the exporters by OTLP's protocol."""
 FLUSH_S = 5.0
 """Longest wait for a collector at a program's end."""
 EXPORT_S = 3.0
@@ -100,13 +102,12 @@ _installed: Telemetry | None = None  # the SDK's providers can be set once per p
 def set_up(
     service: str,
     *,
-    environ: Mapping[str, str] = os.environ,
     attributes: Mapping[str, str] | None = None,
     port_required: bool = True,
     readers: Sequence[Any] = (),
     id_generator: Any = None,
 ) -> Telemetry:
-    """Install the SDK if it is asked for. Returns what ends it.
+    """Install the SDK if this process's environment asks for it. Returns what ends it.
 
     Args:
         service: name of the service on every span and metric.
@@ -120,7 +121,7 @@ def set_up(
     not installed, an exporter is unknown, the SDK refuses a variable, or the port is taken.
     """
     global _installed
-    exporters = wanted(environ)
+    exporters = wanted(os.environ)
     if not any(exporters.values()) and not readers:
         return Telemetry()
     if _installed is None:
@@ -210,7 +211,12 @@ def _exporter(signal: Signal, name: str) -> Any:
     entry = name
     if name == "otlp":
         protocol = _variable("PROTOCOL", signal) or "http/protobuf"
-        entry = f"otlp_proto_{protocol.partition('/')[0]}"
+        if protocol not in OTLP_ENTRIES:
+            raise ConfigError(
+                f"OTEL_EXPORTER_OTLP_PROTOCOL: expected {' or '.join(OTLP_ENTRIES)}, got "
+                f"{protocol!r}"
+            )
+        entry = OTLP_ENTRIES[protocol]
         if not _variable("TIMEOUT", signal):
             options["timeout"] = EXPORT_S
     found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))

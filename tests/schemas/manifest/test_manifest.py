@@ -271,6 +271,22 @@ def test_unreadable_texts_are_refused_clearly(content: str | bytes, expected: st
     assert findings(content)[0].startswith(expected)
 
 
+def test_both_mistakes_of_a_block_are_told() -> None:
+    """Regression: a block told its first mistake only."""
+    text = changed("reward", "check_floor: 0.4", "check_floor: 0.6")
+    text = text.replace("progress_range: [0.0, 1.0]", "progress_range: [1.0, 0.0]")
+    assert [line.split(" ")[1] for line in findings(text)] == [
+        "reward.progress_range:",
+        "reward.check_floor:",
+    ]
+    text = changed("vla", 'layout: "rc365"', 'layout: "rc365"\n  parts: [{kind: base_twist}]')
+    text = text.replace('    base_frame: "base_link"\n', "")
+    assert {line.split(" ")[1] for line in findings(text)} == {
+        "state_contract.parts:",
+        "state_contract.bindings.base_frame:",
+    }
+
+
 @pytest.mark.parametrize("key", ["1", "on", "~"])
 def test_a_key_that_is_no_word_is_an_unknown_key_with_its_line(key: str) -> None:
     (found,) = findings(f"{sample('vlm')}\n{key}: x")

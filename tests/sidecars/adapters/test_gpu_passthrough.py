@@ -65,7 +65,7 @@ def test_the_arm_keeps_the_pose_it_had_at_first(adapter: GpuPassthroughAdapter) 
     ("changes", "said"),
     [
         ({FRONT: None}, f"lacks {FRONT}"),
-        ({FRONT: b"\x89PNG"}, "uint8"),
+        ({FRONT: b"\x89PNG"}, "neither PNG nor JPEG"),
         ({FRONT: "float"}, "uint8"),
         ({FRONT: (100, 200)}, "uint8"),
         ({FRONT: (100, 200, 4)}, "uint8"),

@@ -94,7 +94,11 @@ def test_the_environment_says_which_exporters_are_wanted(
         ),
         (
             {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_PROTOCOL": "carrier-pigeon"},
-            "no exporter 'otlp_proto_carrier-pigeon' is installed",
+            "expected http/protobuf or grpc, got 'carrier-pigeon'",
+        ),
+        (
+            {"OTEL_METRICS_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_METRICS_PROTOCOL": "http/json"},
+            "expected http/protobuf or grpc, got 'http/json'",  # protobuf was sent instead
         ),
         (
             {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"},
@@ -224,19 +228,23 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
 
 
 @needs_sdk
-@pytest.mark.parametrize(("flag", "kept"), [("01", 3), ("00", 0)])
+@pytest.mark.parametrize(("flag", "kept"), [("01", 3), ("00", 0), ("none", 0)])
 def test_a_trace_that_began_elsewhere_is_kept_if_it_was_kept_there(flag: str, kept: int) -> None:
+    """And one that begins here by the sampler's share, 0. Regression: the pages named
+    OTEL_TRACES_SAMPLER_ARG alone, which has no effect."""
     parent = f"00-{'a' * 32}-{'b' * 16}-{flag}"
     with Collector() as collector:
         environ = {
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
+            "OTEL_TRACES_SAMPLER": "parentbased_traceidratio",
             "OTEL_TRACES_SAMPLER_ARG": "0",
         }
         result = run_program(f"import sys; sys.argv[1:] = [{parent!r}]\n{PROGRAM}", environ)
         assert (result.returncode, result.stderr) == (0, "")
         assert len(collector.spans()) == kept
         assert {span.trace_id for span in collector.spans()} <= {"a" * 32}
-        assert result.stdout.startswith(f"00-{'a' * 32}-"), "the chain is passed on, kept or not"
+        joined = result.stdout.startswith(f"00-{'a' * 32}-")
+        assert joined == (flag != "none"), "the chain is passed on, kept or not"
         collector.wait(
             lambda: bool(collector.points("vram_runner.goals")), "metrics, which are never sampled"
         )
