@@ -84,7 +84,7 @@ def test_what_is_needed_is_said_before_the_first_command() -> None:
 
 
 def test_the_commands_of_the_base_install_work(reader: Reader) -> None:
-    printed = reader.types("On your machine", skip=INSTALLS)
+    printed = reader.types("For an operator", "For a program", skip=INSTALLS)
     assert re.search(r"^6 commands of README\.md work$", printed, re.MULTILINE)
     assert "Traceback" not in printed
 
@@ -107,7 +107,7 @@ def test_each_sidecar_of_the_page_has_a_shipped_model() -> None:
 def test_the_commands_with_a_robot_work(reader: Reader) -> None:
     """One sidecar is started: each imports for 8 s of a core."""
     skip = f"{INSTALLS}|{LONG}|{OTHER_SIDECARS}|^vramctl "
-    printed = reader.types("On your machine", "With a robot", skip=skip)
+    printed = reader.types("For an operator", "For a robot", skip=skip)
     assert "vram-sidecar --name grab" in printed
     assert "dry run: nothing was opened" in printed
     assert "Traceback" not in printed
