@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli.benchmark_report import MAX_STEPS, REPORT, table, write_report
 from vram_arbiter.runner.cli.common import (
-    add_license_flag,
-    add_trace_flag,
+    add_skill_flags,
     check_sidecars,
     connect_arbiter,
     default_skills,
@@ -96,17 +95,7 @@ def add_parser(
     )
     bench.add_argument("--videos", action=argparse.BooleanOptionalAction, default=True)
     add_record_flags(bench, "every episode of the one contestant")
-    bench.add_argument(
-        "--skills", type=Path, nargs="+", action="extend",
-        help="rskill.yaml files or folders of them",
-    )  # fmt: skip
-    bench.add_argument("--arbiter", help="the arbiter's endpoint")
-    bench.add_argument(
-        "--no-arbiter", action="store_true", help="run without an arbiter and leases"
-    )
-    bench.add_argument("--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT")
-    add_license_flag(bench)
-    add_trace_flag(bench)
+    add_skill_flags(bench)
     return bench
 
 

@@ -53,18 +53,12 @@ def unlicensed(manifests: Iterable[RSkillManifest], *, allow_noncommercial: bool
     return {name: why for name, why in found.items() if why}
 
 
-def add_serving_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags of every command that serves goals."""
+def add_skill_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags of every command that executes skills."""
     parser.add_argument(
-        "--skills",
-        type=Path,
-        nargs="+",
-        action="extend",
+        "--skills", type=Path, nargs="+", action="extend",
         help="rskill.yaml files or folders of them",
-    )
-    parser.add_argument(
-        "--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock"
-    )
+    )  # fmt: skip
     parser.add_argument("--arbiter", help="the arbiter's endpoint")
     parser.add_argument(
         "--no-arbiter", action="store_true", help="run without an arbiter and leases"
@@ -74,13 +68,21 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         help="address of a policy's sidecar; default ipc://RUNTIME/NAME.sock,"
         " where NAME is the part of the skill's name after the first -",
     )  # fmt: skip
+    add_license_flag(parser)
+    add_trace_flag(parser)
+
+
+def add_serving_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags of every command that serves goals."""
+    add_skill_flags(parser)
+    parser.add_argument(
+        "--endpoint", help="where goals are served; default ipc://RUNTIME/runner.sock"
+    )
     parser.add_argument(
         "--realtime", action=argparse.BooleanOptionalAction, default=True,
         help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value)"
         " if the machine allows it",
     )  # fmt: skip
-    add_license_flag(parser)
-    add_trace_flag(parser)
     parser.add_argument("--max-seconds", type=positive, help="stop after this many seconds")
 
 

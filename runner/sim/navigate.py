@@ -14,6 +14,8 @@ from vram_arbiter.runner.sim.config import SceneConfig, wrap_angle
 EDGE_CLEARANCE_M = 0.025
 REACHED_M = 0.006
 REACHED_RAD = 0.015
+MAX_SPEED_M_S, MAX_ACCEL_M_S2, MAX_TURN_RAD_S = 0.35, 0.8, 0.8
+GAIN_PER_S = 3.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -56,19 +58,10 @@ class PlanarController:
         goal: Pose2D,
         config: SceneConfig,
         *,
-        max_speed_m_s: float = 0.35,
-        max_turn_rad_s: float = 0.8,
-        gain_per_s: float = 3.0,
-        max_accel_m_s2: float = 0.8,
         control_dt_s: float = 1.0 / 30.0,
     ) -> None:
         self.goal = goal
-        self._config, self._gain, self._dt = config, gain_per_s, control_dt_s
-        self._max_speed, self._max_turn, self._max_accel = (
-            max_speed_m_s,
-            max_turn_rad_s,
-            max_accel_m_s2,
-        )
+        self._config, self._dt = config, control_dt_s
         self._speed = 0.0
 
     def distance_m(self, pose: Pose2D) -> float:
@@ -83,8 +76,8 @@ class PlanarController:
     def command(self, pose: Pose2D) -> tuple[float, float, float]:
         """Return (vx, vy, wz) in the base frame, m/s and rad/s; never across the table's edge."""
         gap = self.distance_m(pose)
-        wanted = min(self._max_speed, self._gain * gap)
-        self._speed = min(wanted, self._speed + self._max_accel * self._dt)
+        wanted = min(MAX_SPEED_M_S, GAIN_PER_S * gap)
+        self._speed = min(wanted, self._speed + MAX_ACCEL_M_S2 * self._dt)
         vx_map = vy_map = 0.0
         if gap > 1e-6:
             vx_map = self._speed * (self.goal.x_m - pose.x_m) / gap
@@ -95,11 +88,11 @@ class PlanarController:
             - pose.x_m
             - front_reach_m(self._config, pose.yaw_rad)
         )
-        vx_map = min(vx_map, max(0.0, room) * self._gain)
-        turn = self._gain * wrap_angle(self.goal.yaw_rad - pose.yaw_rad)
+        vx_map = min(vx_map, max(0.0, room) * GAIN_PER_S)
+        turn = GAIN_PER_S * wrap_angle(self.goal.yaw_rad - pose.yaw_rad)
         cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
         return (
             cos * vx_map + sin * vy_map,
             -sin * vx_map + cos * vy_map,
-            min(max(turn, -self._max_turn), self._max_turn),
+            min(max(turn, -MAX_TURN_RAD_S), MAX_TURN_RAD_S),
         )

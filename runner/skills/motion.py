@@ -34,7 +34,7 @@ def bounded(here: float, there: float, reach: float) -> float:
 
 
 class JointRamp:
-    """Motion from the present pose to `goal` (rad, by name) at a bounded speed; `longest` are the
+    """Motion from the present pose to `goal` (rad, by name) at SPEED_RAD_S; `longest` are the
     longest steps (rad) of joints that are slower.
 
     `done` when the joints arrived, or cannot go further.
@@ -46,12 +46,11 @@ class JointRamp:
         goal: Mapping[str, float],
         *,
         period_s: float,
-        speed_rad_s: float = SPEED_RAD_S,
         longest: Mapping[str, float] | None = None,
     ) -> None:
         self._target = {name: start[name] for name in goal}
         self._goal = dict(goal)
-        stride = speed_rad_s * period_s
+        stride = SPEED_RAD_S * period_s
         self._strides = {name: min(stride, (longest or {}).get(name, stride)) for name in goal}
         self._settling = 0
 

@@ -131,11 +131,10 @@ class SidecarPolicy(SkillBase):
         period_s: float,
         wait_s: float = 0.0,
         latency_steps: int | None = None,
-        revision: str = "",
         speeds_rad_s: Mapping[str, float] | None = None,
         sent: Callable[[], Mapping[str, float]] | None = None,
     ) -> None:
-        super().__init__(manifest, revision=revision)
+        super().__init__(manifest)
         longest = {name: STEP_SHARE * v * period_s for name, v in (speeds_rad_s or {}).items()}
         self._longest_steps = longest
         leads = bool(longest) and wiring.actions.direct and wiring.rollout.targets_lead

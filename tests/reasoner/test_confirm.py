@@ -22,6 +22,8 @@ from vram_arbiter.schemas.errors import BadState
 from vram_arbiter.schemas.reasoner import Result
 from vram_arbiter.schemas.tools import ExecuteRskill, QueryScene, ToolCall
 
+pytestmark = pytest.mark.anyio
+
 PALETTE = Palette((Skill("lab/grab", "vla", "grab", ("grasp",)),))
 GRAB = ExecuteRskill(rskill_id="lab/grab")
 
@@ -125,13 +127,10 @@ def test_a_line_on_the_terminal_answers_the_motion_that_waits(tmp_path: Path) ->
     assert "not so fast" in result["steps"][-1]["text"]
 
 
-def test_a_reasoner_without_the_flag_takes_no_confirmation(tmp_path: Path) -> None:
+async def test_a_reasoner_without_the_flag_takes_no_confirmation(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/reasoner.sock"
 
-    async def story() -> None:
-        async with operator_server(endpoint, TaskQueue.of_one("x")):
-            assert (await send(endpoint, {"op": "state"}))["motion"] is None
-            with pytest.raises(BadState, match="asks for no confirmation"):
-                await send(endpoint, {"op": "confirm", "motion": 1, "yes": True})
-
-    play(story)
+    async with operator_server(endpoint, TaskQueue.of_one("x")):
+        assert (await send(endpoint, {"op": "state"}))["motion"] is None
+        with pytest.raises(BadState, match="asks for no confirmation"):
+            await send(endpoint, {"op": "confirm", "motion": 1, "yes": True})

@@ -25,6 +25,8 @@ from vram_arbiter.schemas.tools import (
     WaitOn,
 )
 
+pytestmark = pytest.mark.anyio
+
 PALETTE = Palette(
     (Skill("lab/grab", "vla", "grab", ("grasp",)), Skill("lab/eye", "vlm", "look", ("query",)))
 )
@@ -90,41 +92,35 @@ def test_a_cancel_passes_a_planner_that_hangs() -> None:
     assert play(story)["reason"] == "canceled: enough"
 
 
-def test_a_danger_ends_the_goal_and_the_episode_while_the_planner_hangs() -> None:
-    async def story() -> tuple[Result, Robot]:
-        robot, inbox = Robot(), Inbox()
-        planner = Planner(lambda episode: None if episode.running else GRAB)
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
-        await robot.begun.wait()
-        inbox.put(Said("careful"))
-        await planner.hanging.wait()
-        inbox.put(Danger("emergency stop: by hand", stop=True))
-        return await episode, robot
-
-    result, robot = play(story)
+async def test_a_danger_ends_the_goal_and_the_episode_while_the_planner_hangs() -> None:
+    robot, inbox = Robot(), Inbox()
+    planner = Planner(lambda episode: None if episode.running else GRAB)
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
+    await robot.begun.wait()
+    inbox.put(Said("careful"))
+    await planner.hanging.wait()
+    inbox.put(Danger("emergency stop: by hand", stop=True))
+    result, robot = await episode, robot
     assert (result["reason"], result["stopped"]) == ("stopped: emergency stop: by hand", True)
     assert robot.cancelled
     assert result["steps"][0]["status"] == "canceled"
 
 
-def test_a_result_passes_a_planner_that_hangs_and_makes_it_think_again() -> None:
-    async def story() -> tuple[Result, Planner, Robot]:
-        robot, inbox = Robot(), Inbox()
+async def test_a_result_passes_a_planner_that_hangs_and_makes_it_think_again() -> None:
+    robot, inbox = Robot(), Inbox()
 
-        def decide(episode: Episode) -> ToolCall | Finish | None:
-            if episode.running:
-                return None
-            return Finish(True, "seen the result") if episode.steps else GRAB
+    def decide(episode: Episode) -> ToolCall | Finish | None:
+        if episode.running:
+            return None
+        return Finish(True, "seen the result") if episode.steps else GRAB
 
-        planner = Planner(decide)
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
-        await robot.begun.wait()
-        inbox.put(Said("how is it going?"))
-        await planner.hanging.wait()
-        robot.end.set()
-        return await episode, planner, robot
-
-    result, planner, robot = play(story)
+    planner = Planner(decide)
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
+    await robot.begun.wait()
+    inbox.put(Said("how is it going?"))
+    await planner.hanging.wait()
+    robot.end.set()
+    result, planner, robot = await episode, planner, robot
     assert result["status"] == "success"
     assert planner.dropped == 1
     assert not robot.cancelled
@@ -133,18 +129,13 @@ def test_a_result_passes_a_planner_that_hangs_and_makes_it_think_again() -> None
     assert result["notes"] == [{"source": "operator", "text": "how is it going?", "after": 0}]
 
 
-def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
-    async def story() -> tuple[Result, Planner]:
-        inbox = Inbox()
-        planner = Planner(
-            lambda episode: Finish(False, "told to leave it") if episode.notes else None
-        )
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
-        await planner.hanging.wait()
-        inbox.put(Said("leave it"))
-        return await episode, planner
-
-    result, planner = play(story)
+async def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
+    inbox = Inbox()
+    planner = Planner(lambda episode: Finish(False, "told to leave it") if episode.notes else None)
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
+    await planner.hanging.wait()
+    inbox.put(Said("leave it"))
+    result, planner = await episode, planner
     assert result["reason"] == "told to leave it"
     assert (len(planner.asked), planner.dropped) == (2, 1)
 
@@ -225,32 +216,27 @@ def test_whoever_speaks_all_the_time_does_not_keep_the_planner_from_deciding() -
         (LlmError("the model is away"), "succeeded", "after the goal"),
     ],
 )
-def test_beside_a_goal_it_goes_on_unless_the_planner_clearly_stops_it(
+async def test_beside_a_goal_it_goes_on_unless_the_planner_clearly_stops_it(
     decision: ToolCall | Finish | LlmError, status: str, reason: str
 ) -> None:
-    async def story() -> Result:
-        robot, inbox, consulted = Robot(), Inbox(), asyncio.Event()
+    robot, inbox, consulted = Robot(), Inbox(), asyncio.Event()
 
-        def decide(episode: Episode) -> ToolCall | Finish:
-            if episode.running:
-                consulted.set()
-                if isinstance(decision, LlmError):
-                    raise decision
-                return decision
-            return Finish(True, "after the goal") if episode.steps else GRAB
+    def decide(episode: Episode) -> ToolCall | Finish:
+        if episode.running:
+            consulted.set()
+            if isinstance(decision, LlmError):
+                raise decision
+            return decision
+        return Finish(True, "after the goal") if episode.steps else GRAB
 
-        episode = asyncio.create_task(
-            run_episode("x", Planner(decide), PALETTE, robot, inbox=inbox)
-        )
-        await robot.begun.wait()
-        inbox.put(Said("?"))
-        await consulted.wait()
-        for _ in range(5):  # what the decision does is done within a few turns of the loop
-            await asyncio.sleep(0)
-        robot.end.set()
-        return await episode
-
-    result = play(story)
+    episode = asyncio.create_task(run_episode("x", Planner(decide), PALETTE, robot, inbox=inbox))
+    await robot.begun.wait()
+    inbox.put(Said("?"))
+    await consulted.wait()
+    for _ in range(5):  # what the decision does is done within a few turns of the loop
+        await asyncio.sleep(0)
+    robot.end.set()
+    result = await episode
     assert [step["status"] for step in result["steps"]] == [status]
     assert result["reason"] == reason
 
@@ -264,15 +250,12 @@ def test_a_planner_that_never_decides_is_given_up() -> None:
     assert play(story)["reason"] == "the planner failed: no decision within 0.05 s"
 
 
-def test_an_emergency_stop_is_not_discussed_with_the_planner() -> None:
+async def test_an_emergency_stop_is_not_discussed_with_the_planner() -> None:
     async def stopped(call: ToolCall) -> Outcome:
         return Outcome("failed", "the stop is latched", "estop_requested")
 
-    async def story() -> tuple[Result, Planner]:
-        planner = Planner(lambda episode: GRAB)
-        return await run_episode("x", planner, PALETTE, stopped), planner
-
-    result, planner = play(story)
+    planner = Planner(lambda episode: GRAB)
+    result, planner = await run_episode("x", planner, PALETTE, stopped), planner
     assert (result["reason"], result["stopped"]) == ("stopped: the stop is latched", True)
     assert len(planner.asked) == 1
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.anyio
+
 UNKNOWN_BODY = [
     "--runner",
     "ipc:///proc/none/runner.sock",
@@ -101,7 +103,7 @@ def written(folder: Path) -> None:
     (folder / "P.md").write_text("Turn left first.")
 
 
-def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: Any) -> None:
+async def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: Any) -> None:
     """The runner knows one skill; the language model's server takes the connection and never
     answers.
     """
@@ -129,62 +131,59 @@ def test_a_running_episode_is_cancelled_from_outside(tmp_path: Path, a_runner: A
 
     asked_for: list[bytes] = []
 
-    async def story() -> tuple[int | None, str]:
-        asked = asyncio.Event()
-        written(tmp_path)
+    asked = asyncio.Event()
+    written(tmp_path)
 
-        async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            asked_for.append(await reader.readuntil(b"\r\n\r\n"))
-            length = next(
-                line
-                for line in asked_for[0].lower().split(b"\r\n")
-                if line.startswith(b"content-length")
-            )
-            asked_for.append(await reader.readexactly(int(length.split(b":")[1])))
-            asked.set()
-            await reader.read()  # until the client hangs up
-            writer.close()
+    async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked_for.append(await reader.readuntil(b"\r\n\r\n"))
+        length = next(
+            line
+            for line in asked_for[0].lower().split(b"\r\n")
+            if line.startswith(b"content-length")
+        )
+        asked_for.append(await reader.readexactly(int(length.split(b":")[1])))
+        asked.set()
+        await reader.read()  # until the client hangs up
+        writer.close()
 
-        server = await asyncio.start_server(silent, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        environ = os.environ | {
-            "VRAM_ARBITER_RUNTIME": str(tmp_path),
-            "VRAM_REASONER_LLM_BASE_URL": f"http://127.0.0.1:{port}",
-            "VRAM_REASONER_LLM_MODEL": "m",
-        }
-        async with a_runner() as runner, asyncio.timeout(200):
-            runner.skills = [manifest]
-            process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-m",
-                "vram_arbiter.reasoner",
-                "--task",
-                "drive home",
-                "--planner",
-                "anthropic",
-                "--detector",
-                "none",
-                "--scene-vlm",
-                "none",
-                "--playbook",
-                str(tmp_path / "rskill.yaml"),
-                "--result",
-                str(tmp_path / "result.json"),
-                env=environ,
-                stderr=asyncio.subprocess.PIPE,
-            )
-            try:
-                await asked.wait()
-                told = await asyncio.to_thread(reasoner, tmp_path, "--cancel", "lunch")
-                assert told.returncode == 0, told.stderr
-                _, err = await process.communicate()
-            finally:
-                if process.returncode is None:
-                    process.kill()
-            server.close()
-            return process.returncode, err.decode()
-
-    code, err = asyncio.run(story())
+    server = await asyncio.start_server(silent, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    environ = os.environ | {
+        "VRAM_ARBITER_RUNTIME": str(tmp_path),
+        "VRAM_REASONER_LLM_BASE_URL": f"http://127.0.0.1:{port}",
+        "VRAM_REASONER_LLM_MODEL": "m",
+    }
+    async with a_runner() as runner, asyncio.timeout(200):
+        runner.skills = [manifest]
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "vram_arbiter.reasoner",
+            "--task",
+            "drive home",
+            "--planner",
+            "anthropic",
+            "--detector",
+            "none",
+            "--scene-vlm",
+            "none",
+            "--playbook",
+            str(tmp_path / "rskill.yaml"),
+            "--result",
+            str(tmp_path / "result.json"),
+            env=environ,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        try:
+            await asked.wait()
+            told = await asyncio.to_thread(reasoner, tmp_path, "--cancel", "lunch")
+            assert told.returncode == 0, told.stderr
+            _, err = await process.communicate()
+        finally:
+            if process.returncode is None:
+                process.kill()
+        server.close()
+        code, err = process.returncode, err.decode()
     assert code == 1, err
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["reason"] == "canceled: lunch"

@@ -35,6 +35,8 @@ from vram_arbiter.schemas.tools import (
     ToolCall,
 )
 
+pytestmark = pytest.mark.anyio
+
 ASK = QueryTaskProgress()
 TASK = "grab the red cube"
 
@@ -98,27 +100,24 @@ def test_thinning_keeps_order_and_both_ends(count: int) -> None:
             assert found == [count - 1]
 
 
-def test_a_camera_that_shows_nothing_leaves_a_gap_and_is_looked_at_again() -> None:
-    async def story() -> None:
-        camera = Camera()
-        past = Past(camera, rate_hz=1000.0)
-        looking = asyncio.create_task(past.run())
-        for error in (FrameStale("too old"), BadRequest("there is no camera"), ModelError("?")):
-            camera.next = error
-            camera.looked.clear()
-            await camera.looked.wait()
-            assert past.since(0.0) == []
-        camera.shows(b"x", age_ms=250.0)
-        looks = camera.looks
-        while camera.looks < looks + 2:
-            camera.looked.clear()
-            await camera.looked.wait()
-        (*_, newest) = past.since(0.0)
-        assert newest.image == b"x"
-        looking.cancel()
-        await asyncio.gather(looking, return_exceptions=True)
-
-    play(story)
+async def test_a_camera_that_shows_nothing_leaves_a_gap_and_is_looked_at_again() -> None:
+    camera = Camera()
+    past = Past(camera, rate_hz=1000.0)
+    looking = asyncio.create_task(past.run())
+    for error in (FrameStale("too old"), BadRequest("there is no camera"), ModelError("?")):
+        camera.next = error
+        camera.looked.clear()
+        await camera.looked.wait()
+        assert past.since(0.0) == []
+    camera.shows(b"x", age_ms=250.0)
+    looks = camera.looks
+    while camera.looks < looks + 2:
+        camera.looked.clear()
+        await camera.looked.wait()
+    (*_, newest) = past.since(0.0)
+    assert newest.image == b"x"
+    looking.cancel()
+    await asyncio.gather(looking, return_exceptions=True)
 
 
 # -- the tool
@@ -280,37 +279,34 @@ class Believes:
         )
 
 
-def test_an_opinion_begins_and_ends_nothing(a_runner: Any, a_sidecar: Any) -> None:
+async def test_an_opinion_begins_and_ends_nothing(a_runner: Any, a_sidecar: Any) -> None:
     """It says *done* before, while and after a goal runs: the goal runs to its own end, and the
     episode to the planner's.
     """
 
-    async def story() -> Any:
-        async with (
-            a_runner() as runner,
-            a_sidecar("lab/reward") as sidecar,
-            RunnerClient(runner.endpoint) as client,
-            RunnerClient(runner.endpoint) as eyes,
-            RewardClient(sidecar.endpoint) as reward,
-        ):
-            sidecar.judgement = {"progress": [1.0], "success": [1.0], "success_threshold": 0.5}
-            past = Past(lambda: eyes.frame("wrist", encoding="png"), rate_hz=1000.0)
-            looking = asyncio.create_task(past.run())
-            tools = Tools(client, None, None, judge=Judge(reward, past, TASK), palette=PALETTE)
-            episode = asyncio.create_task(run_episode(TASK, Believes(), PALETTE, tools))
-            await runner.accepted.wait()
-            scored = sidecar.asked.count("score")
-            await runner.feed(0.1)
-            assert not episode.done()
-            assert sidecar.asked.count("score") == scored == 1, (
-                "nobody asks by himself while a goal runs"
-            )
-            assert runner.cancelled == []
-            await runner.end("failed", code="limit_exceeded", message="not grasped")
-            looking.cancel()
-            return await episode, runner.cancelled
-
-    result, cancelled = play(story)
+    async with (
+        a_runner() as runner,
+        a_sidecar("lab/reward") as sidecar,
+        RunnerClient(runner.endpoint) as client,
+        RunnerClient(runner.endpoint) as eyes,
+        RewardClient(sidecar.endpoint) as reward,
+    ):
+        sidecar.judgement = {"progress": [1.0], "success": [1.0], "success_threshold": 0.5}
+        past = Past(lambda: eyes.frame("wrist", encoding="png"), rate_hz=1000.0)
+        looking = asyncio.create_task(past.run())
+        tools = Tools(client, None, None, judge=Judge(reward, past, TASK), palette=PALETTE)
+        episode = asyncio.create_task(run_episode(TASK, Believes(), PALETTE, tools))
+        await runner.accepted.wait()
+        scored = sidecar.asked.count("score")
+        await runner.feed(0.1)
+        assert not episode.done()
+        assert sidecar.asked.count("score") == scored == 1, (
+            "nobody asks by himself while a goal runs"
+        )
+        assert runner.cancelled == []
+        await runner.end("failed", code="limit_exceeded", message="not grasped")
+        looking.cancel()
+        result, cancelled = await episode, runner.cancelled
     assert [step["status"] for step in result["steps"]] == ["answered", "failed", "answered"]
     assert (result["status"], result["reason"]) == ("failure", "the planner decides, nobody else")
     assert result["vlm_confirmed"] is False, "an opinion about progress confirms nothing"

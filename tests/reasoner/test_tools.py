@@ -20,7 +20,7 @@ from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
 from vram_arbiter.reasoner.perception import LOOKED_AT_MAX_S, LOOKS_MAX, PLACE_MAX_S
-from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.reasoner.planner import Episode, Finish
 from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.reasoner.watch import watch
 from vram_arbiter.schemas.errors import (
@@ -48,30 +48,30 @@ from vram_arbiter.schemas.tools import (
 )
 from vram_arbiter.schemas.world import CameraModel
 
+pytestmark = pytest.mark.anyio
+
 GRAB = ExecuteRskill(rskill_id="lab/grab", prompt="grab it", deadline_s=30)
 LOOK = LocateInView(query="red cube")
 ASK = QueryScene(question="what is held?")
 
 
-def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
-    async def story() -> list[tuple[str, str]]:
-        found = []
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            for status, code in (
-                ("succeeded", ""),
-                ("failed", "oom"),
-                ("canceled", ""),
-                ("deadline", ""),
-            ):
-                runner.accepted.clear()
-                doing = asyncio.create_task(Tools(client, None, None)(GRAB))
-                await runner.accepted.wait()
-                await runner.end(status, code=code)
-                outcome = await doing
-                found.append((outcome.status, outcome.code))
-        return found
-
-    assert play(story) == [
+async def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
+    found = []
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        for status, code in (
+            ("succeeded", ""),
+            ("failed", "oom"),
+            ("canceled", ""),
+            ("deadline", ""),
+        ):
+            runner.accepted.clear()
+            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+            await runner.accepted.wait()
+            await runner.end(status, code=code)
+            outcome = await doing
+            found.append((outcome.status, outcome.code))
+    found = found
+    assert found == [
         ("succeeded", ""),
         ("failed", "oom"),
         ("canceled", ""),
@@ -79,7 +79,7 @@ def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
     ]
 
 
-def test_what_follows_a_goal_is_said_while_it_runs(a_runner: Any) -> None:
+async def test_what_follows_a_goal_is_said_while_it_runs(a_runner: Any) -> None:
     class Said(Hints):
         def __init__(self) -> None:
             self.follow = asyncio.Queue[str]()
@@ -87,51 +87,48 @@ def test_what_follows_a_goal_is_said_while_it_runs(a_runner: Any) -> None:
         async def follows(self, rskill_id: str) -> None:
             await self.follow.put(rskill_id)
 
-    async def story() -> tuple[str, str]:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            said = Said()
-            drive = GRAB.model_copy(update={"next_rskill_id": "test/next"})
-            doing = asyncio.create_task(Tools(client, None, None, hints=said)(drive))
-            await runner.accepted.wait()
-            follows = await said.follow.get()
-            await runner.end("succeeded")
-            return follows, (await doing).status
-
-    assert play(story) == ("test/next", "succeeded")
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        said = Said()
+        drive = GRAB.model_copy(update={"next_rskill_id": "test/next"})
+        doing = asyncio.create_task(Tools(client, None, None, hints=said)(drive))
+        await runner.accepted.wait()
+        follows = await said.follow.get()
+        await runner.end("succeeded")
+        found = follows, (await doing).status
+    assert found == ("test/next", "succeeded")
 
 
-def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(a_runner: Any) -> None:
+async def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(
+    a_runner: Any,
+) -> None:
     """Regression: a goal went on moving the arm after the reasoner that had sent it was told to
     end."""
 
-    async def story() -> tuple[list[str], bool]:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
-            await runner.accepted.wait()
-            doing.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await doing
-            return runner.cancelled, runner.goal is None
-
-    cancelled, ended = play(story)
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+        await runner.accepted.wait()
+        doing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await doing
+        cancelled, ended = runner.cancelled, runner.goal is None
     assert len(cancelled) == 1
     assert ended
 
 
-def test_a_goal_whose_acceptance_was_not_heard_is_cancelled_by_its_name(a_runner: Any) -> None:
+async def test_a_goal_whose_acceptance_was_not_heard_is_cancelled_by_its_name(
+    a_runner: Any,
+) -> None:
     """Regression: a goal whose acceptance was not received was forgotten and went on."""
 
-    async def story() -> bool:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            runner.deaf.add("goal")
-            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
-            await runner.heard.wait()
-            doing.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await doing
-            return len(runner.cancelled) == 1 and runner.goal is None
-
-    assert play(story)
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        runner.deaf.add("goal")
+        doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+        await runner.heard.wait()
+        doing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await doing
+        found = len(runner.cancelled) == 1 and runner.goal is None
+    assert found
 
 
 def test_patience_counts_motion_and_not_the_wait_for_the_gpu(a_runner: Any) -> None:
@@ -164,51 +161,49 @@ def test_patience_counts_motion_and_not_the_wait_for_the_gpu(a_runner: Any) -> N
     assert cancelled == []
 
 
-def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
+async def test_progress_that_was_told_while_the_reasoner_stood_still_counts() -> None:
     """Regression: the time was up and the feedback there, both at once; the goal was called off for
     no progress.
     """
 
-    async def story() -> bool:
-        loop, goal = asyncio.get_running_loop(), Goal(RunnerClient("ipc:///nobody"), "g")
+    loop, goal = asyncio.get_running_loop(), Goal(RunnerClient("ipc:///nobody"), "g")
 
-        def feed(progress: float) -> None:
-            goal.fed(
-                {
-                    "push": "feedback",
-                    "goal_id": "g",
-                    "progress": progress,
-                    "state": "running",
-                    "tick_idx": 0,
-                    "detail": "",
-                }
-            )
-
-        patient = ExecuteRskill(rskill_id="lab/grab", patience_s=5.0, progress_tolerance=0.05)
-        watching = asyncio.create_task(_stands_still(goal, patient))
-        feed(0.2)
-        for _ in range(5):  # it has heard of it
-            await asyncio.sleep(0)
-        # type: ignore[method-assign,misc]  # nothing ran for six seconds
-        loop.time = lambda now=loop.time: now() + 6.0
-        loop.call_soon_threadsafe(feed, 0.4)
-        for _ in range(5):
-            await asyncio.sleep(0)
-        assert not watching.done()
-        goal.ended(
+    def feed(progress: float) -> None:
+        goal.fed(
             {
-                "push": "result",
+                "push": "feedback",
                 "goal_id": "g",
-                "status": "succeeded",
-                "success": True,
-                "code": "",
-                "message": "",
-                "data": {},
+                "progress": progress,
+                "state": "running",
+                "tick_idx": 0,
+                "detail": "",
             }
         )
-        return await watching
 
-    assert play(story) is False
+    patient = ExecuteRskill(rskill_id="lab/grab", patience_s=5.0, progress_tolerance=0.05)
+    watching = asyncio.create_task(_stands_still(goal, patient))
+    feed(0.2)
+    for _ in range(5):  # it has heard of it
+        await asyncio.sleep(0)
+    # type: ignore[method-assign,misc]  # nothing ran for six seconds
+    loop.time = lambda now=loop.time: now() + 6.0
+    loop.call_soon_threadsafe(feed, 0.4)
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert not watching.done()
+    goal.ended(
+        {
+            "push": "result",
+            "goal_id": "g",
+            "status": "succeeded",
+            "success": True,
+            "code": "",
+            "message": "",
+            "data": {},
+        }
+    )
+    found = await watching
+    assert found is False
 
 
 @contextlib.asynccontextmanager
@@ -254,22 +249,20 @@ def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
         assert (outcome.status, outcome.code) == (status, error.code)
 
 
-def test_looked_not_seen_answered_and_no_frame_are_four_things(
+async def test_looked_not_seen_answered_and_no_frame_are_four_things(
     a_runner: Any, a_sidecar: Any
 ) -> None:
-    async def story() -> list[str]:
-        async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
-            found = [(await tools(LOOK)).status, (await tools(ASK)).status]
-            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
-            seen = await tools(LOOK)
-            assert "the camera cannot say where it stands" in seen.text
-            runner.frame_error = FrameStale("the newest frame is 9 s old")
-            return [*found, seen.status, (await tools(LOOK)).status, (await tools(ASK)).status]
-
-    assert play(story) == ["not_seen", "answered", "error", "no_frame", "no_frame"]
+    async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
+        found = [(await tools(LOOK)).status, (await tools(ASK)).status]
+        sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
+        seen = await tools(LOOK)
+        assert "the camera cannot say where it stands" in seen.text
+        runner.frame_error = FrameStale("the newest frame is 9 s old")
+        found = [*found, seen.status, (await tools(LOOK)).status, (await tools(ASK)).status]
+    assert found == ["not_seen", "answered", "error", "no_frame", "no_frame"]
 
 
-def test_a_look_tells_all_places_best_first_and_where_the_base_stood(
+async def test_a_look_tells_all_places_best_first_and_where_the_base_stood(
     a_runner: Any, a_sidecar: Any
 ) -> None:
     """Boxes that lie on one thing are that one thing."""
@@ -284,17 +277,14 @@ def test_a_look_tells_all_places_best_first_and_where_the_base_stood(
         base_pose=(0.4, -0.2, 0.1),
     )
 
-    async def story() -> Outcome:
-        async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
-            runner.camera_model = down.model_dump(mode="json")
-            sidecar.detections = [
-                {"label": "red cube", "score": 0.6, "box": [18, 38, 22, 42]},
-                {"label": "red cube", "score": 0.5, "box": [79, 58, 83, 62]},
-                {"label": "red cube", "score": 0.7, "box": [78, 58, 82, 62]},
-            ]
-            return await tools(LOOK)
-
-    outcome = play(story)
+    async with looking(a_runner, a_sidecar) as (runner, sidecar, _, tools):
+        runner.camera_model = down.model_dump(mode="json")
+        sidecar.detections = [
+            {"label": "red cube", "score": 0.6, "box": [18, 38, 22, 42]},
+            {"label": "red cube", "score": 0.5, "box": [79, 58, 83, 62]},
+            {"label": "red cube", "score": 0.7, "box": [78, 58, 82, 62]},
+        ]
+        outcome = await tools(LOOK)
     assert outcome.status == "found"
     seen = [(*one["point_base_m"][:2], one["score"]) for one in outcome.data["seen"]]
     assert [pytest.approx(one) for one in seen] == [(0.3, -0.1, 0.7), (-0.3, 0.1, 0.6)]
@@ -312,60 +302,51 @@ def test_a_look_tells_all_places_best_first_and_where_the_base_stood(
         {"score": 7.0},
     ],
 )
-def test_a_place_that_is_no_number_is_no_place(
+async def test_a_place_that_is_no_number_is_no_place(
     a_runner: Any, a_sidecar: Any, wrong: dict[str, Any]
 ) -> None:
     """Regression: it was `found` at (nan, nan) m from the base."""
 
-    async def story() -> Any:
-        async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
-            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]} | wrong]
-            return await tools(LOOK)
-
-    outcome = play(story)
+    async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
+        sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]} | wrong]
+        outcome = await tools(LOOK)
     assert (outcome.status, outcome.code) == ("error", "model_error")
 
 
-def test_a_place_that_is_always_of_long_ago_is_none(
+async def test_a_place_that_is_always_of_long_ago_is_none(
     a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: the second answer was taken for one of now, however long it had taken."""
     now = [100.0]
     monkeypatch.setattr("vram_arbiter.reasoner.perception.monotonic", lambda: now[0])
 
-    async def story() -> tuple[Any, list[str]]:
-        async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
-            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
-            detect = detector.detect
+    async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
+        sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
+        detect = detector.detect
 
-            async def slow(*arguments: Any, **options: Any) -> Any:
-                now[0] += 2 * PLACE_MAX_S
-                return await detect(*arguments, **options)
+        async def slow(*arguments: Any, **options: Any) -> Any:
+            now[0] += 2 * PLACE_MAX_S
+            return await detect(*arguments, **options)
 
-            monkeypatch.setattr(detector, "detect", slow)
-            return await tools(LOOK), sidecar.asked
-
-    outcome, asked = play(story)
+        monkeypatch.setattr(detector, "detect", slow)
+        outcome, asked = await tools(LOOK), sidecar.asked
     assert (outcome.status, outcome.code) == ("no_frame", "frame_stale")
     assert asked.count("detect") == LOOKS_MAX
 
 
 @pytest.mark.parametrize("call", [LOOK, ASK])
 @pytest.mark.parametrize("late", [0, LOOKS_MAX - 1, LOOKS_MAX])
-def test_a_picture_that_waited_for_the_gpu_is_not_looked_at_and_a_new_one_is(
+async def test_a_picture_that_waited_for_the_gpu_is_not_looked_at_and_a_new_one_is(
     a_runner: Any, a_sidecar: Any, call: Any, late: int
 ) -> None:
     """Regression: only the detector's was looked at again, by the time that the answer took."""
 
-    async def story() -> tuple[str, list[float]]:
-        async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
-            sidecar.late = late
-            outcome = await tools(call)
-            limits = [message["fresh_s"] for message in sidecar.messages if "fresh_s" in message]
-            return outcome.status, limits
-
     looked = "not_seen" if call is LOOK else "answered"
-    found, limits = play(story)
+    async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
+        sidecar.late = late
+        outcome = await tools(call)
+        limits = [message["fresh_s"] for message in sidecar.messages if "fresh_s" in message]
+        found, limits = outcome.status, limits
     assert (found, len(limits)) == (
         "no_frame" if late == LOOKS_MAX else looked,
         min(late + 1, LOOKS_MAX),
@@ -375,7 +356,7 @@ def test_a_picture_that_waited_for_the_gpu_is_not_looked_at_and_a_new_one_is(
     )
 
 
-def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
+async def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     a_runner: Any, a_sidecar: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: a detector that waited two minutes for the GPU told where the thing had stood
@@ -384,66 +365,57 @@ def test_what_was_seen_before_the_detector_was_loaded_is_no_place(
     now = [100.0]
     monkeypatch.setattr("vram_arbiter.reasoner.perception.monotonic", lambda: now[0])
 
-    async def story() -> tuple[str, list[str]]:
-        async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
-            sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
-            detect = detector.detect
+    async with looking(a_runner, a_sidecar) as (_, sidecar, detector, tools):
+        sidecar.detections = [{"label": "red cube", "score": 0.9, "box": [0, 0, 2, 2]}]
+        detect = detector.detect
 
-            async def loads_first(*arguments: Any, **options: Any) -> Any:
-                found = await detect(*arguments, **options)
-                if sidecar.detections:  # meanwhile somebody takes it away
-                    sidecar.detections = []
-                    now[0] += 2 * PLACE_MAX_S
-                return found
+        async def loads_first(*arguments: Any, **options: Any) -> Any:
+            found = await detect(*arguments, **options)
+            if sidecar.detections:  # meanwhile somebody takes it away
+                sidecar.detections = []
+                now[0] += 2 * PLACE_MAX_S
+            return found
 
-            monkeypatch.setattr(detector, "detect", loads_first)
-            return (await tools(LOOK)).status, sidecar.asked
-
-    status, asked = play(story)
+        monkeypatch.setattr(detector, "detect", loads_first)
+        status, asked = (await tools(LOOK)).status, sidecar.asked
     assert (status, asked.count("detect")) == ("not_seen", 2)
 
 
-def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
+async def test_a_model_whose_licence_is_barred_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
     palette = Palette((Skill("lab/eye", "vlm", "", ("query",), barred="its licence"),))
 
-    async def story() -> tuple[Any, list[str]]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            SceneVlmClient(sidecar.endpoint) as vlm,
-        ):
-            return await Tools(client, None, vlm, palette=palette)(ASK), sidecar.asked
-
-    outcome, asked = play(story)
+    async with (
+        a_runner() as runner,
+        RunnerClient(runner.endpoint) as client,
+        a_sidecar("lab/eye") as sidecar,
+        SceneVlmClient(sidecar.endpoint) as vlm,
+    ):
+        outcome, asked = await Tools(client, None, vlm, palette=palette)(ASK), sidecar.asked
     assert (outcome.status, outcome.code) == ("refused", "not_permitted")
     assert asked == ["ping"]
 
 
-def test_servers_of_the_field_are_looked_through(a_runner: Any, tmp_path: Path) -> None:
+async def test_servers_of_the_field_are_looked_through(a_runner: Any, tmp_path: Path) -> None:
     """They have no lease, so that nothing is loaded or unloaded; one that is gone saw nothing."""
 
-    async def story() -> list[Outcome]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            DetectorClient(f"ipc://{tmp_path}/field", connect_timeout_s=60.0) as detector,
-            SceneVlmClient(f"ipc://{tmp_path}/field") as vlm,
-        ):
-            tools = Tools(client, detector, vlm, components={"detector": detector})
-            with FieldServer(detector.endpoint, "<box><400><400><600><600></box>") as server:
-                found = [await tools(LOOK), await tools(ASK)]
-                server.answer = "None."
-                found.append(await tools(LOOK))
-                for transition in ("configure", "activate", "deactivate"):
-                    call = {"node": "detector", "transition": transition}
-                    found.append(await tools(LifecycleTransition.model_validate(call)))
-            while detector._rpc.proven:  # it has not noticed yet
-                await asyncio.sleep(0)
-            detector._connect_timeout_s = 0.05
-            return [*found, await tools(LOOK)]
-
-    outcomes = play(story)
+    async with (
+        a_runner() as runner,
+        RunnerClient(runner.endpoint) as client,
+        DetectorClient(f"ipc://{tmp_path}/field", connect_timeout_s=60.0) as detector,
+        SceneVlmClient(f"ipc://{tmp_path}/field") as vlm,
+    ):
+        tools = Tools(client, detector, vlm, components={"detector": detector})
+        with FieldServer(detector.endpoint, "<box><400><400><600><600></box>") as server:
+            found = [await tools(LOOK), await tools(ASK)]
+            server.answer = "None."
+            found.append(await tools(LOOK))
+            for transition in ("configure", "activate", "deactivate"):
+                call = {"node": "detector", "transition": transition}
+                found.append(await tools(LifecycleTransition.model_validate(call)))
+        while detector._rpc.proven:  # it has not noticed yet
+            await asyncio.sleep(0)
+        detector._connect_timeout_s = 0.05
+        outcomes = [*found, await tools(LOOK)]
     assert [(one.status, one.code) for one in outcomes] == [
         ("error", "frame_stale"),  # seen, but the camera does not say where it stands
         ("answered", ""),
@@ -457,72 +429,64 @@ def test_servers_of_the_field_are_looked_through(a_runner: Any, tmp_path: Path) 
     assert outcomes[3].text == "detector serves field/model, resident"
 
 
-def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_sidecar: Any) -> None:
+async def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_sidecar: Any) -> None:
     """The defect of the field: a language model could activate the detector in the middle of a
     grab.
     """
 
-    async def story() -> tuple[list[str], list[str], list[str]]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            RunnerClient(runner.endpoint) as other,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-        ):
-            tools = Tools(client, detector, None, components={"detector": detector})
-            await other.send_goal("lab/grab")  # somebody else's goal counts as well
-            calls = [
-                LifecycleTransition.model_validate({"node": "detector", "transition": transition})
-                for transition in ("activate", "deactivate", "cleanup", "configure")
-            ]
-            beside = [(await tools(call)).status for call in calls]
-            asked = [op for op in sidecar.asked if op != "ping"]
-            await runner.end()
-            after = [(await tools(call)).status for call in calls]
-            assert asked == []
-            return beside, after, [op for op in sidecar.asked if op != "ping"]
-
-    beside, after, asked = play(story)
+    async with (
+        a_runner() as runner,
+        RunnerClient(runner.endpoint) as client,
+        RunnerClient(runner.endpoint) as other,
+        a_sidecar("lab/eye") as sidecar,
+        DetectorClient(sidecar.endpoint) as detector,
+    ):
+        tools = Tools(client, detector, None, components={"detector": detector})
+        await other.send_goal("lab/grab")  # somebody else's goal counts as well
+        calls = [
+            LifecycleTransition.model_validate({"node": "detector", "transition": transition})
+            for transition in ("activate", "deactivate", "cleanup", "configure")
+        ]
+        beside = [(await tools(call)).status for call in calls]
+        asked = [op for op in sidecar.asked if op != "ping"]
+        await runner.end()
+        after = [(await tools(call)).status for call in calls]
+        assert asked == []
+        beside, after, asked = beside, after, [op for op in sidecar.asked if op != "ping"]
     assert beside == ["refused", "refused", "refused", "done"]
     assert after == ["done"] * 4
     assert asked == ["load", "unload", "unload"]
 
 
-def test_an_unknown_component_and_a_prompt(a_runner: Any) -> None:
-    async def story() -> list[str]:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            tools = Tools(client, None, None)
-            calls = [
-                LifecycleTransition(node="kernel", transition="deactivate"),
-                EmitPrompt(target_topic="/operator", text="help"),
-                LOOK,
-                ASK,
-            ]
-            return [(await tools(call)).status for call in calls]
-
-    assert play(story) == ["refused", "done", "refused", "refused"]
+async def test_an_unknown_component_and_a_prompt(a_runner: Any) -> None:
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        tools = Tools(client, None, None)
+        calls = [
+            LifecycleTransition(node="kernel", transition="deactivate"),
+            EmitPrompt(target_topic="/operator", text="help"),
+            LOOK,
+            ASK,
+        ]
+        found = [(await tools(call)).status for call in calls]
+    assert found == ["refused", "done", "refused", "refused"]
 
 
-def test_an_emergency_stop_and_a_runner_that_is_gone_reach_the_inbox(a_runner: Any) -> None:
-    async def story() -> list[Any]:
-        inbox = Inbox()
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            watching = asyncio.create_task(watch(client, inbox, period_s=0.01, answer_s=60.0))
-            await client.state()
-            assert inbox.take() == []
-            runner.diagnostics = {"front": "stale", "joint_state": "ok"}
-            await inbox.wait()
-            assert inbox.take() == [Danger("not to be trusted now, too old: front", stop=False)]
-            runner.estop = "somebody pressed it"
-            await inbox.wait()
-            await watching
-            stopped = inbox.take()
-        async with RunnerClient(runner.endpoint, connect_timeout_s=0.1) as client:
-            await watch(client, inbox, period_s=0.01, answer_s=0.1)
-        return stopped + inbox.take()
-
-    stopped, gone = play(story)
+async def test_an_emergency_stop_and_a_runner_that_is_gone_reach_the_inbox(a_runner: Any) -> None:
+    inbox = Inbox()
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        watching = asyncio.create_task(watch(client, inbox, period_s=0.01, answer_s=60.0))
+        await client.state()
+        assert inbox.take() == []
+        runner.diagnostics = {"front": "stale", "joint_state": "ok"}
+        await inbox.wait()
+        assert inbox.take() == [Danger("not to be trusted now, too old: front", stop=False)]
+        runner.estop = "somebody pressed it"
+        await inbox.wait()
+        await watching
+        stopped = inbox.take()
+    async with RunnerClient(runner.endpoint, connect_timeout_s=0.1) as client:
+        await watch(client, inbox, period_s=0.01, answer_s=0.1)
+    stopped, gone = stopped + inbox.take()
     assert stopped == Danger("emergency stop: somebody pressed it", stop=True)
     assert gone.stop
     assert "gone" in gone.text
@@ -539,85 +503,80 @@ class Persistent:
         return GRAB
 
 
-def test_a_runner_that_hangs_up_ends_the_episode_at_once(a_runner: Any) -> None:
+async def test_a_runner_that_hangs_up_ends_the_episode_at_once(a_runner: Any) -> None:
     """Regression: the episode ended after three unanswered states of 11 s each; meanwhile the
     planner was asked on and two motions were tried.
     """
 
-    async def story() -> tuple[int, list[Any], str, int]:
-        inbox, planner = Inbox(), Persistent()
-        palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
-        async with contextlib.AsyncExitStack() as stack:
-            async with a_runner() as runner:
-                client, watching = [
-                    await stack.enter_async_context(
-                        RunnerClient(runner.endpoint, connect_timeout_s=3600.0)
-                    )
-                    for _ in range(2)
-                ]
-                await watching.state()
-                beside = asyncio.create_task(watch(watching, inbox, period_s=3600.0))
-                stack.callback(beside.cancel)
-                episode = asyncio.create_task(
-                    run_episode("x", planner, palette, Tools(client, None, None), inbox=inbox)
+    inbox, planner = Inbox(), Persistent()
+    palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
+    async with contextlib.AsyncExitStack() as stack:
+        async with a_runner() as runner:
+            client, watching = [
+                await stack.enter_async_context(
+                    RunnerClient(runner.endpoint, connect_timeout_s=3600.0)
                 )
-                await runner.accepted.wait()
-            result = await episode
-            return planner.asked, result["steps"], result["reason"], result["stopped"]
-
-    asked, steps, reason, stopped = play(story)
+                for _ in range(2)
+            ]
+            await watching.state()
+            beside = asyncio.create_task(watch(watching, inbox, period_s=3600.0))
+            stack.callback(beside.cancel)
+            episode = asyncio.create_task(
+                run_episode("x", planner, palette, Tools(client, None, None), inbox=inbox)
+            )
+            await runner.accepted.wait()
+        result = await episode
+        asked, steps, reason, stopped = (
+            planner.asked,
+            result["steps"],
+            result["reason"],
+            result["stopped"],
+        )
     assert stopped
     assert reason == "stopped: the runner is gone: it hung up"
     assert asked <= 2, "asked once more at most, in the moment of the hang-up"
     assert len(steps) == 1, "no further motion was tried"
 
 
-def test_a_runner_that_was_started_again_ends_the_episode_and_gets_no_goal(a_runner: Any) -> None:
+async def test_a_runner_that_was_started_again_ends_the_episode_and_gets_no_goal(
+    a_runner: Any,
+) -> None:
     """Its robot may stand elsewhere, and its goals are those of another task."""
 
-    async def story() -> tuple[str, list[Any], str]:
-        inbox = Inbox()
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            await watch(client, inbox, "the session before")
-            outcome = await Tools(client, None, None, session="the session before")(GRAB)
-            assert runner.goal is None
-            return inbox.take()[0].text, inbox.take(), outcome.code
-
-    danger, more, code = play(story)
+    inbox = Inbox()
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        await watch(client, inbox, "the session before")
+        outcome = await Tools(client, None, None, session="the session before")(GRAB)
+        assert runner.goal is None
+        danger, more, code = inbox.take()[0].text, inbox.take(), outcome.code
     assert (danger, more, code) == ("the runner was started again", [], "goal_rejected")
 
 
-def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
-    async def story() -> tuple[Any, list[str]]:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            outcome = await Tools(client, None, None, goal_grace_s=0.0)(
-                ExecuteRskill(rskill_id="lab/grab", deadline_s=0.2)
-            )
-            return outcome, runner.cancelled
-
-    outcome, cancelled = play(story)
+async def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        outcome = await Tools(client, None, None, goal_grace_s=0.0)(
+            ExecuteRskill(rskill_id="lab/grab", deadline_s=0.2)
+        )
+        outcome, cancelled = outcome, runner.cancelled
     assert (outcome.status, outcome.code) == ("failed", "wait_timeout")
     assert len(cancelled) == 1
 
 
-def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
+async def test_a_goal_whose_runner_is_gone_is_not_called_cancelled(
     a_runner: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: lost contact and a missing result were one case, reported as canceled."""
     monkeypatch.setattr("vram_arbiter.reasoner.execution.CANCEL_S", 0.3)
 
-    async def story() -> Any:
-        async with contextlib.AsyncExitStack() as stack:
-            async with a_runner() as runner:
-                client = await stack.enter_async_context(RunnerClient(runner.endpoint))
-                doing = asyncio.create_task(Tools(client, None, None)(GRAB))
-                await runner.accepted.wait()
-                client._timeout_s = client._connect_timeout_s = (
-                    0.3  # of no use any more: nobody will answer
-                )
-            return await doing
-
-    outcome = play(story)
+    async with contextlib.AsyncExitStack() as stack:
+        async with a_runner() as runner:
+            client = await stack.enter_async_context(RunnerClient(runner.endpoint))
+            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+            await runner.accepted.wait()
+            client._timeout_s = client._connect_timeout_s = (
+                0.3  # of no use any more: nobody will answer
+            )
+        outcome = await doing
     assert (outcome.status, outcome.code) == ("failed", "runner_unreachable")
     assert "it may still run" in outcome.text
     assert "no result within" not in outcome.text
@@ -630,75 +589,65 @@ class Stopper:
         return GRAB if episode.running is None else StopGoal()
 
 
-def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(a_runner: Any) -> None:
+async def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(a_runner: Any) -> None:
     """Regression: the second cancel (a person's, behind the planner's) ended the wait for its
     end.
     """
 
-    async def story() -> tuple[str, list[str]]:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            runner.ends_on_cancel, runner.result_error = False, BadState("it is still running")
-            inbox = Inbox()
-            palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
-            episode = asyncio.create_task(
-                run_episode("x", Stopper(), palette, Tools(client, None, None), inbox=inbox)
-            )
-            await runner.accepted.wait()
-            inbox.put(Said("stop it"))
-            while not runner.cancelled:
-                await asyncio.sleep(0.01)
-            inbox.put(Cancel("at once"))
-            await asyncio.wait(
-                {episode}, timeout=0.3
-            )  # what is tested is that time passes without an end
-            waits = not episode.done()
-            runner.result_error = None
-            await runner.end("canceled")
-            result = await episode
-            return ("waited" if waits else "left it running"), [
-                step["status"] for step in result["steps"]
-            ]
-
-    assert play(story) == ("waited", ["canceled"])
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        runner.ends_on_cancel, runner.result_error = False, BadState("it is still running")
+        inbox = Inbox()
+        palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
+        episode = asyncio.create_task(
+            run_episode("x", Stopper(), palette, Tools(client, None, None), inbox=inbox)
+        )
+        await runner.accepted.wait()
+        inbox.put(Said("stop it"))
+        while not runner.cancelled:
+            await asyncio.sleep(0.01)
+        inbox.put(Cancel("at once"))
+        await asyncio.wait(
+            {episode}, timeout=0.3
+        )  # what is tested is that time passes without an end
+        waits = not episode.done()
+        runner.result_error = None
+        await runner.end("canceled")
+        result = await episode
+        found = (
+            ("waited" if waits else "left it running"),
+            [step["status"] for step in result["steps"]],
+        )
+    assert found == ("waited", ["canceled"])
 
 
 @pytest.mark.parametrize("ended", [InternalError("a defect"), LimitExceeded("too many")])
-def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(
+async def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(
     a_runner: Any, ended: VramError
 ) -> None:
     """Regression: the goal went on without anybody who waited for it."""
 
-    async def story() -> tuple[str, str, int]:
-        async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-            runner.result_error = ended
-            outcome = await Tools(client, None, None)(GRAB)
-            return outcome.status, outcome.code, len(runner.cancelled)
-
-    assert play(story) == ("failed", ended.code, 1)
+    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
+        runner.result_error = ended
+        outcome = await Tools(client, None, None)(GRAB)
+        found = outcome.status, outcome.code, len(runner.cancelled)
+    assert found == ("failed", ended.code, 1)
 
 
-def test_a_model_whose_licence_is_barred_is_not_loaded_either(
+async def test_a_model_whose_licence_is_barred_is_not_loaded_either(
     a_runner: Any, a_sidecar: Any
 ) -> None:
     """Regression: it was not asked, but `lifecycle_transition` put it on the GPU."""
 
-    async def story() -> tuple[str, str, list[str]]:
-        async with (
-            a_runner() as runner,
-            RunnerClient(runner.endpoint) as client,
-            a_sidecar("lab/eye") as sidecar,
-            DetectorClient(sidecar.endpoint) as detector,
-        ):
-            palette = Palette(
-                (Skill("lab/eye", "detector", "", ("detect",), barred="its licence"),)
-            )
-            tools = Tools(
-                client, detector, None, palette=palette, components={"detector": detector}
-            )
-            outcome = await tools(LifecycleTransition(node="detector", transition="activate"))
-            return outcome.status, outcome.code, sidecar.asked
-
-    status, code, asked = play(story)
+    async with (
+        a_runner() as runner,
+        RunnerClient(runner.endpoint) as client,
+        a_sidecar("lab/eye") as sidecar,
+        DetectorClient(sidecar.endpoint) as detector,
+    ):
+        palette = Palette((Skill("lab/eye", "detector", "", ("detect",), barred="its licence"),))
+        tools = Tools(client, detector, None, palette=palette, components={"detector": detector})
+        outcome = await tools(LifecycleTransition(node="detector", transition="activate"))
+        status, code, asked = outcome.status, outcome.code, sidecar.asked
     assert (status, code) == ("refused", "not_permitted")
     assert "load" not in asked
 

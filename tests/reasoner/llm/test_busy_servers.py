@@ -2,7 +2,6 @@
 is given up. No test waits: the pauses are only written down.
 """
 
-import asyncio
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
@@ -17,6 +16,8 @@ from vram_arbiter.reasoner.llm.http import PAUSE_MAX_S, TRIES_MAX, retry_after_s
 from vram_arbiter.reasoner.planner import Episode
 from vram_arbiter.schemas.errors import LlmError
 from vram_arbiter.schemas.tools import LocateInView
+
+pytestmark = pytest.mark.anyio
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -53,7 +54,7 @@ def test_a_server_that_stays_busy_is_given_up_when_its_time_is_over(
     assert all(pause <= PAUSE_MAX_S for pause in pauses)
 
 
-def test_a_refused_try_counts_as_a_failed_request_and_fails_no_decision(
+async def test_a_refused_try_counts_as_a_failed_request_and_fails_no_decision(
     api: Any, stand_in: Any
 ) -> None:
     """Regression: a task whose server had refused three times told of one request and no failure:
@@ -63,12 +64,9 @@ def test_a_refused_try_counts_as_a_failed_request_and_fails_no_decision(
         stand_in.json(OVERLOADED, 429, {"retry-after": "0"})
     stand_in.json(api.says(LOOK))
 
-    async def once() -> Any:
-        async with api.planner(LlmConfig(stand_in.url + api.base, "m"), PALETTE) as planner:
-            assert await planner.decide(Episode("grab it")) == LocateInView(query="cube")
-            return planner.tally.as_result("m")
-
-    told = asyncio.run(once())
+    async with api.planner(LlmConfig(stand_in.url + api.base, "m"), PALETTE) as planner:
+        assert await planner.decide(Episode("grab it")) == LocateInView(query="cube")
+        told = planner.tally.as_result("m")
     assert (told["requests"], told["failed"], told["rejected"]) == (4, 3, 0)
 
 

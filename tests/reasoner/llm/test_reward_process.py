@@ -18,7 +18,7 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import RewardClient
 from vram_arbiter.schemas.errors import Evicted
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
 ROOT = Path(__file__).parents[3]
 CONFIGS = ROOT / "configs"
@@ -46,7 +46,7 @@ async def program(environ: dict[str, str], name: str, *argv: str) -> AsyncIterat
         print(*printed)  # shown by pytest where the test fails
 
 
-def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
+async def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
     arbiter_daemon: Any, stand_in: Any, tmp_path: Path
 ) -> None:
     runtime = arbiter_daemon.runtime
@@ -139,11 +139,8 @@ def test_progress_is_asked_for_under_a_lease_and_evicted_like_any_other(
             judged = await reward.score([picture], "grab the red cube")  # there is room again
             assert judged.progress[0] < 0.5
 
-    async def bounded() -> None:
-        async with asyncio.timeout(350):
-            await story()
-
-    asyncio.run(bounded())
+    async with asyncio.timeout(350):
+        await story()
     steps = json.loads(result.read_text())["steps"]
     assert [(step["call"]["tool"], step["status"], step["code"]) for step in steps] == [
         ("query_task_progress", "answered", ""),

@@ -19,8 +19,10 @@ from vram_arbiter.reasoner.palette import Palette, Skill
 from vram_arbiter.reasoner.planner import Episode, Outcome, Step
 from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.errors import LlmError
-from vram_arbiter.schemas.reasoner import Result, TranscriptLine
+from vram_arbiter.schemas.reasoner import TranscriptLine
 from vram_arbiter.schemas.tools import ExecuteRskill, Look, QueryScene, ToolCall
+
+pytestmark = pytest.mark.anyio
 
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
@@ -44,7 +46,7 @@ def test_current_parameters(api: Any, stand_in: Any, decide: Any) -> None:
         assert body["tool_choice"]["disable_parallel_tool_use"] is True
 
 
-def test_a_parameter_that_a_model_refuses_is_left_out_from_then_on(stand_in: Any) -> None:
+async def test_a_parameter_that_a_model_refuses_is_left_out_from_then_on(stand_in: Any) -> None:
     """o1, o3 and o4-mini refuse `parallel_tool_calls`, which other models have to be told."""
     for name in ("parallel_tool_calls", "max_completion_tokens"):
         text = f"Unsupported parameter: '{name}' is not supported with this model."
@@ -53,14 +55,11 @@ def test_a_parameter_that_a_model_refuses_is_left_out_from_then_on(stand_in: Any
         stand_in.json(OpenAi.says(("query_scene", '{"question": "?"}')))
     stand_in.json({"error": {"message": "Unsupported parameter: 'tools'"}}, 400)
 
-    async def thrice() -> None:
-        async with OpenAiPlanner(LlmConfig(stand_in.url, "m", KEY), PALETTE) as planner:
-            for _ in range(2):
-                await planner.decide(Episode("x"))
-            with pytest.raises(LlmError, match="'tools'"):
-                await planner.decide(Episode("x"))
-
-    asyncio.run(thrice())
+    async with OpenAiPlanner(LlmConfig(stand_in.url, "m", KEY), PALETTE) as planner:
+        for _ in range(2):
+            await planner.decide(Episode("x"))
+        with pytest.raises(LlmError, match="'tools'"):
+            await planner.decide(Episode("x"))
     assert len(stand_in.asked) == 5
     assert "parallel_tool_calls" not in stand_in.asked[1]
     for body in stand_in.asked[2:]:
@@ -179,7 +178,7 @@ def test_only_what_is_there_is_named_in_the_instructions() -> None:
     assert "Nothing here moves the robot" in bare
 
 
-def test_the_next_skill_is_a_choice_and_another_one_is_ignored_with_a_note(
+async def test_the_next_skill_is_a_choice_and_another_one_is_ignored_with_a_note(
     api: Any, stand_in: Any
 ) -> None:
     """A hint is not worth a refused motion: the drive begins without it."""
@@ -193,12 +192,9 @@ def test_the_next_skill_is_a_choice_and_another_one_is_ignored_with_a_note(
         called.append(call)
         return Outcome("succeeded", "there")
 
-    async def episode() -> Result:
-        config = LlmConfig(stand_in.url + api.base, "m", KEY)
-        async with api.planner(config, PALETTE) as planner:
-            return await run_episode("grab the red cube", planner, PALETTE, driven)
-
-    result = asyncio.run(episode())
+    config = LlmConfig(stand_in.url + api.base, "m", KEY)
+    async with api.planner(config, PALETTE) as planner:
+        result = await run_episode("grab the red cube", planner, PALETTE, driven)
     go = ExecuteRskill(rskill_id="lab/navigate")
     assert called == [go.model_copy(update={"next_rskill_id": "lab/grab"}), go]
     offered = api.offered(stand_in.asked[0])

@@ -17,7 +17,7 @@ from tests.support.prepared import Forked, start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.reasoner.server import send
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e]
 
 ROOT = Path(__file__).parents[3]
 TURN = "execute_rskill__vram-arbiter__so101-navigate"
@@ -92,7 +92,7 @@ async def comes_true(condition: Callable[[], Any]) -> Any:
         await asyncio.sleep(0.02)
 
 
-def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
+async def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
     tmp_path: Path, stand_in: Any
 ) -> None:
     pytest.importorskip("mujoco", reason="needs the full install")
@@ -147,8 +147,5 @@ def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
                 assert await asyncio.to_thread(reasoner.wait) == 1
             assert programs.result()["reason"].startswith("stopped: emergency stop")
 
-    async def bounded() -> None:
-        async with asyncio.timeout(280):
-            await story()
-
-    asyncio.run(bounded())
+    async with asyncio.timeout(280):
+        await story()

@@ -20,6 +20,8 @@ from vram_arbiter.runner.protocols import Hold
 from vram_arbiter.schemas.errors import BadState, ConfigError, RunnerUnreachable, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 
+pytestmark = pytest.mark.anyio
+
 RSKILL = "vram-arbiter/so101-navigate"
 Serving = Callable[[], Any]
 
@@ -48,11 +50,10 @@ def serving(
     return serve
 
 
-def test_a_session_by_commands_alone(
+async def test_a_session_by_commands_alone(
     serving: Serving,
     endpoint: str,
     env: Any,
-    run_async: Callable[[Any], Any],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
@@ -64,53 +65,45 @@ def test_a_session_by_commands_alone(
         args = parse([*argv, "--endpoint", endpoint])
         return int(await args.run(args))
 
-    async def session() -> None:
-        early = asyncio.create_task(command("state", "--json"))  # the runner is still starting
-        while "waiting for a runner at" not in caplog.text:
-            await asyncio.sleep(0.01)
-        async with serving():
-            assert await early == 0
-            state = json.loads(capsys.readouterr().out)
-            assert (state["cameras"], state["goal"]) == (["front"], None)
-            assert await command("state") == 0
-            assert "cameras   front" in capsys.readouterr().out
+    early = asyncio.create_task(command("state", "--json"))  # the runner is still starting
+    while "waiting for a runner at" not in caplog.text:
+        await asyncio.sleep(0.01)
+    async with serving():
+        assert await early == 0
+        state = json.loads(capsys.readouterr().out)
+        assert (state["cameras"], state["goal"]) == (["front"], None)
+        assert await command("state") == 0
+        assert "cameras   front" in capsys.readouterr().out
 
-            assert await command("goal", RSKILL, "nod", "--params", '{"times": 3}') == 0
-            said = capsys.readouterr()
-            result = json.loads(said.out)
-            assert (result["status"], result["data"]["nods"]) == ("succeeded", 3)
-            with pytest.raises(UnknownSkill):
-                await command("goal", "vram-arbiter/none")
+        assert await command("goal", RSKILL, "nod", "--params", '{"times": 3}') == 0
+        said = capsys.readouterr()
+        result = json.loads(said.out)
+        assert (result["status"], result["data"]["nods"]) == ("succeeded", 3)
+        with pytest.raises(UnknownSkill):
+            await command("goal", "vram-arbiter/none")
 
-            picture = tmp_path / "front.png"
-            assert await command("frame", "--out", str(picture), "--max-age-ms", "60000") == 0
-            assert picture.read_bytes().startswith(b"\x89PNG")
-            with pytest.raises(ConfigError, match=r"ends in \.jpg or \.png"):
-                await command("frame", "--out", str(tmp_path / "front.gif"))
+        picture = tmp_path / "front.png"
+        assert await command("frame", "--out", str(picture), "--max-age-ms", "60000") == 0
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        with pytest.raises(ConfigError, match=r"ends in \.jpg or \.png"):
+            await command("frame", "--out", str(tmp_path / "front.gif"))
 
-            assert await command("reset", "--seed", "7") == 0
-            assert await command("reset") == 0
-            assert env.resets == [4, 7, 7]
-            with pytest.raises(BadState, match="records nothing"):
-                await command("mark", "success")
-
-    run_async(session())
+        assert await command("reset", "--seed", "7") == 0
+        assert await command("reset") == 0
+        assert env.resets == [4, 7, 7]
+        with pytest.raises(BadState, match="records nothing"):
+            await command("mark", "success")
 
 
-def test_the_scene_of_a_goal_is_not_reset(
-    serving: Serving, endpoint: str, env: Any, run_async: Callable[[Any], Any]
-) -> None:
-    async def body() -> None:
-        async with serving(), RunnerClient(endpoint) as client:
-            assert (await (await client.send_goal(RSKILL)).result(60))["success"]
-            goal = await client.send_goal(RSKILL, max_ticks=100_000)
-            with pytest.raises(BadState, match="is running"):
-                await client.reset(3)
-            await goal.cancel()
-            assert (await goal.result(60))["status"] == "canceled"
-            assert env.resets == [4]
-
-    run_async(body())
+async def test_the_scene_of_a_goal_is_not_reset(serving: Serving, endpoint: str, env: Any) -> None:
+    async with serving(), RunnerClient(endpoint) as client:
+        assert (await (await client.send_goal(RSKILL)).result(60))["success"]
+        goal = await client.send_goal(RSKILL, max_ticks=100_000)
+        with pytest.raises(BadState, match="is running"):
+            await client.reset(3)
+        await goal.cancel()
+        assert (await goal.result(60))["status"] == "canceled"
+        assert env.resets == [4]
 
 
 def test_a_runner_that_never_comes_is_unreachable(

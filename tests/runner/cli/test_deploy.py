@@ -22,7 +22,7 @@ from vram_arbiter.runner.cli.deploy import claim
 from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
 from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, InternalError, UnknownSkill
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e]
 
 ROOT = Path(__file__).parents[3]
 RSKILL = "vram-arbiter/so101-navigate"
@@ -288,7 +288,7 @@ def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_r
     assert not mark.exists()  # a person ended it
 
 
-def test_a_port_has_one_runner_whatever_its_robots_are_called(
+async def test_a_port_has_one_runner_whatever_its_robots_are_called(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two files of one arm, copied and renamed, would both drive its motors."""
@@ -303,16 +303,11 @@ def test_a_port_has_one_runner_whatever_its_robots_are_called(
             hal=HalConfig(adapter="lerobot:so101_follower", transport={"port": str(port)}),
         )
 
-    async def scenario() -> None:
-        async with contextlib.AsyncExitStack() as stack:
-            claim(robot("left", bus), stack)
-            with pytest.raises(
-                AlreadyRunning, match=rf"pid {os.getpid()}\) already uses port .*by-id"
-            ):
-                claim(robot("right", link), stack)
-            claim(robot("other", tmp_path / "ttyACM1"), stack)
-
-    asyncio.run(scenario())
+    async with contextlib.AsyncExitStack() as stack:
+        claim(robot("left", bus), stack)
+        with pytest.raises(AlreadyRunning, match=rf"pid {os.getpid()}\) already uses port .*by-id"):
+            claim(robot("right", link), stack)
+        claim(robot("other", tmp_path / "ttyACM1"), stack)
 
 
 def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:

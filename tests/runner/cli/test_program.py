@@ -18,6 +18,8 @@ from vram_arbiter.runner.cli.common import sidecars_given
 from vram_arbiter.runner.goals.catalogue import sidecar_endpoint
 from vram_arbiter.schemas.errors import ConfigError
 
+pytestmark = pytest.mark.anyio
+
 Run = Callable[[Any], Any]
 ROOT = Path(__file__).parents[3]
 
@@ -189,10 +191,7 @@ def test_where_a_sidecar_is() -> None:
         sidecars_given(["=x"])
 
 
-def test_a_runner_that_is_not_there_is_unreachable(tmp_path: Path, run_async: Run) -> None:
-    async def scenario() -> None:
-        async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=0.2) as client:
-            with pytest.raises(RunnerUnreachable):
-                await client.skills()
-
-    run_async(scenario())
+async def test_a_runner_that_is_not_there_is_unreachable(tmp_path: Path) -> None:
+    async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=0.2) as client:
+        with pytest.raises(RunnerUnreachable):
+            await client.skills()

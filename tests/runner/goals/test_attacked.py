@@ -5,10 +5,9 @@ loop ticks, and a stop is answered.
 import asyncio
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,11 +23,10 @@ from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import EstopRequested
 from vram_arbiter.schemas.manifest import Kind, load_manifest
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 ATTACKER = SUPPORT / "attacker.py"
 RSKILL = "vram-arbiter/so101-navigate"
-Run = Callable[[Any], Any]
 
 
 @asynccontextmanager
@@ -70,28 +68,25 @@ async def attacked(endpoint: str, mode: str) -> AsyncIterator[None]:
 
 
 @pytest.mark.parametrize("mode", ["empties", "maps", "more", "connects"])
-def test_goals_ticks_and_the_stop_of_an_attacked_runner(
-    endpoint: str, navigate_manifest: Path, run_async: Run, mode: str
+async def test_goals_ticks_and_the_stop_of_an_attacked_runner(
+    endpoint: str, navigate_manifest: Path, mode: str
 ) -> None:
     """Regression: empty frames delayed a stop by 20.9 s, maps stopped the control loop for 2.6 s,
     connects ended the process at 1,024, and MORE took memory without end.
     """
 
-    async def scenario() -> None:
-        async with serving(endpoint, navigate_manifest) as runner, RunnerClient(endpoint) as client:
-            await client.ping(timeout_s=60.0)
-            async with (
-                attacked(endpoint, mode),
-                RunnerClient(endpoint, connect_timeout_s=60.0, timeout_s=60.0) as another,
-            ):
-                for one in (client, another):
-                    goal = await one.send_goal(RSKILL)
-                    assert (await goal.result(60))["success"]
-                ticks = runner.tick_idx
-                while runner.tick_idx < ticks + 20:
-                    await another.state()
-                assert "stand still" in (await another.estop("smoke")).message
-                with pytest.raises(EstopRequested):
-                    await another.send_goal(RSKILL)
-
-    run_async(scenario())
+    async with serving(endpoint, navigate_manifest) as runner, RunnerClient(endpoint) as client:
+        await client.ping(timeout_s=60.0)
+        async with (
+            attacked(endpoint, mode),
+            RunnerClient(endpoint, connect_timeout_s=60.0, timeout_s=60.0) as another,
+        ):
+            for one in (client, another):
+                goal = await one.send_goal(RSKILL)
+                assert (await goal.result(60))["success"]
+            ticks = runner.tick_idx
+            while runner.tick_idx < ticks + 20:
+                await another.state()
+            assert "stand still" in (await another.estop("smoke")).message
+            with pytest.raises(EstopRequested):
+                await another.send_goal(RSKILL)

@@ -16,36 +16,30 @@ from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas.errors import BadRequest, FrameStale
 from vram_arbiter.schemas.world import CameraModel
 
-pytestmark = pytest.mark.heavy  # pictures: numpy, OpenCV
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy]  # pictures: numpy, OpenCV
 
-Run = Callable[[Any], Any]
 Make = Callable[..., Any]
 
 
-def test_the_first_camera_is_the_default(make_runner: Make, run_async: Run) -> None:
+async def test_the_first_camera_is_the_default(make_runner: Make) -> None:
     import cv2
     import numpy as np
 
-    async def scenario() -> None:
-        runner = make_runner(rate_hz=200.0, cameras=("front", "wrist"))
-        async with ControlThread(runner) as control:
-            for camera, encoding, magic in (
-                ("", "png", b"\x89PNG"),
-                ("wrist", "jpeg", b"\xff\xd8"),
-            ):
-                reply = await frames.fetch(control, SystemClock(), camera, 60_000.0, encoding)
-                assert reply["camera"] == (camera or "front")
-                assert reply["data"].startswith(magic)
-                picture = cv2.imdecode(
-                    np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR
-                )
-                assert picture.shape == (24, 32, 3) == (reply["height"], reply["width"], 3)
-                assert 0 <= reply["age_ms"] <= 60_000
-                CameraModel.model_validate(reply["camera_model"])
-            with pytest.raises(BadRequest, match="front, wrist"):
-                await frames.fetch(control, SystemClock(), "rear", 500.0, "png")
-
-    run_async(scenario())
+    runner = make_runner(rate_hz=200.0, cameras=("front", "wrist"))
+    async with ControlThread(runner) as control:
+        for camera, encoding, magic in (
+            ("", "png", b"\x89PNG"),
+            ("wrist", "jpeg", b"\xff\xd8"),
+        ):
+            reply = await frames.fetch(control, SystemClock(), camera, 60_000.0, encoding)
+            assert reply["camera"] == (camera or "front")
+            assert reply["data"].startswith(magic)
+            picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
+            assert picture.shape == (24, 32, 3) == (reply["height"], reply["width"], 3)
+            assert 0 <= reply["age_ms"] <= 60_000
+            CameraModel.model_validate(reply["camera_model"])
+        with pytest.raises(BadRequest, match="front, wrist"):
+            await frames.fetch(control, SystemClock(), "rear", 500.0, "png")
 
 
 def test_png_is_lossless_and_in_rgb_order() -> None:
@@ -57,8 +51,8 @@ def test_png_is_lossless_and_in_rgb_order() -> None:
     assert (decoded[..., ::-1] == picture).all()
 
 
-def test_a_control_loop_that_hangs_gives_no_picture(
-    make_runner: Make, run_async: Run, monkeypatch: pytest.MonkeyPatch
+async def test_a_control_loop_that_hangs_gives_no_picture(
+    make_runner: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frames, "FIRST_FRAME_GRACE_S", 0.05)
     hung, released = threading.Event(), threading.Event()
@@ -67,30 +61,24 @@ def test_a_control_loop_that_hangs_gives_no_picture(
         hung.set()
         released.wait(60)
 
-    async def scenario() -> None:
-        runner = make_runner(rate_hz=200.0, cameras=("front",))
-        async with ControlThread(runner) as control:
-            hanging = asyncio.create_task(control.call(hang))
-            await asyncio.to_thread(hung.wait, 60)
-            try:
-                with pytest.raises(FrameStale, match="has given no frame"):
-                    await frames.fetch(control, SystemClock(), "front", 20.0, "png")
-            finally:
-                released.set()
-                await hanging
-
-    run_async(scenario())
+    runner = make_runner(rate_hz=200.0, cameras=("front",))
+    async with ControlThread(runner) as control:
+        hanging = asyncio.create_task(control.call(hang))
+        await asyncio.to_thread(hung.wait, 60)
+        try:
+            with pytest.raises(FrameStale, match="has given no frame"):
+                await frames.fetch(control, SystemClock(), "front", 20.0, "png")
+        finally:
+            released.set()
+            await hanging
 
 
-def test_an_old_picture_is_never_served(make_runner: Make, run_async: Run, clock: Any) -> None:
+async def test_an_old_picture_is_never_served(make_runner: Make, clock: Any) -> None:
     class Late(SystemClock):
         def now_ns(self) -> int:
             return super().now_ns() + 70 * 10**9
 
-    async def scenario() -> None:
-        runner = make_runner(rate_hz=200.0, cameras=("front",))
-        async with ControlThread(runner) as control:
-            with pytest.raises(FrameStale, match="60000 ms are accepted"):
-                await frames.fetch(control, Late(), "front", 60_000.0, "png")
-
-    run_async(scenario())
+    runner = make_runner(rate_hz=200.0, cameras=("front",))
+    async with ControlThread(runner) as control:
+        with pytest.raises(FrameStale, match="60000 ms are accepted"):
+            await frames.fetch(control, Late(), "front", 60_000.0, "png")

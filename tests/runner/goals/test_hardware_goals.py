@@ -34,7 +34,8 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 from vram_arbiter.schemas.world import WorldState
 
-Run = Callable[[Any], Any]
+pytestmark = pytest.mark.anyio
+
 RSKILL = "vram-arbiter/so101-navigate"
 
 
@@ -113,17 +114,22 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
     return serving
 
 
-def on_bench(
-    run_async: Run,
+@pytest.fixture
+async def serving(
     bench: Callable[..., Any],
-    body: Callable[[Bench, RunnerClient], Any],
-    **options: Any,
-) -> None:
-    async def scenario() -> None:
-        async with bench(**options) as (b, client):
-            await body(b, client)
+) -> AsyncIterator[tuple[Bench, RunnerClient]]:
+    async with bench() as made:
+        yield made
 
-    run_async(scenario())
+
+@pytest.fixture
+def b(serving: tuple[Bench, RunnerClient]) -> Bench:
+    return serving[0]
+
+
+@pytest.fixture
+def client(serving: tuple[Bench, RunnerClient]) -> RunnerClient:
+    return serving[1]
 
 
 async def diagnosed(client: RunnerClient, as_what: str) -> None:
@@ -147,38 +153,33 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
-def test_the_stop_fails_the_goal_and_refuses_new_ones(
-    bench: Any, run_async: Run, prompt: str
+async def test_the_stop_fails_the_goal_and_refuses_new_ones(
+    b: Bench, client: RunnerClient, prompt: str
 ) -> None:
-    async def body(b: Bench, client: RunnerClient) -> None:
-        goal = await client.send_goal(RSKILL, prompt=prompt)
-        await b.skill.begun.wait()
-        reply = await client.estop("a hand is in the way")
-        assert "a hand is in the way; all joints stand still" in reply.message
-        assert b.twin.story == ["connect", "halt"]
-        sent = len(b.twin.sent)
-        result = await goal.result(60)
-        assert (result["status"], result["success"], result["code"]) == (
-            "failed",
-            False,
-            "estop_requested",
-        )
-        with pytest.raises(EstopRequested, match="a hand is in the way"):
-            await client.send_goal(RSKILL, prompt="nod")
-        state = await client.state()
-        assert "a hand is in the way" in state["estop"]
-        await diagnosed(client, "ok")  # it can still be looked at
-        again = await client.estop("once more")
-        assert "a hand is in the way" in again.message
-        assert len(b.twin.sent) == sent
-
-    on_bench(run_async, bench, body)
+    goal = await client.send_goal(RSKILL, prompt=prompt)
+    await b.skill.begun.wait()
+    reply = await client.estop("a hand is in the way")
+    assert "a hand is in the way; all joints stand still" in reply.message
+    assert b.twin.story == ["connect", "halt"]
+    sent = len(b.twin.sent)
+    result = await goal.result(60)
+    assert (result["status"], result["success"], result["code"]) == (
+        "failed",
+        False,
+        "estop_requested",
+    )
+    with pytest.raises(EstopRequested, match="a hand is in the way"):
+        await client.send_goal(RSKILL, prompt="nod")
+    state = await client.state()
+    assert "a hand is in the way" in state["estop"]
+    await diagnosed(client, "ok")  # it can still be looked at
+    again = await client.estop("once more")
+    assert "a hand is in the way" in again.message
+    assert len(b.twin.sent) == sent
 
 
-def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
-    bench: Any, run_async: Run
-) -> None:
-    async def body(b: Bench, client: RunnerClient) -> None:
+async def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any) -> None:
+    async with bench(estop_s=0.5) as (b, client):
         await client.send_goal(RSKILL, prompt="hang in the step")
         await b.skill.begun.wait()
         with pytest.raises(InternalError, match="cut the robot's power"):
@@ -190,33 +191,25 @@ def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(
             await asyncio.sleep(0.01)
         assert b.twin.sent == []  # what the step came back with was not sent
 
-    on_bench(run_async, bench, body, estop_s=0.5)
 
-
-def test_what_was_fresh_is_stale_while_the_loop_hangs(bench: Any, run_async: Run) -> None:
+async def test_what_was_fresh_is_stale_while_the_loop_hangs(b: Bench, client: RunnerClient) -> None:
     """Regression: `state` showed the last world state, which was fresh when it was made."""
 
-    async def body(b: Bench, client: RunnerClient) -> None:
-        await client.send_goal(RSKILL, prompt="hang in the step")
-        await b.skill.begun.wait()
-        await diagnosed(client, "stale")
-        b.skill.go_on.set()
-        await diagnosed(client, "ok")
-
-    on_bench(run_async, bench, body)
+    await client.send_goal(RSKILL, prompt="hang in the step")
+    await b.skill.begun.wait()
+    await diagnosed(client, "stale")
+    b.skill.go_on.set()
+    await diagnosed(client, "ok")
 
 
 @pytest.mark.usefixtures("patient")
-def test_the_command_line_stops_the_robot(
-    bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str]
+async def test_the_command_line_stops_the_robot(
+    b: Bench, endpoint: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    async def body(b: Bench, client: RunnerClient) -> None:
-        argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
-        assert await asyncio.to_thread(main, argv) == 0
-        assert b.runner.estop is not None
-        assert b.twin.story == ["connect", "halt"]
-
-    on_bench(run_async, bench, body)
+    argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
+    assert await asyncio.to_thread(main, argv) == 0
+    assert b.runner.estop is not None
+    assert b.twin.story == ["connect", "halt"]
     assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
 
 
@@ -224,39 +217,40 @@ def test_the_command_line_stops_the_robot(
 @pytest.mark.parametrize(
     "cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")]
 )
-def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
-    bench: Any, run_async: Run, endpoint: str, capfd: pytest.CaptureFixture[str], cause: Exception
+async def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
+    b: Bench,
+    client: RunnerClient,
+    endpoint: str,
+    capfd: pytest.CaptureFixture[str],
+    cause: Exception,
 ) -> None:
     """Regression: the runner counted the attempt as the stop: a lost packet left the motors running
     and the command exited 0."""
 
-    async def body(b: Bench, client: RunnerClient) -> None:
-        b.twin.halt_breaks = cause
-        goal = await client.send_goal(RSKILL, prompt="nod")
-        await b.skill.begun.wait()
-        argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
-        assert await asyncio.to_thread(main, argv) == 1
-        assert "cut the robot's power" in capfd.readouterr().err
-        assert (await goal.result(60))["code"] == "estop_requested"
-        assert "halt" not in b.twin.story
-        b.twin.halt_breaks = None  # the bus is back: nobody has to ask again
-        while "halt" not in b.twin.story:
-            await client.state()
-        assert await asyncio.to_thread(main, argv) == 0
-        said = capfd.readouterr().out
-        assert "emergency stop: smoke; all joints stand still" in said
-        assert b.twin.story.count("halt") == 1
-
-    on_bench(run_async, bench, body)
+    b.twin.halt_breaks = cause
+    goal = await client.send_goal(RSKILL, prompt="nod")
+    await b.skill.begun.wait()
+    argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
+    assert await asyncio.to_thread(main, argv) == 1
+    assert "cut the robot's power" in capfd.readouterr().err
+    assert (await goal.result(60))["code"] == "estop_requested"
+    assert "halt" not in b.twin.story
+    b.twin.halt_breaks = None  # the bus is back: nobody has to ask again
+    while "halt" not in b.twin.story:
+        await client.state()
+    assert await asyncio.to_thread(main, argv) == 0
+    said = capfd.readouterr().out
+    assert "emergency stop: smoke; all joints stand still" in said
+    assert b.twin.story.count("halt") == 1
 
 
-def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
-    bench: Any, run_async: Run
+async def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
+    bench: Any,
 ) -> None:
     """Regression: requests that waited for a hanging control loop held all slots, so a stop was not
     read."""
 
-    async def body(b: Bench, client: RunnerClient) -> None:
+    async with bench(estop_s=0.5) as (b, client):
         await client.send_goal(RSKILL, prompt="hang in the step")
         await b.skill.begun.wait()
         flood = [asyncio.create_task(client.frame("front", max_age_ms=60_000)) for _ in range(100)]
@@ -269,24 +263,22 @@ def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read
         assert any(isinstance(answer, LimitExceeded) for answer in answers)
         assert b.twin.sent == []
 
-    on_bench(run_async, bench, body, estop_s=0.5)
-
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
-def test_a_stop_is_not_refused_for_its_words(bench: Any, run_async: Run, reason: str) -> None:
+async def test_a_stop_is_not_refused_for_its_words(
+    b: Bench, client: RunnerClient, reason: str
+) -> None:
     """Regression: a reason of more than 500 characters made the runner refuse the stop."""
 
-    async def body(b: Bench, client: RunnerClient) -> None:
-        assert "stand still" in (await client.estop(reason)).message
-        assert b.runner.estop is not None
-        assert b.twin.story == ["connect", "halt"]
-
-    on_bench(run_async, bench, body)
+    assert "stand still" in (await client.estop(reason)).message
+    assert b.runner.estop is not None
+    assert b.twin.story == ["connect", "halt"]
 
 
-def test_whoever_names_no_endpoint_stops_the_system_service_too(
+async def test_whoever_names_no_endpoint_stops_the_system_service_too(
+    b: Bench,
+    client: RunnerClient,
     bench: Any,
-    run_async: Run,
     endpoint: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -300,23 +292,20 @@ def test_whoever_names_no_endpoint_stops_the_system_service_too(
         endpoint.removeprefix("ipc://").rpartition("/")[0],
     )
 
-    async def body(b: Bench, client: RunnerClient) -> None:
-        assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
-        assert b.twin.story == ["connect", "halt"]
-        (tmp_path / "of-this-login").mkdir()
-        (
-            tmp_path / "of-this-login" / "runner.sock"
-        ).touch()  # nobody answers there: was that the robot that moves?
-        assert await asyncio.to_thread(main, ["estop"]) == 1
-        said = capfd.readouterr()
-        assert said.out.count("bench: emergency stop: smoke") == 2
-        assert "cut its power" in said.err
-
-    on_bench(run_async, bench, body)
+    assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
+    assert b.twin.story == ["connect", "halt"]
+    (tmp_path / "of-this-login").mkdir()
+    (
+        tmp_path / "of-this-login" / "runner.sock"
+    ).touch()  # nobody answers there: was that the robot that moves?
+    assert await asyncio.to_thread(main, ["estop"]) == 1
+    said = capfd.readouterr()
+    assert said.out.count("bench: emergency stop: smoke") == 2
+    assert "cut its power" in said.err
 
 
-def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
-    bench: Any, run_async: Run, endpoint: str, monkeypatch: pytest.MonkeyPatch
+async def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
+    b: Bench, client: RunnerClient, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: the path was checked before anything was stopped."""
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
@@ -325,11 +314,8 @@ def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_fr
         endpoint.removeprefix("ipc://").rpartition("/")[0],
     )
 
-    async def body(b: Bench, client: RunnerClient) -> None:
-        assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
-        assert b.twin.story == ["connect", "halt"]
-
-    on_bench(run_async, bench, body)
+    assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
+    assert b.twin.story == ["connect", "halt"]
 
 
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
@@ -351,48 +337,41 @@ def test_a_stop_that_nobody_hears_is_an_error(
     assert "cut its power" in capsys.readouterr().err
 
 
-def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(bench: Any, run_async: Run) -> None:
-    async def body(b: Bench, client: RunnerClient) -> None:
-        goal = await client.send_goal(RSKILL, prompt="nod")
-        await b.skill.begun.wait()
-        await goal.cancel()
-        assert (await goal.result(60))["status"] == "canceled"
-        sent = len(b.twin.sent)
-        ticks = (await client.state())["ticks"]
-        while (await client.state())["ticks"] < ticks + 5:
-            pass
-        assert len(b.twin.sent) == sent
-        assert (await client.state())["estop"] is None
+async def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(
+    b: Bench, client: RunnerClient
+) -> None:
+    goal = await client.send_goal(RSKILL, prompt="nod")
+    await b.skill.begun.wait()
+    await goal.cancel()
+    assert (await goal.result(60))["status"] == "canceled"
+    sent = len(b.twin.sent)
+    ticks = (await client.state())["ticks"]
+    while (await client.state())["ticks"] < ticks + 5:
+        pass
+    assert len(b.twin.sent) == sent
+    assert (await client.state())["estop"] is None
 
-    on_bench(run_async, bench, body)
 
-
-def test_a_goal_is_limited_in_ticks(bench: Any, run_async: Run) -> None:
-    async def body(b: Bench, client: RunnerClient) -> None:
-        goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
-        result = await goal.result(60)
-        assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
-        assert (
-            result["data"]["ticks"] >= 4
-        )  # more where the machine stood still, and the skill was not asked
-        assert b.skill.taken <= 4
-
-    on_bench(run_async, bench, body)
+async def test_a_goal_is_limited_in_ticks(b: Bench, client: RunnerClient) -> None:
+    goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
+    result = await goal.result(60)
+    assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
+    assert (
+        result["data"]["ticks"] >= 4
+    )  # more where the machine stood still, and the skill was not asked
+    assert b.skill.taken <= 4
 
 
 @pytest.mark.heavy
-def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
-    bench: Any, run_async: Run
+async def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
+    b: Bench, client: RunnerClient
 ) -> None:
-    async def body(b: Bench, client: RunnerClient) -> None:
-        import cv2
-        import numpy as np
+    import cv2
+    import numpy as np
 
-        reply = await client.frame("front", max_age_ms=60_000, encoding="png")
-        picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
-        assert picture.tolist() == [[[255, 0, 0], [0, 0, 255]]]
-        b.camera.stop()
-        with pytest.raises(FrameStale, match="stopped"):
-            await client.frame("front", max_age_ms=60_000)
-
-    on_bench(run_async, bench, body)
+    reply = await client.frame("front", max_age_ms=60_000, encoding="png")
+    picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
+    assert picture.tolist() == [[[255, 0, 0], [0, 0, 255]]]
+    b.camera.stop()
+    with pytest.raises(FrameStale, match="stopped"):
+        await client.frame("front", max_age_ms=60_000)

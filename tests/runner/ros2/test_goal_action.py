@@ -19,7 +19,7 @@ from vram_arbiter.runner.ros2 import action_server
 from vram_arbiter.runner.ros2.action_server import ActionServer
 from vram_arbiter.runner.ros2.goal_action import INTERFACE, RunnerGoals
 
-pytestmark = pytest.mark.heavy
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy]
 pytest.importorskip("cyclonedds")
 
 from cyclonedds.core import Policy, Qos  # noqa: E402
@@ -236,81 +236,70 @@ def served_action(
     return both
 
 
-def test_goals_are_served_with_feedback_status_and_result(
-    served_action: Serving, run_async: Any
+async def test_goals_are_served_with_feedback_status_and_result(served_action: Serving) -> None:
+    async with served_action() as (bench, commander):
+        goal_id = await commander.goal("end", params='{"deep": {"er": [1]}}')
+        assert goal_id is not None
+        told = await commander.ended(goal_id)
+        assert (told.status, told.result.success, told.result.failure_reason) == (4, True, "")
+        assert len(told.result.trace_id) == 32
+        await commander.status(goal_id, 4)
+
+        failing = await commander.goal("defect")
+        assert failing is not None
+        told = await commander.ended(failing)
+        assert (told.status, told.result.success) == (6, False)
+        assert "oops" in told.result.failure_reason
+
+        assert await commander.goal("end", rskill="a/unknown") is None
+        assert await commander.goal("end", params="[1]") is None
+        assert await commander.goal("end", params="{") is None
+        assert (await commander.ended(UUID_(uuid.uuid4().bytes))).status == 0
+        assert bench.made[0].story.count("finish") == 2
+
+
+async def test_a_goal_is_canceled_alone_with_all_others_and_when_the_server_ends(
+    served_action: Serving,
 ) -> None:
-    async def scenario() -> None:
-        async with served_action() as (bench, commander):
-            goal_id = await commander.goal("end", params='{"deep": {"er": [1]}}')
-            assert goal_id is not None
-            told = await commander.ended(goal_id)
-            assert (told.status, told.result.success, told.result.failure_reason) == (4, True, "")
-            assert len(told.result.trace_id) == 32
-            await commander.status(goal_id, 4)
+    async with served_action() as (bench, commander):
+        first = await commander.goal("forever")
+        assert first is not None
+        assert (await commander.heard(first)).state in ("loading", "warming", "executing")
+        assert await commander.goal("end") is None, "the runner has one goal at a time"
+        unknown = await commander.canceled(UUID_(uuid.uuid4().bytes))
+        assert (unknown.return_code, unknown.goals_canceling) == (2, [])
+        told = await commander.canceled(first)
+        assert (told.return_code, [g.goal_id for g in told.goals_canceling]) == (0, [first])
+        assert (await commander.ended(first)).status == 5
+        assert (await commander.canceled(first)).return_code == 3
 
-            failing = await commander.goal("defect")
-            assert failing is not None
-            told = await commander.ended(failing)
-            assert (told.status, told.result.success) == (6, False)
-            assert "oops" in told.result.failure_reason
+        second = await commander.goal("forever")
+        assert second is not None
+        told = await commander.canceled(NO_ID)
+        assert [goal.goal_id for goal in told.goals_canceling] == [second]
+        assert (await commander.ended(second)).status == 5
 
-            assert await commander.goal("end", rskill="a/unknown") is None
-            assert await commander.goal("end", params="[1]") is None
-            assert await commander.goal("end", params="{") is None
-            assert (await commander.ended(UUID_(uuid.uuid4().bytes))).status == 0
-            assert bench.made[0].story.count("finish") == 2
-
-    run_async(scenario())
-
-
-def test_a_goal_is_canceled_alone_with_all_others_and_when_the_server_ends(
-    served_action: Serving, run_async: Any
-) -> None:
-    async def scenario() -> None:
-        async with served_action() as (bench, commander):
-            first = await commander.goal("forever")
-            assert first is not None
-            assert (await commander.heard(first)).state in ("loading", "warming", "executing")
-            assert await commander.goal("end") is None, "the runner has one goal at a time"
-            unknown = await commander.canceled(UUID_(uuid.uuid4().bytes))
-            assert (unknown.return_code, unknown.goals_canceling) == (2, [])
-            told = await commander.canceled(first)
-            assert (told.return_code, [g.goal_id for g in told.goals_canceling]) == (0, [first])
-            assert (await commander.ended(first)).status == 5
-            assert (await commander.canceled(first)).return_code == 3
-
-            second = await commander.goal("forever")
-            assert second is not None
-            told = await commander.canceled(NO_ID)
-            assert [goal.goal_id for goal in told.goals_canceling] == [second]
-            assert (await commander.ended(second)).status == 5
-
-            third = await commander.goal("forever")
-            assert third is not None
-            await bench.made[0].begun.wait()
-            asked = asyncio.create_task(commander.ended(third))
-            await commander.status(third, 2)
-        told = await asked
-        assert told.status == 5, "whoever leaves does not leave a robot that moves"
-        assert bench.made[0].story.count("finish") == 3
-
-    run_async(scenario())
+        third = await commander.goal("forever")
+        assert third is not None
+        await bench.made[0].begun.wait()
+        asked = asyncio.create_task(commander.ended(third))
+        await commander.status(third, 2)
+    told = await asked
+    assert told.status == 5, "whoever leaves does not leave a robot that moves"
+    assert bench.made[0].story.count("finish") == 3
 
 
-def test_goals_that_ended_are_forgotten_in_the_end(
-    served_action: Serving, run_async: Any, monkeypatch: pytest.MonkeyPatch
+async def test_goals_that_ended_are_forgotten_in_the_end(
+    served_action: Serving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(action_server, "GOALS_KEPT", 2)
 
-    async def scenario() -> None:
-        async with served_action() as (_, commander):
-            first = await commander.goal("end")
-            assert first is not None
-            await commander.ended(first)
-            for _ in range(2):
-                goal_id = await commander.goal("end")
-                assert goal_id is not None
-                assert (await commander.ended(goal_id)).status == 4
-            assert (await commander.ended(first)).status == 0
-
-    run_async(scenario())
+    async with served_action() as (_, commander):
+        first = await commander.goal("end")
+        assert first is not None
+        await commander.ended(first)
+        for _ in range(2):
+            goal_id = await commander.goal("end")
+            assert goal_id is not None
+            assert (await commander.ended(goal_id)).status == 4
+        assert (await commander.ended(first)).status == 0

@@ -5,7 +5,6 @@ it.
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,7 +16,8 @@ from vram_arbiter.schemas.errors import BadState, ManifestInvalid, SidecarUnavai
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.world import WorldState
 
-Run = Callable[[Any], Any]
+pytestmark = pytest.mark.anyio
+
 GOAL = Goal("g", "r", prompt="now")
 
 
@@ -63,189 +63,152 @@ def skill(navigate_manifest: Path) -> Callable[..., Recording]:
     return make
 
 
-def test_the_same_key_is_reused_whatever_the_prompt(
-    skill: Callable[..., Recording], run_async: Run
-) -> None:
-    async def scenario() -> None:
-        residency, made = Residency(), skill()
-        for prompt in ("red", "blue"):
-            got = await residency.acquire(made.key, lambda: made)
-            await got.start(Goal("g", "r", prompt=prompt))
-            await got.finish()
-        assert made.story == ["start red", "finish", "start blue", "finish"]
-
-    run_async(scenario())
+async def test_the_same_key_is_reused_whatever_the_prompt(skill: Callable[..., Recording]) -> None:
+    residency, made = Residency(), skill()
+    for prompt in ("red", "blue"):
+        got = await residency.acquire(made.key, lambda: made)
+        await got.start(Goal("g", "r", prompt=prompt))
+        await got.finish()
+    assert made.story == ["start red", "finish", "start blue", "finish"]
 
 
 @pytest.mark.parametrize("fails", ["", "release"])
-def test_another_key_makes_the_old_one_leave_first(
-    skill: Callable[..., Recording], run_async: Run, fails: str
+async def test_another_key_makes_the_old_one_leave_first(
+    skill: Callable[..., Recording], fails: str
 ) -> None:
-    async def scenario() -> None:
-        residency, old, new = Residency(), skill("1", fails=fails), skill("2")
-        await residency.acquire(old.key, lambda: old)
-        assert await residency.acquire(new.key, lambda: new) is new
-        assert old.story == ["release"]
-        assert residency.resident == new.key
-        await residency.close()
-        assert new.story == ["release"]
-        assert residency.resident is None
-
-    run_async(scenario())
+    residency, old, new = Residency(), skill("1", fails=fails), skill("2")
+    await residency.acquire(old.key, lambda: old)
+    assert await residency.acquire(new.key, lambda: new) is new
+    assert old.story == ["release"]
+    assert residency.resident == new.key
+    await residency.close()
+    assert new.story == ["release"]
+    assert residency.resident is None
 
 
-def test_a_gpu_free_skill_makes_nobody_leave(
-    skill: Callable[..., Recording], run_async: Run
-) -> None:
-    async def scenario() -> None:
-        residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False)
-        await residency.acquire(policy.key, lambda: policy)
-        assert await residency.acquire(drive.key, lambda: drive) is drive
-        assert await residency.acquire(drive.key, lambda: skill()) is drive
-        assert policy.story == []
-        assert residency.resident == policy.key
-
-    run_async(scenario())
+async def test_a_gpu_free_skill_makes_nobody_leave(skill: Callable[..., Recording]) -> None:
+    residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False)
+    await residency.acquire(policy.key, lambda: policy)
+    assert await residency.acquire(drive.key, lambda: drive) is drive
+    assert await residency.acquire(drive.key, lambda: skill()) is drive
+    assert policy.story == []
+    assert residency.resident == policy.key
 
 
-def test_a_skill_that_cannot_be_made_leaves_the_resident_one_alone(
-    skill: Callable[..., Recording], run_async: Run
+async def test_a_skill_that_cannot_be_made_leaves_the_resident_one_alone(
+    skill: Callable[..., Recording],
 ) -> None:
     def broken() -> Recording:
         raise ManifestInvalid("no")
 
-    async def scenario() -> None:
-        residency, old = Residency(), skill("1")
-        await residency.acquire(old.key, lambda: old)
-        with pytest.raises(ManifestInvalid):
-            await residency.acquire(SkillKey("x"), broken)
-        assert residency.resident == old.key
-        assert old.story == []
-
-    run_async(scenario())
+    residency, old = Residency(), skill("1")
+    await residency.acquire(old.key, lambda: old)
+    with pytest.raises(ManifestInvalid):
+        await residency.acquire(SkillKey("x"), broken)
+    assert residency.resident == old.key
+    assert old.story == []
 
 
-def test_a_failed_start_is_cleaned_up_and_can_be_tried_again(
-    skill: Callable[..., Recording], run_async: Run
+async def test_a_failed_start_is_cleaned_up_and_can_be_tried_again(
+    skill: Callable[..., Recording],
 ) -> None:
-    async def scenario() -> None:
-        made = skill(fails="start")
-        with pytest.raises(SidecarUnavailable):
-            await made.start(Goal("g", "r"))
-        assert made.story == ["start ", "finish"]
-        made.fails = ""
+    made = skill(fails="start")
+    with pytest.raises(SidecarUnavailable):
         await made.start(Goal("g", "r"))
-        assert made.state == "active"
+    assert made.story == ["start ", "finish"]
+    made.fails = ""
+    await made.start(Goal("g", "r"))
+    assert made.state == "active"
 
-    run_async(scenario())
 
-
-def test_steps_out_of_order_are_refused(skill: Callable[..., Recording], run_async: Run) -> None:
-    async def scenario() -> None:
-        made = skill()
-        with pytest.raises(BadState, match="idle, not active"):
-            made.step(None)  # type: ignore[arg-type]  # refused before it is looked at
+async def test_steps_out_of_order_are_refused(skill: Callable[..., Recording]) -> None:
+    made = skill()
+    with pytest.raises(BadState, match="idle, not active"):
+        made.step(None)  # type: ignore[arg-type]  # refused before it is looked at
+    await made.start(Goal("g", "r"))
+    with pytest.raises(BadState):
         await made.start(Goal("g", "r"))
-        with pytest.raises(BadState):
-            await made.start(Goal("g", "r"))
-        await made.release()
-        await made.release()
-        assert made.story.count("release") == 1
-        with pytest.raises(BadState, match="released"):
-            await made.start(Goal("g", "r"))
-
-    run_async(scenario())
+    await made.release()
+    await made.release()
+    assert made.story.count("release") == 1
+    with pytest.raises(BadState, match="released"):
+        await made.start(Goal("g", "r"))
 
 
-def test_a_skill_that_does_not_let_go_holds_nobody_up(
-    skill: Callable[..., Recording], run_async: Run, monkeypatch: pytest.MonkeyPatch
+async def test_a_skill_that_does_not_let_go_holds_nobody_up(
+    skill: Callable[..., Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(residency_module, "EVICT_S", 0.05)
 
-    async def scenario() -> None:
-        residency, old, new = Residency(), skill("1", fails="hang"), skill("2")
-        await residency.acquire(old.key, lambda: old)
-        assert await residency.acquire(new.key, lambda: new) is new
-        assert residency.resident == new.key
-
-    run_async(scenario())
+    residency, old, new = Residency(), skill("1", fails="hang"), skill("2")
+    await residency.acquire(old.key, lambda: old)
+    assert await residency.acquire(new.key, lambda: new) is new
+    assert residency.resident == new.key
 
 
-def test_another_revision_of_the_same_skill_is_another_key(
-    skill: Callable[..., Recording], run_async: Run
+async def test_another_revision_of_the_same_skill_is_another_key(
+    skill: Callable[..., Recording],
 ) -> None:
-    async def scenario() -> None:
-        residency, old, new = Residency(), skill("1"), skill("2")
-        assert old.key.rskill_id == new.key.rskill_id
-        assert await residency.acquire(old.key, lambda: old) is old
-        assert await residency.acquire(new.key, lambda: new) is new
-        assert (old.story, residency.resident) == (["release"], new.key)
-
-    run_async(scenario())
+    residency, old, new = Residency(), skill("1"), skill("2")
+    assert old.key.rskill_id == new.key.rskill_id
+    assert await residency.acquire(old.key, lambda: old) is old
+    assert await residency.acquire(new.key, lambda: new) is new
+    assert (old.story, residency.resident) == (["release"], new.key)
 
 
 @pytest.mark.parametrize("fails", ["start", "cancel"])
-def test_a_first_start_that_fails_leaves_nothing_behind(
-    skill: Callable[..., Recording], run_async: Run, fails: str
+async def test_a_first_start_that_fails_leaves_nothing_behind(
+    skill: Callable[..., Recording], fails: str
 ) -> None:
     """Regression: the runner called a skill resident whose model had never come up."""
 
-    async def scenario() -> None:
-        residency, old, new = Residency(), skill("1"), skill("2", fails=fails)
-        await residency.start(await residency.acquire(old.key, lambda: old), GOAL)
-        await old.finish()
-        await residency.acquire(new.key, lambda: new)
-        starting = asyncio.create_task(residency.start(new, GOAL))
-        if fails == "cancel":
-            await new.starting.wait()
-            starting.cancel()
-        with pytest.raises((SidecarUnavailable, asyncio.CancelledError)):
-            await starting
-        assert new.story == ["start now", "finish", "release"]
-        assert residency.resident is None
-        assert old.story[-1] == "release", (
-            "it has left already, and comes back by the next goal that wants it"
-        )
-        again = skill("1")
-        assert await residency.acquire(again.key, lambda: again) is again
-
-    run_async(scenario())
+    residency, old, new = Residency(), skill("1"), skill("2", fails=fails)
+    await residency.start(await residency.acquire(old.key, lambda: old), GOAL)
+    await old.finish()
+    await residency.acquire(new.key, lambda: new)
+    starting = asyncio.create_task(residency.start(new, GOAL))
+    if fails == "cancel":
+        await new.starting.wait()
+        starting.cancel()
+    with pytest.raises((SidecarUnavailable, asyncio.CancelledError)):
+        await starting
+    assert new.story == ["start now", "finish", "release"]
+    assert residency.resident is None
+    assert old.story[-1] == "release", (
+        "it has left already, and comes back by the next goal that wants it"
+    )
+    again = skill("1")
+    assert await residency.acquire(again.key, lambda: again) is again
 
 
-def test_a_skill_that_has_served_stays_when_a_later_start_fails(
-    skill: Callable[..., Recording], run_async: Run
+async def test_a_skill_that_has_served_stays_when_a_later_start_fails(
+    skill: Callable[..., Recording],
 ) -> None:
-    async def scenario() -> None:
-        residency, made = Residency(), skill()
-        await residency.acquire(made.key, lambda: made)
+    residency, made = Residency(), skill()
+    await residency.acquire(made.key, lambda: made)
+    await residency.start(made, GOAL)
+    await made.finish()
+    made.fails = "start"
+    with pytest.raises(SidecarUnavailable):
         await residency.start(made, GOAL)
-        await made.finish()
-        made.fails = "start"
-        with pytest.raises(SidecarUnavailable):
-            await residency.start(made, GOAL)
-        assert residency.resident == made.key
-        assert "release" not in made.story
-        made.fails = ""
-        await residency.start(made, GOAL)
-        assert made.state == "active"
-
-    run_async(scenario())
+    assert residency.resident == made.key
+    assert "release" not in made.story
+    made.fails = ""
+    await residency.start(made, GOAL)
+    assert made.state == "active"
 
 
-def test_a_failing_gpu_free_skill_leaves_the_resident_one_alone(
-    skill: Callable[..., Recording], run_async: Run
+async def test_a_failing_gpu_free_skill_leaves_the_resident_one_alone(
+    skill: Callable[..., Recording],
 ) -> None:
-    async def scenario() -> None:
-        residency, policy, drive = (
-            Residency(),
-            skill("1"),
-            skill("drive", holds_gpu=False, fails="start"),
-        )
-        await residency.acquire(policy.key, lambda: policy)
-        await residency.acquire(drive.key, lambda: drive)
-        with pytest.raises(SidecarUnavailable):
-            await residency.start(drive, GOAL)
-        assert residency.resident == policy.key
-        assert "release" not in policy.story + drive.story
-
-    run_async(scenario())
+    residency, policy, drive = (
+        Residency(),
+        skill("1"),
+        skill("drive", holds_gpu=False, fails="start"),
+    )
+    await residency.acquire(policy.key, lambda: policy)
+    await residency.acquire(drive.key, lambda: drive)
+    with pytest.raises(SidecarUnavailable):
+        await residency.start(drive, GOAL)
+    assert residency.resident == policy.key
+    assert "release" not in policy.story + drive.story
