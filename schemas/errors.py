@@ -6,8 +6,12 @@ The type says who must act: `CallerError` (the program that asked), `OperatorErr
 
 from typing import ClassVar
 
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.errors import ErrorView
+
+CODES: dict[str, type["VramError"]] = {}
+"""Wire code → type."""
 
 
 class VramError(Exception):
@@ -18,6 +22,11 @@ class VramError(Exception):
     """
 
     code: ClassVar[str] = "internal"
+
+    def __init_subclass__(cls, *, code: str = "") -> None:
+        if code:
+            cls.code = code
+            CODES[code] = cls
 
     def __init__(self, message: str, *, hint: str = "", details: JsonMap | None = None) -> None:
         super().__init__(f"{message} ({hint})" if hint else message)
@@ -31,12 +40,7 @@ class VramError(Exception):
 
     def to_wire(self) -> Message:
         """The `error` map of a reply."""
-        return {
-            "code": self.code,
-            "message": self.message,
-            "hint": self.hint,
-            "details": self.details,
-        }
+        return to_map(self.view())
 
 
 class CallerError(VramError):
@@ -56,323 +60,212 @@ class InternalError(VramError):
 
 
 # -- the wire itself
-class BadFrame(CallerError):
+class BadFrame(CallerError, code="bad_frame"):
     """The frame is not a msgpack map."""
 
-    code = "bad_frame"
 
-
-class BadRequest(CallerError):
+class BadRequest(CallerError, code="bad_request"):
     """A field is missing, unknown or wrong; `details.fields` lists them."""
 
-    code = "bad_request"
 
-
-class UnknownOp(CallerError):
+class UnknownOp(CallerError, code="unknown_op"):
     """There is no such request; `details.known` lists those that exist."""
 
-    code = "unknown_op"
 
-
-class MessageTooLarge(CallerError):
+class MessageTooLarge(CallerError, code="message_too_large"):
     """The message exceeds a limit; the message names it."""
 
-    code = "message_too_large"
 
-
-class VersionMismatch(CallerError):
+class VersionMismatch(CallerError, code="version_mismatch"):
     """Client and server speak different versions of the wire."""
 
-    code = "version_mismatch"
 
-
-class UnknownSession(TransientError):
+class UnknownSession(TransientError, code="unknown_session"):
     """No hello yet, or the arbiter restarted: say hello and reattach."""
 
-    code = "unknown_session"
 
-
-class NotPermitted(CallerError):
+class NotPermitted(CallerError, code="not_permitted"):
     """The role or the process does not allow it."""
 
-    code = "not_permitted"
 
-
-class LimitExceeded(CallerError):
+class LimitExceeded(CallerError, code="limit_exceeded"):
     """A limit of clients, leases, uses, waiters or requests a second; `details.limit` names
     it."""
 
-    code = "limit_exceeded"
-
 
 # -- leases
-class VramInsufficient(CallerError):
+class VramInsufficient(CallerError, code="vram_insufficient"):
     """It can never fit: `details.needed_bytes`, `capacity_bytes`, `reserve_bytes`."""
 
-    code = "vram_insufficient"
 
-
-class HostRamInsufficient(TransientError):
+class HostRamInsufficient(TransientError, code="host_ram_insufficient"):
     """No host RAM is left to park: `details.needed_bytes`, `budget_bytes`, `booked_bytes`."""
 
-    code = "host_ram_insufficient"
 
-
-class LoadFailing(TransientError):
+class LoadFailing(TransientError, code="load_failing"):
     """Its loads failed several times in a row, and it needs an eviction: `details.retry_in_s`,
     `cause`."""
 
-    code = "load_failing"
 
-
-class WouldDeadlock(CallerError):
+class WouldDeadlock(CallerError, code="would_deadlock"):
     """An acquire inside a use of this process waited 30 s: it may wait for what that use keeps.
     `details.uses` names the uses."""
 
-    code = "would_deadlock"
 
-
-class UnknownGpu(CallerError):
+class UnknownGpu(CallerError, code="unknown_gpu"):
     """No GPU has this UUID or index."""
 
-    code = "unknown_gpu"
 
-
-class UnknownLease(CallerError):
+class UnknownLease(CallerError, code="unknown_lease"):
     """No lease has this id or consumer."""
 
-    code = "unknown_lease"
 
-
-class StaleToken(CallerError):
+class StaleToken(CallerError, code="stale_token"):
     """The lease was granted again, or never to this client."""
 
-    code = "stale_token"
 
-
-class LeaseRevoking(TransientError):
+class LeaseRevoking(TransientError, code="lease_revoking"):
     """The holder was revoked: no new use begins."""
 
-    code = "lease_revoking"
 
-
-class LeaseExpired(CallerError):
+class LeaseExpired(CallerError, code="lease_expired"):
     """The lease was not renewed within its TTL: acquire again."""
 
-    code = "lease_expired"
 
-
-class LeaseLost(CallerError):
+class LeaseLost(CallerError, code="lease_lost"):
     """The lease was revoked, expired or fenced: acquire again."""
 
-    code = "lease_lost"
 
-
-class BadState(CallerError):
+class BadState(CallerError, code="bad_state"):
     """The request does not fit the lease's state; `details.story` has its last changes."""
 
-    code = "bad_state"
 
-
-class WaitTimeout(TransientError):
+class WaitTimeout(TransientError, code="wait_timeout"):
     """The wait's own time limit ended; `details.why` explains what blocked."""
 
-    code = "wait_timeout"
 
-
-class Cancelled(CallerError):
+class Cancelled(CallerError, code="cancelled"):
     """It was canceled or stopped before it was done."""
 
-    code = "cancelled"
 
-
-class JournalUnavailable(OperatorError):
+class JournalUnavailable(OperatorError, code="journal_unavailable"):
     """The journal cannot be written: nothing is granted until it can."""
-
-    code = "journal_unavailable"
 
 
 # -- the daemon
-class ArbiterUnreachable(TransientError):
+class ArbiterUnreachable(TransientError, code="arbiter_unreachable"):
     """The arbiter does not answer: not running, hanging, or another socket."""
 
-    code = "arbiter_unreachable"
 
-
-class UntrustedServer(OperatorError):
+class UntrustedServer(OperatorError, code="untrusted_server"):
     """Another user's process serves the socket: `details.uid`, `user`, `endpoint`."""
 
-    code = "untrusted_server"
 
-
-class AlreadyRunning(OperatorError):
+class AlreadyRunning(OperatorError, code="already_running"):
     """Another arbiter serves the socket or uses the state folder."""
 
-    code = "already_running"
 
-
-class ConfigError(OperatorError):
+class ConfigError(OperatorError, code="config_error"):
     """A flag, a file or a variable is wrong; `details.fields` has path, line and problem."""
 
-    code = "config_error"
 
-
-class UnsupportedQuantization(ConfigError):
+class UnsupportedQuantization(ConfigError, code="unsupported_quantization"):
     """Device or program cannot compute in this number format: `details.dtype`, `supported`."""
 
-    code = "unsupported_quantization"
 
-
-class NoGpu(OperatorError):
+class NoGpu(OperatorError, code="no_gpu"):
     """There is no driver, no GPU, or not the one that is asked for."""
 
-    code = "no_gpu"
 
-
-class ProbeFailed(TransientError):
+class ProbeFailed(TransientError, code="probe_failed"):
     """A GPU could not be read, or answered nonsense."""
-
-    code = "probe_failed"
 
 
 # -- sidecars
-class Evicted(TransientError):
+class Evicted(TransientError, code="evicted"):
     """The model left the GPU; never to be read as "object not found"."""
 
-    code = "evicted"
 
-
-class NotResident(TransientError):
+class NotResident(TransientError, code="not_resident"):
     """The model is not on the GPU, and the request does not load it."""
 
-    code = "not_resident"
 
-
-class Loading(TransientError):
+class Loading(TransientError, code="loading"):
     """The model loads."""
 
-    code = "loading"
 
-
-class ModelError(CallerError):
+class ModelError(CallerError, code="model_error"):
     """The model failed at this request, or does not answer."""
 
-    code = "model_error"
 
-
-class OutOfMemory(TransientError):
+class OutOfMemory(TransientError, code="oom"):
     """The GPU was full, real or simulated."""
 
-    code = "oom"
 
-
-class SidecarUnavailable(TransientError):
+class SidecarUnavailable(TransientError, code="sidecar_unavailable"):
     """A sidecar cannot be started or reached: `details.endpoint`."""
 
-    code = "sidecar_unavailable"
 
-
-class CalibrationFailed(OperatorError):
+class CalibrationFailed(OperatorError, code="calibration_failed"):
     """A footprint could not be measured: `details.exit_code` of a program that failed."""
-
-    code = "calibration_failed"
 
 
 # -- programs that know nothing of the arbiter
-class InstallFailed(OperatorError):
+class InstallFailed(OperatorError, code="install_failed"):
     """`vramctl install`: a command of the machine, or a file."""
 
-    code = "install_failed"
 
-
-class ActionFailed(TransientError):
+class ActionFailed(TransientError, code="action_failed"):
     """A program did not free or restore its memory: `details.url`, `status`."""
 
-    code = "action_failed"
 
-
-class CheckpointUnsupported(OperatorError):
+class CheckpointUnsupported(OperatorError, code="checkpoint_unsupported"):
     """Driver, architecture, package or privileges do not allow suspending a program."""
-
-    code = "checkpoint_unsupported"
 
 
 # -- runner and reasoner
-class RunnerUnreachable(TransientError):
+class RunnerUnreachable(TransientError, code="runner_unreachable"):
     """The runner does not answer: not running, or hanging."""
 
-    code = "runner_unreachable"
 
-
-class ReasonerUnreachable(TransientError):
+class ReasonerUnreachable(TransientError, code="reasoner_unreachable"):
     """No reasoner runs there, or it hangs."""
 
-    code = "reasoner_unreachable"
 
-
-class GoalRejected(CallerError):
+class GoalRejected(CallerError, code="goal_rejected"):
     """The goal does not fit the robot, the skill or the moment, or was not reached."""
 
-    code = "goal_rejected"
 
-
-class EstopRequested(OperatorError):
+class EstopRequested(OperatorError, code="estop_requested"):
     """The emergency stop is latched: look at the robot, then start the runner again."""
 
-    code = "estop_requested"
 
-
-class RobotFault(OperatorError):
+class RobotFault(OperatorError, code="robot_fault"):
     """The robot does not answer, or answers nonsense: cables, power, calibration."""
 
-    code = "robot_fault"
 
-
-class EnvironmentFailed(OperatorError):
+class EnvironmentFailed(OperatorError, code="environment_failed"):
     """A simulated world raised, or reported what cannot be: its own code or packages."""
 
-    code = "environment_failed"
 
-
-class FrameStale(TransientError):
+class FrameStale(TransientError, code="frame_stale"):
     """No camera frame is young enough."""
 
-    code = "frame_stale"
 
-
-class StateStale(TransientError):
+class StateStale(TransientError, code="state_stale"):
     """The robot does not report, or no longer reports, where its joints are."""
 
-    code = "state_stale"
 
-
-class UnknownSkill(CallerError):
+class UnknownSkill(CallerError, code="unknown_skill"):
     """No installed skill has this name."""
 
-    code = "unknown_skill"
 
-
-class ManifestInvalid(OperatorError):
+class ManifestInvalid(OperatorError, code="manifest_invalid"):
     """A skill's manifest is wrong; the message lists the findings."""
 
-    code = "manifest_invalid"
 
-
-class LlmError(TransientError):
+class LlmError(TransientError, code="llm_error"):
     """The language model failed, or its answers cannot be read."""
-
-    code = "llm_error"
-
-
-def _leaves(cls: type[VramError]) -> list[type[VramError]]:
-    found = [cls] if "code" in cls.__dict__ and cls is not VramError else []
-    for child in cls.__subclasses__():
-        found += _leaves(child)
-    return found
-
-
-CODES: dict[str, type[VramError]] = {cls.code: cls for cls in _leaves(VramError)}
-"""Wire code → type."""
 
 
 def from_wire(error: JsonMap) -> VramError:

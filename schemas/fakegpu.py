@@ -452,7 +452,7 @@ def _step(
 
 
 def _return(
-    name: str, process: ProcessFile, now: float, size: int, update: Mapping[str, object]
+    name: str, process: ProcessFile, now: float, size: int, update: JsonMap
 ) -> Callable[[GpuState], Change]:
     return _step(name, process.model_copy(update=update), now, "returned", size, -size)
 

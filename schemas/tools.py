@@ -35,6 +35,8 @@ PROGRESS_WINDOW_MAX_S = 60.0
 TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
 
 Text = Annotated[str, Field(max_length=4096)]
+Words = Annotated[Text, Field(min_length=1)]
+Name = Annotated[str, Field(min_length=1, max_length=256)]
 Camera = Annotated[
     str, Field(max_length=128, description="Name of the camera; empty: the default one.")
 ]
@@ -42,16 +44,15 @@ Camera = Annotated[
 
 class _Tool(BaseModel):
     model_config = ConfigDict(
-        frozen=True, extra="forbid", populate_by_name=True, allow_inf_nan=False
+        frozen=True,
+        extra="forbid",
+        populate_by_name=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
     )
 
-    rationale: Annotated[
-        Text,
-        Field(
-            validation_alias=AliasChoices("rationale", "rational"),
-            description="One sentence: why this call, now.",
-        ),
-    ] = ""
+    rationale: Annotated[Text, Field(validation_alias=AliasChoices("rationale", "rational"))] = ""
+    """One sentence: why this call, now."""
 
 
 class ExecuteRskill(_Tool):
@@ -59,45 +60,20 @@ class ExecuteRskill(_Tool):
     anything."""
 
     tool: Literal["execute_rskill"] = "execute_rskill"
-    rskill_id: Annotated[
-        str, Field(min_length=1, max_length=256, description="Name of the skill, OWNER/REPOSITORY.")
-    ]
-    prompt: Annotated[Text, Field(description="What the skill is to do, in words.")] = ""
-    goal_params_json: Annotated[
-        Text,
-        Field(description="JSON object with the skill's structured parameters; empty for none."),
-    ] = ""
-    deadline_s: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="Seconds until it is cancelled; 0: as the manifest says.",
-        ),
-    ] = 0.0
-    patience_s: Annotated[
-        float | None,
-        Field(
-            gt=0,
-            description="Cancel it when its progress stands still for so long, seconds.",
-        ),
-    ] = None
-    progress_tolerance: Annotated[
-        float | None,
-        Field(
-            ge=0,
-            le=1,
-            description="A gain of progress (0..1) no larger than this is none.",
-        ),
-    ] = None
-
-    next_rskill_id: Annotated[
-        str,
-        Field(
-            max_length=256,
-            description="The skill that follows, so that its model is made ready meanwhile."
-            " It starts nothing.",
-        ),
-    ] = ""
+    rskill_id: Name
+    """Name of the skill, OWNER/REPOSITORY."""
+    prompt: Text = ""
+    """What the skill is to do, in words."""
+    goal_params_json: Text = ""
+    """JSON object with the skill's structured parameters; empty for none."""
+    deadline_s: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds until it is cancelled; 0: as the manifest says."""
+    patience_s: Annotated[float | None, Field(gt=0)] = None
+    """Cancel it when its progress stands still for so long, seconds."""
+    progress_tolerance: Annotated[float | None, Field(ge=0, le=1)] = None
+    """A gain of progress (0..1) no larger than this is none."""
+    next_rskill_id: Annotated[str, Field(max_length=256)] = ""
+    """The skill that follows, so that its model is made ready meanwhile. It starts nothing."""
 
     @field_validator("goal_params_json")
     @classmethod
@@ -124,9 +100,8 @@ class LocateInView(_Tool):
     """Look for an object in a camera's present picture. Moves nothing."""
 
     tool: Literal["locate_in_view"] = "locate_in_view"
-    query: Annotated[
-        Text, Field(min_length=1, description="The object, in words, e.g. `red cube`.")
-    ]
+    query: Words
+    """The object, in words, e.g. `red cube`."""
     camera: Camera = ""
 
 
@@ -134,9 +109,8 @@ class QueryScene(_Tool):
     """Ask a question about a camera's present picture and get a sentence back. Moves nothing."""
 
     tool: Literal["query_scene"] = "query_scene"
-    question: Annotated[
-        Text, Field(min_length=1, description="A question that the picture can answer.")
-    ]
+    question: Words
+    """A question that the picture can answer."""
     camera: Camera = ""
 
 
@@ -152,17 +126,10 @@ class QueryTaskProgress(_Tool):
     nothing; its word is an opinion, never a proof."""
 
     tool: Literal["query_task_progress"] = "query_task_progress"
-    window_s: Annotated[
-        float,
-        Field(
-            gt=0,
-            le=PROGRESS_WINDOW_MAX_S,
-            description="How far to look back, seconds.",
-        ),
-    ] = 8.0
-    task: Annotated[
-        Text, Field(description="Progress towards what, in words; empty: the present task.")
-    ] = ""
+    window_s: Annotated[float, Field(gt=0, le=PROGRESS_WINDOW_MAX_S)] = 8.0
+    """How far to look back, seconds."""
+    task: Text = ""
+    """Progress towards what, in words; empty: the present task."""
 
 
 class LifecycleTransition(_Tool):
@@ -170,7 +137,8 @@ class LifecycleTransition(_Tool):
     manage."""
 
     tool: Literal["lifecycle_transition"] = "lifecycle_transition"
-    node: Annotated[str, Field(min_length=1, max_length=256, description="Name of the component.")]
+    node: Name
+    """Name of the component."""
     transition: Literal["configure", "activate", "deactivate", "cleanup"]
 
 
@@ -178,10 +146,9 @@ class EmitPrompt(_Tool):
     """Say something to another component or to the operator. Moves nothing."""
 
     tool: Literal["emit_prompt"] = "emit_prompt"
-    target_topic: Annotated[
-        str, Field(pattern=r"^/\S+$", max_length=256, description="Where to, starting with `/`.")
-    ]
-    text: Annotated[Text, Field(min_length=1)]
+    target_topic: Annotated[str, Field(pattern=r"^/\S+$", max_length=256)]
+    """Where to, starting with `/`."""
+    text: Words
 
 
 class WaitOn(_Tool):

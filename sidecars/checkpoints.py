@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.sidecars.packed_weights import PackedHeader, install, packed_in, read_packed
 from vram_arbiter.sidecars.quantization import Nf4, load_bitsandbytes, settle
 from vram_arbiter.sidecars.weights import (
@@ -172,7 +173,7 @@ def _compared(cls: Any, weights: Weights, options: Mapping[str, Any]) -> Any:
     return model.eval()
 
 
-def _differences(account: Mapping[str, Any]) -> Differences:
+def _differences(account: JsonMap) -> Differences:
     return Differences(
         missing=set(account["missing_keys"]),
         foreign=set(account["unexpected_keys"]),

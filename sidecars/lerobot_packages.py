@@ -15,7 +15,7 @@ _FLAGS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def import_policies(without: Sequence[Literal["diffusers", "peft"]]) -> None:
-    """Import the code of all of lerobot's policies, as if the packages `without` were not installed.
+    """Import the code of all of lerobot's policies, as if `without` were not installed.
 
     The other packages import bitsandbytes, which is imported first, without a GPU: it would
     initialize CUDA.

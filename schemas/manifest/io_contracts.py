@@ -181,52 +181,44 @@ class ActionSlot(ManifestBlock):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        problems = []
+        problems = self._check_command()
         if self.width < 1:
-            problems.append(
-                Problem(
-                    ("range",), f"must be [first, last] with last ≥ first, not {list(self.range)}"
-                )
-            )
-        if self.discard or self.terminate:
-            kind = "discarded" if self.discard else "terminate"
-            alien = _OF_A_COMMAND if not self.discard else (*_OF_A_COMMAND, "terminate")
-            problems += [
-                Problem((field,), f"is not allowed in a {kind} slot")
-                for field in alien
-                if getattr(self, field)
-            ]
-            if self.terminate and self.width > 1:
-                problems.append(
-                    Problem(("range",), f"must cover one value for terminate, not {self.width}")
-                )
-        elif self.control_mode is None:
-            problems.append(Problem(("control_mode",), "is required unless the slot is discarded"))
-        else:
-            problems += self._check_mode(self.control_mode)
+            said = f"must be [first, last] with last ≥ first, not {list(self.range)}"
+            problems.append(Problem(("range",), said))
         if self.input_bounds is not None and not self.input_bounds[0] < self.input_bounds[1]:
             problems.append(Problem(("input_bounds",), "must be [low, high] with high > low"))
         raise_if(problems)
         return self
+
+    def _check_command(self) -> list[Problem]:
+        """Return what is wrong with where the slice goes."""
+        if self.discard or self.terminate:
+            kind = "discarded" if self.discard else "terminate"
+            alien = _OF_A_COMMAND if not self.discard else (*_OF_A_COMMAND, "terminate")
+            said = f"is not allowed in a {kind} slot"
+            problems = [Problem((field,), said) for field in alien if getattr(self, field)]
+            return problems + self._check_single("terminate" if self.terminate else "")
+        if self.control_mode is None:
+            return [Problem(("control_mode",), "is required unless the slot is discarded")]
+        return self._check_mode(self.control_mode)
+
+    def _check_single(self, of: str) -> list[Problem]:
+        """Return that the slice has several values, where what it is `of` takes one."""
+        if not of or self.width <= 1:
+            return []
+        return [Problem(("range",), f"must cover one value for {of}, not {self.width}")]
 
     def _check_mode(self, mode: ControlMode) -> list[Problem]:
         rules = dict(zip(("ee", "frame", "joint_names"), _SLOT_RULES.get(mode, ""), strict=False))
         rules["rotation"] = "-" if mode is ControlMode.CARTESIAN_POSE else "F"
         rules["gripper_convention"] = "-" if mode in GRIPPER_MODES else "F"
         problems = misplaced(self, rules, mode.value)
-        if self.joint_names and len(self.joint_names) != self.width > 0 and not problems:
-            problems.append(
-                Problem(
-                    ("joint_names",),
-                    f"has {len(self.joint_names)} names for {self.width} values of the action "
-                    "vector",
-                )
-            )
-        if mode is ControlMode.COMPOSITE_MODE and self.width != 1:
-            problems.append(
-                Problem(("range",), f"must cover one value for {mode.value!r}, not {self.width}")
-            )
-        return problems
+        count = len(self.joint_names)
+        if count and count != self.width > 0 and not problems:
+            said = f"has {count} names for {self.width} values of the action vector"
+            problems.append(Problem(("joint_names",), said))
+        single = mode is ControlMode.COMPOSITE_MODE
+        return problems + self._check_single(repr(mode.value) if single else "")
 
 
 _DIM_MAX = 4096  # far above any robot; keeps the check of the cover cheap
@@ -261,33 +253,19 @@ class ActionContract(ManifestBlock):
         problems = []
         owner: dict[int, int] = {}
         for index, slot in enumerate(self.slots):
-            first, last = slot.range
+            place, (first, last) = ("slots", index, "range"), slot.range
             if last >= self.dim:
-                problems.append(
-                    Problem(
-                        ("slots", index, "range"),
-                        f"ends at {last}, beyond the {self.dim} values of dim",
-                    )
-                )
-            for value in range(first, min(last, self.dim - 1) + 1):
-                if value in owner:
-                    problems.append(
-                        Problem(
-                            ("slots", index, "range"),
-                            f"covers value {value}, which slots[{owner[value]}] covers already",
-                        )
-                    )
-                    break
-                owner[value] = index
+                said = f"ends at {last}, beyond the {self.dim} values of dim"
+                problems.append(Problem(place, said))
+            values = range(first, min(last, self.dim - 1) + 1)
+            if (taken := next((value for value in values if value in owner), None)) is not None:
+                said = f"covers value {taken}, which slots[{owner[taken]}] covers already"
+                problems.append(Problem(place, said))
+            owner |= dict.fromkeys([value for value in values if value not in owner], index)
         missing = [value for value in range(self.dim) if value not in owner]
         if missing and not problems:
-            problems.append(
-                Problem(
-                    ("slots",),
-                    f"must cover every value of dim; not covered: {missing}. Discard what is "
-                    "unused",
-                )
-            )
+            said = f"must cover every value of dim; not covered: {missing}. Discard what is unused"
+            problems.append(Problem(("slots",), said))
         return problems
 
     def _check_scale(self) -> list[Problem]:
@@ -301,10 +279,6 @@ class ActionContract(ManifestBlock):
         if not all(math.isfinite(value) for value in scale):
             return [Problem(("cartesian_delta_scale",), "must be finite")]
         if not widths or set(widths) != {len(scale)}:
-            return [
-                Problem(
-                    ("cartesian_delta_scale",),
-                    f"has {len(scale)} values; the cartesian_delta slots have {widths or 'none'}",
-                )
-            ]
+            said = f"has {len(scale)} values; the cartesian_delta slots have {widths or 'none'}"
+            return [Problem(("cartesian_delta_scale",), said)]
         return []

@@ -3,10 +3,9 @@
 Works on plain values, so that the same rules judge a half-written file and a finished manifest.
 """
 
-from collections.abc import Mapping
-
 from vram_arbiter.schemas.findings import Problem
 from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES, Kind
+from vram_arbiter.schemas.plain import JsonMap
 
 KINDS = tuple(Kind)
 
@@ -53,7 +52,7 @@ _WHY = {
 }
 
 
-def check_kind(kind: Kind, values: Mapping[str, object]) -> list[Problem]:
+def check_kind(kind: Kind, values: JsonMap) -> list[Problem]:
     """Findings of the table, and of the families that need processors; `values` maps field names to
     raw or validated values."""
     problems = []

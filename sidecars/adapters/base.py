@@ -3,7 +3,7 @@
 An adapter knows its model and nothing of leases, sockets or bytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from vram_arbiter.schemas.plain import Message
@@ -16,6 +16,8 @@ LEROBOT = "vram_arbiter.sidecars.preload_lerobot"
 DIFFUSERS = "vram_arbiter.sidecars.preload_diffusers"
 PEFT = "vram_arbiter.sidecars.preload_peft"
 """Modules of lerobot's policies, for `ModelAdapter.modules`."""
+type Inputs = Mapping[str, Any]
+"""Inputs of a model by name: tensors, texts."""
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
 
 

@@ -1,11 +1,12 @@
 """Inputs of a transformers model: on its device, pictures in its precision."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.manifest.contracts import DetectorContract
 from vram_arbiter.schemas.sidecar import DetectOp
+from vram_arbiter.sidecars.adapters.base import Inputs
 from vram_arbiter.sidecars.images import decode, sizes, within
 
 if TYPE_CHECKING:
@@ -19,14 +20,14 @@ def picture_of(call: DetectOp, contract: DetectorContract) -> "tuple[Image, Imag
     return picture, within(picture, min(call.max_side, contract.max_side or call.max_side))
 
 
-def processed(processor: Any, pictures: "Sequence[Image]", **given: Any) -> Mapping[str, Any]:
+def processed(processor: Any, pictures: "Sequence[Image]", **given: Any) -> Inputs:
     """Call a processor with what is `given` for a caller's pictures.
 
     Raises BadRequest for whatever its arithmetic raises, such as for a picture 200 times as wide
     as high, of which resizing leaves nothing.
     """
     try:
-        inputs: Mapping[str, Any] = processor(return_tensors="pt", **given)
+        inputs: Inputs = processor(return_tensors="pt", **given)
     except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
         raise BadRequest(
             f"{type(processor).__name__} cannot read pictures of {sizes(pictures)}: {error}",
@@ -35,7 +36,7 @@ def processed(processor: Any, pictures: "Sequence[Image]", **given: Any) -> Mapp
     return inputs
 
 
-def to_model(inputs: Mapping[str, Any], model: Any) -> Any:
+def to_model(inputs: Inputs, model: Any) -> Any:
     """Return a processor's inputs on the model's device, pictures in the model's type.
 
     Processors make float32, which a layer of 16 bits refuses. Other numbers, such as the seconds

@@ -4,11 +4,12 @@ lerobot reads its image encoder (Wan VAE) and text encoder (UMT5) at the first a
 revision of a hub repository. Here they are a local folder, read and compared with the rest.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
+from vram_arbiter.sidecars.adapters.base import Inputs
 from vram_arbiter.sidecars.checkpoints import META, Differences, load_transformers
 from vram_arbiter.sidecars.weights import Weights
 
@@ -115,7 +116,7 @@ def _vae_outline(folder: Path) -> Any:
     return outline.eval()
 
 
-def act(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
+def act(policy: Any, steps: Sequence[Inputs]) -> "Tensor":
     """Return the actions (B, T, D) that `select_action` plays until it would predict again.
 
     They stay in the policy's queue: the next call replays the episode's control steps through

@@ -1,7 +1,7 @@
 """Robot policies through lerobot's classes and processors: observation in, chunk of actions out."""
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict
 
 from vram_arbiter.schemas.errors import BadRequest, ModelError
@@ -10,7 +10,7 @@ from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall, RealTimeChunking
 from vram_arbiter.sidecars.adapters import lingbot
-from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, ModelCall
+from vram_arbiter.sidecars.adapters.base import DIFFUSERS, LEROBOT, PEFT, Inputs, ModelCall
 from vram_arbiter.sidecars.adapters.policy_checks import (
     need_absolute,
     need_statistics,
@@ -269,7 +269,7 @@ class PolicyAdapter:
             # operations that the policy's code does in float32 meet weights of another type
             torch.autocast(torch.device(self._device).type, dtype, enabled=casts),
         ):
-            inputs: list[Mapping[str, Any]] = [self._before(step) for step in steps]
+            inputs: list[Inputs] = [self._before(step) for step in steps]
             if casts:
                 inputs = [BatchFeature(dict(batch)).to(dtype).data for batch in inputs]
             chunk = self._predict(inputs, guidance)
@@ -326,7 +326,7 @@ class PolicyAdapter:
         self._policy.requires_grad_(False)  # else each step would keep its activations
         self._guided = True
 
-    def _predict(self, steps: Sequence[Mapping[str, Any]], guidance: Guidance) -> "Tensor":
+    def _predict(self, steps: Sequence[Inputs], guidance: Guidance) -> "Tensor":
         """Return the actions (B, T, D) after the last of `steps`, which are oldest first."""
         if not self._selects:
             chunk: Tensor = self._policy.predict_action_chunk(dict(steps[-1]), **guidance)
@@ -378,7 +378,7 @@ def _cast(policy: Any, dtype: Any) -> Any:
     return policy
 
 
-def _select(policy: Any, steps: Sequence[Mapping[str, Any]]) -> "Tensor":
+def _select(policy: Any, steps: Sequence[Inputs]) -> "Tensor":
     """Return the actions (B, T, D) that `select_action` plays until it would predict again.
 
     While an action is queued, `select_action` only records the observation: that is how all steps

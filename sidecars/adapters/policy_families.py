@@ -15,6 +15,7 @@ from typing import Any, Final
 from vram_arbiter.schemas.errors import ConfigError, ModelError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.extras import EXTRA_OF, not_installed
 from vram_arbiter.sidecars.quantization import nf4_of
 from vram_arbiter.sidecars.weights import ProcessorFiles
@@ -25,7 +26,7 @@ _BF16: Final = frozenset({Dtype.BF16})  # its code computes in nothing else
 _CONSENT_HINT: Final = "read that code, then write trust_remote_code: true in quantization.extra"
 _OWN_STEPS: Final = ("lerobot.", "vram_arbiter.")
 
-_NOT_COMPARED: Final[Mapping[str, Mapping[str, object]]] = {
+_NOT_COMPARED: Final[Mapping[str, JsonMap]] = {
     "groot": {"use_relative_actions": True},  # each row needs the state that its chunk began with
     "molmoact2": {"inference_action_mode": "discrete", "enable_lora_vlm": True},
     "lingbot_va": {"camera_layout": "robotwin_tshape"},

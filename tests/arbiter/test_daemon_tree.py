@@ -70,7 +70,7 @@ def job(
         process.stdout.close()
 
 
-def seen(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+def gpu_when(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """The GPU's view as soon as it is like that. Every answer of the daemon paces the questions;
     raises TimeoutError."""
     deadline = time.monotonic() + PATIENCE_S
@@ -105,7 +105,9 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
 ) -> None:
     assert observer.ask("subscribe")["ok"]
     with job(quick_reader, 4 * GIB, *through) as (vramctl, child):
-        gpu = seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
+        gpu = gpu_when(
+            observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"])
+        )
         (process,) = gpu["processes"]
         assert child != vramctl.pid
         assert (process["pid"], process["used_bytes"], process["stowaway"]) == (
@@ -121,7 +123,7 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
         )
     verified = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
     assert (verified["verdict"], verified["before_bytes"]) == ("verified", 4 * GIB)
-    gpu = seen(observer, lambda gpu: not gpu["charged_bytes"])
+    gpu = gpu_when(observer, lambda gpu: not gpu["charged_bytes"])
     assert gpu["stowaway_bytes"] == 0
     assert told(observer, "stowaway", "pressure", "lost") == []
     assert vramctl.returncode == 0
@@ -134,18 +136,18 @@ def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
     """The program itself dies with `vramctl`, here a shell; what it started does not."""
     assert observer.ask("subscribe")["ok"]
     with job(quick_reader, 4 * GIB, *THROUGH_SHELL) as (vramctl, child):
-        seen(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
+        gpu_when(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
         vramctl.send_signal(signal.SIGKILL)
         stowaway = wait_told(observer, "stowaway", lambda event: event["pid"] == child)
         assert (stowaway["name"], stowaway["used_bytes"]) == ("job", 4 * GIB)
         verdict = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
         assert verdict["verdict"] == "contested"
         assert verdict["culprits"] == [{"pid": child, "name": "job", "bytes": 4 * GIB}]
-        gpu = seen(observer, lambda gpu: not gpu["charged_bytes"])
+        gpu = gpu_when(observer, lambda gpu: not gpu["charged_bytes"])
         assert gpu["stowaway_bytes"] == 4 * GIB, (
             "charged once: the debt is over, the orphan is still there"
         )
-    seen(observer, lambda gpu: not gpu["stowaway_bytes"])
+    gpu_when(observer, lambda gpu: not gpu["stowaway_bytes"])
 
 
 def test_what_the_child_of_an_observer_holds_is_not_hidden(
@@ -158,6 +160,6 @@ def test_what_the_child_of_an_observer_holds_is_not_hidden(
     ) as child:  # fmt: skip
         assert child.stdout is not None
         assert int(child.stdout.readline()) == child.pid
-        gpu = seen(observer, lambda gpu: bool(gpu["stowaway_bytes"]))
+        gpu = gpu_when(observer, lambda gpu: bool(gpu["stowaway_bytes"]))
         assert [process["pid"] for process in gpu["processes"]] == [child.pid]
         child.communicate("\n", PATIENCE_S)

@@ -35,7 +35,7 @@ def reloadable() -> Iterator[ArbiterProcess]:
 
 
 @pytest.fixture
-def observer(reloadable: ArbiterProcess) -> Iterator[WireClient]:
+def watcher(reloadable: ArbiterProcess) -> Iterator[WireClient]:
     made = WireClient(reloadable.endpoint).hello()
     yield made
     made.close()
@@ -55,9 +55,9 @@ def reloaded(reloadable: ArbiterProcess, text: str | None) -> None:
     reloadable.wait_for("READY=1", 60.0)
 
 
-def newest_event(observer: WireClient) -> Mapping[str, Any]:
+def newest_event(watcher: WireClient) -> Mapping[str, Any]:
     """Return the newest event of the history about the configuration."""
-    reply = observer.ask("history", limit=1000, kinds=["config_reloaded", "config_refused"])
+    reply = watcher.ask("history", limit=1000, kinds=["config_reloaded", "config_refused"])
     newest: Mapping[str, Any] = reply["events"][-1]
     return newest
 
@@ -103,36 +103,36 @@ BAD = {
 
 @pytest.mark.e2e
 def test_a_file_takes_effect_or_is_refused_whole_and_a_replay_knows(
-    reloadable: ArbiterProcess, observer: WireClient
+    reloadable: ArbiterProcess, watcher: WireClient
 ) -> None:
     """Replayed with the constants of the start alone, the third lease would be refused."""
     assert room(reloadable) == 2
     reloaded(reloadable, "limits: {leases_per_client_max: 3}\nwire: {heartbeat_s: 7}\n")
     assert room(reloadable) == 3
-    event = newest_event(observer)
+    event = newest_event(watcher)
     assert event["changed"] == {"limits.leases_per_client_max": [2, 3]}
     assert event["needs_restart"] == {"wire.heartbeat_s": [2.0, 7.0]}
     pending = "changed keys need a restart: wire.heartbeat_s"
-    assert observer.ask("status")["problems"] == [pending]
+    assert watcher.ask("status")["problems"] == [pending]
     assert pending in reloadable.messages[-1], "what the reload itself tells the manager"
     doctor = vramctl("doctor", environ=reloadable.environ).stdout
     assert pending in doctor
     for name, (text, words) in BAD.items():
         reloaded(reloadable, text)
-        problem, still = observer.ask("status")["problems"]
+        problem, still = watcher.ask("status")["problems"]
         assert still == pending
         assert problem.startswith("the changed configuration is refused"), name
         assert words in problem, name
-        assert "secret" not in str(newest_event(observer)) + problem, "a link was quoted"
-        event = newest_event(observer)
+        assert "secret" not in str(newest_event(watcher)) + problem, "a link was quoted"
+        event = newest_event(watcher)
         assert (event["kind"], event["problem"] in problem) == ("config_refused", True), name
         assert room(reloadable) == 3, f"{name}: the former configuration is in force"
     assert "the former one is in force" in vramctl("status", environ=reloadable.environ).stdout
     assert levels(reloadable) <= {"info", "warning"}
     reloaded(reloadable, "limits: {leases_per_client_max: 4}\nlog: {level: debug}\n")
-    assert observer.ask("status")["problems"] == []
+    assert watcher.ask("status")["problems"] == []
     changed = {"limits.leases_per_client_max": [3, 4], "log.level": ["info", "debug"]}
-    assert newest_event(observer)["changed"] == changed
+    assert newest_event(watcher)["changed"] == changed
     assert room(reloadable) == 4
     with (
         Client("user", endpoint=reloadable.endpoint) as user,

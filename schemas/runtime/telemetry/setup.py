@@ -207,8 +207,7 @@ def _exporter(signal: Signal, name: str) -> Any:
     """Return an exporter by its name in the specification, from the installed entry points."""
     from importlib.metadata import entry_points
 
-    options: dict[str, object] = {}
-    entry = name
+    entry, options = name, {}
     if name == "otlp":
         protocol = _variable("PROTOCOL", signal) or "http/protobuf"
         if protocol not in OTLP_ENTRIES:
@@ -218,7 +217,7 @@ def _exporter(signal: Signal, name: str) -> Any:
             )
         entry = OTLP_ENTRIES[protocol]
         if not _variable("TIMEOUT", signal):
-            options["timeout"] = EXPORT_S
+            options = {"timeout": EXPORT_S}
     found = tuple(entry_points(group=f"opentelemetry_{signal}_exporter", name=entry))
     if not found:
         raise ConfigError(

@@ -17,6 +17,7 @@ import pytest
 from tests.support.collector import Collector, ReceivedSpan
 from tests.support.observer import ObserverProcess
 from tests.support.process import ArbiterProcess
+from tests.support.processes import children
 from tests.support.status_page import EventStream, get, port_of
 from tests.support.waiting import until
 from tests.support.wire import WireClient
@@ -230,7 +231,7 @@ def test_an_observer_beside_the_daemon_ends_with_it_even_if_that_is_killed(
     test has made it adopt orphans."""
     arbiter = make_arbiter(arguments=("--http", "127.0.0.1:0")).start()
     port_of(arbiter)
-    (child,) = children(arbiter.pid)
+    (child,) = until(lambda: children(arbiter.pid))
     arbiter.kill()
     until(lambda: ended(child))
 
@@ -238,14 +239,6 @@ def test_an_observer_beside_the_daemon_ends_with_it_even_if_that_is_killed(
 def ended(pid: int) -> bool:
     stat = procfs.read_stat(pid)
     return stat is None or not stat.alive
-
-
-def children(pid: int) -> list[int]:
-    def found() -> list[int]:
-        with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
-            return [int(word) for word in file.read().split()]
-
-    return until(found)
 
 
 def test_no_event_is_lost_or_counted_twice_across_restarts_of_the_daemon(

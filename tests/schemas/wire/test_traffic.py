@@ -77,7 +77,7 @@ def violations(name: str, message: dict[str, Any]) -> list[str]:
 
 
 @pytest.fixture
-def recorded(arbiter_daemon: ArbiterProcess) -> Iterator[Callable[..., RecordedClient]]:
+def recording(arbiter_daemon: ArbiterProcess) -> Iterator[Callable[..., RecordedClient]]:
     made: list[RecordedClient] = []
 
     def connect(**hello: Any) -> RecordedClient:
@@ -138,9 +138,9 @@ def everything(connect: Callable[..., RecordedClient]) -> list[RecordedClient]:
 
 
 def test_every_message_is_valid_under_the_published_schemas(
-    recorded: Callable[..., RecordedClient],
+    recording: Callable[..., RecordedClient],
 ) -> None:
-    clients = everything(recorded)
+    clients = everything(recording)
     messages = [message for client in clients for message in client.messages]
     assert {message["op"] for _, message in messages if "op" in message} == set(REPLIES)
     seen = {name for name, _ in messages}

@@ -123,7 +123,7 @@ def copied(weights: Weights, folder: Path) -> Weights:
     return Weights(str(folder), local=True)
 
 
-def refused(adapter: PolicyAdapter, told: str = "", error: type[VramError] = ModelError) -> None:
+def is_refused(adapter: PolicyAdapter, told: str = "", error: type[VramError] = ModelError) -> None:
     """Check that neither a load nor `--check` takes a checkpoint."""
     for device in ("cpu", "meta"):
         with pytest.raises(error, match=told):
@@ -486,10 +486,10 @@ def test_statistics_that_cannot_convert_are_refused(
 
         change(folder, f"policy_{step}*.safetensors", damaged)
         adapter = prepared(manifest_of(name), weights)
-        refused(adapter, f"convert {feature}: {told}")
+        is_refused(adapter, f"convert {feature}: {told}")
         if case == "missing":
             next(folder.glob(f"policy_{step}*.safetensors")).unlink()
-            refused(adapter, "its processors cannot be read")
+            is_refused(adapter, "its processors cannot be read")
 
 
 @pytest.mark.parametrize("name", ["act", "diffusion"])
@@ -533,7 +533,7 @@ def test_weights_that_are_no_numbers_are_refused(
         return tensors
 
     change(folder, "model.safetensors", damaged)
-    refused(prepared(manifest_of("act"), weights), rf"1 with NaN or infinity \({key}\)")
+    is_refused(prepared(manifest_of("act"), weights), rf"1 with NaN or infinity \({key}\)")
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "act ensembling"])
@@ -577,7 +577,7 @@ def test_linear_layers_in_nf4(checkpoint: Callable[[str], Weights], name: str) -
     assert not any(last in layer for layer in layers)
     assert ask(adapter, observations(1)[0]).shape == (ROWS.get(name, 3), DIM)
     adapter = prepared(manifest_of(name, "int4"), weights)  # 4,000,000 weights and more
-    refused(adapter, "no linear layer to quantize", UnsupportedQuantization)
+    is_refused(adapter, "no linear layer to quantize", UnsupportedQuantization)
 
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
@@ -609,11 +609,11 @@ def test_an_incomplete_policy_is_refused(
     adapter.load("meta")
     dropped = sorted(tensors)[0]
     save_file({key: tensors[key] for key in tensors if key != dropped}, file)
-    refused(adapter, "missing from it")
+    is_refused(adapter, "missing from it")
     save_file(tensors | {"another.models.weight": torch.zeros(3)}, file)
-    refused(adapter, r"unknown to the model \(.*another.models")
+    is_refused(adapter, r"unknown to the model \(.*another.models")
     file.unlink()
-    refused(adapter)
+    is_refused(adapter)
 
 
 def test_every_type_of_lerobot_is_named() -> None:
@@ -656,7 +656,9 @@ def test_what_cannot_act_is_refused(checkpoint: Callable[[str], Weights], tmp_pa
     flag = {"vqbet.action_head.vqvae_model.discretized": torch.tensor(False)}
     change(folder, "model.safetensors", lambda tensors: tensors | flag)
     # regression: `--check` was ok
-    refused(prepared(manifest_of("vqbet"), weights), "the quantizer of its actions is not trained")
+    is_refused(
+        prepared(manifest_of("vqbet"), weights), "the quantizer of its actions is not trained"
+    )
     config = folder / "config.json"
     config.write_text(config.read_text().replace('"use_peft": false', '"use_peft": true'))
     with pytest.raises(ModelError, match="is a PEFT adapter"):
