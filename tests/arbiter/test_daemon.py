@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.prepared import run
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import until
 from tests.support.wire import WireClient
@@ -29,15 +30,8 @@ Make = Callable[..., ArbiterProcess]
 def run_daemon(
     arbiter: ArbiterProcess, *arguments: str, **environ: str
 ) -> "subprocess.CompletedProcess[str]":
-    """`python -m vram_arbiter.arbiter` with exactly these flags, to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.arbiter", *arguments],
-        env={**arbiter.environ, **environ},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    """`vram-arbiter` with exactly these flags, to its end."""
+    return run("vram-arbiter", arguments, {**arbiter.environ, **environ}, PATIENCE_S)
 
 
 def test_help_documents_the_exit_codes(make_arbiter: Make) -> None:

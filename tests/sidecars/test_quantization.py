@@ -214,6 +214,7 @@ assert bnb.cuda_ops
 """
 
 
+@pytest.mark.nightly  # it imports torch once more, in a fresh interpreter
 def test_bitsandbytes_is_imported_without_initializing_cuda() -> None:
     """Its import asks torch for the GPUs' capabilities, which initializes CUDA: no process forked
     from this one could use a GPU."""

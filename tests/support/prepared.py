@@ -103,6 +103,7 @@ PROGRAMS: Mapping[str, Program] = {
     ),
     "vram-reasoner": Program("vram_arbiter.reasoner.__main__", server="vram-runner"),
     "deploy-nod": Program("tests.runner.deploy_nod", server="vram-runner"),
+    "op-server": Program("tests.support.server_process", server="echo"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),
     "lerobot-train": Program("lerobot.scripts.lerobot_train", server="vram-sidecar"),
 }

@@ -1,7 +1,6 @@
-"""A sidecar of the tests, in a process of its own: the op family on `clients.net.server`, without
-any model. Not a test module.
+"""A sidecar of the tests: the op family on `clients.net.server`, without any model.
 
-Usage: server_process.py ENDPOINT.
+Usage: `prepared.start("op-server", [ENDPOINT], …)`.
 """
 
 import asyncio
@@ -23,7 +22,7 @@ def failure(error: VramError) -> dict[str, Any]:
     }
 
 
-async def main(endpoint: str) -> None:
+async def _serve(endpoint: str) -> None:
     stopped = asyncio.Event()
 
     async with RouterServer(endpoint, failure) as server:
@@ -72,4 +71,6 @@ async def main(endpoint: str) -> None:
         serving.cancel()
 
 
-asyncio.run(main(sys.argv[1]))
+def main() -> None:
+    """Serve at the endpoint of `sys.argv` until `shutdown`."""
+    asyncio.run(_serve(sys.argv[1]))

@@ -5,7 +5,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Awaitable, Callable, Iterator
 
 import pytest
@@ -23,11 +22,7 @@ def children() -> Iterator[Callable[[], "subprocess.Popen[bytes]"]]:
     made: list[subprocess.Popen[bytes]] = []
 
     def make() -> "subprocess.Popen[bytes]":
-        made.append(
-            subprocess.Popen(
-                [sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE
-            )
-        )
+        made.append(subprocess.Popen(["cat"], stdin=subprocess.PIPE))
         return made[-1]
 
     yield make

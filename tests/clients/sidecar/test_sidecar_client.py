@@ -2,14 +2,14 @@
 that die."""
 
 import asyncio
-import subprocess
-import sys
+import os
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 
 import pytest
 
-from tests.support.paths import SUPPORT
+from tests.support import prepared
+from tests.support.prepared import Forked
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.perception import Detection, DetectorClient, SceneVlmClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
@@ -26,7 +26,6 @@ from vram_arbiter.schemas.sidecar import QueryOp
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
-SERVER = SUPPORT / "server_process.py"
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -36,20 +35,16 @@ def endpoint() -> Iterator[str]:
         yield f"ipc://{folder}/s.sock"
 
 
-def server_command(endpoint: str, mode: str = "") -> list[str]:
-    return [sys.executable, str(SERVER), endpoint, mode]
-
-
-type Start = Callable[[], subprocess.Popen[bytes]]
+type Start = Callable[[], Forked]
 
 
 @pytest.fixture
 def spawn(endpoint: str) -> Iterator[Start]:
     """Start the sidecar."""
-    started: list[subprocess.Popen[bytes]] = []
+    started: list[Forked] = []
 
-    def start() -> subprocess.Popen[bytes]:
-        started.append(subprocess.Popen([sys.executable, str(SERVER), endpoint]))
+    def start() -> Forked:
+        started.append(prepared.start("op-server", [endpoint], os.environ))
         return started[-1]
 
     yield start

@@ -20,7 +20,10 @@ from vram_arbiter.runner.sim.tasks import stand_before
 
 pytestmark = pytest.mark.heavy
 
-UNSEEN = range(900, 906)
+UNSEEN = pytest.mark.parametrize(
+    "scenes", [range(900, 902), pytest.param(range(900, 906), marks=pytest.mark.nightly)]
+)
+"""Seeds. Each scene costs seconds of a core: a usual run plays two."""
 
 
 def adapter_of(skill: str):
@@ -31,7 +34,8 @@ def adapter_of(skill: str):
     return adapter
 
 
-def test_the_detector_finds_the_target_and_turns_down_the_absent():
+@UNSEEN
+def test_the_detector_finds_the_target_and_turns_down_the_absent(scenes: range):
     adapter = adapter_of("so101-detector")
 
     def found(image: bytes, query: str) -> list[dict]:
@@ -39,7 +43,7 @@ def test_the_detector_finds_the_target_and_turns_down_the_absent():
 
     alarms = 0
     with SimEnv() as env:
-        for seed in UNSEEN:
+        for seed in scenes:
             env.reset(seed)
             image, truth = photo(env, "front"), env.seen_objects("front")[env.target].box
             best = max(found(image, f"the {env.target}"), key=lambda one: one["score"])["box"]
@@ -49,10 +53,11 @@ def test_the_detector_finds_the_target_and_turns_down_the_absent():
             there = {thing.name for thing in env.layout.objects}
             absent = [name for name in NAMES if name not in there]
             alarms += sum(bool(found(image, name)) for name in absent[::5])
-    assert alarms <= 5  # of 18; the model card tells how often
+    assert alarms < len(scenes)  # of three times as many; the model card tells how often
 
 
-def test_the_scene_vlm_tells_held_from_empty_and_from_another():
+@UNSEEN
+def test_the_scene_vlm_tells_held_from_empty_and_from_another(scenes: range):
     adapter, wrong = adapter_of("so101-scene-vlm"), []
 
     def expect(word: str, name: str, env: SimEnv) -> None:
@@ -63,7 +68,7 @@ def test_the_scene_vlm_tells_held_from_empty_and_from_another():
 
     with SimEnv() as env:
         kinematics = ArmKinematics(env.config)
-        for seed in UNSEEN:
+        for seed in scenes:
             env.reset(seed)
             target, other = env.layout.objects[0].name, env.layout.objects[1].name
             stand_before(env, target, random.Random(seed))
@@ -71,8 +76,9 @@ def test_the_scene_vlm_tells_held_from_empty_and_from_another():
             assert run_expert(env, GrabExpert(env, kinematics, target)), "choose another seed"
             expect("Yes", target, env)
             expect("No", other, env)
-    # 18 questions; the card gives 98 % over all, 95 % while another one of the same color is held
-    assert len(wrong) <= 2, wrong
+    # three questions each; the card gives 98 % over all, 95 % while another one of the same color
+    # is held
+    assert len(wrong) <= len(scenes) // 3, wrong
 
 
 def test_the_shipped_models_are_small():
