@@ -211,7 +211,8 @@ async def _episode(
         target = (await runner.ground_truth())["target"]
         task = f"grab the {target}"
         watch.start_s = time.monotonic()
-        display = stack.enter_context(Display(task, arbiter=arbiter))
+        display = Display()
+        display.say(f"{task}{'' if arbiter else ', without an arbiter'}")
         result_file = out / "reasoner.json"
         reasoner = await programs.start(
             "reasoner", "reasoner", "--task", task, "--result", str(result_file.resolve())
@@ -363,7 +364,6 @@ async def _watch(
 
 async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> None:
     if client is None:
-        display.show(None)
         return
     status = to_map(await client.status())
     watch.samples += [(time.monotonic(), gpu) for gpu in status["gpus"]]
@@ -372,7 +372,6 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
     for event in (await client.history(after=after)).events:
         watch.events.append(dict(event))
         display.event(event, event["at_wall_s"] - watch.wall_offset_s - watch.start_s)
-    display.show(status)
 
 
 def _check_others(programs: Programs, reasoner: Program) -> None:

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from vram_arbiter.clients.cli.demo_display import QUIET_KINDS, describe
+from vram_arbiter.clients.cli.demo_display import Display
 from vram_arbiter.clients.cli.demo_programs import Program, Programs
 from vram_arbiter.clients.cli.timeline import chart, collect
 from vram_arbiter.clients.cli.timeline.collect import Range
@@ -19,7 +19,6 @@ from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ArbiterUnreachable
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
-from vram_arbiter.schemas.runtime.printable import printable
 
 STAND_INS: Final = {"detector": "5.3GB", "scene-vlm": "3.3GB", "grab": "4.3GB"}
 LIMIT_S: Final = 60.0
@@ -68,13 +67,12 @@ async def _demo() -> int:
 
 async def _follow(client: AsyncClient, started: list[Program]) -> list[JsonMap]:
     """Print what happens until all programs have ended. Returns the events."""
-    events, began_s, going = list[JsonMap](), time.time(), True
+    events, began_s, going, display = list[JsonMap](), time.time(), True, Display()
     while going:
         left_s = LIMIT_S - (time.time() - began_s)
         going = left_s > 0 and any(one.process.returncode is None for one in started)
         for event in (await client.history(after=events[-1]["seq"] if events else 0)).events:
             events.append(event)
-            if event["kind"] not in QUIET_KINDS:
-                print(printable(f"{event['at_wall_s'] - began_s:5.1f} s  {describe(event)}"))
+            display.event(event, event["at_wall_s"] - began_s)
         await asyncio.sleep(0.1)
     return events

@@ -10,7 +10,6 @@ What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs
 
 import argparse
 import asyncio
-import json
 import os
 import shutil
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
-from vram_arbiter.clients.foreign.http import METHODS, HttpAction, Request, checked_url
+from vram_arbiter.clients.foreign.http import HttpAction, Request, checked_url
 from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram, adopt_orphans
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
@@ -45,7 +44,7 @@ program ends. term: make room for any request, and when the arbiter stays away. 
 CHECKPOINT: Final = "cuda-checkpoint"
 ON_EVICT: Final = ("end", "stop", "http", *SERVERS, CHECKPOINT)
 OPTIONS: Final = (
-    "url", "restore_url", "method", "body", "restore_body", "allow_remote", "timeout", "park",
+    "url", "restore_url", "allow_remote", "timeout", "park",
 )  # fmt: skip
 TIMEOUT_S: Final = 60.0
 NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
@@ -110,17 +109,12 @@ def _add_eviction(parser: argparse.ArgumentParser) -> None:
         default="end",
         metavar="ACTION",
         help="end: end the program for good; stop: end it, and start it again when there is room; "
-        "http: call --url to free and --restore-url to restore; vllm, ollama, llama.cpp, comfyui: "
+        "http: POST to --url to free and to --restore-url to restore; vllm, ollama, llama.cpp, comfyui: "
         "call that server's own API at --url; cuda-checkpoint: suspend its CUDA processes, and "
         "resume them (default: %(default)s)",
     )
     group.add_argument("--url", help="http: the URL that frees; a server: its address")
     group.add_argument("--restore-url", metavar="URL", help="http: the URL that restores")
-    group.add_argument(
-        "--method", choices=METHODS, help="http: method of both requests (default: POST)"
-    )
-    group.add_argument("--body", metavar="JSON", help="http: body for --url")
-    group.add_argument("--restore-body", metavar="JSON", help="http: body for --restore-url")
     group.add_argument("--allow-remote", action="store_true", help="allow URLs of other hosts")
     group.add_argument(
         "--timeout",
@@ -190,14 +184,8 @@ def _action(args: argparse.Namespace) -> Action | None:
         return None
     if args.url is None:
         args.parser.error("--on-evict http needs --url, the URL that frees")
-    if args.restore_body is not None and args.restore_url is None:
-        args.parser.error("--restore-body needs --restore-url")
-    method = args.method or "POST"
-    restoring = None
-    if args.restore_url is not None:
-        restoring = Request(_url(args, "restore_url"), method, _json(args, "restore_body"))
-    freeing = Request(_url(args, "url"), method, _json(args, "body"))
-    return HttpAction(freeing, restoring, timeout_s)
+    restoring = None if args.restore_url is None else Request(_url(args, "restore_url"))
+    return HttpAction(Request(_url(args, "url")), restoring, timeout_s)
 
 
 def _url(args: argparse.Namespace, option: str, default: str = "") -> str:
@@ -206,15 +194,6 @@ def _url(args: argparse.Namespace, option: str, default: str = "") -> str:
     except ValueError as error:
         parser: argparse.ArgumentParser = args.parser
         parser.error(f"--{option.replace('_', '-')}: {error}")
-
-
-def _json(args: argparse.Namespace, option: str) -> str:
-    text: str = getattr(args, option) or ""
-    try:
-        json.loads(text or "null")
-    except ValueError as error:
-        args.parser.error(f"--{option.replace('_', '-')}: expected JSON, got {text!r} ({error})")
-    return text
 
 
 async def run_leased(spec: RunSpec, endpoint: str | None) -> int:

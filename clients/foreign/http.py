@@ -17,7 +17,6 @@ from vram_arbiter.clients.foreign.actions import Deadline
 from vram_arbiter.schemas.errors import ActionFailed
 from vram_arbiter.schemas.runtime.printable import printable
 
-METHODS: Final = ("GET", "POST", "PUT", "PATCH", "DELETE")
 OTHER_API: Final = "is this the program's address, and a version of it that is supported?"
 ANSWER_MAX_BYTES: Final = 4 << 20
 SHOWN_MAX_CHARS: Final = 200

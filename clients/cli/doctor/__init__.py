@@ -13,7 +13,6 @@ from vram_arbiter.clients.cli import arguments, terminal
 from vram_arbiter.clients.cli.doctor import (
     access,
     cgroup,
-    clocks,
     driver,
     health,
     installation,
@@ -33,7 +32,7 @@ from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.version import version
 
 DESCRIPTIONS = {
-    "doctor": "Examine installation, driver, socket, permissions, clocks, cgroups, suspend, "
+    "doctor": "Examine installation, driver, socket, permissions, cgroups, suspend, "
     "leftovers, a second arbiter, units, and what the arbiter says of itself and its GPUs. Each "
     "finding names a command that resolves it; nothing is changed. Exits 0 without a warning or "
     "error, 1 with one, 3 if the arbiter cannot be reached."
@@ -52,12 +51,8 @@ CHECKS: Final[Checks[Machine]] = (
     ("probe", health.probe, ""),
     ("stowaways", health.stowaways, "every GPU process has a lease"),
     ("orphans", leftovers.sockets, "every socket beside the arbiter's is served"),
-    ("files", leftovers.files, "no journal or history was set aside"),
-    ("clocks", clocks.wall, "the wall clock did not go back"),
-    ("clocks", clocks.monotonic, "no suspend since the start"),
     ("cgroup", cgroup.memory, "no memory limit affects the daemon"),
-    ("oom", cgroup.out_of_memory, "the daemon is neither first to be killed nor swapped out"),
-    ("parked", cgroup.parked, "parked weights fit into host RAM"),
+    ("oom", cgroup.out_of_memory, "the daemon is not the first to be killed"),
     ("ports", leftovers.arbiters, "no second arbiter of real GPUs"),
     ("units", installation.units, "the unit is enabled, and its program exists"),
 )

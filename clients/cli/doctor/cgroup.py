@@ -3,15 +3,13 @@
 from collections.abc import Iterator
 from typing import Final
 
-from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, error, note, warning
-from vram_arbiter.clients.cli.doctor.health import status_of
+from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, error, warning
 from vram_arbiter.clients.cli.doctor.machine import Machine
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.sizes import format_bytes
 
 LIMIT_MIN_BYTES: Final = 256 * MIB
 """The daemon takes 30 to 140 MiB."""
-SWAPPED_MIN_BYTES: Final = MIB
 UNIT_SCORE: Final = -500
 """OOMScoreAdjust= of the unit."""
 
@@ -41,7 +39,7 @@ def memory(m: Machine) -> Iterator[Finding]:
 
 
 def out_of_memory(m: Machine) -> Iterator[Finding]:
-    """The daemon is not the first to be killed, and is not swapped out."""
+    """The daemon is not the first to be killed."""
     score = int(m.daemon_file("oom_score_adj"))
     if score > 0 or (score > UNIT_SCORE and m.is_system):
         yield warning(
@@ -49,37 +47,6 @@ def out_of_memory(m: Machine) -> Iterator[Finding]:
             f"oom_score_adj of the daemon is {score}: when host memory runs out it ends before "
             "programs that it knows",
             f"echo {UNIT_SCORE} | {m.sudo}tee /proc/{m.arbiter.pid}/oom_score_adj",
-        )
-    swapped = _field(m.daemon_file("status"), "VmSwap:") * 1024
-    if swapped >= SWAPPED_MIN_BYTES:
-        keep = f"{m.sudo}systemctl set-property vram-arbiter MemorySwapMax=0"
-        what = f"{format_bytes(swapped)} of the daemon are swapped out: decisions wait for the disk"
-        yield warning("oom.swapped", what, f"{keep} && {m.service('restart')}")
-
-
-def parked(m: Machine) -> Iterator[Finding]:
-    """Parked weights fit into host RAM."""
-    ram, info = status_of(m).host_ram, m.text("/proc/meminfo")
-    if info is None:
-        raise CouldNotLook("/proc/meminfo is not there")
-    available = _field(info, "MemAvailable:") * 1024
-    free, swap = format_bytes(available), _field(info, "SwapTotal:")
-    if ram.budget_bytes - ram.parked_bytes > available + _field(info, "SwapFree:") * 1024:
-        without = "" if swap else ", and there is no swap"
-        yield warning(
-            "parked.budget",
-            f"parked weights may take {format_bytes(ram.budget_bytes)}, "
-            f"{format_bytes(ram.parked_bytes)} are taken, and {free} of host RAM are available"
-            f"{without}",
-            f"printf 'host:\\n  park_budget_bytes: {available // 2}\\n' | "
-            f"{m.sudo}tee -a /etc/vram-arbiter/arbiter.yaml && {m.service('restart')}",
-        )
-    elif not swap:
-        yield note(
-            "parked.no-swap",
-            f"the machine has no swap: what exceeds {free} of host RAM ends a process",
-            f"{m.sudo}fallocate -l 4G /swapfile && {m.sudo}chmod 600 /swapfile && "
-            f"{m.sudo}mkswap /swapfile && {m.sudo}swapon /swapfile",
         )
 
 

@@ -19,16 +19,12 @@ SYSTEM_FOLDERS: Final = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib
 
 
 def origins(m: Machine) -> Iterator[Finding]:
-    """One copy of the package is on the path, and the programs on PATH belong to it."""
+    """All modules are of one copy of the package, and the programs on PATH belong to it."""
     installed = m.installed
     yield ok("installation.origin", f"{installed.package} ({installed.version})")
     for stray in installed.strays[:1]:
         what = f"modules come from two copies of the package, also from {stray}"
         yield error("installation.mixed", what, _remove(stray, installed.bin))
-    for copy in installed.copies:
-        if os.path.realpath(copy) != os.path.realpath(installed.package):
-            what = f"another copy is on the path of this Python, but is not used: {copy}"
-            yield note("installation.shadowed", what, _remove(copy, installed.bin))
     for name, place in installed.programs.items():
         own = os.path.realpath(f"{installed.bin}/{name}")
         if place != own and os.path.exists(own):

@@ -11,7 +11,6 @@ import pwd
 import shutil
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,16 +20,12 @@ from vram_arbiter.clients.cli.doctor.findings import CouldNotLook
 from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.codec import CodecError, from_map
 from vram_arbiter.schemas.errors import ConfigError, VramError
-from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
 from vram_arbiter.schemas.wire.errors import ErrorView
-from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
+from vram_arbiter.schemas.wire.replies import PingReply, StatusReply
 
 CONNECT_S: Final = 1.0
-EVENTS: Final = 500
-"""Of the history, for jumps of the clock."""
-SYSTEM_STATE: Final = "/var/lib/vram-arbiter"
 UNIT: Final = "vram-arbiter.service"
 
 
@@ -51,7 +46,6 @@ class Arbiter:
     `refusal`: it answered with an error."""
 
     status: StatusReply | None = None
-    history: tuple[JsonMap, ...] = ()
     server: str = ""  # its version
     pid: int | None = None  # 0: of another pid namespace
     uid: int | None = None
@@ -61,24 +55,14 @@ class Arbiter:
 
 @dataclass(frozen=True, slots=True)
 class Import:
-    """Where this program comes from. `copies`: folders on the path that have the package;
-    `strays`: modules of it that were imported from elsewhere."""
+    """Where this program comes from. `strays`: modules of the package that were imported from
+    elsewhere."""
 
     package: str
     version: str
     bin: str  # of this interpreter
-    copies: Sequence[str] = ()
     strays: Sequence[str] = ()
     programs: Mapping[str, str] = field(default_factory=dict)  # on PATH: name → resolved path
-
-
-@dataclass(frozen=True, slots=True)
-class Clocks:
-    """Readings of the kernel's clocks, in seconds."""
-
-    wall: float
-    monotonic: float
-    boottime: float
 
 
 @dataclass(frozen=True)
@@ -93,7 +77,6 @@ class Machine:
     environ: Mapping[str, str] = field(default_factory=dict)
     uid: int = 0
     gids: frozenset[int] = frozenset({0})
-    clocks: Clocks = Clocks(2e9, 1.0, 1.0)
     group_name: Callable[[int], str] = str
     group_members: Callable[[str], Sequence[str]] = lambda name: ()
     user_name: Callable[[int], str] = str
@@ -202,11 +185,6 @@ def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
         environ=os.environ,
         uid=os.geteuid(),
         gids=frozenset({os.getegid(), *os.getgroups()}),
-        clocks=Clocks(
-            time.time(),
-            time.clock_gettime(time.CLOCK_MONOTONIC),
-            time.clock_gettime(time.CLOCK_BOOTTIME),
-        ),
         group_name=lambda gid: _found(lambda key: grp.getgrgid(key).gr_name, gid, str(gid)),
         group_members=lambda name: _found(lambda key: grp.getgrnam(key).gr_mem, name, []),
         user_name=lambda uid: _found(lambda key: pwd.getpwuid(key).pw_name, uid, str(uid)),
@@ -223,11 +201,8 @@ def ask_arbiter(endpoint: str) -> Arbiter:
             view = ErrorView(error["code"], error["message"], error.get("hint", ""), {})
             return Arbiter(pid=pid, uid=uid, refusal=view)
         ping = request.ask("ping", {}, endpoint)
-        last = request.ask("history", {"after": 1 << 62, "limit": 1}, endpoint)
-        after = max(0, int(last.get("last_seq", 0)) - EVENTS)
-        events = request.ask("history", {"after": after, "limit": EVENTS}, endpoint)
-        told, name = from_map(HistoryReply, events), from_map(PingReply, ping)
-        return Arbiter(from_map(StatusReply, status), told.events, name.server, pid, uid)
+        server = from_map(PingReply, ping).server
+        return Arbiter(from_map(StatusReply, status), server, pid, uid)
     except VramError as error:
         return Arbiter(problem=error)
     except (CodecError, KeyError) as error:
@@ -247,13 +222,8 @@ def _listener(endpoint: str) -> tuple[int | None, int | None]:
 
 
 def this_installation(package: str, version: str) -> Import:
-    """Look where this program and its namesakes lie."""
+    """Look where this program and its modules lie."""
     name = Path(package).name
-    copies = [
-        str(Path(entry or ".").resolve() / name)
-        for entry in sys.path
-        if (Path(entry or ".") / name / "__init__.py").is_file()
-    ]
     programs = {
         program: os.path.realpath(found)
         for program in ("vramctl", "vram-arbiter")
@@ -268,7 +238,6 @@ def this_installation(package: str, version: str) -> Import:
         package=package,
         version=version,
         bin=os.path.dirname(sys.executable),
-        copies=tuple(dict.fromkeys(copies)),
         strays=tuple(sorted(file for file in files if not file.startswith(f"{package}/"))),
         programs=programs,
     )

@@ -7,7 +7,7 @@ from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.events import Resize
-from textual.widgets import Input, Static
+from textual.widgets import Static
 
 from vram_arbiter.clients.cli.text import duration, plural
 from vram_arbiter.clients.cli.top import gpus
@@ -15,7 +15,7 @@ from vram_arbiter.clients.cli.top.dialogs import Confirm, Help
 from vram_arbiter.clients.cli.top.feed import Feed, Order
 from vram_arbiter.clients.cli.top.gpus import Samples
 from vram_arbiter.clients.cli.top.leases import Leases
-from vram_arbiter.clients.cli.top.rows import ORDERS, Row, Table, arranged, fitted, rows_of
+from vram_arbiter.clients.cli.top.rows import ORDERS, Row, Table, fitted, rows_of
 from vram_arbiter.schemas.runtime.printable import printable
 
 TICK_S = 1.0
@@ -34,15 +34,11 @@ class Top(App[None]):
     #selected, #events { border-top: solid $panel; }
     #selected { max-height: 50%; }
     Leases { height: 1fr; min-height: 3; scrollbar-size-vertical: 1; overflow-x: hidden; }
-    #filter { display: none; height: 1; border: none; padding: 0; }
-    #filter.shown { display: block; }
     """
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("q,ctrl+c", "quit", "quit", priority=False),
-        Binding("s", "sort(1)", "sort"),
-        Binding("S", "sort(-1)", "sort back"),
-        Binding("slash", "filter", "filter"),
+        Binding("s", "sort", "sort"),
         Binding("e", "evict", "evict"),
         Binding("p", "pin", "pin"),
         Binding("d", "drain", "drain"),
@@ -53,7 +49,6 @@ class Top(App[None]):
         super().__init__(ansi_color=True)  # the terminal's own colors; none at all with NO_COLOR
         self._feed = feed
         self._order = "queue"
-        self._wanted = ""
         self._said: tuple[float, str, str] = (0.0, "", "")  # until, what, style
 
     def compose(self) -> ComposeResult:
@@ -61,8 +56,6 @@ class Top(App[None]):
         yield Static(id="gpus")
         yield Static(id="titles")
         yield Leases()
-        what = "consumer, model, lease, state or GPU"
-        yield Input(id="filter", placeholder=what, compact=True, select_on_focus=False)
         yield Static(id="selected")
         yield Static(id="events")
         yield Static(id="keys")
@@ -95,7 +88,7 @@ class Top(App[None]):
         panel = gpus.panel(status, samples, width, self.size.height)
         base.query_one("#gpus", Static).update(Text("\n".join(panel), no_wrap=True))
         table = Table(width - 1)  # the last column is the scroll bar's
-        rows = arranged(rows_of(status), self._order, self._wanted)
+        rows = sorted(rows_of(status), key=ORDERS[self._order])
         base.query_one("#titles", Static).update(Text(table.head(), no_wrap=True))
         base.query_one(Leases).show(rows, table)
         self._show_selected()
@@ -122,8 +115,7 @@ class Top(App[None]):
         base, status = self.screen_stack[0], self._feed.status
         lines = gpus.selected_lines(base.query_one(Leases).row)
         if not lines and status is not None:
-            wanted = f"no lease matches {printable(self._wanted)!r}"
-            lines = [wanted if status.leases else "no leases"]
+            lines = ["no leases"]
         base.query_one("#selected", Static).update(Text("\n".join(lines)))
 
     def _keys(self) -> Text:
@@ -136,10 +128,8 @@ class Top(App[None]):
         if self._feed.refusal:
             orders = [("", "e p d: operators only")]
         sort = f"sort {self._order}" if wide else "sort"
-        for key, what in [("s", sort), ("/", "filter"), *orders, ("?", "keys"), ("q", "quit")]:
+        for key, what in [("s", sort), *orders, ("?", "keys"), ("q", "quit")]:
             shown.append(f"{key} " if key else "", "bold").append(f"{what}  ", "" if key else "dim")
-        if self._wanted and wide:
-            shown.append(f"filter: {printable(self._wanted)}", "bold yellow")
         return shown
 
     def _say(self, said: str, style: str) -> None:
@@ -147,33 +137,10 @@ class Top(App[None]):
         self.show()
 
     # -- keys
-    def action_sort(self, by: int) -> None:
+    def action_sort(self) -> None:
         names = list(ORDERS)
-        self._order = names[(names.index(self._order) + by) % len(names)]
+        self._order = names[(names.index(self._order) + 1) % len(names)]
         self._say(f"sorted by {self._order}", "bold")
-
-    def action_filter(self) -> None:
-        field = self.query_one("#filter", Input)
-        field.add_class("shown")
-        field.focus()
-
-    def on_input_changed(self, event: Input.Changed) -> None:
-        if event.input.id == "filter":
-            self._wanted = event.value
-            self.show()
-
-    def on_input_submitted(self, event: Input.Submitted) -> None:
-        if event.input.id == "filter":
-            self._close_filter()
-
-    def key_escape(self) -> None:
-        if len(self.screen_stack) == 1:
-            self.query_one("#filter", Input).value = ""
-            self._close_filter()
-
-    def _close_filter(self) -> None:
-        self.query_one("#filter", Input).remove_class("shown")
-        self.query_one(Leases).focus()
 
     def action_help(self) -> None:
         self.push_screen(Help(self._feed.refusal))

@@ -68,8 +68,7 @@ class Confirm(ModalScreen[str | None]):
 
 
 KEYS = (
-    ("s", "sort by the next column (S: the one before)"),
-    ("/", "filter by consumer, model, lease, state or GPU (Esc: all)"),
+    ("s", "sort by the next column"),
     ("e", "evict the selected lease; a use in flight finishes first"),
     ("p", "pin the selected lease, or undo an operator's pin"),
     ("d", "drain: grant nothing new; again: resume"),

@@ -1,4 +1,4 @@
-"""Leases as rows of `vramctl top`: columns by width, order, filter, and what a waiter waits for.
+"""Leases as rows of `vramctl top`: columns by width, order, and what a waiter waits for.
 
 Pure. Words of reasons and estimates are the arbiter's own (`StatusReply.details`).
 """
@@ -81,7 +81,7 @@ def _tier(lease: LeaseView, indices: Mapping[str, int]) -> str:
     return f"GPU {indices[lease.gpu]}" if lease.gpu in indices else "GPU"
 
 
-# -- order and filter
+# -- order
 ORDERS: Mapping[str, Callable[[Row], tuple[float, str]]] = {
     "queue": lambda row: (0.0, ""),  # the arbiter's order stays
     "consumer": lambda row: (0.0, row.lease.consumer),
@@ -93,19 +93,6 @@ ORDERS: Mapping[str, Callable[[Row], tuple[float, str]]] = {
     "since": lambda row: (-row.since_s, row.lease.consumer),
 }
 """Orders by name; the key `s` takes the next one."""
-
-
-def arranged(rows: Sequence[Row], order: str, wanted: str) -> list[Row]:
-    """Return the rows that hold the text `wanted`, sorted."""
-    text = wanted.strip().lower()
-    kept = [row for row in rows if not text or text in _searched(row)]
-    return sorted(kept, key=ORDERS[order])
-
-
-def _searched(row: Row) -> str:
-    lease = row.lease
-    words = (lease.consumer, lease.model, lease.lease_id, lease.state, row.tier, lease.gpu or "")
-    return printable(" ".join(words)).lower()
 
 
 # -- columns

@@ -182,25 +182,19 @@ def test_columns_stay_columns_beside_an_escaped_name() -> None:
     assert head.index("PRIO") + len("PRIO") == len(one) == len(other)
 
 
-# -- the demo's display
-def test_the_demos_display_obeys_neither_escapes_nor_markup(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    out = io.StringIO()
-    monkeypatch.setattr("sys.stdout", out)
-    monkeypatch.setenv("COLUMNS", "400")
-    display = demo_display.Display(HOSTILE, arbiter=True)
-    with display:
-        display.event(poisoned(EVENT, HOSTILE, frozenset({"consumer", "reason"})), 1.0)
-        display.robot(HOSTILE, 2.0)
-    assert not obeyed(out.getvalue())
-    assert out.getvalue().count("[red]line[/red]") == 3
-    assert out.getvalue().count("\n") == 2
+# -- the demo's lines
+def test_the_demos_lines_obey_no_escapes(capsys: pytest.CaptureFixture[str]) -> None:
+    display = demo_display.Display()
+    display.event(poisoned(EVENT, HOSTILE, frozenset({"consumer", "reason"})), 1.0)
+    display.robot(HOSTILE, 2.0)
+    shown = capsys.readouterr().out
+    assert not obeyed(shown)
+    assert shown.count("[red]line[/red]") == 3
+    assert shown.count("\n") == 2
 
 
-def test_the_demos_table_has_no_markup() -> None:
+def test_a_status_has_no_markup() -> None:
     console = Console(file=io.StringIO(), width=200)
-    console.print(demo_display._table([poisoned(LEASE, HOSTILE)]))
     console.print(Text("\n".join(text.status_lines(poisoned(STATUS, HOSTILE)))))
     shown = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO
     assert "[red]line[/red]" in shown

@@ -242,9 +242,7 @@ def test_a_restore_that_fails_gives_the_lease_back_and_keeps_the_program(
     [
         (["http"], "needs --url"),
         (["http", "--url", "http://192.0.2.1/free"], "--allow-remote"),
-        (["http", "--url", "http://localhost/", "--body", "{"], "--body: expected JSON"),
-        (["http", "--url", "http://localhost/", "--restore-body", "{}"], "needs --restore-url"),
-        (["vllm", "--method", "PUT"], "--method has no effect with --on-evict vllm"),
+        (["vllm", "--restore-url", "x"], "--restore-url has no effect with --on-evict vllm"),
         (["stop", "--url", "http://localhost/"], "--url has no effect with --on-evict stop"),
         (["cuda-checkpoint", "--allow-remote"], "--allow-remote has no effect"),
         (["stop", "--pin"], "leave out --on-evict stop"),
