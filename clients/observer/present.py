@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.requests import Status
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +78,7 @@ class Present:
         leases = {lease.lease_id: lease for lease in self.newest.status.leases}
         if len(leases) <= SOME_MAX or time.monotonic() - self._whole_at > WHOLE_S:
             return None
-        found = await self._page({"leases": list(touched)})
+        found = await self._page(Status(leases=tuple(map(LeaseId, touched))))
         if found.epoch != self.newest.status.epoch:
             return None
         for lease_id in touched:
@@ -87,16 +88,14 @@ class Present:
 
     async def _pages(self) -> StatusReply:
         self._whole_at = time.monotonic()
-        first = page = await self._page({})
+        first = page = await self._page(Status())
         leases = {lease.lease_id: lease for lease in page.leases}
         for _ in range(PAGES_MAX - 1):
             if page.next is None:
                 break
-            page = await self._page({"after": page.next})
+            page = await self._page(Status(after=page.next))
             leases |= {lease.lease_id: lease for lease in page.leases}
         return replace(first, leases=tuple(leases.values()), next=None)
 
-    async def _page(self, fields: JsonMap) -> StatusReply:
-        reply = await self._client.ask("status", fields, timeout_s=ASK_S)
-        assert isinstance(reply, StatusReply)
-        return reply
+    async def _page(self, request: Status) -> StatusReply:
+        return await self._client.ask(request, timeout_s=ASK_S)

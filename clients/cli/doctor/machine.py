@@ -26,6 +26,7 @@ from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import HistoryReply, PingReply, StatusReply
+from vram_arbiter.schemas.wire.requests import History, Ping, Status
 
 CONNECT_S: Final = 1.0
 EVENTS: Final = 500
@@ -216,16 +217,16 @@ def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
 def ask_arbiter(endpoint: str) -> Arbiter:
     """Ask the arbiter, and the kernel for its pid and uid."""
     try:
-        status = request.ask("status", {}, endpoint)
+        status = request.ask(Status(), endpoint)
         pid, uid = _listener(endpoint)
         if not status.get("ok"):
             error = status["error"]
             view = ErrorView(error["code"], error["message"], error.get("hint", ""), {})
             return Arbiter(pid=pid, uid=uid, refusal=view)
-        ping = request.ask("ping", {}, endpoint)
-        last = request.ask("history", {"after": 1 << 62, "limit": 1}, endpoint)
+        ping = request.ask(Ping(), endpoint)
+        last = request.ask(History(1 << 62, 1), endpoint)
         after = max(0, int(last.get("last_seq", 0)) - EVENTS)
-        events = request.ask("history", {"after": after, "limit": EVENTS}, endpoint)
+        events = request.ask(History(after, EVENTS), endpoint)
         told, name = from_map(HistoryReply, events), from_map(PingReply, ping)
         return Arbiter(from_map(StatusReply, status), told.events, name.server, pid, uid)
     except VramError as error:
