@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, Self, cast
 
 import anyio
 from anyio.abc import TaskGroup
@@ -30,9 +30,10 @@ from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.dealer import Dealer, Transport
 from vram_arbiter.clients.net.diagnose import START, obstacle
-from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
+from vram_arbiter.schemas.ids import LeaseId, Token, UseId
 from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -83,7 +84,7 @@ class _Subscriber:
 class Session:
     """Open inside `async with`, for one event loop and one process (`clients.eviction.Driver`)."""
 
-    def __init__(self, name: str, endpoint: str, role: str, connect_timeout_s: float) -> None:
+    def __init__(self, name: str, endpoint: str, role: w.Role, connect_timeout_s: float) -> None:
         self.endpoint = endpoint
         self.protocol = ClientProtocol(
             name=name, instance=f"{os.getpid()}-{uuid.uuid4().hex[:8]}", role=role
@@ -149,11 +150,7 @@ class Session:
                 log.warning("closing although leases are still in use: %s", self.held)
             if self.connected:
                 with contextlib.suppress(VramError), anyio.CancelScope(shield=True):
-                    await self.reply(
-                        self.protocol.connection.request(
-                            "bye", {}, self.now(), timeout_s=BYE_TIMEOUT_S
-                        )
-                    )
+                    await self.ask(w.Bye(), BYE_TIMEOUT_S)
         finally:
             await self._shut()
 
@@ -181,7 +178,7 @@ class Session:
         self._waits[nonce] = _Wait(granted, spec, handlers)
         self.protocol.waits.acquire(
             nonce,
-            to_map(spec),
+            spec,
             self.now(),
             wait_timeout_s=wait_timeout_s,
             traceparent=traceparent or traces.present(),
@@ -196,28 +193,29 @@ class Session:
             self._waits.pop(nonce, None)
 
     async def begin_use(
-        self, lease_id: str, token: r.TokenPair, label: str, timeout_s: float
+        self, lease_id: LeaseId, token: Token, label: str, timeout_s: float
     ) -> AsyncForeignUse:
         self.check_open()
-        use_id = f"{self.protocol.connection.instance}/{self.new_id()}"
-        use = AsyncForeignUse(self, lease_id, token, use_id, label)
-        request = self.protocol.foreign_uses.begin(
-            lease_id,
-            token,
-            use_id,
-            label,
-            self.now(),
-            timeout_s=timeout_s,
-            traceparent=traces.present(),
-        )
+        use_id = UseId(f"{self.protocol.connection.instance}/{self.new_id()}")
+        request = w.UseBegin(lease_id, token, use_id, label)
+        use = AsyncForeignUse(self, request)
+        asked = self.protocol.foreign_uses.begin(request, self.now(), timeout_s, traces.present())
         self._foreign_uses[use_id] = use
         try:
-            await self.reply(request)
+            await self.reply(asked)
         except BaseException:
             await use.end()
             raise
         use_context.enter(use_id, use.name)
         return use
+
+    async def ask[R](
+        self, request: w.Request[R], timeout_s: float, traceparent: str | None = None
+    ) -> R:
+        """Send a request and return its reply."""
+        connection = self.protocol.connection
+        asked = connection.ask(request, self.now(), timeout_s, traceparent=traceparent)
+        return cast("R", await self.reply(asked))  # the type that the request names
 
     async def events(self) -> AsyncGenerator[JsonMap]:
         """Yield history events from now on."""

@@ -3,16 +3,22 @@
 from collections.abc import Mapping
 from dataclasses import fields as dataclass_fields
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.sizes import parse_bytes, parse_need
-from vram_arbiter.schemas.wire.requests import checked_spec
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+
+_SPEC = TypeAdapter(LeaseSpec)
 
 type Vram = int | str | Footprint
 """Bytes, a text such as `5.3GB` or `8GiB`, or a footprint with its parts."""
+
+
+def checked_spec(fields: Mapping[str, object]) -> LeaseSpec:
+    """Return the spec with these fields, within its limits. Raises pydantic's ValidationError."""
+    return _SPEC.validate_python(fields)
 
 
 def lease_spec(

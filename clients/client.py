@@ -29,11 +29,12 @@ from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.handlers import Handler, Handlers, with_signature_of
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.ids import LeaseId, Token
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import (
-    AnyReply,
     HistoryReply,
     PingReply,
     PrepareReply,
@@ -81,7 +82,7 @@ class AsyncClient:
         name: str,
         *,
         endpoint: str | None = None,
-        role: str = "client",
+        role: w.Role = "client",
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self._name = name
@@ -194,8 +195,8 @@ class AsyncClient:
 
         Raises: LeaseRevoking, StaleToken, LeaseLost.
         """
-        pair = (int(token[0]), int(token[1]))
-        return await self._session.begin_use(lease_id, pair, label, timeout_s)
+        pair = Token(int(token[0]), int(token[1]))
+        return await self._session.begin_use(LeaseId(lease_id), pair, label, timeout_s)
 
     @asynccontextmanager
     async def use(
@@ -209,21 +210,9 @@ class AsyncClient:
             await use.end()
 
     # -- questions
-    async def ask(
-        self,
-        op: str,
-        fields: JsonMap | None = None,
-        *,
-        timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> AnyReply:
-        """Send any request of `schemas.wire.requests` that has no method here. Returns the reply's
-        type of `schemas.wire.replies`."""
-        session = self._session
-        return await session.reply(
-            session.protocol.connection.request(
-                op, traces.along(fields), session.now(), timeout_s=timeout_s
-            )
-        )
+    async def ask[R](self, request: w.Request[R], *, timeout_s: float = REQUEST_TIMEOUT_S) -> R:
+        """Send any request of `schemas.wire.requests`, and return its reply."""
+        return await self._session.ask(request, timeout_s, traces.present())
 
     async def status(self, *, details: bool = False) -> StatusReply:
         """Return the state of everything, with the leases of all pages. A lease that moves
@@ -231,12 +220,11 @@ class AsyncClient:
 
         `details`: with declared and measured bytes of each lease, and why each waiter waits.
         """
-        asked: JsonMap = {"details": True} if details else {}
-        first = page = await self._asked(StatusReply, "status", asked)
+        first = page = await self.ask(w.Status(details))
         leases = {lease.lease_id: lease for lease in page.leases}
         told = {detail.lease_id: detail for detail in page.details}
         while page.next is not None:
-            page = await self._asked(StatusReply, "status", {**asked, "after": page.next})
+            page = await self.ask(w.Status(details, after=page.next))
             leases |= {lease.lease_id: lease for lease in page.leases}
             told |= {detail.lease_id: detail for detail in page.details}
         return replace(
@@ -246,19 +234,18 @@ class AsyncClient:
     async def why(self, consumer: str) -> WhyReply:
         """Return what blocks a consumer, by how many bytes, on which condition, and what
         is next."""
-        return await self._asked(WhyReply, "why", {"consumer": consumer})
+        return await self.ask(w.AskWhy(consumer))
 
     async def history(
         self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()
     ) -> HistoryReply:
         """Return events after sequence number `after`, oldest first."""
-        fields = {"after": after, "limit": limit, "kinds": list(kinds)}
-        return await self._asked(HistoryReply, "history", fields)
+        return await self.ask(w.History(after, limit, tuple(kinds)))
 
     async def prepare(self, consumer: str) -> PrepareReply:
         """Tell a consumer that its model is wanted soon; it may read its weights into host RAM.
         Nothing is granted, and nothing evicted, for a hint."""
-        return await self._asked(PrepareReply, "prepare", {"consumer": consumer})
+        return await self.ask(w.Prepare(consumer))
 
     def on_prepare(self, hinted: Callable[[str], object]) -> None:
         """Call `hinted` with the name of a client that says that this consumer's model is wanted
@@ -267,7 +254,7 @@ class AsyncClient:
 
     async def ping(self, *, timeout_s: float = 2.0) -> PingReply:
         """Wait for a sign of life."""
-        return await self._asked(PingReply, "ping", timeout_s=timeout_s)
+        return await self.ask(w.Ping(), timeout_s=timeout_s)
 
     async def subscribe(self) -> AsyncIterator[JsonMap]:
         """Yield history events from now on, also across restarts of the arbiter. A subscriber that
@@ -278,15 +265,3 @@ class AsyncClient:
                 yield event
         finally:
             await events.aclose()
-
-    async def _asked[R](
-        self,
-        kind: type[R],
-        op: str,
-        fields: JsonMap | None = None,
-        *,
-        timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> R:
-        reply = await self.ask(op, fields, timeout_s=timeout_s)
-        assert isinstance(reply, kind)
-        return reply

@@ -12,11 +12,13 @@ from typing import Literal
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import traces
-from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord, TokenPair
+from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord
 from vram_arbiter.clients.eviction import Departure, Driver
 from vram_arbiter.clients.handlers import Handlers, call
 from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
+from vram_arbiter.schemas.ids import Token, UseId
 from vram_arbiter.schemas.wire.pushes import RevokePush
+from vram_arbiter.schemas.wire.requests import UseBegin, UseEnd
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -53,7 +55,7 @@ class AsyncLease:
         return self._record.lease_id
 
     @property
-    def token(self) -> TokenPair:
+    def token(self) -> Token:
         """Fencing token (epoch, serial). A process that has it and the lease id can mark uses."""
         return self._record.token
 
@@ -130,7 +132,7 @@ class AsyncLease:
 
         Raises: LeaseRevoking or LeaseLost before the block begins.
         """
-        use = AsyncUse(self, f"{self.lease_id}/{self._driver.new_id()}", label)
+        use = AsyncUse(self, UseId(f"{self.lease_id}/{self._driver.new_id()}"), label)
         try:
             await use._begin()
             yield use
@@ -326,14 +328,14 @@ class AsyncLease:
 class AsyncUse:
     """A use on the holder's own lease; made by `AsyncLease.use`."""
 
-    def __init__(self, lease: AsyncLease, use_id: str, label: str) -> None:
+    def __init__(self, lease: AsyncLease, use_id: UseId, label: str) -> None:
         self._use_id = use_id
         self._lease = lease
         self._label = label
         self.name = use_context.named(label, lease.lease_id)
 
     @property
-    def use_id(self) -> str:
+    def use_id(self) -> UseId:
         return self._use_id
 
     async def _begin(self) -> None:
@@ -361,28 +363,24 @@ class AsyncForeignUse:
     """A use on the lease of another process, begun with its token. It ends with the client at the
     latest."""
 
-    def __init__(
-        self, driver: Driver, lease_id: str, token: TokenPair, use_id: str, label: str
-    ) -> None:
-        self.name = use_context.named(label, lease_id)
+    def __init__(self, driver: Driver, request: UseBegin) -> None:
+        self.name = use_context.named(request.label, request.lease_id)
         self._driver = driver
-        self._lease_id = lease_id
-        self._token = token
-        self._use_id = use_id
+        self._request = request
         self._lost: VramError | None = None
         self._ended = False
 
     @property
     def lease_id(self) -> str:
-        return self._lease_id
+        return self._request.lease_id
 
     @property
-    def token(self) -> TokenPair:
-        return self._token
+    def token(self) -> Token:
+        return self._request.token
 
     @property
     def use_id(self) -> str:
-        return self._use_id
+        return self._request.use_id
 
     @property
     def lost(self) -> VramError | None:
@@ -396,7 +394,7 @@ class AsyncForeignUse:
         self._ended = True
         use_context.leave(self.use_id)
         self._driver.forget_use(self.use_id)
-        self._driver.protocol.foreign_uses.end(
-            self.lease_id, self.token, self.use_id, self._driver.now()
-        )
+        begun = self._request
+        request = UseEnd(begun.lease_id, begun.token, begun.use_id)
+        self._driver.protocol.foreign_uses.end(request, self._driver.now())
         self._driver.pump()

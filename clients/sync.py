@@ -35,15 +35,16 @@ from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
 from vram_arbiter.clients.handlers import Handler, Handlers, with_signature_of
 from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease, AsyncUse, LeaseState
 from vram_arbiter.schemas.errors import BadState, VramError
+from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import (
-    AnyReply,
     HistoryReply,
     PingReply,
     PrepareReply,
     StatusReply,
 )
+from vram_arbiter.schemas.wire.requests import Request, Role
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
@@ -137,7 +138,7 @@ class Lease:
         return self._lease.lease_id
 
     @property
-    def token(self) -> r.TokenPair:
+    def token(self) -> Token:
         """Fencing token (epoch, serial). A process that has it and the lease id can mark uses."""
         return self._lease.token
 
@@ -255,7 +256,7 @@ class ForeignUse:
         return self._use.lease_id
 
     @property
-    def token(self) -> r.TokenPair:
+    def token(self) -> Token:
         return self._use.token
 
     @property
@@ -299,7 +300,7 @@ class Client:
         name: str,
         *,
         endpoint: str | None = None,
-        role: str = "client",
+        role: Role = "client",
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self._client = AsyncClient(
@@ -418,15 +419,10 @@ class Client:
             use.end()
 
     # -- questions ---------------------------------------------------------------------------------
-    def ask(
-        self,
-        op: str,
-        fields: JsonMap | None = None,
-        *,
-        timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> AnyReply:
-        """Send any request of `schemas.wire.requests` that has no method here."""
-        return self._portal.call(self._client.ask, op, fields, timeout_s=timeout_s)
+    def ask[R](self, request: Request[R], *, timeout_s: float = REQUEST_TIMEOUT_S) -> R:
+        """Send any request of `schemas.wire.requests`, and return its reply."""
+        ask: Callable[..., Awaitable[R]] = self._client.ask
+        return self._portal.call(ask, request, timeout_s=timeout_s)
 
     def status(self, *, details: bool = False) -> StatusReply:
         """Return the state of everything; see `AsyncClient.status`."""

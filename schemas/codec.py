@@ -201,6 +201,10 @@ def _itself(value: Any) -> Any:
     return value
 
 
+def _refuse(value: Any) -> Any:
+    raise CodecError(f"expected one of several kinds of map, got {value!r:.80}")
+
+
 def _decode_items(items: Sequence[_Convert | None], value: Any) -> tuple[Any, ...]:
     """Decode a tuple of a fixed length."""
     found = zip(items, _listed(value, len(items)), strict=True)
@@ -222,7 +226,8 @@ def _union_decoding(arguments: Sequence[Any], strict: bool) -> _Convert | None:
         for cls in classes
         if not hasattr(cls, "TAG")
     ]
-    otherwise = (_decoding(others[0], strict) if others else None) or _itself
+    otherwise = _decoding(others[0], strict) if others else _refuse if strict else None
+    rest = otherwise or _itself
 
     def choose(data: Any) -> Any:
         if isinstance(data, Mapping):
@@ -232,7 +237,7 @@ def _union_decoding(arguments: Sequence[Any], strict: bool) -> _Convert | None:
             for known, decode in untagged:
                 if data.keys() <= known:
                     return decode(data)
-        return otherwise(data)
+        return rest(data)
 
     return _optional(choose) if NoneType in arguments else choose
 

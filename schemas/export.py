@@ -18,6 +18,7 @@ from pydantic import BaseModel, TypeAdapter
 from vram_arbiter import schemas
 from vram_arbiter.schemas import wire
 from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.wire import requests
 
 ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
@@ -39,10 +40,9 @@ def documents() -> dict[str, str]:
         found[name] = model.model_json_schema()
     for name in modules():
         document = name.partition(".")[0]
-        definitions = _of_module(importlib.import_module(f"vram_arbiter.schemas.{name}"))
-        if definitions:
+        if defined := definitions(importlib.import_module(f"vram_arbiter.schemas.{name}")):
             empty = {"title": f"schemas.{document}", "$defs": {}}
-            found.setdefault(document, empty)["$defs"].update(definitions)
+            found.setdefault(document, empty)["$defs"].update(defined)
     return {
         f"{name}.json": json.dumps(
             {"$schema": _DIALECT, **schema}, indent=1, ensure_ascii=False, sort_keys=True
@@ -80,13 +80,14 @@ def public_models(module: ModuleType) -> list[type]:
     ]
 
 
-def _of_module(module: ModuleType) -> JsonObject:
+def definitions(module: ModuleType) -> JsonObject:
+    """Return the schemas of what a module defines, by name."""
     mode: Literal["validation"] = "validation"
     inputs: list[tuple[str, Literal["validation"], TypeAdapter[Any]]] = [
         (model.__name__, mode, TypeAdapter(model)) for model in public_models(module)
     ]
-    found, definitions = TypeAdapter.json_schemas(inputs)
-    defs = dict(definitions.get("$defs", {}))
+    found, shared = TypeAdapter.json_schemas(inputs)
+    defs = dict(shared.get("$defs", {}))
     for (name, _), schema in found.items():
         if schema != {"$ref": f"#/$defs/{name}"}:
             defs[name] = schema
@@ -109,3 +110,7 @@ def _as_sent(model: Any, schema: JsonObject) -> None:
         key, value = tag
         schema["properties"] = {key: {"const": value}, **schema.get("properties", {})}
         schema["required"] = sorted([key, *schema.get("required", ())])
+    if issubclass(model, requests.Request):
+        envelope = TypeAdapter(requests.Envelope).json_schema()
+        schema["properties"].update(envelope["properties"])
+        schema["required"] = sorted([*envelope["required"], *schema["required"]])

@@ -2,7 +2,7 @@
 same effects.
 
 `handle` is one decision tree:
-  1. what happened, by `_STEPS`
+  1. what happened, by `_STEPS`, or what is asked for, by `_REQUESTS`
   2. recovery ends when every lease is accounted for
   3. GPUs are granted (its own numbered tree: `grants`); an acquire that has to wait is answered
   4. the next reading of each GPU is planned
@@ -27,6 +27,7 @@ from vram_arbiter.arbiter.core.scheduling import grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -58,20 +59,6 @@ _STEPS: Mapping[type, Callable[[Core, Any], None]] = {
     ev.ClientConnected: sessions.on_connected,
     ev.ClientLeft: sessions.on_left,
     ev.ProcessDied: sessions.on_died,
-    # requests: each raises Refused before it has changed anything
-    ev.AcquireRequested: requests.acquire,
-    ev.Reacquired: requests.reacquire,
-    ev.CancelRequested: requests.cancel,
-    ev.ReadyReported: requests.ready,
-    ev.UseBegan: uses.begin,
-    ev.UseEnded: uses.end,
-    ev.Renewed: requests.renew,
-    ev.OomReported: requests.oom,
-    ev.RevokeAcknowledged: requests.revoke_ack,
-    ev.UnloadStarted: requests.unloading,
-    ev.ReleaseReported: requests.release,
-    ev.Reattached: recovery.on_reattached,
-    ev.OperatorAsked: operators.on_operator,
     # the machine
     ev.MemorySampled: _on_reading,
     ev.ProbeFailed: schedule.on_probe_failed,
@@ -82,6 +69,23 @@ _STEPS: Mapping[type, Callable[[Core, Any], None]] = {
     # time
     ev.Tick: _on_tick,
 }
+_REQUESTS: Mapping[type, Callable[[Core, ev.Asked, Any], None]] = {
+    w.Acquire: requests.acquire,
+    w.Reacquire: requests.reacquire,
+    w.Cancel: requests.cancel,
+    w.Ready: requests.ready,
+    w.UseBegin: uses.begin,
+    w.UseEnd: uses.end,
+    w.Renew: requests.renew,
+    w.Oom: requests.oom,
+    w.RevokeAck: requests.revoke_ack,
+    w.Unloading: requests.unloading,
+    w.Release: requests.release,
+    w.Reattach: recovery.reattach,
+    **dict.fromkeys(operators.TO_LEASE, operators.order_lease),
+    **dict.fromkeys(operators.TO_ALL, operators.order_all),
+}
+"""Each raises Refused before it has changed anything."""
 _DUE: Mapping[str, Callable[[Core, str], None]] = {
     "ttl": sessions.expire,
     "wait": requests.on_wait_timeout,
@@ -112,8 +116,8 @@ class Arbiter:
         """
         core = self._core
         core.now = max(core.now, now)
-        if isinstance(event, ev.ClientRequest):  # 1
-            self._requested(event)
+        if isinstance(event, ev.Asked):  # 1
+            self._asked(event)
         else:
             _STEPS[type(event)](core, event)
         if not core.serving and not core.recovering:  # 2
@@ -127,17 +131,17 @@ class Arbiter:
         turn, core.turn = core.turn, Turn()
         return turn.effects
 
-    def _requested(self, event: ev.ClientRequest) -> None:
-        core = self._core
-        if event.client not in core.clients:
-            core.refuse(event.client, event.request, NoSession())
+    def _asked(self, asked: ev.Asked) -> None:
+        core, request = self._core, asked.request
+        if asked.client not in core.clients:
+            core.refuse(asked.client, asked.id, NoSession())
             return
         try:
-            _STEPS[type(event)](core, event)
+            _REQUESTS[type(request)](core, asked, request)
         except Refused as refused:
-            core.refuse(event.client, event.request, refused.refusal)
-            if isinstance(event, ev.AcquireRequested | ev.Reacquired):
-                requests.note_refused(core, event, refused.refusal)
+            core.refuse(asked.client, asked.id, refused.refusal)
+            if isinstance(request, (w.Acquire, w.Reacquire)):
+                requests.note_refused(core, asked.client, request, refused.refusal)
 
     def _keep_reading(self) -> None:
         """Plan the next reading of each GPU that the event touched, while a load or a client, a

@@ -3,19 +3,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 from vram_arbiter.arbiter.core.model.records import AnyRecord
-from vram_arbiter.schemas.ids import (
-    ClientId,
-    GpuId,
-    LeaseId,
-    ProcessKey,
-    RequestId,
-    Token,
-    UseId,
-)
-from vram_arbiter.schemas.wire.spec import LeaseSpec
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.wire.requests import AnyRequest
 
 DOUBT_KEY: Final = "doubt"
 """Key of a journal record that says why leases may be missing among the others. It outlives
@@ -56,131 +48,15 @@ class ProcessDied:
 
 # -- requests
 @dataclass(frozen=True, slots=True)
-class ClientRequest:
-    """A message that gets one answer."""
+class Asked:
+    """A client sent a request, which gets one answer. `operator` names the peer of an action by
+    hand, by the kernel's word."""
 
     client: ClientId
-    request: RequestId
-
-
-@dataclass(frozen=True, slots=True)
-class LeaseRequest(ClientRequest):
-    """One about a granted lease, which it names by its exact token."""
-
-    lease: LeaseId
-    token: Token
-
-
-@dataclass(frozen=True, slots=True)
-class AcquireRequested(ClientRequest):
-    """A lease is wanted; a repeat with the same nonce is the same request."""
-
-    nonce: str
-    spec: LeaseSpec
-    wait_timeout_s: float | None
+    id: RequestId
+    request: AnyRequest
     traceparent: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ReadyReported(LeaseRequest):
-    """The model is loaded."""
-
-    measured_bytes: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class UseBegan(LeaseRequest):
-    """A busy interval begins."""
-
-    use: UseId
-    label: str
-
-
-@dataclass(frozen=True, slots=True)
-class UseEnded(LeaseRequest):
-    """A busy interval is over."""
-
-    use: UseId
-
-
-@dataclass(frozen=True, slots=True)
-class Renewed(ClientRequest):
-    """The holder lives."""
-
-    leases: tuple[tuple[LeaseId, Token], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class RevokeAcknowledged(LeaseRequest):
-    """The holder heard that it is revoked."""
-
-    safe_point_eta_s: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class UnloadStarted(LeaseRequest):
-    """The holder is at its safe point and unloads."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReleaseReported(LeaseRequest):
-    """The holder freed its memory. `exiting`: its process will end, so nothing may stay."""
-
-    exiting: bool
-    parked: bool = False  # its weights are in host RAM
-
-
-@dataclass(frozen=True, slots=True)
-class CancelRequested(ClientRequest):
-    """A queued lease is not wanted any more."""
-
-    lease: LeaseId
-
-
-@dataclass(frozen=True, slots=True)
-class Reacquired(LeaseRequest):
-    """A lease that is away is wanted now: from here on it is a waiter like any other."""
-
-    wait_timeout_s: float | None
-    traceparent: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ReattachedLease:
-    lease: LeaseId
-    token: Token
-    spec: LeaseSpec
-    state: Literal["loading", "held", "standby", "parked"]
-    measured_bytes: int | None
-    uses: tuple[UseId, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Reattached(ClientRequest):
-    """A client says after a restart what it still holds."""
-
-    leases: tuple[ReattachedLease, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class OomReported(LeaseRequest):
-    """An allocation of the holder failed."""
-
-    requested_bytes: int
-    allocated_bytes: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class OperatorAsked(ClientRequest):
-    """An operator wants something done by hand.
-
-    `target` is a lease or a consumer ("" for drain and resume).
-    """
-
-    action: Literal["evict", "kill", "pin", "unpin", "drain", "resume", "release_dead"]
-    target: str
-    by: str
-    reason: str
+    operator: str = ""
 
 
 # -- the machine
@@ -265,19 +141,7 @@ Event = (
     ClientConnected
     | ClientLeft
     | ProcessDied
-    | AcquireRequested
-    | ReadyReported
-    | UseBegan
-    | UseEnded
-    | Renewed
-    | RevokeAcknowledged
-    | UnloadStarted
-    | ReleaseReported
-    | CancelRequested
-    | Reacquired
-    | Reattached
-    | OomReported
-    | OperatorAsked
+    | Asked
     | MemorySampled
     | ProbeFailed
     | JournalFailed

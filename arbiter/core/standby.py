@@ -24,12 +24,13 @@ from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, NONCES_MAX, Departure, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.refusals import End
-from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.model.state import Client, Core
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId
 from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.notes import CancelledNote, LostNote, ParkedNote, StandbyNote
 from vram_arbiter.schemas.wire.pushes import LostPush
+from vram_arbiter.schemas.wire.requests import Acquire, Reacquire
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
@@ -107,7 +108,7 @@ def on_away_due(core: Core, lease_id: str) -> None:
 
 
 # -- wanted by the holder --------------------------------------------------------------------------
-def wanted(core: Core, event: ev.AcquireRequested, known: Lease | None) -> Lease | None:
+def wanted(core: Core, client: Client, request: Acquire, known: Lease | None) -> Lease | None:
     """Return the lease that is away and that an acquire wants back; None: there is none.
 
     That is the one of its nonce (`known`), or the first of its process for the same model.
@@ -116,32 +117,32 @@ def wanted(core: Core, event: ev.AcquireRequested, known: Lease | None) -> Lease
         # a restart ended its wait, if the journal knows no grant since it was asked for; a late
         # repeat of one that waited and was granted means nothing
         waits = known.granted_at <= known.request.arrived_at
-        waits = waits and event.nonce == known.request.nonce and known.state in AWAY
+        waits = waits and request.nonce == known.request.nonce and known.state in AWAY
         return known if waits else None
     if not core.away:
         return None
-    model = (event.spec.consumer, event.spec.model)
-    mine = core.leases_of(core.clients[event.client].process)
+    model = (request.spec.consumer, request.spec.model)
+    mine = core.leases_of(client.process)
     away = [lease for lease in mine if lease.state in AWAY]
     return next((one for one in away if (one.spec.consumer, one.spec.model) == model), None)
 
 
 def call_back(
-    core: Core, lease: Lease, event: ev.AcquireRequested | ev.Reacquired, spec: LeaseSpec
+    core: Core, lease: Lease, asked: ev.Asked, wish: Acquire | Reacquire, spec: LeaseSpec
 ) -> None:
     """Queue a lease that is away, as it is asked for now. Raises Refused."""
-    client, request = core.clients[event.client], lease.request
+    client, request = core.clients[asked.client], lease.request
     load_peak, steady = core.footprints.expected_bytes(spec)
     gpus = admission.places(core.gpus, spec, load_peak)
     admission.check_waiters(core, client, spec.priority)
     request.load_peak_bytes, request.steady_bytes = load_peak, steady
-    if isinstance(event, ev.AcquireRequested) and event.nonce != request.nonce:
-        _rename(core, lease, event.nonce)
+    if isinstance(wish, Acquire) and wish.nonce != request.nonce:
+        _rename(core, lease, wish.nonce)
         lease.spec = spec
         core.record_lease(lease)  # still away: if a restart ends the wait, it comes back so
-    request.traceparent, request.gpus, request.uid = event.traceparent, gpus, client.uid
-    request.wait_timeout_s = event.wait_timeout_s
-    _queue(core, lease, event.client, event.request, core.now)
+    request.traceparent, request.gpus, request.uid = asked.traceparent, gpus, client.uid
+    request.wait_timeout_s = wish.wait_timeout_s
+    _queue(core, lease, asked.client, asked.id, core.now)
     core.costs.wanted(spec.consumer, core.now)
     core.turn.unanswered.append(lease)
 

@@ -2,9 +2,9 @@
 
     record/20261121T144512-000003-0000.jsonl      start of the daemon, epoch, number of the file
     within this start
-    {"log": 1, "version": …, "engine": …, "epoch": …, "segment": …, "cause": …, "at_wall_s": …,
+    {"log": 2, "version": …, "engine": …, "epoch": …, "segment": …, "cause": …, "at_wall_s": …,
     "now": …, "settings": …, "state": …}
-    {"t": 812.25, "event": "UseBegan", "data": {…}, "effects": "Reply Note:use_began", "digest":
+    {"t": 812.25, "event": "Asked", "data": {…}, "effects": "Reply Note:use_began", "digest":
     "77c0…"}
 
 `state` is null in the first file of a start: the engine begins empty. Every later file begins with
@@ -32,7 +32,7 @@ from vram_arbiter.schemas.codec import CodecError, from_map, to_map
 from vram_arbiter.schemas.errors import OperatorError
 from vram_arbiter.schemas.plain import JsonMap
 
-FORMAT = 1
+FORMAT = 2
 SUFFIX = ".jsonl"
 FOLDER = "record"
 """Inside the daemon's state folder."""

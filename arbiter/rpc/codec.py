@@ -1,28 +1,27 @@
-"""The wire's frames: a frame → a validated request → an event of the engine; a reply → a frame.
+"""The wire's frames: a frame → a validated request; a reply → a frame.
 
-1. `decode` counts a message before it is built (`msgpack_codec`) and lets `schemas.wire` validate
-   it, which stops at the first wrong item of a list: the worst message of 1 MiB costs a few
-   milliseconds, and nothing that a peer sends raises anything but `Undecodable`.
-2. `event_of` turns a request that can change the engine into its event.
-3. `reply`, `refusal` and `push` put what the engine answers into words and encode it.
+1. `decode` counts a message before it is built (`msgpack_codec`) and validates its request, which
+   stops at the first wrong item of a list: the worst message of 1 MiB costs a few milliseconds, and
+   nothing that a peer sends raises anything but `Undecodable`.
+2. `reply`, `refusal` and `push` put what the engine answers into words and encode it.
 
 Pure: no sockets, no sessions.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, get_args
 
 import msgpack
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.codec import encoders
 from vram_arbiter.schemas.errors import BadRequest, UnknownOp, VramError
-from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token, UseId
+from vram_arbiter.schemas.ids import RequestId
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
-from vram_arbiter.schemas.wire import requests as w
+from vram_arbiter.schemas.runtime.telemetry import traceparent
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.pushes import AnyPush, DeniedPush, LostPush, RevokePush
@@ -32,14 +31,15 @@ from vram_arbiter.schemas.wire.replies import (
     RenewReply,
     StatusReply,
 )
-from vram_arbiter.schemas.wire.requests import OPS, REQUEST, Request
+from vram_arbiter.schemas.wire.requests import REQUESTS, AnyRequest, Envelope
 
 FIELDS_MAX = 20  # problems listed in one reply; the peer's text is never echoed at length
 KEYS_MAX = 64
 """Keys of one map: every unknown key makes validation build one more error. The largest map of the
 wire has 20."""
+UNKNOWN_KEY = "Extra inputs are not permitted"
 # the adapter's own method only adds options that are not used
-_validate = REQUEST.validator.validate_python
+_VALIDATE = {op: TypeAdapter(cls).validator.validate_python for op, cls in REQUESTS.items()}
 _pack: Callable[[object], bytes] = msgpack.Packer(use_bin_type=True).pack
 
 _PLAIN = encoders(*get_args(AnyReply.__value__), *get_args(AnyPush.__value__), ErrorView)
@@ -57,28 +57,45 @@ class Undecodable(Exception):
         self.request_id = request_id
 
 
-def decode(payload: bytes | bytearray | memoryview, size_max: int) -> Request:
+def decode(payload: bytes | bytearray | memoryview, size_max: int) -> tuple[Envelope, AnyRequest]:
     """One frame to one request. Raises Undecodable with BadFrame, MessageTooLarge, UnknownOp or
     BadRequest."""
     try:
         message = unpack_map(payload, _limits(size_max))
     except VramError as error:
         raise Undecodable(error, None) from error
-    op = message.get("op")
+    request_id = _id(message)
     try:
-        if not isinstance(op, str):
-            raise BadRequest(
-                "the request has no op",
-                details={"fields": [{"field": "op", "problem": "missing or no text"}]},
-            )
-        if op not in OPS:
-            raise UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(OPS)})
-        request: Request = _validate(message)
-        return request
+        return _envelope(message, request_id), _request(message)
     except VramError as error:
-        raise Undecodable(error, _id(message)) from error
+        raise Undecodable(error, request_id) from error.__cause__ or error
+
+
+def _envelope(message: JsonObject, request_id: int | None) -> Envelope:
+    """Take what is not the request's own out of a message. Raises BadRequest, UnknownOp."""
+    op = message.get("op")
+    if not isinstance(op, str):
+        raise BadRequest(
+            "the request has no op",
+            details={"fields": [{"field": "op", "problem": "missing or no text"}]},
+        )
+    if op not in _VALIDATE:
+        raise UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(_VALIDATE)})
+    if request_id is None:
+        problem = "expected a whole number below 2^53" if "id" in message else "Field required"
+        raise _bad_request(op, [("id", problem)], 1)
+    del message["id"]
+    return Envelope(RequestId(request_id), traceparent.read(message.pop("traceparent", None)))
+
+
+def _request(message: JsonObject) -> AnyRequest:
+    """Validate the rest. Raises BadRequest."""
+    op = message.pop("op")
+    try:
+        request: AnyRequest = _VALIDATE[op](message)
     except ValidationError as error:
-        raise Undecodable(_bad_request(str(op), error), _id(message)) from error
+        raise _invalid(op, error) from error
+    return request
 
 
 def id_of(payload: bytes | bytearray | memoryview, size_max: int) -> int | None:
@@ -100,73 +117,25 @@ def _id(message: Mapping[Any, Any]) -> int | None:
     return found if type(found) is int and 0 <= found < 1 << 53 else None
 
 
-def _bad_request(op: str, error: ValidationError) -> BadRequest:
-    fields = []
-    for finding in error.errors(include_url=False, include_context=False, include_input=False)[
-        :FIELDS_MAX
-    ]:
-        path = [str(part)[:64] for part in finding["loc"]]
-        if path and path[0] == op:
-            path = path[1:]  # the union's tag, no field of the message
-        fields.append({"field": ".".join(path), "problem": finding["msg"]})
-    first = fields[0] if fields else {"field": "", "problem": "invalid"}
-    more = f" and {error.error_count() - 1} more" if error.error_count() > 1 else ""
+def _invalid(op: str, error: ValidationError) -> BadRequest:
+    found = error.errors(include_url=False, include_context=False, include_input=False)
+    fields = [
+        (
+            ".".join(str(part)[:64] for part in finding["loc"]),
+            # pydantic speaks of a call of the class
+            UNKNOWN_KEY if finding["type"] == "unexpected_keyword_argument" else finding["msg"],
+        )
+        for finding in found[:FIELDS_MAX]
+    ]
+    return _bad_request(op, fields, len(found))
+
+
+def _bad_request(op: str, fields: Sequence[tuple[str, str]], count: int) -> BadRequest:
+    (field, problem), more = fields[0], f" and {count - 1} more" if count > 1 else ""
     return BadRequest(
-        f"{op}: {first['field']}: {first['problem']}{more}",
+        f"{op}: {field}: {problem}{more}",
         hint="details.fields lists what is wrong",
-        details={"fields": fields},
-    )
-
-
-# -- requests → events
-def event_of(request: w.Request, client: ClientId, operator: str) -> ev.Event:
-    """Return the event of a request that can change the engine. `operator` names the peer of an
-    action by hand."""
-    re = RequestId(request.id)
-    if isinstance(request, w.OnLease):
-        on = (client, re, LeaseId(request.lease_id), Token(*request.token))
-    match request:
-        case w.Acquire():
-            spec, wait_s = request.spec, request.wait_timeout_s
-            return ev.AcquireRequested(client, re, request.nonce, spec, wait_s, request.traceparent)
-        case w.Ready():
-            return ev.ReadyReported(*on, request.measured_bytes)
-        case w.UseBegin():
-            return ev.UseBegan(*on, UseId(request.use_id), request.label)
-        case w.UseEnd():
-            return ev.UseEnded(*on, UseId(request.use_id))
-        case w.Renew(leases=leases):
-            held = tuple((LeaseId(lease.lease_id), Token(*lease.token)) for lease in leases)
-            return ev.Renewed(client, re, held)
-        case w.RevokeAck():
-            return ev.RevokeAcknowledged(*on, request.safe_point_eta_s)
-        case w.Unloading():
-            return ev.UnloadStarted(*on)
-        case w.Release():
-            return ev.ReleaseReported(*on, request.exiting, request.parked)
-        case w.Cancel():
-            return ev.CancelRequested(client, re, LeaseId(request.lease_id))
-        case w.Reacquire():
-            return ev.Reacquired(*on, request.wait_timeout_s, request.traceparent)
-        case w.Reattach():
-            return ev.Reattached(client, re, tuple(map(_reattached, request.leases)))
-        case w.ByHand():
-            target = request.target if isinstance(request, w.ByHandOn) else ""
-            return ev.OperatorAsked(client, re, request.op, target, operator, request.reason)
-        case w.Oom():
-            return ev.OomReported(*on, request.requested_bytes, request.allocated_bytes)
-        case _:
-            raise TypeError(f"{request.op} changes nothing in the engine")
-
-
-def _reattached(lease: w.ReattachLease) -> ev.ReattachedLease:
-    return ev.ReattachedLease(
-        lease=LeaseId(lease.lease_id),
-        token=Token(*lease.token),
-        spec=lease.spec,
-        state=lease.state,
-        measured_bytes=lease.measured_bytes,
-        uses=tuple(UseId(use) for use in lease.use_ids),
+        details={"fields": [{"field": field, "problem": problem} for field, problem in fields]},
     )
 
 

@@ -34,7 +34,7 @@ from vram_arbiter.schemas.errors import (
     VersionMismatch,
     VramError,
 )
-from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
@@ -63,12 +63,8 @@ SKIPPED_CHARGE_BYTES = 64 * 1024
 BUDGETS_MAX = 1024
 """Budgets of processes kept before those that have refilled are forgotten."""
 
-_READS = frozenset(("status", "why", "history", "subscribe", "ping", "bye", "hello"))
-"""Ops that no event of the engine answers; all that an observer may do."""
-_HOLDING = frozenset(("acquire", "reacquire", "reattach", "use_begin"))
-"""Ops that can make the engine remember something of a client beyond its connection."""
-_BY_HAND = frozenset(("evict", "kill", "pin", "unpin", "release_dead", "drain", "resume"))
-"""Ops for operators only."""
+_HOLDING = (w.Acquire, w.Reacquire, w.Reattach, w.UseBegin)
+"""Requests that can make the engine remember something of a client beyond its connection."""
 _KINDS = frozenset((*NOTES, *DAEMON_KINDS))
 
 
@@ -164,32 +160,27 @@ class SessionTable:
         try:
             if isinstance(payload, Oversize):  # 2
                 raise _too_large(payload, stranger=session is None)
-            request = codec.decode(payload, self._settings.message_max_bytes)
-            request_id, op = request.id, request.op
+            envelope, request = codec.decode(payload, self._settings.message_max_bytes)
+            request_id = envelope.id
             if session is None:  # 3
                 if not isinstance(request, w.Hello):
                     raise UnknownSession(
-                        f"{op} before hello", hint="say hello first, then reattach your leases"
+                        f"{request.TAG[1]} before hello",
+                        hint="say hello first, then reattach your leases",
                     )
                 _check_version(request)
-                self._welcome(self._registry.open(connection, request, now), request)
+                self._welcome(self._registry.open(connection, request, now), request_id)
                 return True
             session.heard_at = now
-            if session.role == "observer" and op not in _READS:  # 4
-                raise NotPermitted(f"an observer may not {op}", hint="say hello as a client")
-            operator = ""
-            if op in _BY_HAND:
-                if session.role != "operator":
-                    raise NotPermitted(f"only an operator may {op}", hint="say hello as operator")
-                # the peer by the kernel's word; the name is what the connection calls itself
-                peer = session.peer
-                operator = f"{session.name} (uid {peer.uid}, pid {peer.process.pid})"
-            if op in _READS or isinstance(request, w.Prepare):  # 5
-                self._answer(session, request)
+            operator = _check_role(session, request)  # 4
+            if isinstance(request, (w.Question, w.Prepare)):  # 5
+                self._answer(session, request_id, request)
                 return True
-            if op in _HOLDING and not session.leased:
+            if not session.leased and isinstance(request, _HOLDING):
                 self._registry.holds(session)
-            self._decisions.post(codec.event_of(request, session.client, operator))
+            self._decisions.post(
+                ev.Asked(session.client, request_id, request, envelope.traceparent, operator)
+            )
         except codec.Undecodable as bad:
             self._refuse(connection, session, bad.request_id, bad.error.view())
         except VramError as error:
@@ -270,7 +261,7 @@ class SessionTable:
         peer, name = connection.peer, "" if session is None else session.name
         self._refusals.say(peer.uid, peer.process.pid, name, error.code, error.message)
 
-    def _welcome(self, session: Session, hello: w.Hello) -> None:
+    def _welcome(self, session: Session, re: RequestId) -> None:
         settings = self._settings
         welcome = WelcomeReply(
             version=WIRE_VERSION,
@@ -280,11 +271,11 @@ class SessionTable:
             heartbeat_s=settings.heartbeat_s,
             grace_s=settings.fence_grace_s,
         )
-        self.reply(session.client, RequestId(hello.id), welcome)
+        self.reply(session.client, re, welcome)
 
-    def _answer(self, session: Session, request: w.Request) -> None:
+    def _answer(self, session: Session, re: RequestId, request: w.AnyRequest) -> None:
         """Answer what changes nothing in the engine."""
-        client, re, decisions = session.client, RequestId(request.id), self._decisions
+        client, decisions = session.client, self._decisions
         match request:
             case w.Hello():
                 _check_version(request)
@@ -294,7 +285,7 @@ class SessionTable:
                         f"this connection already said hello as {session.name!r}",
                         hint="open another connection",
                     )
-                self._welcome(session, request)
+                self._welcome(session, re)
             case w.Ping():
                 self.reply(client, re, PingReply(self._settings.server))
             case w.Status():
@@ -333,7 +324,7 @@ class SessionTable:
         request: w.Status,
     ) -> None:
         if request.leases:
-            status = self._decisions.leases(map(LeaseId, request.leases))
+            status = self._decisions.leases(request.leases)
         else:
             status = self._decisions.status(reader, request.after, details=request.details)
         problems = tuple(self._problems())
@@ -357,6 +348,20 @@ class SessionTable:
                         details={"limit": limit, "value": allowed},
                     )
         subscribers[session.client] = session
+
+
+def _check_role(session: Session, request: w.AnyRequest) -> str:
+    """Return the name of the operator of an action by hand; "" for any other request. Raises
+    NotPermitted."""
+    role, op = session.role, request.TAG[1]
+    if role == "observer" and not isinstance(request, w.Question):
+        raise NotPermitted(f"an observer may not {op}", hint="say hello as a client")
+    if not isinstance(request, w.ByHand):
+        return ""
+    if role != "operator":
+        raise NotPermitted(f"only an operator may {op}", hint="say hello as operator")
+    # the peer by the kernel's word; the name is what the connection calls itself
+    return f"{session.name} (uid {session.peer.uid}, pid {session.peer.process.pid})"
 
 
 def _check_version(hello: w.Hello) -> None:

@@ -10,23 +10,22 @@ the pushes. The owner (`clients._session`) feeds `receive`, takes what it finds 
 idempotent. Each request has a deadline.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Protocol
+from typing import Any, Protocol
 
 from vram_arbiter.clients._protocol.records import (
     ContactLost,
     Event,
     Failed,
     OnError,
-    OnReply,
     Pending,
     Refused,
     Replied,
     Up,
 )
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.codec import CodecError, from_map
+from vram_arbiter.schemas.codec import CodecError, from_map, to_map
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
     InternalError,
@@ -34,9 +33,10 @@ from vram_arbiter.schemas.errors import (
     VramError,
     from_wire,
 )
-from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import PUSHES, AnyPush
-from vram_arbiter.schemas.wire.replies import REPLIES, ReattachReply, WelcomeReply
+from vram_arbiter.schemas.wire.replies import ReattachReply, WelcomeReply
 
 HELLO_TIMEOUT_S = 2.0  # an unanswered hello is said again on a fresh socket
 REFUSED_RETRY_S = 1.0  # after a refused hello (a full server may have room later)
@@ -45,11 +45,14 @@ REQUEST_TIMEOUT_S = 30.0  # a restart of the daemon takes a few seconds: a reque
 WAIT_SLACK_S = 5.0  # the arbiter ends waits; we only do if it does not
 
 
+type Kinds = tuple[type[w.OnLease[Any]], ...]
+
+
 class Above(Protocol):
     """The part of the protocol that uses the connection."""
 
-    def reattachments(self) -> list[Message]:
-        """Return what the arbiter needs first (`ReattachLease`); empty: nothing."""
+    def reattachments(self) -> tuple[w.ReattachLease, ...]:
+        """Return what the arbiter needs first; empty: nothing."""
         ...
 
     def reattached(self, reply: ReattachReply) -> None:
@@ -70,7 +73,7 @@ class Connection:
     """`phase`, what the arbiter said of itself (`epoch`, `heartbeat_s`, `grace_s`), and what its
     owner takes: `outgoing` messages and `events`."""
 
-    def __init__(self, above: Above, *, name: str, instance: str, role: str) -> None:
+    def __init__(self, above: Above, *, name: str, instance: str, role: w.Role) -> None:
         self.instance = instance
         self.phase = "down"
         self.epoch: int | None = None
@@ -79,13 +82,7 @@ class Connection:
         self.asked_at = 0.0
         """When the newest answered request was *sent*: what is read now was sent after that."""
         self._above = above
-        self._hello = {
-            "op": "hello",
-            "version": d.WIRE_VERSION,
-            "name": name,
-            "instance": instance,
-            "role": role,
-        }
+        self._hello = w.Hello(name=name, instance=instance, role=role)
         self._ids = count(1)
         self.outgoing: list[Message] = []
         self.events: list[Event] = []
@@ -129,71 +126,58 @@ class Connection:
         else:
             self._reply(message, now)
 
-    def request(
-        self,
-        op: str,
-        fields: JsonMap,
-        now: float,
-        *,
-        timeout_s: float = REQUEST_TIMEOUT_S,
-    ) -> int:
-        """Queue a request; it ends as `Replied` or `Failed`. Without contact it is kept until the
-        next hello."""
-        return self.ask({"op": op, **fields}, now, timeout_s)
-
     def forget(self, request_id: int) -> None:
         """Stop reporting the end of a request: its caller waits no more."""
         request = self._pending.get(request_id)
         if request is not None:
             request.quiet = True
 
-    # -- for what is above -------------------------------------------------------------------------
-    def ask(
+    def ask[R](
         self,
-        message: Message,
+        request: w.Request[R],
         now: float,
         timeout_s: float = REQUEST_TIMEOUT_S,
         *,
-        on_reply: OnReply | None = None,
+        on_reply: Callable[[R, float], None] | None = None,
         on_error: OnError | None = None,
         quiet: bool = False,
+        traceparent: str | None = None,
     ) -> int:
         """Queue a request. Its end (also its deadline) goes to `on_reply` or `on_error`, then to
-        the owner unless `quiet`."""
+        the owner as `Replied` or `Failed` unless `quiet`. Without contact it is kept until the next
+        hello."""
         request_id = next(self._ids)
-        request = Pending(
-            {**message, "id": request_id},
-            now + timeout_s,
-            on_reply=on_reply,
-            on_error=on_error,
-            quiet=quiet,
+        pending = Pending(
+            request, request_id, traceparent, now + timeout_s, None, on_reply, on_error, quiet
         )
-        self._pending[request_id] = request
+        self._pending[request_id] = pending
         if self.phase == "up":
-            self._send(request, now)
+            self._send(pending, now)
         return request_id
+
+    # -- for what is above -------------------------------------------------------------------------
 
     def awaits(self, request_id: int | None) -> bool:
         """Return whether the reply is missing; then the request is sent again after a reconnect."""
         return request_id in self._pending
 
-    def drop_unsent(self, lease_id: str, ops: frozenset[str]) -> None:
+    def drop_unsent(self, lease_id: str, kinds: Kinds) -> None:
         """Drop requests on a lease that were not sent yet and have no meaning any more."""
-        for request_id in self._unsent(lease_id, ops):
+        for request_id in self._unsent(lease_id, kinds):
             del self._pending[request_id]
 
-    def fail_unsent(self, lease_id: str, ops: frozenset[str], error: VramError, now: float) -> None:
+    def fail_unsent(self, lease_id: str, kinds: Kinds, error: VramError, now: float) -> None:
         """End requests on a lease that were not sent yet: the lease is over."""
-        for request_id in self._unsent(lease_id, ops):
+        for request_id in self._unsent(lease_id, kinds):
             self._fail(request_id, error, now)
 
-    def _unsent(self, lease_id: str, ops: frozenset[str]) -> list[int]:
+    def _unsent(self, lease_id: str, kinds: Kinds) -> list[int]:
         return [
-            request_id
-            for request_id, request in self._pending.items()
-            if request.sent_at is None
-            and request.message["op"] in ops
-            and request.message.get("lease_id") == lease_id
+            pending.id
+            for pending in self._pending.values()
+            if pending.sent_at is None
+            and isinstance(pending.request, kinds)
+            and pending.request.lease_id == lease_id
         ]
 
     # -- time --------------------------------------------------------------------------------------
@@ -216,7 +200,7 @@ class Connection:
         """Fail the requests past their deadline."""
         for request_id in [i for i, r in self._pending.items() if now >= r.deadline]:
             if request_id in self._pending:  # one's end may drop another
-                self._fail(request_id, _unreachable(self._pending[request_id].message["op"]), now)
+                self._fail(request_id, _unreachable(self._pending[request_id].request), now)
 
     def stays_up(self, now: float) -> bool:
         """Declare contact lost if a hello or a ping had no answer. Returns whether the phase is
@@ -230,7 +214,7 @@ class Connection:
     def ping_if_silent(self, now: float, expects_grants: bool) -> None:
         if not self._pinged and now >= self._ping_at(expects_grants):
             self._pinged = True
-            self.ask({"op": "ping"}, now, quiet=True)
+            self.ask(w.Ping(), now, quiet=True)
 
     def _silent_at(self) -> float:
         return self._heard_at + SILENCE_BEATS * self.heartbeat_s
@@ -241,11 +225,11 @@ class Connection:
         return since + self.heartbeat_s
 
     # -- steps: greeting ---------------------------------------------------------------------------
-    def _send_handshake(self, message: Message, now: float) -> None:
+    def _send_handshake(self, request: w.Hello | w.Reattach, now: float) -> None:
         """Send hello or the reattachment, which come before any request."""
         self._handshake_id, self._handshake_at = next(self._ids), now
         self._phase_deadline = now + HELLO_TIMEOUT_S
-        self.outgoing.append({**message, "id": self._handshake_id})
+        self.outgoing.append({**to_map(request), "id": self._handshake_id})
 
     def _handshake_reply(self, message: Message, now: float) -> None:
         if not message.get("ok"):
@@ -262,7 +246,7 @@ class Connection:
             self.heartbeat_s, self.grace_s = welcome.heartbeat_s, welcome.grace_s
             if kept := self._above.reattachments():
                 self.phase = "reattaching"
-                self._send_handshake({"op": "reattach", "leases": kept}, now)
+                self._send_handshake(w.Reattach(kept), now)
                 return
         else:
             self._above.reattached(from_map(ReattachReply, message))
@@ -296,10 +280,10 @@ class Connection:
             self._fail(request_id, error, now)
 
     def _succeed(self, request_id: int, request: Pending, message: Message, now: float) -> None:
-        op = request.message["op"]
         try:
-            reply = from_map(REPLIES[op], message)
+            reply = from_map(w.REPLIES[type(request.request)], message)
         except CodecError as error:
+            op = request.request.TAG[1]
             wrong = f"the arbiter's answer to {op} is not understood: {error}"
             self._fail(request_id, InternalError(wrong, hint="do both have the same version?"), now)
             return
@@ -316,12 +300,14 @@ class Connection:
         if not request.quiet:
             self.events.append(Failed(request_id, error))
 
-    def _send(self, request: Pending, now: float) -> None:
-        request.sent_at = now
-        self.outgoing.append(request.message)
+    def _send(self, pending: Pending, now: float) -> None:
+        pending.sent_at = now
+        trace = {} if pending.traceparent is None else {"traceparent": pending.traceparent}
+        self.outgoing.append({**to_map(pending.request), **trace, "id": pending.id})
 
 
-def _unreachable(op: str) -> ArbiterUnreachable:
+def _unreachable(request: w.Request[Any]) -> ArbiterUnreachable:
     return ArbiterUnreachable(
-        f"the arbiter did not answer {op} in time", hint="is it running? see `vramctl status`"
+        f"the arbiter did not answer {request.TAG[1]} in time",
+        hint="is it running? see `vramctl status`",
     )

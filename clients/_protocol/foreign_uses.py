@@ -6,9 +6,10 @@ what is reattached (`clients._protocol.leases`).
 """
 
 from vram_arbiter.clients._protocol.connection import Connection
-from vram_arbiter.clients._protocol.records import ForeignUseRecord, TokenPair, UseLost
+from vram_arbiter.clients._protocol.records import ForeignUseRecord, UseLost
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.wire.replies import AnyReply
+from vram_arbiter.schemas.wire.replies import UsesReply
+from vram_arbiter.schemas.wire.requests import UseBegin, UseEnd
 
 
 class ForeignUses:
@@ -18,18 +19,15 @@ class ForeignUses:
 
     def begin(
         self,
-        lease_id: str,
-        token: TokenPair,
-        use_id: str,
-        label: str,
+        request: UseBegin,
         now: float,
         timeout_s: float,
         traceparent: str | None = None,
     ) -> int:
-        use = ForeignUseRecord(lease_id, token, label, traceparent)
+        use_id, use = request.use_id, ForeignUseRecord(request, traceparent)
         self._uses[use_id] = use
 
-        def begun(_: AnyReply, __: float) -> None:
+        def begun(_: UsesReply, __: float) -> None:
             use.begun = True
 
         def refused(_: VramError, __: float) -> None:
@@ -37,23 +35,31 @@ class ForeignUses:
                 del self._uses[use_id]
 
         return self._connection.ask(
-            use.begin(use_id), now, timeout_s, on_reply=begun, on_error=refused
+            request,
+            now,
+            timeout_s,
+            on_reply=begun,
+            on_error=refused,
+            traceparent=traceparent,
         )
 
-    def end(self, lease_id: str, token: TokenPair, use_id: str, now: float) -> int:
+    def end(self, request: UseEnd, now: float) -> int:
         """Also right while the begin is under way: the arbiter hears both in order."""
-        self._uses.pop(use_id, None)
-        message = {"op": "use_end", "lease_id": lease_id, "token": list(token), "use_id": use_id}
-        return self._connection.ask(message, now, quiet=True)
+        self._uses.pop(request.use_id, None)
+        return self._connection.ask(request, now, quiet=True)
 
     def say_again(self, now: float) -> None:
-        for use_id, use in self._uses.items():
+        for use in self._uses.values():
             if use.begun:  # else its begin has no reply yet, and is repeated itself
-                self._begin_again(use_id, use, now)
+                self._begin_again(use, now)
 
-    def _begin_again(self, use_id: str, use: ForeignUseRecord, now: float) -> None:
+    def _begin_again(self, use: ForeignUseRecord, now: float) -> None:
+        use_id = use.request.use_id
+
         def lost(error: VramError, _: float) -> None:
             if self._uses.pop(use_id, None) is not None:
                 self._connection.events.append(UseLost(use_id, error))
 
-        self._connection.ask(use.begin(use_id), now, on_error=lost, quiet=True)
+        self._connection.ask(
+            use.request, now, on_error=lost, quiet=True, traceparent=use.traceparent
+        )

@@ -10,18 +10,16 @@ The module must not know how the first grant came about (`clients._protocol.wait
 (`clients.lease`) and safe points (`clients.eviction`).
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S, Connection
 from vram_arbiter.clients._protocol.records import (
     Gone,
     LeaseRecord,
     OnError,
-    OnReply,
     Returned,
     RevokeAsked,
     RevokeWithdrawn,
-    TokenPair,
     error_of,
 )
 from vram_arbiter.schemas import defaults as d
@@ -31,23 +29,25 @@ from vram_arbiter.schemas.errors import (
     VramError,
     WaitTimeout,
 )
-from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.ids import Token, UseId
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import LostPush, RevokePush
 from vram_arbiter.schemas.wire.replies import (
     AcquireReply,
-    AnyReply,
+    ReadyReply,
     ReattachReply,
     ReleaseReply,
     RenewReply,
 )
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
 
 GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_token"})
 """Codes of replies to a request on a lease that this client no longer holds."""
 AWAY = ("standby", "parked")
-_MEANINGLESS = frozenset({"revoke_ack", "use_end"})
+_MEANINGLESS = (w.RevokeAck, w.UseEnd)
 """Requests that are dropped with their lease."""
-_AWAITED = frozenset({"ready", "use_begin", "oom"})
+_AWAITED = (w.Ready, w.UseBegin, w.Oom)
 """Requests whose caller waits for the arbiter while it holds the lease, and not longer."""
 
 
@@ -61,13 +61,13 @@ class Holdings:
 
     # -- requests of the holder --------------------------------------------------------------------
     def ready(self, record: LeaseRecord, measured_bytes: int | None, now: float) -> int:
-        def held(_: AnyReply, __: float) -> None:
+        def held(_: ReadyReply, __: float) -> None:
             record.held, record.measured_bytes = True, measured_bytes
 
-        message = {"op": "ready", **record.ref(), "measured_bytes": measured_bytes}
-        return self._ask(record, message, now, on_reply=held)
+        request = w.Ready(record.lease_id, record.token, measured_bytes)
+        return self._ask(record, request, now, on_reply=held)
 
-    def use_begin(self, record: LeaseRecord, use_id: str, label: str, now: float) -> int:
+    def use_begin(self, record: LeaseRecord, use_id: UseId, label: str, now: float) -> int:
         """The use counts from now on, so that a reattachment on the way names it."""
         record.uses.add(use_id)
 
@@ -75,36 +75,37 @@ class Holdings:
             if not isinstance(error, ArbiterUnreachable):  # it may go on until the lease is fenced
                 record.uses.discard(use_id)
 
-        message = {"op": "use_begin", **record.ref(), "use_id": use_id, "label": label}
-        return self._ask(record, message, now, on_error=refused)
+        request = w.UseBegin(record.lease_id, record.token, use_id, label)
+        return self._ask(record, request, now, on_error=refused)
 
-    def use_end(self, record: LeaseRecord, use_id: str, now: float) -> int:
+    def use_end(self, record: LeaseRecord, use_id: UseId, now: float) -> int:
         record.uses.discard(use_id)
-        message = {"op": "use_end", **record.ref(), "use_id": use_id}
-        return self._connection.ask(message, now, quiet=True)
+        request = w.UseEnd(record.lease_id, record.token, use_id)
+        return self._connection.ask(request, now, quiet=True)
 
     def oom(
         self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float
     ) -> int:
-        message = {
-            "op": "oom",
-            **record.ref(),
-            "requested_bytes": requested_bytes,
-            "allocated_bytes": allocated_bytes,
-        }
-        return self._ask(record, message, now)
+        request = w.Oom(record.lease_id, record.token, requested_bytes, allocated_bytes)
+        return self._ask(record, request, now)
 
     def revoke_ack(self, record: LeaseRecord, eta_s: float | None, now: float) -> int:
-        message = {"op": "revoke_ack", **record.ref(), "safe_point_eta_s": eta_s}
-        return self._ask(record, message, now, quiet=True)
+        request = w.RevokeAck(record.lease_id, record.token, eta_s)
+        return self._ask(record, request, now, quiet=True)
 
     def unloading(
         self, record: LeaseRecord, now: float, timeout_s: float = REQUEST_TIMEOUT_S
     ) -> int:
-        return self._ask(record, {"op": "unloading", **record.ref()}, now, timeout_s)
+        return self._ask(record, w.Unloading(record.lease_id, record.token), now, timeout_s)
 
     def release(
-        self, record: LeaseRecord, exiting: bool, now: float, timeout_s: float, *, asleep: str = ""
+        self,
+        record: LeaseRecord,
+        exiting: bool,
+        now: float,
+        timeout_s: float,
+        *,
+        asleep: str = "",
     ) -> int:
         """Report freed bytes; the lease is not renewed any more. One that is gone counts as
         released.
@@ -118,21 +119,15 @@ class Holdings:
         if asleep:
             record.asleep = asleep
             self.asleep[record.lease_id] = record
-        message = {
-            "op": "release",
-            **record.ref(),
-            "exiting": exiting,
-            "parked": asleep == "parked",
-        }
+        request = w.Release(record.lease_id, record.token, exiting, asleep == "parked")
         if asleep:
-            return self._say_asleep(record, message, now, timeout_s)
+            return self._say_asleep(record, request, now, timeout_s)
 
-        def let_go(reply: AnyReply, at: float) -> None:
-            assert isinstance(reply, ReleaseReply)
+        def let_go(reply: ReleaseReply, at: float) -> None:
             if reply.next in AWAY:
                 self._cancel(record, at)
 
-        return self._connection.ask(message, now, timeout_s, on_reply=let_go)
+        return self._connection.ask(request, now, timeout_s, on_reply=let_go)
 
     def reacquire(
         self,
@@ -182,7 +177,7 @@ class Holdings:
             record.revoke, record.withdrawn = push, False
             self._connection.events.append(RevokeAsked(record, push))
 
-    def revoke_withdrawn(self, lease_id: str, token: TokenPair) -> None:
+    def revoke_withdrawn(self, lease_id: str, token: Token) -> None:
         record = self.held.get(lease_id)
         if record is not None and record.token == token and record.revoke is not None:
             record.withdrawn = True
@@ -194,8 +189,9 @@ class Holdings:
             self._gone(record, error_of(push.error))
 
     # -- contact -----------------------------------------------------------------------------------
-    def reattachments(self) -> list[Message]:
-        return [record.reattachment() for record in (*self.held.values(), *self.asleep.values())]
+    def reattachments(self) -> tuple[w.ReattachLease, ...]:
+        records = (*self.held.values(), *self.asleep.values())
+        return tuple([record.reattachment() for record in records])
 
     def reattached(self, reply: ReattachReply) -> None:
         for entry in reply.leases:
@@ -261,14 +257,14 @@ class Holdings:
     def _record(self, lease_id: str) -> LeaseRecord | None:
         return self.held.get(lease_id) or self.asleep.get(lease_id)
 
-    def _ask(
+    def _ask[R](
         self,
         record: LeaseRecord,
-        message: Message,
+        request: w.OnLease[R],
         now: float,
         timeout_s: float = REQUEST_TIMEOUT_S,
         *,
-        on_reply: OnReply | None = None,
+        on_reply: Callable[[R, float], None] | None = None,
         on_error: OnError | None = None,
         quiet: bool = False,
     ) -> int:
@@ -282,13 +278,13 @@ class Holdings:
                 self._gone(record, error)
 
         return self._connection.ask(
-            message, now, timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet
+            request, now, timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet
         )
 
     def _say_asleep(
         self,
         record: LeaseRecord,
-        release: Message,
+        release: w.Release,
         now: float,
         timeout_s: float,
         *,
@@ -301,8 +297,7 @@ class Holdings:
         def sleeps() -> bool:
             return record.asleep != "" and record.token == token
 
-        def let_go(reply: AnyReply, _: float) -> None:
-            assert isinstance(reply, ReleaseReply)
+        def let_go(reply: ReleaseReply, _: float) -> None:
             if not sleeps():
                 return
             if reply.next in AWAY:
@@ -331,8 +326,7 @@ class Holdings:
     def _send_reacquire(self, record: LeaseRecord, now: float, *, quiet: bool = False) -> int:
         """`quiet`: a repetition, so a refusal is reported as the end of the lease."""
 
-        def replied(reply: AnyReply, _: float) -> None:
-            assert isinstance(reply, AcquireReply)
+        def replied(reply: AcquireReply, _: float) -> None:
             self.returned(reply.lease)
 
         def refused(error: VramError, _: float) -> None:
@@ -341,23 +335,24 @@ class Holdings:
                 self._gone(record, error)
 
         left_s = None if record.wanted_until is None else max(0.0, record.wanted_until - now)
-        message = {"op": "reacquire", **record.ref(), "wait_timeout_s": left_s}
-        if record.wanted_by is not None:
-            message["traceparent"] = record.wanted_by
         record.reacquire_id = self._connection.ask(
-            message, now, on_reply=replied, on_error=refused, quiet=quiet
+            w.Reacquire(record.lease_id, record.token, left_s),
+            now,
+            on_reply=replied,
+            on_error=refused,
+            quiet=quiet,
+            traceparent=record.wanted_by,
         )
         return record.reacquire_id
 
     def _cancel(self, record: LeaseRecord, now: float) -> None:
-        self._connection.ask({"op": "cancel", "lease_id": record.lease_id}, now, quiet=True)
+        self._connection.ask(w.Cancel(record.lease_id), now, quiet=True)
 
     def _renew(self, batch: list[LeaseRecord], now: float) -> None:
         for record in batch:
             record.renewed_at = now
 
-        def renewed(reply: AnyReply, _: float) -> None:
-            assert isinstance(reply, RenewReply)
+        def renewed(reply: RenewReply, _: float) -> None:
             alive = set(reply.alive)
             for record in batch:
                 if record.lease_id in alive:
@@ -367,8 +362,8 @@ class Holdings:
                 if gone is not None and gone in batch:
                     self._gone(gone, error_of(entry.error))
 
-        message = {"op": "renew", "leases": [record.ref() for record in batch]}
-        self._connection.ask(message, now, on_reply=renewed, quiet=True)
+        refs = tuple([w.LeaseRef(record.lease_id, record.token) for record in batch])
+        self._connection.ask(w.Renew(refs), now, on_reply=renewed, quiet=True)
 
     def _wake(self, record: LeaseRecord) -> bool:
         """Stop waiting for its return. Returns whether it did wait."""
@@ -383,11 +378,11 @@ class Holdings:
         self._connection.events.append(Gone(record, error, fenced))
 
 
-def waited_in_vain(spec: Message, what: str, waited_s: float | None = None) -> WaitTimeout:
+def waited_in_vain(spec: LeaseSpec, what: str, waited_s: float | None = None) -> WaitTimeout:
     """Return the error of a wait whose end the arbiter did not report."""
     within = "in time" if waited_s is None else f"within {waited_s:.1f} s"
     return WaitTimeout(
-        f"no answer on {what} for {spec.get('consumer')} {within}, and no contact to the arbiter",
+        f"no answer on {what} for {spec.consumer} {within}, and no contact to the arbiter",
         hint="is the arbiter running? see `vramctl status`",
         details={} if waited_s is None else {"waited_s": waited_s},
     )

@@ -16,7 +16,7 @@ from vram_arbiter.clients._protocol.foreign_uses import ForeignUses
 from vram_arbiter.clients._protocol.leases import Holdings
 from vram_arbiter.clients._protocol.records import HistoryEvent, PrepareAsked, error_of
 from vram_arbiter.clients._protocol.waits import Waits
-from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import (
     AnyPush,
     DeniedPush,
@@ -27,14 +27,14 @@ from vram_arbiter.schemas.wire.pushes import (
     RevokePush,
     RevokeWithdrawnPush,
 )
-from vram_arbiter.schemas.wire.replies import AnyReply, ReattachReply
+from vram_arbiter.schemas.wire.replies import DoneReply, ReattachReply
 
 
 class ClientProtocol:
     """One client. After each call on it or its parts, take `connection.outgoing` and `events`, and
     wake up at `next_deadline`."""
 
-    def __init__(self, *, name: str, instance: str, role: str = "client") -> None:
+    def __init__(self, *, name: str, instance: str, role: w.Role = "client") -> None:
         self.connection = Connection(self, name=name, instance=instance, role=role)
         self.holdings = Holdings(self.connection)
         self.waits = Waits(self.connection, self.holdings)
@@ -44,10 +44,10 @@ class ClientProtocol:
     def subscribe(self, now: float) -> int:
         """History events from now on, also after reconnects."""
 
-        def subscribed(_: AnyReply, __: float) -> None:
+        def subscribed(_: DoneReply, __: float) -> None:
             self._subscribed = True
 
-        return self.connection.ask({"op": "subscribe"}, now, on_reply=subscribed)
+        return self.connection.ask(w.Subscribe(), now, on_reply=subscribed)
 
     # -- time --------------------------------------------------------------------------------------
     def next_deadline(self) -> float | None:
@@ -74,7 +74,7 @@ class ClientProtocol:
         return bool(self.waits.waiters or self.holdings.asleep)
 
     # -- for the connection (`clients._protocol.connection.Above`) ---------------------------------
-    def reattachments(self) -> list[Message]:
+    def reattachments(self) -> tuple[w.ReattachLease, ...]:
         return self.holdings.reattachments()
 
     def reattached(self, reply: ReattachReply) -> None:
@@ -82,7 +82,7 @@ class ClientProtocol:
 
     def say_again(self, now: float) -> None:
         if self._subscribed:
-            self.connection.ask({"op": "subscribe"}, now, quiet=True)
+            self.connection.ask(w.Subscribe(), now, quiet=True)
         self.waits.say_again(now)
         self.holdings.say_again(now)
         self.foreign_uses.say_again(now)

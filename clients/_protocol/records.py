@@ -4,17 +4,19 @@ uses. Plain data.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError, from_wire
-from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.ids import LeaseId, Token, UseId
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.pushes import RevokePush
 from vram_arbiter.schemas.wire.replies import AnyReply
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
 
-TokenPair = tuple[int, int]
-OnReply = Callable[[AnyReply, float], None]
 OnError = Callable[[VramError, float], None]
 
 
@@ -164,17 +166,17 @@ Event = (
 class LeaseRecord:
     """One granted lease, as this client knows it."""
 
-    lease_id: str
-    token: TokenPair
+    lease_id: LeaseId
+    token: Token
     nonce: str
-    spec: Message
+    spec: LeaseSpec
     ttl_s: float
     view: LeaseView
     confirmed_at: float  # when the last message that the arbiter confirmed was *sent*
     renewed_at: float
     held: bool = False  # False: still loading
     measured_bytes: int | None = None
-    uses: set[str] = field(default_factory=set)
+    uses: set[UseId] = field(default_factory=set)
     revoke: RevokePush | None = None
     withdrawn: bool = False  # `revoke` is over; the lease stays if it has not begun to unload
     released: bool = False
@@ -188,19 +190,12 @@ class LeaseRecord:
         """Forget the revoke that was withdrawn."""
         self.revoke, self.withdrawn = None, False
 
-    def ref(self) -> Message:
-        """`schemas.wire.LeaseRef`."""
-        return {"lease_id": self.lease_id, "token": list(self.token)}
-
-    def reattachment(self) -> Message:
-        """`schemas.wire.ReattachLease`."""
-        return {
-            **self.ref(),
-            "spec": self.spec,
-            "state": self.asleep or ("held" if self.held else "loading"),
-            "measured_bytes": self.measured_bytes,
-            "use_ids": sorted(self.uses),
-        }
+    def reattachment(self) -> w.ReattachLease:
+        state: Any = self.asleep or ("held" if self.held else "loading")
+        uses = tuple(sorted(self.uses))
+        return w.ReattachLease(
+            self.lease_id, self.token, self.spec, state, self.measured_bytes, uses
+        )
 
 
 @dataclass(slots=True)
@@ -208,11 +203,11 @@ class Waiter:
     """An acquire that is not granted yet."""
 
     nonce: str
-    spec: Message
-    extra: Message
+    spec: LeaseSpec
+    traceparent: str | None
     asked_at: float
     deadline: float | None
-    lease_id: str | None = None
+    lease_id: LeaseId | None = None
     request_id: int | None = None
     abandoned: bool = False
 
@@ -221,10 +216,12 @@ class Waiter:
 class Pending:
     """A request whose reply is not here yet; sent again after a reconnect."""
 
-    message: Message
+    request: w.Request[Any]
+    id: int
+    traceparent: str | None
     deadline: float
     sent_at: float | None = None
-    on_reply: OnReply | None = None  # our own bookkeeping, before the owner hears
+    on_reply: Callable[[Any, float], None] | None = None  # our own bookkeeping, before the owner's
     on_error: OnError | None = None
     quiet: bool = False  # its end is not reported
 
@@ -233,13 +230,6 @@ class Pending:
 class ForeignUseRecord:
     """A use on the lease of another process; resumed after a reconnect."""
 
-    lease_id: str
-    token: TokenPair
-    label: str
-    traceparent: str | None = None
+    request: w.UseBegin
+    traceparent: str | None
     begun: bool = False
-
-    def begin(self, use_id: str) -> Message:
-        on = {"lease_id": self.lease_id, "token": list(self.token)}
-        message = {"op": "use_begin", **on, "use_id": use_id, "label": self.label}
-        return message | ({"traceparent": self.traceparent} if self.traceparent else {})

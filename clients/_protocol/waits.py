@@ -20,10 +20,11 @@ from vram_arbiter.clients._protocol.records import (
     LeaseRecord,
     Waiter,
 )
-from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.wire.replies import AcquireReply, AnyReply
+from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire import requests as w
+from vram_arbiter.schemas.wire.replies import AcquireReply
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
 
 
@@ -39,7 +40,7 @@ class Waits:
     def acquire(
         self,
         nonce: str,
-        spec: JsonMap,
+        spec: LeaseSpec,
         now: float,
         *,
         wait_timeout_s: float | None = None,
@@ -47,8 +48,7 @@ class Waits:
     ) -> None:
         """Ask for a lease; ends as `Granted` or `Denied` with this nonce."""
         deadline = None if wait_timeout_s is None else now + wait_timeout_s
-        extra = {"traceparent": traceparent} if traceparent else {}
-        waiter = Waiter(nonce, dict(spec), extra, now, deadline)
+        waiter = Waiter(nonce, spec, traceparent, now, deadline)
         self.waiters[nonce] = waiter
         self._ask(waiter, now)
 
@@ -90,7 +90,7 @@ class Waits:
     def end_overdue(self, now: float) -> None:
         """End waits that are over while the arbiter cannot be reached."""
         ends_at = self._connection.wait_ends_at
-        for waiter in [w for w in self.waiters.values() if now >= ends_at(w.deadline)]:
+        for waiter in [one for one in self.waiters.values() if now >= ends_at(one.deadline)]:
             if not waiter.abandoned:
                 error = waited_in_vain(waiter.spec, "a lease", now - waiter.asked_at)
                 self._connection.events.append(Denied(waiter.nonce, error))
@@ -104,29 +104,21 @@ class Waits:
 
     def _ask(self, waiter: Waiter, now: float) -> None:
         left_s = None if waiter.deadline is None else max(0.0, waiter.deadline - now)
-        message = {
-            "op": "acquire",
-            "nonce": waiter.nonce,
-            "spec": waiter.spec,
-            "wait_timeout_s": 0.0 if waiter.abandoned else left_s,
-            **waiter.extra,
-        }
-
         waiter.request_id = self._connection.ask(
-            message,
+            w.Acquire(waiter.nonce, waiter.spec, 0.0 if waiter.abandoned else left_s),
             now,
             REQUEST_TIMEOUT_S if left_s is None else max(REQUEST_TIMEOUT_S, left_s),
             on_reply=partial(self._replied, waiter),
             on_error=lambda error, _: self._denied(waiter, error),
             quiet=True,
+            traceparent=waiter.traceparent,
         )
 
-    def _replied(self, waiter: Waiter, reply: AnyReply, now: float) -> None:
-        assert isinstance(reply, AcquireReply)
+    def _replied(self, waiter: Waiter, reply: AcquireReply, now: float) -> None:
         if waiter.nonce not in self.waiters:
             return
         view = reply.lease
-        waiter.lease_id = view.lease_id
+        waiter.lease_id = LeaseId(view.lease_id)
         if reply.state == "loading":  # not by its token: one that was away shows its last one
             self._granted(waiter, view, now)
         elif waiter.abandoned:
@@ -140,19 +132,17 @@ class Waits:
             raise ValueError("a grant without a token")
         heard_at = self._connection.asked_at
         record = LeaseRecord(
-            lease_id=view.lease_id,
+            lease_id=LeaseId(view.lease_id),
             token=view.token,
             nonce=waiter.nonce,
             spec=waiter.spec,
-            ttl_s=float(waiter.spec.get("ttl_s", d.LEASE_TTL_S)),
+            ttl_s=waiter.spec.ttl_s,
             view=view,
             confirmed_at=heard_at,
             renewed_at=heard_at,
         )
         if waiter.abandoned:  # release it at once: nothing was loaded
-            self._connection.ask(
-                {"op": "release", **record.ref(), "exiting": False}, now, quiet=True
-            )
+            self._connection.ask(w.Release(record.lease_id, record.token), now, quiet=True)
             return
         self._holdings.held[record.lease_id] = record
         self._connection.events.append(Granted(waiter.nonce, record))
@@ -165,5 +155,6 @@ class Waits:
         def over(_: object, __: float) -> None:
             self.waiters.pop(waiter.nonce, None)
 
-        message = {"op": "cancel", "lease_id": waiter.lease_id}
-        self._connection.ask(message, now, on_reply=over, on_error=over, quiet=True)
+        assert waiter.lease_id is not None
+        request = w.Cancel(waiter.lease_id)
+        self._connection.ask(request, now, on_reply=over, on_error=over, quiet=True)

@@ -33,6 +33,7 @@ from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, from_wir
 from vram_arbiter.schemas.manifest import ManifestError, load_manifest
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
+from vram_arbiter.schemas.wire.requests import Status
 
 DESCRIPTIONS = {
     "calibrate": "Measure what a model needs on a GPU: vramctl calibrate MANIFEST loads it in a "
@@ -192,7 +193,7 @@ async def _measure(args: argparse.Namespace, record: Record, command: list[str],
 def _room(gpu: Gpu, endpoint: str | None) -> int:
     """Return the bytes that a lease alone on the GPU can have now. Raises ConfigError, and what the
     arbiter answers."""
-    reply = ask("status", {}, endpoint)
+    reply = ask(Status(), endpoint)
     if not reply.get("ok"):
         raise from_wire(reply["error"])
     for view in reply["gpus"]:

@@ -12,12 +12,14 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from vram_arbiter.clients.cli import arguments, text
 from vram_arbiter.clients.cli.replies import ENVELOPE, OK, answer
 from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.wire.requests import History
 
 LIMIT = 50
 PAGE = 2000  # events in one reply; more would not fit a message
@@ -170,18 +172,12 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
             lines.append(f"({text.plural(folded, 'quiet event')} not shown: --all)")
         return lines
 
-    def question(op: str, fields: JsonMap, where: str | None) -> Message:
-        return collect(wanted, where)
-
     hidden = ENVELOPE | {"epoch"}
     return answer(
-        "history",
-        {},
-        endpoint=endpoint,
+        partial(collect, wanted, endpoint),
         as_json=as_json,
         lines=shown,
         hidden=hidden,
-        question=question,
     )[0]
 
 
@@ -226,7 +222,7 @@ def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
 
 def page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
     """Ask for the events after a number. Raises ArbiterUnreachable."""
-    return request.ask("history", {"after": after, "limit": limit, "kinds": list(kinds)}, endpoint)
+    return request.ask(History(after, limit, tuple(kinds)), endpoint)
 
 
 def _start(wanted: Wanted, last_seq: int, endpoint: str | None) -> int:

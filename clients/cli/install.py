@@ -41,6 +41,7 @@ from vram_arbiter.schemas.errors import ConfigError, InstallFailed, VramError
 from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME, arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.runtime.version import version
+from vram_arbiter.schemas.wire.requests import Status
 
 DESCRIPTIONS = {
     "install": "Make the arbiter a service of this machine, or of your user with --user-units: "
@@ -251,7 +252,7 @@ def _stops(site: Site, record: Installed) -> list[Step]:
     if not layout.system:
         endpoint = arbiter_endpoint(os.environ, os.getuid())
     try:
-        leases = ask("status", {}, endpoint).get("leases", ()) if found else ()
+        leases = ask(Status(), endpoint).get("leases", ()) if found else ()
     except VramError:
         leases = ()
     held = ", ".join(lease["consumer"] for lease in leases if lease["charge_bytes"])

@@ -6,6 +6,7 @@ from functools import partial
 from vram_arbiter.clients.cli import arguments, text
 from vram_arbiter.clients.cli.replies import answer
 from vram_arbiter.clients.net.request import ask
+from vram_arbiter.schemas.wire.requests import REQUESTS
 
 DESCRIPTIONS = {
     "evict": "Revoke a lease. A use in flight finishes first; a pinned lease is refused. With "
@@ -52,15 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 def run(args: argparse.Namespace) -> int:
     kill = args.command_name == "evict" and args.kill
     action = "kill" if kill else args.command_name.replace("-", "_")
-    fields = {"reason": args.reason}
-    if args.command_name in _WITH_TARGET:
-        fields["target"] = args.target
+    target = (args.target,) if args.command_name in _WITH_TARGET else ()
     code, _ = answer(
-        action,
-        fields,
-        endpoint=args.endpoint,
+        partial(ask, REQUESTS[action](args.reason, *target), args.endpoint, role="operator"),
         as_json=args.as_json,
         lines=lambda reply: text.by_hand_lines(action, reply),
-        question=partial(ask, role="operator"),
     )
     return code

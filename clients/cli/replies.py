@@ -5,7 +5,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 from vram_arbiter.clients.cli import text
-from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.plain import Message
 
 OK, NO, USAGE, UNREACHABLE = 0, 1, 2, 3
@@ -14,20 +13,17 @@ ENVELOPE = frozenset({"re", "ok"})
 
 
 def answer(
-    op: str,
-    fields: Mapping[str, object],
+    question: Callable[[], Message],
     *,
-    endpoint: str | None,
     as_json: bool,
     lines: Callable[[Message], Sequence[str]],
     hidden: frozenset[str] = ENVELOPE,
-    question: Callable[..., Message] = ask,
 ) -> tuple[int, Message]:
     """Ask and print. Returns the exit code and the reply. Raises what the question raises.
 
     `--json` prints the reply of `schemas.wire` without the fields in `hidden`.
     """
-    reply = question(op, fields, endpoint)
+    reply = question()
     if not reply.get("ok"):
         complain(reply["error"], as_json=as_json)
         return NO, {}

@@ -17,6 +17,7 @@ from typing import Final
 
 from pydantic import ValidationError
 
+from vram_arbiter.clients._spec import checked_spec
 from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
@@ -31,8 +32,7 @@ from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.requests import checked_spec
+from vram_arbiter.schemas.wire.requests import Status
 from vram_arbiter.schemas.wire.views import GpuView
 
 PRIORITY: Final = 40
@@ -210,8 +210,7 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS], endpoint=endpoint
     ) as client:
         if spec.action is not None:
-            status = await client.ask("status")
-            assert isinstance(status, StatusReply)
+            status = await client.ask(Status())  # the page of all GPUs
             check_gpus(spec.gpu, status.gpus)
         supervisor = Supervisor(spec, client, program)
         await supervisor.acquire()

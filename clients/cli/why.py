@@ -1,10 +1,13 @@
 """`vramctl why`: what keeps a consumer from running."""
 
 import argparse
+from functools import partial
 
 from vram_arbiter.clients.cli import arguments, terminal, text
 from vram_arbiter.clients.cli.replies import ENVELOPE, NO, OK, answer
+from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.wire.requests import AskWhy
 
 INDENT = len("  blocked   ")
 
@@ -27,9 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 
 def run(args: argparse.Namespace) -> int:
     code, reply = answer(
-        "why",
-        {"consumer": args.consumer},
-        endpoint=args.endpoint,
+        partial(ask, AskWhy(args.consumer), args.endpoint),
         as_json=args.as_json,
         lines=_lines,
         hidden=ENVELOPE | {"epoch"},

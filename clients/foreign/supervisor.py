@@ -30,6 +30,7 @@ from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.errors import CalibrationFailed, VramError
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.requests import Status
 
 log = logging.getLogger(__name__)
 
@@ -341,8 +342,7 @@ class Supervisor:
             self._wake.clear()
             self._decide(None)
             with contextlib.suppress(VramError):
-                status = await self._client.ask("status")  # its first page has all queues' heads
-                assert isinstance(status, StatusReply)
+                status = await self._client.ask(Status())  # its first page has all queues' heads
                 self.peak.measure(status, self.lease.lease_id)
                 self._decide(status)
             if self._program is not None and self._program.running and self._spec.comes_back:

@@ -7,13 +7,14 @@ Operators type `vramctl status` often and scripts poll it; a test checks the imp
 import contextlib
 import os
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vram_arbiter.schemas.defaults import WIRE_VERSION
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import ArbiterUnreachable
-from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.msgpack_codec import pack
+from vram_arbiter.schemas.wire import requests as w
 
 if TYPE_CHECKING:
     import zmq
@@ -32,11 +33,10 @@ HANGS = (
 
 
 def ask(
-    op: str,
-    fields: JsonMap,
+    request: w.Request[Any],
     endpoint: str | None = None,
     timeout_s: float = TIMEOUT_S,
-    role: str = "observer",
+    role: w.Role = "observer",
 ) -> Message:
     """Hello, then one request. Returns its reply, error replies too.
 
@@ -45,14 +45,7 @@ def ask(
     import zmq
 
     deadline = time.monotonic() + timeout_s
-    hello = {
-        "op": "hello",
-        "id": 1,
-        "version": WIRE_VERSION,
-        "name": "vramctl",
-        "instance": f"vramctl-{os.getpid()}",
-        "role": role,
-    }
+    hello = w.Hello(name="vramctl", instance=f"vramctl-{os.getpid()}", role=role)
     where = endpoint or arbiter_endpoint(os.environ, os.getuid())
     late = f"no arbiter answers at {where} within {timeout_s:g} s"
     silent = ArbiterUnreachable(late, hint=HANGS)
@@ -62,8 +55,8 @@ def ask(
         zmq.Context() as context,
         contextlib.closing(_link(context, where, deadline, silent)) as link,
     ):
-        for message in (hello, {"op": op, "id": 2, **fields}):
-            link.send(pack(message))
+        for number, asked in enumerate((hello, request), 1):
+            link.send(pack({**to_map(asked), "id": number}))
         return _reply(link, where, deadline, silent)
 
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.requests import Status
 
 log = logging.getLogger(__name__)
 
@@ -74,8 +76,8 @@ class Present:
         leases = {lease.lease_id: lease for lease in self.newest.status.leases}
         if len(leases) <= SOME_MAX or time.monotonic() - self._whole_at > WHOLE_S:
             return None
-        found = await self._client.ask("status", {"leases": list(touched)}, timeout_s=ASK_S)
-        assert isinstance(found, StatusReply)
+        request = Status(leases=tuple(map(LeaseId, touched)))
+        found = await self._client.ask(request, timeout_s=ASK_S)
         if found.epoch != self.newest.status.epoch:
             return None
         for lease_id in touched:

@@ -1,10 +1,8 @@
 """Answers to requests: `{"re": n, "epoch": e, "ok": true, …}`, one class per shape. Standard
 library only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Literal
 
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
@@ -49,7 +47,7 @@ class ReadyReply:
 
 @dataclass(frozen=True, slots=True)
 class UsesReply:
-    """Answer to `use_begin`, `use_end` and `yield`: busy uses of the lease."""
+    """Answer to `use_begin` and `use_end`: busy uses of the lease."""
 
     uses: int
 
@@ -181,36 +179,3 @@ type AnyReply = (
     | PrepareReply
     | WhyReply
 )
-
-REPLIES: Final[Mapping[str, type[Any]]] = MappingProxyType(
-    {
-        "hello": WelcomeReply,
-        "ping": PingReply,
-        "prepare": PrepareReply,
-        "bye": DoneReply,
-        "subscribe": DoneReply,
-        "acquire": AcquireReply,
-        "reacquire": AcquireReply,
-        "ready": ReadyReply,
-        "use_begin": UsesReply,
-        "use_end": UsesReply,
-        "revoke_ack": StateReply,
-        "unloading": StateReply,
-        "cancel": StateReply,
-        "release": ReleaseReply,
-        "renew": RenewReply,
-        "reattach": ReattachReply,
-        "oom": OomReply,
-        "status": StatusReply,
-        "why": WhyReply,
-        "history": HistoryReply,
-        "evict": OperatorReply,
-        "kill": OperatorReply,
-        "pin": OperatorReply,
-        "unpin": OperatorReply,
-        "release_dead": OperatorReply,
-        "drain": DrainReply,
-        "resume": DrainReply,
-    }
-)
-"""Op → type of its reply."""

@@ -1,4 +1,8 @@
-"""Requests of the arbiter's wire, validated: frozen models that refuse unknown keys.
+"""Requests of the arbiter's wire, each declared once: clients build them, the daemon validates them
+and the engine handles them as the same frozen objects.
+
+On the wire a request is the map of its fields with its `op` and the two fields of `Envelope`.
+Validation refuses unknown keys. Standard library only.
 
 The life of a lease on the wire: `acquire` → reply `loading` (granted at once) or `queued`, then
 push `granted` → `ready` → `use_begin`/`use_end`… → push `revoke` → `revoke_ack` → `unloading` →
@@ -7,108 +11,149 @@ after its `release`: push `granted` (with a new token) when it is back, or `reac
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, get_args
-
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.limits import Bytes, Name, Seconds
-from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
+from vram_arbiter.schemas.ids import LeaseId, RequestId, Token, UseId
+from vram_arbiter.schemas.limits import NAME, STRICT, AsPair, Bytes, Limits, Name, Seconds
+from vram_arbiter.schemas.wire import replies as r
+from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-LeaseIdText = Annotated[str, Field(min_length=1, max_length=64)]
-TokenPair = Annotated[tuple[int, int], Field(description="[epoch, serial]")]
-Serial = Annotated[int, Field(ge=0, lt=1 << 63)]
-Reason = Annotated[str, Field(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
-UseIds = Annotated[tuple[Name, ...], Field(max_length=d.USES_PER_LEASE_MAX, fail_fast=True)]
+LeaseIdText = Annotated[LeaseId, Limits(min_length=1, max_length=64)]
+UseName = Annotated[UseId, NAME]
+TokenPair = Annotated[Token, AsPair()]
+"""`[epoch, serial]`."""
+Serial = Annotated[int, Limits(ge=0, lt=1 << 63)]
+Reason = Annotated[str, Limits(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Role = Literal["client", "observer", "operator"]
+UseNames = Annotated[tuple[UseName, ...], Limits(max_length=d.USES_PER_LEASE_MAX, fail_fast=True)]
 """Lists end at their first wrong item: a message with thousands of wrong ones must not cost an
 error for each."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """What a message says beside its request: the id that the reply repeats as `re`, and the W3C
+    traceparent of the caller's span. A traceparent that is none is ignored."""
+
+    id: Annotated[RequestId, Limits(ge=0, lt=1 << 53)]
+    traceparent: str | None = None
 
 
-class LeaseRef(_Frozen):
-    lease_id: LeaseIdText
-    token: TokenPair
+class Request[R]:
+    """Base of all requests; `R` is the type of the reply."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar = STRICT
+    TAG: ClassVar[tuple[str, str]]
+    WHOLE: ClassVar = True
 
 
-class _Request(_Frozen):
-    id: Annotated[int, Field(ge=0, lt=1 << 53)]
-    traceparent: Traceparent = None
+class Question[R](Request[R]):
+    """A request that changes nothing in the engine: all that an observer may send."""
+
+    __slots__ = ()
 
 
-class Hello(_Request):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hello(Question[r.WelcomeReply]):
     """First message of a connection. `instance` names the client object, to find its leases again
     after a reconnect."""
 
-    op: Literal["hello"]
+    TAG: ClassVar = ("op", "hello")
     version: int = d.WIRE_VERSION
     name: Name
     instance: Name
-    role: Literal["client", "observer", "operator"] = "client"
+    role: Role = "client"
 
 
-class Acquire(_Request):
+@dataclass(frozen=True, slots=True)
+class Acquire(Request[r.AcquireReply]):
     """Ask for a lease. The same `nonce` from the same process is the same request: a repeat never
     makes a second lease."""
 
-    op: Literal["acquire"]
+    TAG: ClassVar = ("op", "acquire")
     nonce: Name
     spec: LeaseSpec
     wait_timeout_s: Seconds | None = None  # None waits for ever
 
 
-class OnLease(_Request):
+@dataclass(frozen=True, slots=True)
+class LeaseRef:
+    """A lease by its exact token."""
+
+    __pydantic_config__: ClassVar = STRICT
+
+    lease_id: LeaseIdText
+    token: TokenPair
+
+
+@dataclass(frozen=True, slots=True)
+class OnLease[R](Request[R]):
     """What a client says about a lease whose token it knows."""
 
     lease_id: LeaseIdText
     token: TokenPair
 
 
-class Ready(OnLease):
+@dataclass(frozen=True, slots=True)
+class Ready(OnLease[r.ReadyReply]):
     """The model is loaded; `measured_bytes` is what the holder sees of its own allocation (None: it
     cannot tell)."""
 
-    op: Literal["ready"]
+    TAG: ClassVar = ("op", "ready")
     measured_bytes: Bytes | None = None
 
 
-class UseBegin(OnLease):
+@dataclass(frozen=True, slots=True)
+class UseBegin(OnLease[r.UsesReply]):
     """Begin a use. Any client that knows the token may; the use ends with that client's process at
     the latest."""
 
-    op: Literal["use_begin"]
-    use_id: Name
-    label: Annotated[str, Field(max_length=d.NAME_MAX_CHARS)] = ""
+    TAG: ClassVar = ("op", "use_begin")
+    use_id: UseName
+    label: Annotated[str, Limits(max_length=d.NAME_MAX_CHARS)] = ""
 
 
-class UseEnd(OnLease):
-    op: Literal["use_end"]
-    use_id: Name
+@dataclass(frozen=True, slots=True)
+class UseEnd(OnLease[r.UsesReply]):
+    """End a use; one that is over is fine."""
+
+    TAG: ClassVar = ("op", "use_end")
+    use_id: UseName
 
 
-class Renew(_Request):
-    op: Literal["renew"]
+@dataclass(frozen=True, slots=True)
+class Renew(Request[r.RenewReply]):
+    """Keep leases alive."""
+
+    TAG: ClassVar = ("op", "renew")
     leases: Annotated[
-        tuple[LeaseRef, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
+        tuple[LeaseRef, ...], Limits(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
     ]
 
 
-class RevokeAck(OnLease):
+@dataclass(frozen=True, slots=True)
+class RevokeAck(OnLease[r.StateReply]):
     """The holder heard `revoke`; `safe_point_eta_s` is its guess of when it will be
     between uses."""
 
-    op: Literal["revoke_ack"]
+    TAG: ClassVar = ("op", "revoke_ack")
     safe_point_eta_s: Seconds | None = None
 
 
-class Unloading(OnLease):
-    op: Literal["unloading"]
+@dataclass(frozen=True, slots=True)
+class Unloading(OnLease[r.StateReply]):
+    """The holder is at its safe point and unloads."""
+
+    TAG: ClassVar = ("op", "unloading")
 
 
-class Release(OnLease):
+@dataclass(frozen=True, slots=True)
+class Release(OnLease[r.ReleaseReply]):
     """The holder has let go of the bytes (its process lives on: residue) or is about to exit
     (`exiting`).
 
@@ -116,155 +161,198 @@ class Release(OnLease):
     `standby` or `parked`.
     """
 
-    op: Literal["release"]
+    TAG: ClassVar = ("op", "release")
     exiting: bool = False
     parked: bool = False  # the weights are in host RAM: the lease lives on as `parked`
 
 
-class Cancel(_Request):
+@dataclass(frozen=True, slots=True)
+class Cancel(Request[r.StateReply]):
     """Give up a queued acquire."""
 
-    op: Literal["cancel"]
+    TAG: ClassVar = ("op", "cancel")
     lease_id: LeaseIdText
 
 
-class Reacquire(OnLease):
+@dataclass(frozen=True, slots=True)
+class Reacquire(OnLease[r.AcquireReply]):
     """A lease that is away is wanted now: it waits like any other. `token` is the last one, so a
     late repeat asks for nothing."""
 
-    op: Literal["reacquire"]
+    TAG: ClassVar = ("op", "reacquire")
     wait_timeout_s: Seconds | None = None
 
 
-class ReattachLease(_Frozen):
-    lease_id: LeaseIdText
-    token: TokenPair
+@dataclass(frozen=True, slots=True)
+class ReattachLease(LeaseRef):
+    """A lease that a client still holds. On standby or parked, `token` is the last one."""
+
+    WHOLE: ClassVar = True
+
     spec: LeaseSpec
-    state: Literal[
-        "loading", "held", "standby", "parked"
-    ]  # standby, parked: `token` is the last one
+    state: Literal["loading", "held", "standby", "parked"]
     measured_bytes: Bytes | None = None
-    use_ids: UseIds = ()
+    use_ids: UseNames = ()
 
 
-class Reattach(_Request):
+@dataclass(frozen=True, slots=True)
+class Reattach(Request[r.ReattachReply]):
     """After a reconnect: what this client still holds. The reply says per lease `kept` or
     why not."""
 
-    op: Literal["reattach"]
+    TAG: ClassVar = ("op", "reattach")
     leases: Annotated[
-        tuple[ReattachLease, ...], Field(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
+        tuple[ReattachLease, ...], Limits(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
     ]
 
 
-class Oom(OnLease):
+@dataclass(frozen=True, slots=True)
+class Oom(OnLease[r.OomReply]):
     """The consumer's allocation failed. Raises the learnt footprint of its model."""
 
-    op: Literal["oom"]
+    TAG: ClassVar = ("op", "oom")
     requested_bytes: Bytes
     allocated_bytes: Bytes | None = None
 
 
-class Status(_Request):
+@dataclass(frozen=True, slots=True)
+class Status(Question[r.StatusReply]):
     """The state of everything. Leases come in pages: `after` is the `next` of the page before.
     `details`: with declared and measured bytes, and why each waiter waits; its pages are
     shorter. `leases`: with these alone, as far as they are not over, and without tokens."""
 
-    op: Literal["status"]
+    TAG: ClassVar = ("op", "status")
+    WHOLE: ClassVar = False  # a question for everything says nothing of its pages
     details: bool = False
-    leases: Annotated[tuple[LeaseIdText, ...], Field(max_length=d.STATUS_PAGE)] = ()
-    after: tuple[Literal[0, 1], Annotated[float, Field(allow_inf_nan=False)], Serial] | None = None
+    leases: Annotated[
+        tuple[LeaseIdText, ...], Limits(max_length=d.STATUS_PAGE, fail_fast=True)
+    ] = ()
+    after: (
+        tuple[
+            Annotated[int, Limits(ge=0, le=1)],
+            Annotated[float, Limits(allow_inf_nan=False)],
+            Serial,
+        ]
+        | None
+    ) = None
 
 
-class AskWhy(_Request):
-    op: Literal["why"]
+@dataclass(frozen=True, slots=True)
+class AskWhy(Question[WhyReply]):
+    """What blocks a consumer."""
+
+    TAG: ClassVar = ("op", "why")
     consumer: Name
 
 
-class History(_Request):
-    op: Literal["history"]
+@dataclass(frozen=True, slots=True)
+class History(Question[r.HistoryReply]):
+    """Events after a number, oldest first; a reply has at most 2000."""
+
+    TAG: ClassVar = ("op", "history")
     after: int = 0  # sequence number of the last event already seen
-    limit: Annotated[int, Field(ge=1, le=5000)] = 500  # a reply has at most 2000 events
-    kinds: Annotated[tuple[str, ...], Field(max_length=d.LISTED_MAX, fail_fast=True)] = ()
+    limit: Annotated[int, Limits(ge=1, le=5000)] = 500
+    kinds: Annotated[tuple[str, ...], Limits(max_length=d.LISTED_MAX, fail_fast=True)] = ()
 
 
-class Subscribe(_Request):
+@dataclass(frozen=True, slots=True)
+class Subscribe(Question[r.DoneReply]):
     """Receive every history event as a push `event` from now on."""
 
-    op: Literal["subscribe"]
+    TAG: ClassVar = ("op", "subscribe")
 
 
-class ByHand(_Request):
+@dataclass(frozen=True, slots=True)
+class ByHand[R](Request[R]):
     """An operator's action. `reason` is kept with the operator's name in history and, for pins and
     drains, in the journal."""
 
     reason: Reason
 
 
-class ByHandOn(ByHand):
-    target: Name  # a lease id, or a consumer that has exactly one lease
+@dataclass(frozen=True, slots=True)
+class ByHandOn(ByHand[r.OperatorReply]):
+    """One on a lease, by its id or by the name of a consumer that has exactly one."""
+
+    target: Name
 
 
+@dataclass(frozen=True, slots=True)
 class Evict(ByHandOn):
     """Ask a holder to leave. In use it finishes first; a pinned one is refused."""
 
-    op: Literal["evict"]
+    TAG: ClassVar = ("op", "evict")
 
 
+@dataclass(frozen=True, slots=True)
 class Kill(ByHandOn):
     """End the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again. Refused
     while another process uses one of its leases, or it uses one of another process."""
 
-    op: Literal["kill"]
+    TAG: ClassVar = ("op", "kill")
 
 
+@dataclass(frozen=True, slots=True)
 class Pin(ByHandOn):
     """Protect the lease from eviction until it is unpinned."""
 
-    op: Literal["pin"]
+    TAG: ClassVar = ("op", "pin")
 
 
+@dataclass(frozen=True, slots=True)
 class Unpin(ByHandOn):
-    op: Literal["unpin"]
+    """Undo a pin."""
+
+    TAG: ClassVar = ("op", "unpin")
 
 
+@dataclass(frozen=True, slots=True)
 class ReleaseDead(ByHandOn):
     """Give up the lease of a holder that is not heard of, before its ttl is over. Refused in use,
     and for a holder that lives."""
 
-    op: Literal["release_dead"]
+    TAG: ClassVar = ("op", "release_dead")
 
 
-class Drain(ByHand):
+@dataclass(frozen=True, slots=True)
+class Drain(ByHand[r.DrainReply]):
     """No new grants until `resume`; what is held is kept. Outlives the daemon, not the machine."""
 
-    op: Literal["drain"]
+    TAG: ClassVar = ("op", "drain")
 
 
-class Resume(ByHand):
-    op: Literal["resume"]
+@dataclass(frozen=True, slots=True)
+class Resume(ByHand[r.DrainReply]):
+    """Grant again."""
+
+    TAG: ClassVar = ("op", "resume")
 
 
-class Prepare(_Request):
+@dataclass(frozen=True, slots=True)
+class Prepare(Request[r.PrepareReply]):
     """A hint: the consumer's model is wanted soon. It is passed on to the consumer, which may read
     its weights into host RAM; it grants nothing and evicts nothing."""
 
-    op: Literal["prepare"]
+    TAG: ClassVar = ("op", "prepare")
     consumer: Name
 
 
-class Ping(_Request):
-    op: Literal["ping"]
+@dataclass(frozen=True, slots=True)
+class Ping(Question[r.PingReply]):
+    """A sign of life."""
+
+    TAG: ClassVar = ("op", "ping")
 
 
-class Bye(_Request):
+@dataclass(frozen=True, slots=True)
+class Bye(Question[r.DoneReply]):
     """The client closes its socket. Its leases are released; a process that lives on keeps its
     residue."""
 
-    op: Literal["bye"]
+    TAG: ClassVar = ("op", "bye")
 
 
-Request = Annotated[
+type AnyRequest = (
     Hello
     | Acquire
     | Ready
@@ -291,18 +379,15 @@ Request = Annotated[
     | Resume
     | Prepare
     | Ping
-    | Bye,
-    Field(discriminator="op"),
-]
-REQUEST: TypeAdapter[Request] = TypeAdapter(Request)
-OPS: tuple[str, ...] = tuple(
-    get_args(request.model_fields["op"].annotation)[0] for request in get_args(get_args(Request)[0])
+    | Bye
 )
+REQUESTS: Final[Mapping[str, type[Any]]] = MappingProxyType(
+    {cls.TAG[1]: cls for cls in get_args(AnyRequest.__value__)}
+)
+"""By their ops."""
 
 
-_SPEC = TypeAdapter(LeaseSpec)
-
-
-def checked_spec(fields: Mapping[str, object]) -> LeaseSpec:
-    """Return the spec with these fields, within its limits. Raises pydantic's ValidationError."""
-    return _SPEC.validate_python(fields)
+REPLIES: Final[Mapping[type, type[Any]]] = MappingProxyType(
+    {cls: get_args(cls.__orig_bases__[0])[0] for cls in REQUESTS.values()}
+)
+"""Type of the reply to each request: the argument of its base."""

@@ -2,12 +2,10 @@
 event log and clients share these records. Standard library only."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Literal
 
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.limits import Bytes, Limits, Name, Seconds
-
-_STRICT: Final = {"extra": "forbid"}
+from vram_arbiter.schemas.limits import STRICT, Bytes, Limits, Name, Seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +13,7 @@ class Footprint:
     """Bytes that a model puts on a GPU: at the worst moment of loading, when resident, and after
     unloading while its process lives."""
 
-    __pydantic_config__: ClassVar = _STRICT
+    __pydantic_config__: ClassVar = STRICT
 
     load_peak_bytes: Bytes
     steady_bytes: Bytes
@@ -26,7 +24,7 @@ class Footprint:
 class LeaseSpec:
     """What a lease is to be. `evictable=False` pins it: it is never evicted."""
 
-    __pydantic_config__: ClassVar = _STRICT
+    __pydantic_config__: ClassVar = STRICT
 
     consumer: Name
     model_id: Name

@@ -32,7 +32,7 @@ def test_a_daemon_replays_identically_also_after_kill_9_and_a_restart(make_arbit
     """The log goes to the disk in batches: a kill before the first of them leaves no file."""
     arbiter = make_arbiter().start()
     lease_something(arbiter)
-    until(lambda: on_disk(arbiter, "AcquireRequested"))
+    until(lambda: on_disk(arbiter, "Asked"))
     arbiter.kill()
     arbiter.start()
     lease_something(arbiter)

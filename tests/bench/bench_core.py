@@ -20,6 +20,7 @@ from vram_arbiter.schemas.ids import (
     Token,
     UseId,
 )
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
@@ -55,23 +56,22 @@ class Bench:
         for number in range(leases):
             lease = self.acquire(clients[number % holders], SLIVER)
             client, token = self.tokens[lease]
-            self.handle(ev.ReadyReported(client, self.request(), lease, token, None))
-            self.handle(ev.UseBegan(client, self.request(), lease, token, UseId("u"), ""))
+            self.handle(self.asked(client, w.Ready(lease, token)))
+            self.handle(self.asked(client, w.UseBegin(lease, token, UseId("u"))))
         for number in range(waiters):
             self.acquire(clients[holders + number % (len(clients) - holders)], 2 * SLIVER)
         self.samples.clear()
 
-    def request(self) -> RequestId:
+    def asked(self, client: ClientId, request: w.AnyRequest) -> ev.Asked:
         self.requests += 1
-        return RequestId(self.requests)
+        return ev.Asked(client, RequestId(self.requests), request)
 
     def handle(self, event: ev.Event) -> list[Any]:
         self.now += STEP_S
         start = time.perf_counter()
         effects = self.core.handle(event, self.now)
-        self.samples.setdefault(type(event).__name__, []).append(
-            (time.perf_counter() - start) * 1e6
-        )
+        kind = type(event.request if isinstance(event, ev.Asked) else event)
+        self.samples.setdefault(kind.__name__, []).append((time.perf_counter() - start) * 1e6)
         for effect in effects:
             if isinstance(effect, Push) and isinstance(effect.body, GrantedPush):
                 raise RuntimeError("nobody fits on this GPU")
@@ -87,7 +87,7 @@ class Bench:
             consumer="bench", model_id="m", footprint=Footprint(size, size, 0), ttl_s=1e9,
             min_residency_s=0.0,
         )  # fmt: skip
-        event = ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
+        event = self.asked(client, w.Acquire(f"n{self.requests + 1}", spec))
         reply = next(effect for effect in self.handle(event) if isinstance(effect, Reply))
         assert isinstance(reply.body, AcquireReply)
         view = reply.body.lease
@@ -105,13 +105,13 @@ class Bench:
         for _ in range(rounds):
             lease = held[dice.randrange(len(held))]
             client, token = self.tokens[lease]
-            self.handle(ev.Renewed(client, self.request(), ((lease, token),)))
-            self.handle(ev.UseBegan(client, self.request(), lease, token, UseId("v"), ""))
-            self.handle(ev.UseEnded(client, self.request(), lease, token, UseId("v")))
+            self.handle(self.asked(client, w.Renew((w.LeaseRef(lease, token),))))
+            self.handle(self.asked(client, w.UseBegin(lease, token, UseId("v"))))
+            self.handle(self.asked(client, w.UseEnd(lease, token, UseId("v"))))
             place = dice.randrange(len(self.queued))
             self.queued[place], self.queued[-1] = self.queued[-1], self.queued[place]
             client, waiting = self.queued.pop()
-            self.handle(ev.CancelRequested(client, self.request(), waiting))
+            self.handle(self.asked(client, w.Cancel(waiting)))
             self.acquire(client, 2 * SLIVER)
             self.read()
 

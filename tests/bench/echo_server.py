@@ -7,7 +7,8 @@ import threading
 import msgpack
 import zmq
 
-from vram_arbiter.schemas.wire.requests import REQUEST
+from vram_arbiter.arbiter.rpc.codec import decode
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 
 PAD = "x" * 160
 
@@ -26,8 +27,8 @@ def main(endpoint: str) -> None:
     while not ended.is_set():
         if socket.poll(50):
             client, frame = socket.recv_multipart()
-            request = REQUEST.validate_python(msgpack.unpackb(frame))
-            body = {"re": request.id, "epoch": 1, "ok": True, "pad": PAD}
+            envelope, _ = decode(frame, MESSAGE_MAX_BYTES)
+            body = {"re": envelope.id, "epoch": 1, "ok": True, "pad": PAD}
             socket.send_multipart([client, msgpack.packb(body)])
     socket.close(linger=0)
 

@@ -19,7 +19,6 @@ from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import STATUS_PAGE
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
@@ -32,7 +31,8 @@ from vram_arbiter.schemas.errors import (
     VramInsufficient,
     WaitTimeout,
 )
-from vram_arbiter.schemas.wire.replies import AnyReply, StatusReply
+from vram_arbiter.schemas.wire.replies import AnyReply
+from vram_arbiter.schemas.wire.requests import Acquire, Evict, Status
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import Totals
 from vram_arbiter.sidecars.device.fake import FakeMemory
@@ -81,7 +81,7 @@ async def test_an_evicted_holder_hears_by_whom_and_why(
         with pytest.raises(LeaseLost, match="was evicted: b needs the room"):
             await first.ready()
         await second.ready()
-        await ops.ask("evict", {"target": "b", "reason": "lunch"})
+        await ops.ask(Evict("lunch", "b"))
         while second.state != "gone":
             await anyio.sleep(0.01)
         assert second.evicted is not None
@@ -101,11 +101,10 @@ async def test_status_is_whole_though_it_comes_in_pages(
             for _ in range(5)
         ]
         await clients[0].acquire(spec("holder", 5))
-        asked = {"spec": to_map(spec("crowd", 5))}
+        crowd = spec("crowd", 5)
         for number in range(waiters):
-            await clients[1 + number % 4].ask("acquire", {"nonce": f"n{number}", **asked})
-        page = await clients[0].ask("status")
-        assert isinstance(page, StatusReply)
+            await clients[1 + number % 4].ask(Acquire(f"n{number}", crowd))
+        page = await clients[0].ask(Status())
         assert (len(page.leases), page.totals) == (STATUS_PAGE, Totals(waiters + 1, waiters))
         whole = await clients[0].status()
         assert [lease.position for lease in whole.leases] == [

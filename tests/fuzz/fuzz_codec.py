@@ -25,7 +25,7 @@ with atheris.instrument_imports(
     from tests.support.hostile import BOMBS, Forger, pack
     from vram_arbiter.arbiter.rpc import codec
     from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
-    from vram_arbiter.schemas.wire.requests import OPS
+    from vram_arbiter.schemas.wire.requests import REQUESTS
 
 ANSWER_MAX_BYTES = 16_384
 SEEDS_PER_OP = 4
@@ -43,7 +43,7 @@ def try_codec(frame: bytes) -> None:
 
 def write_corpus(folder: Path) -> None:
     """Requests of every op and the small bombs: what libFuzzer starts from."""
-    for op in OPS:
+    for op in REQUESTS:
         for number in range(SEEDS_PER_OP):
             (folder / f"{op}-{number}").write_bytes(pack(Forger(random.Random(number)).request(op)))
     for number, bomb in enumerate(BOMBS.values()):

@@ -343,7 +343,8 @@ def tokens_inside(machine: Machine) -> dict[str, list[int] | None]:
     """The tokens of all leases, which an operator sees."""
     code = (
         "import json; from vram_arbiter.clients.net.request import ask\n"
-        f"reply = ask('status', {{}}, '{ENDPOINT}', role='operator')\n"
+        "from vram_arbiter.schemas.wire.requests import Status\n"
+        f"reply = ask(Status(), '{ENDPOINT}', role='operator')\n"
         "print(json.dumps({lease['lease_id']: lease['token'] for lease in reply['leases']}))"
     )
     found: dict[str, list[int] | None] = json.loads(

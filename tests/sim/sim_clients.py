@@ -19,13 +19,14 @@ from tests.support.simulation.device import SimOutOfMemory
 from tests.support.simulation.world import Entitlement, SimProcess, World
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.clients._session import Session
+from vram_arbiter.clients._spec import checked_spec
 from vram_arbiter.clients.client import CONNECT_TIMEOUT_S, AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.dealer import Transport
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VramError
 from vram_arbiter.schemas.ids import GpuId
-from vram_arbiter.schemas.wire.requests import checked_spec
+from vram_arbiter.schemas.wire.requests import REQUESTS, Role
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 SIZES = (600 * d.MIB, d.GIB, 2 * d.GIB, 3_300_000_000, 4_300_000_000, 5_300_000_000, 7 * d.GIB)
@@ -38,7 +39,7 @@ LOAD_STEPS = 3
 class SimSession(Session):
     """The real client's connection with simulated time, names and sockets."""
 
-    def __init__(self, world: World, process: SimProcess, role: str) -> None:
+    def __init__(self, world: World, process: SimProcess, role: Role) -> None:
         super().__init__(process.name, "ipc://simulated", role, CONNECT_TIMEOUT_S)
         self._world, self._process = world, process
         self.protocol = ClientProtocol(
@@ -67,7 +68,7 @@ class SimSession(Session):
 class SimClient(AsyncClient):
     """The real client on a simulated connection."""
 
-    def __init__(self, world: World, process: SimProcess, role: str = "client") -> None:
+    def __init__(self, world: World, process: SimProcess, role: Role = "client") -> None:
         super().__init__(process.name, endpoint="ipc://simulated", role=role)
         self._session = SimSession(world, process, role)
         self.process = process
@@ -159,7 +160,7 @@ class Cast:
             for record in client.protocol.holdings.held.values():
                 if client.now() >= client.protocol.holdings.fence_at(record):
                     continue
-                spec = checked_spec(record.spec)
+                spec = record.spec
                 holding = self.holdings.get(record.lease_id)
                 residue = spec.footprint.residue_bytes
                 loaded = holding is not None and holding.loaded
@@ -201,7 +202,7 @@ class Cast:
 class Program(ABC):
     """One simulated program: its process, its client, its life as a coroutine."""
 
-    role = "client"
+    role: Role = "client"
     uid = 1000
 
     def __init__(self, cast: Cast, name: str, pid: int | None = None) -> None:
@@ -557,9 +558,9 @@ class Operator(Program):
 
     async def _do(self, action: str, target: str = "") -> bool:
         """False: nobody answered, say it again."""
-        fields = {"reason": "simulated"} | ({"target": target} if target else {})
+        request = REQUESTS[action]("simulated", *([target] if target else []))
         try:
-            await self.client.ask(action, fields, timeout_s=5.0)
+            await self.client.ask(request, timeout_s=5.0)
         except ArbiterUnreachable:
             return False
         except VramError as error:

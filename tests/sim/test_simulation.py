@@ -16,10 +16,10 @@ from tests.support.simulation.clock import Clock, new_loop
 from tests.support.simulation.daemon import Happening
 from tests.support.simulation.device import Device, SimOutOfMemory
 from tests.support.simulation.world import Entitlement, SimFailure, SimProcess, World
+from vram_arbiter.clients._spec import checked_spec
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
-from vram_arbiter.schemas.wire.requests import checked_spec
 from vram_arbiter.schemas.wire.spec import Footprint
 
 first_report = functools.cache(run_seed)

@@ -31,29 +31,17 @@ from vram_arbiter.arbiter.core.effects import (
 )
 from vram_arbiter.arbiter.core.events import (
     BYE,
-    AcquireRequested,
-    CancelRequested,
+    Asked,
     ClientConnected,
     ClientLeft,
     Event,
     JournalFailed,
     MemorySampled,
-    OomReported,
     ProbeFailed,
     ProcessDied,
     ProcessUse,
-    Reacquired,
-    ReadyReported,
-    Reattached,
-    ReattachedLease,
     Recovered,
-    ReleaseReported,
-    Renewed,
-    RevokeAcknowledged,
     Tick,
-    UnloadStarted,
-    UseBegan,
-    UseEnded,
 )
 from vram_arbiter.arbiter.core.model.refusals import NotJournaled
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
@@ -70,6 +58,7 @@ from vram_arbiter.schemas.ids import (
     Token,
     UseId,
 )
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
@@ -462,16 +451,8 @@ class Consumer:
     ) -> list[Effect]:
         """Ask for a lease; every effect of it."""
         self.nonces += 1
-        return self.driver.post(
-            AcquireRequested(
-                self.client,
-                self.driver.next_request(),
-                nonce or f"n{self.nonces}",
-                self.spec(load_peak_bytes, steady_bytes, **spec),
-                wait_timeout_s,
-                self.traceparent,
-            )
-        )
+        wanted = self.spec(load_peak_bytes, steady_bytes, **spec)
+        return self.ask(w.Acquire(nonce or f"n{self.nonces}", wanted, wait_timeout_s))
 
     def token(self, lease: LeaseId) -> Token:
         view = self.driver.view(lease)
@@ -480,51 +461,24 @@ class Consumer:
         return Token(*view["token"])
 
     def ready(self, lease: LeaseId, measured_bytes: int | None = None) -> list[Effect]:
-        return self.driver.post(
-            ReadyReported(
-                self.client, self.driver.next_request(), lease, self.token(lease), measured_bytes
-            )
-        )
+        return self.ask(w.Ready(lease, self.token(lease), measured_bytes))
 
     def use_begin(
         self, lease: LeaseId, use: str = "u1", token: Token | None = None, label: str = ""
     ) -> list[Effect]:
-        return self.driver.post(
-            UseBegan(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                token or self.token(lease),
-                UseId(use),
-                label,
-            )
-        )
+        return self.ask(w.UseBegin(lease, token or self.token(lease), UseId(use), label))
 
     def use_end(self, lease: LeaseId, use: str = "u1", token: Token | None = None) -> list[Effect]:
-        return self.driver.post(
-            UseEnded(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                token or self.token(lease),
-                UseId(use),
-            )
-        )
+        return self.ask(w.UseEnd(lease, token or self.token(lease), UseId(use)))
 
     def renew(self, *leases: tuple[LeaseId, Token]) -> list[Effect]:
-        return self.driver.post(Renewed(self.client, self.driver.next_request(), leases))
+        return self.ask(w.Renew(tuple(w.LeaseRef(*lease) for lease in leases)))
 
     def ack(self, lease: LeaseId, eta_s: float | None = None) -> list[Effect]:
-        return self.driver.post(
-            RevokeAcknowledged(
-                self.client, self.driver.next_request(), lease, self.token(lease), eta_s
-            )
-        )
+        return self.ask(w.RevokeAck(lease, self.token(lease), eta_s))
 
     def unloading(self, lease: LeaseId) -> list[Effect]:
-        return self.driver.post(
-            UnloadStarted(self.client, self.driver.next_request(), lease, self.token(lease))
-        )
+        return self.ask(w.Unloading(lease, self.token(lease)))
 
     def release(
         self,
@@ -534,47 +488,31 @@ class Consumer:
         token: Token | None = None,
         parked: bool = False,
     ) -> list[Effect]:
-        return self.driver.post(
-            ReleaseReported(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                token or self.token(lease),
-                exiting,
-                parked,
-            )
-        )
+        return self.ask(w.Release(lease, token or self.token(lease), exiting, parked))
 
     def cancel(self, lease: LeaseId) -> list[Effect]:
-        return self.driver.post(CancelRequested(self.client, self.driver.next_request(), lease))
+        return self.ask(w.Cancel(lease))
 
     def reacquire(
         self, lease: LeaseId, *, wait_timeout_s: float | None = None, token: Token | None = None
     ) -> list[Effect]:
-        return self.driver.post(
-            Reacquired(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                token or self.token(lease),
-                wait_timeout_s,
-                self.traceparent,
-            )
-        )
+        return self.ask(w.Reacquire(lease, token or self.token(lease), wait_timeout_s))
 
     def oom(
         self, lease: LeaseId, requested_bytes: int, allocated_bytes: int | None = None
     ) -> list[Effect]:
-        return self.driver.post(
-            OomReported(
-                self.client,
-                self.driver.next_request(),
-                lease,
-                self.token(lease),
-                requested_bytes,
-                allocated_bytes,
-            )
-        )
+        return self.ask(w.Oom(lease, self.token(lease), requested_bytes, allocated_bytes))
+
+    def order(
+        self, action: str, target: str = "", reason: str = "test", by: str = "ops"
+    ) -> list[Effect]:
+        """An operator's action. `target`: "" for drain and resume."""
+        return self.ask(w.REQUESTS[action](reason, *([target] if target else [])), by)
+
+    def ask(self, request: w.AnyRequest, operator: str = "") -> list[Effect]:
+        """Send any request."""
+        number = self.driver.next_request()
+        return self.driver.post(Asked(self.client, number, request, self.traceparent, operator))
 
     def reattach(
         self,
@@ -588,7 +526,7 @@ class Consumer:
         away: bool = False,
         parked: bool = False,
     ) -> list[Effect]:
-        item = ReattachedLease(
+        item = w.ReattachLease(
             lease,
             token,
             spec or self.specs[lease],
@@ -596,7 +534,7 @@ class Consumer:
             measured_bytes,
             tuple(UseId(use) for use in uses),
         )
-        return self.driver.post(Reattached(self.client, self.driver.next_request(), (item,)))
+        return self.ask(w.Reattach((item,)))
 
     # -- as a cooperative holder
     def hold(self, count: int, *, gpu: GpuId | None = None) -> None:

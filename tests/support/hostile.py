@@ -13,14 +13,14 @@ from typing import Any
 
 import msgpack
 
-from vram_arbiter.schemas.wire.requests import OPS, REQUEST
+from vram_arbiter.schemas.export import definitions
+from vram_arbiter.schemas.wire import requests, spec
 
-_SCHEMA = REQUEST.json_schema()
+_SCHEMA = {**definitions(spec), **definitions(requests)}
 _BY_OP: Mapping[str, Mapping[str, Any]] = {
-    definition["properties"]["op"]["const"]: definition
-    for definition in _SCHEMA["$defs"].values()
-    if "const" in definition["properties"].get("op", {})
+    op: _SCHEMA[cls.__name__] for op, cls in requests.REQUESTS.items()
 }
+OPS = tuple(requests.REQUESTS)
 OPTIONAL = 0.4  # of the fields that may be left out, how many are there
 
 BOMBS: Mapping[str, bytes] = {
@@ -90,7 +90,7 @@ class Forger:
     def _sample(self, schema: Mapping[str, Any], name: str) -> Any:
         draw = self._draw
         if "$ref" in schema:
-            return self._sample(_SCHEMA["$defs"][schema["$ref"].rpartition("/")[2]], name)
+            return self._sample(_SCHEMA[schema["$ref"].rpartition("/")[2]], name)
         if "const" in schema:
             return schema["const"]
         if "enum" in schema:

@@ -4,14 +4,16 @@ test tells it to."""
 from collections.abc import Mapping
 from typing import Any
 
+import msgpack
+
+from vram_arbiter.arbiter.rpc.codec import decode
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.codec import to_map
-from vram_arbiter.schemas.wire import requests as wire
+from vram_arbiter.schemas.runtime.msgpack_codec import pack
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-SPEC = to_map(LeaseSpec(consumer="detector", model_id="m", ttl_s=9.0, footprint=Footprint(5, 4, 1)))
+SPEC = LeaseSpec(consumer="detector", model_id="m", ttl_s=9.0, footprint=Footprint(5, 4, 1))
 WELCOME = {
     "version": d.WIRE_VERSION,
     "boot_id": "b",
@@ -83,9 +85,10 @@ class Wire:
 
     def sent(self) -> list[dict[str, Any]]:
         messages, self.connection.outgoing = self.connection.outgoing, []
-        for message in messages:
-            wire.REQUEST.validate_python(message)
-        return messages
+        frames = [pack(message) for message in messages]
+        for frame in frames:
+            decode(frame, d.MESSAGE_MAX_BYTES)
+        return [msgpack.unpackb(frame) for frame in frames]
 
     def told(self) -> list[r.Event]:
         events, self.connection.events = self.connection.events, []

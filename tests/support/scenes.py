@@ -4,7 +4,6 @@ sent away, a tree of leases."""
 from typing import Any, Literal
 
 from tests.support.core_driver import Consumer, CoreDriver
-from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
 
@@ -76,4 +75,4 @@ def sent_away(
 def order(driver: CoreDriver, action: Literal["evict", "pin"], lease: LeaseId) -> None:
     """An operator does this to a lease."""
     ops = driver.consumer("ops")
-    driver.post(OperatorAsked(ops.client, driver.next_request(), action, lease, "ops", "test"))
+    ops.order(action, lease)

@@ -13,7 +13,7 @@ from typing import Final, Literal
 
 from vram_arbiter.arbiter.core import eviction, standby
 from vram_arbiter.arbiter.core.effects import Signal
-from vram_arbiter.arbiter.core.events import DRAIN_KEY, OperatorAsked, SettingsChanged
+from vram_arbiter.arbiter.core.events import DRAIN_KEY, Asked, SettingsChanged
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.records import DrainRecord
@@ -23,6 +23,7 @@ from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.requests.requests import over
 from vram_arbiter.arbiter.core.requests.sessions import expire
 from vram_arbiter.schemas.ids import LeaseId
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.codes import Order
 from vram_arbiter.schemas.wire.notes import OperatorNote, SignalledNote
 from vram_arbiter.schemas.wire.replies import DrainReply, OperatorReply
@@ -32,19 +33,19 @@ SILENT_SHARE = 2 / 3
 declared dead."""
 
 
-def on_operator(core: Core, event: OperatorAsked) -> None:
-    """Do what an operator orders, note it and answer. Raises Refused, and then nothing has
-    changed."""
-    order = Order(event.by, event.reason)
-    if event.action in _TO_ALL:
-        _TO_ALL[event.action](core, order)
-        drained = "" if core.drain is None else str(core.drain)
-        core.reply(event.client, event.request, DrainReply(drained))
-        return
-    lease = find(core, event.target)
-    _TO_LEASE[event.action](core, lease, order)
+def order_lease(core: Core, asked: Asked, request: w.ByHandOn) -> None:
+    """Do what an operator orders for a lease, note it and answer. Raises Refused, and then nothing
+    has changed."""
+    lease = find(core, request.target)
+    TO_LEASE[type(request)](core, lease, Order(asked.operator, request.reason))
     view = status.view(core, lease) if lease.id in core.leases else None
-    core.reply(event.client, event.request, OperatorReply(lease.state, view))
+    core.reply(asked.client, asked.id, OperatorReply(lease.state, view))
+
+
+def order_all(core: Core, asked: Asked, request: w.Drain | w.Resume) -> None:
+    """Do what an operator orders for all GPUs, note it and answer."""
+    TO_ALL[type(request)](core, Order(asked.operator, request.reason))
+    core.reply(asked.client, asked.id, DrainReply("" if core.drain is None else str(core.drain)))
 
 
 def on_settings(core: Core, event: SettingsChanged) -> None:
@@ -191,11 +192,11 @@ def _impractical(lease: Lease, problem: Impractical, silent_s: float | None = No
     return Refused(no.BadTargetState(lease.id, lease.state, problem, evictable, silent_s))
 
 
-_TO_LEASE: Final[Mapping[str, Callable[[Core, Lease, Order], None]]] = {
-    "evict": evict,
-    "kill": kill,
-    "pin": pin,
-    "unpin": unpin,
-    "release_dead": release_dead,
+TO_LEASE: Final[Mapping[type, Callable[[Core, Lease, Order], None]]] = {
+    w.Evict: evict,
+    w.Kill: kill,
+    w.Pin: pin,
+    w.Unpin: unpin,
+    w.ReleaseDead: release_dead,
 }
-_TO_ALL: Final[Mapping[str, Callable[[Core, Order], None]]] = {"drain": drain, "resume": resume}
+TO_ALL: Final[Mapping[type, Callable[[Core, Order], None]]] = {w.Drain: drain, w.Resume: resume}

@@ -36,6 +36,7 @@ from vram_arbiter.schemas.wire.codes import Order, Why
 from vram_arbiter.schemas.wire.notes import ReattachedNote, RecoveredNote, ResumedNote, ServingNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
+from vram_arbiter.schemas.wire.requests import Reattach, ReattachLease
 
 
 # -- restoring
@@ -166,21 +167,21 @@ def _restore_residue(gpu: Gpu, record: ResidueRecord, now: float) -> int:
 
 
 # -- reattaching
-def on_reattached(core: Core, event: ev.Reattached) -> None:
+def reattach(core: Core, asked: ev.Asked, request: Reattach) -> None:
     """Take what a client says that it still holds. Every lease is answered for itself."""
-    client = core.clients[event.client]
+    client = core.clients[asked.client]
     answers: list[ReattachedView] = []
-    for item in event.leases:
+    for item in request.leases:
         try:
             view = status.view(core, _reattach(core, client, item))
-            answers.append(ReattachedView(item.lease, kept=True, lease=view))
+            answers.append(ReattachedView(item.lease_id, kept=True, lease=view))
         except Refused as refused:
             error = refused.refusal.view()
-            answers.append(ReattachedView(item.lease, kept=False, error=error))
-    core.reply(event.client, event.request, ReattachReply(tuple(answers)))
+            answers.append(ReattachedView(item.lease_id, kept=False, error=error))
+    core.reply(asked.client, asked.id, ReattachReply(tuple(answers)))
 
 
-def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
+def _reattach(core: Core, client: Client, item: ReattachLease) -> Lease:
     """Return the lease that a holder reattaches. Raises Refused.
 
     1. The lease is the one that the journal names, or its holder is believed.
@@ -188,10 +189,10 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     3. What was lost with the daemon is made up: a standby, a `ready`, uses.
     4. Nothing waits for this holder any longer.
     """
-    lease = core.leases.get(item.lease)  # 1
+    lease = core.leases.get(item.lease_id)  # 1
     if lease is None:
-        if item.lease in core.ended:
-            raise over(core, item.lease)
+        if item.lease_id in core.ended:
+            raise over(core, item.lease_id)
         lease = _adopt(core, client, item)
     elif lease.token != item.token:
         in_doubt = EMPTY_JOURNAL in core.recovering and item.token.epoch < core.settings.epoch
@@ -199,7 +200,7 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
             lease.token = item.token
             core.record_lease(lease)
     elif lease.process != client.process:
-        raise Refused(no.NotHolder(item.lease, lease.process.pid))
+        raise Refused(no.NotHolder(item.lease_id, lease.process.pid))
     core.hand_to(lease, client.id)  # 2
     if not lease.attached:
         lease.attached = True
@@ -220,7 +221,7 @@ def _reattach(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     return lease
 
 
-def _reattach_away(core: Core, lease: Lease, item: ev.ReattachedLease) -> None:
+def _reattach_away(core: Core, lease: Lease, item: ReattachLease) -> None:
     """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
     if lease.state in AWAY:
         core.timers.cancel(("away", lease.id))
@@ -235,7 +236,7 @@ def _reattach_away(core: Core, lease: Lease, item: ev.ReattachedLease) -> None:
         released(core, lease, exiting=False, why=Why.LET_GO_BEFORE)
 
 
-def _knows_newer(lease: Lease, client: Client, item: ev.ReattachedLease, *, in_doubt: bool) -> bool:
+def _knows_newer(lease: Lease, client: Client, item: ReattachLease, *, in_doubt: bool) -> bool:
     """Return whether a holder that knows its lease by another token is right. Raises Refused.
 
     Either a journal in doubt has lost the last grant, and the holder is right; or the lease came
@@ -246,10 +247,10 @@ def _knows_newer(lease: Lease, client: Client, item: ev.ReattachedLease, *, in_d
             return True
         if item.state in AWAY and lease.state is LeaseState.LOADING and item.token < lease.token:
             return False
-    raise Refused(no.WrongToken(item.lease, str(item.token)))
+    raise Refused(no.WrongToken(item.lease_id, str(item.token)))
 
 
-def _restore_uses(core: Core, lease: Lease, client: Client, item: ev.ReattachedLease) -> None:
+def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachLease) -> None:
     """Take what this client says runs as what runs, as far as its own uses go.
 
     Other connections, of this process too, answer for theirs: after a restart they may have begun
@@ -259,10 +260,14 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ev.ReattachedL
     siblings = core.connected[client.process].values()
     others = {other.id for other in siblings if other.instance != client.instance}
     for use in list(lease.uses.values()):
-        if use.process == client.process and use.id not in item.uses and use.client not in others:
+        if (
+            use.process == client.process
+            and use.id not in item.use_ids
+            and use.client not in others
+        ):
             core.unmark(lease, use)
     if lease.state in (LeaseState.HELD, LeaseState.REVOKING):
-        for use_id in item.uses:
+        for use_id in item.use_ids:
             key = (client.process, use_id)
             known = lease.uses.get(key)
             began = Use(use_id, client.id, client.process, "", core.now)
@@ -273,13 +278,13 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ev.ReattachedL
     core.wake(core.gpu_of(lease))
 
 
-def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
+def _adopt(core: Core, client: Client, item: ReattachLease) -> Lease:
     """Return a lease that the journal does not know, by its holder's word. Raises Refused.
 
     Its token is of an earlier epoch, and the engine recovers: else there is no such lease.
     """
     if core.serving or item.token.epoch >= core.settings.epoch:
-        raise Refused(no.Lost(item.lease, Why.UNKNOWN))
+        raise Refused(no.Lost(item.lease_id, Why.UNKNOWN))
     gpus, spec = admission.selected(core.gpus, item.spec), item.spec
     if not gpus:
         raise Refused(no.UnknownGpu(spec.gpu, tuple(core.gpus)))
@@ -290,13 +295,13 @@ def _adopt(core: Core, client: Client, item: ev.ReattachedLease) -> Lease:
     if item.state == "held" and item.measured_bytes is not None:
         charge = max(item.measured_bytes, spec.footprint.residue_bytes)
     record = LeaseRecord(
-        lease_id=item.lease,
+        lease_id=item.lease_id,
         token=(item.token.epoch, item.token.serial),
         state=item.state,
         gpu=None if item.state in AWAY else gpu.info.id,
         pid=client.process.pid,
         start_ticks=client.process.start_ticks,
-        nonce=f"adopted {item.lease}",
+        nonce=f"adopted {item.lease_id}",
         charge_bytes=charge,
         load_peak_bytes=peak,
         measured_bytes=item.measured_bytes,

@@ -5,6 +5,8 @@ Permission: leases belong to a process, so a request on a lease must come from a
 process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
+from typing import Any
+
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, learning, standby
 from vram_arbiter.arbiter.core.learning import check_load, newest
@@ -16,7 +18,8 @@ from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.report.why import ahead_of, explain
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
-from vram_arbiter.schemas.ids import GpuId, LeaseId
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.notes import (
@@ -40,6 +43,9 @@ from vram_arbiter.schemas.wire.replies import (
     StateReply,
 )
 
+type OnLease = w.OnLease[Any] | w.LeaseRef
+"""What names a lease by its exact token."""
+
 AT_ONCE = 16
 """Refusals of one process that are noted one by one; after that one a second."""
 PROCESSES_REMEMBERED = 1024
@@ -54,25 +60,25 @@ def over(core: Core, lease_id: LeaseId) -> Refused:
     return Refused(ended.error or no.LeaseOver(ended.lease, ended.state, ended.revoked))
 
 
-def lease_for(core: Core, event: ev.LeaseRequest) -> Lease:
+def lease_for(core: Core, on: OnLease) -> Lease:
     """Return a live lease by its exact token. Raises Refused."""
-    lease = core.leases.get(event.lease)
+    lease = core.leases.get(on.lease_id)
     if lease is None:
-        raise over(core, event.lease)
+        raise over(core, on.lease_id)
     if lease.token is None:
         raise bad_state(lease, Misfit.STILL_QUEUED)
-    if lease.token != event.token:
-        raise Refused(no.WrongToken(lease.id, str(event.token)))
+    if lease.token != on.token:
+        raise Refused(no.WrongToken(lease.id, str(on.token)))
     return lease
 
 
-def own_lease(core: Core, event: ev.LeaseRequest) -> Lease:
+def own_lease(core: Core, client: ClientId, on: OnLease) -> Lease:
     """Return a live lease of the client's own process; its time to live starts anew.
 
     Raises Refused.
     """
-    lease = lease_for(core, event)
-    if lease.process != core.clients[event.client].process:
+    lease = lease_for(core, on)
+    if lease.process != core.clients[client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     if lease.attached:
         keep(core, lease)
@@ -93,7 +99,7 @@ def bad_state(lease: Lease, misfit: Misfit) -> Refused:
 
 
 # -- waiting
-def acquire(core: Core, event: ev.AcquireRequested) -> None:
+def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
     """Queue a lease. The scheduling after this event may grant it at once, and answers either way.
 
     Raises Refused.
@@ -104,13 +110,15 @@ def acquire(core: Core, event: ev.AcquireRequested) -> None:
       5. The model does not crash in every load.
       6. The lease is new, and waits in the queues.
     """
-    client, spec, known = core.clients[event.client], event.spec, _known_by(core, event)
-    away = standby.wanted(core, event, known)
+    client, spec = core.clients[asked.client], request.spec
+    known = _known_by(core, client, request.nonce)
+    away = standby.wanted(core, client, request, known)
     if away is not None:  # 1
-        standby.call_back(core, away, event, spec if known is None else away.spec)
+        spec = spec if known is None else away.spec
+        standby.call_back(core, away, asked, request, spec)
         return
     if known is not None:  # 2
-        _answer_again(core, event, known)
+        _answer_again(core, asked, known)
         return
     load_peak, steady = core.footprints.expected_bytes(spec)  # 3
     gpus = admission.places(core.gpus, spec, load_peak)
@@ -119,13 +127,13 @@ def acquire(core: Core, event: ev.AcquireRequested) -> None:
     admission.check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
     if core.costs.failures:  # 5
         check_load(core.costs, [core.gpus[gpu] for gpu in gpus], spec, load_peak, core.now)
-    core.enqueue(_new_lease(core, event, client, load_peak, steady, gpus))  # 6
+    core.enqueue(_new_lease(core, asked, request, load_peak, steady, gpus))  # 6
 
 
-def _known_by(core: Core, event: ev.AcquireRequested) -> Lease | None:
+def _known_by(core: Core, client: Client, nonce: str) -> Lease | None:
     """Return the lease that an earlier acquire with the same nonce asked for. Raises Refused where
     it is over."""
-    lease_id = core.nonces.get((core.clients[event.client].process, event.nonce))
+    lease_id = core.nonces.get((client.process, nonce))
     if lease_id is None:
         return None
     lease = core.leases.get(lease_id)
@@ -134,67 +142,68 @@ def _known_by(core: Core, event: ev.AcquireRequested) -> Lease | None:
     return lease
 
 
-def _answer_again(core: Core, event: ev.AcquireRequested, lease: Lease) -> None:
+def _answer_again(core: Core, asked: ev.Asked, lease: Lease) -> None:
     """Answer a repeat as its lease is. The newest connection of a process is the one that
     listens."""
-    core.hand_to(lease, event.client)
+    core.hand_to(lease, asked.client)
     if lease.state is LeaseState.LOADING and not lease.attached:
         lease.attached = True  # its grant was lost in a restart: no holder has it to reattach
         keep(core, lease)
         core.recovering.discard(lease.id)
     state = lease.state if lease.state in (LeaseState.QUEUED, *AWAY) else LeaseState.LOADING
-    core.reply(event.client, event.request, AcquireReply(str(state), status.view(core, lease)))
+    core.reply(asked.client, asked.id, AcquireReply(str(state), status.view(core, lease)))
 
 
 def _new_lease(
     core: Core,
-    event: ev.AcquireRequested,
-    client: Client,
+    asked: ev.Asked,
+    wanted: w.Acquire,
     load_peak: int,
     steady: int,
     gpus: tuple[GpuId, ...],
 ) -> Lease:
     """Return a lease that is asked for, known by its nonce from now on."""
+    client, spec = core.clients[asked.client], wanted.spec
     request = Request(
-        nonce=event.nonce,
+        nonce=wanted.nonce,
         arrived_at=core.now,
         arrival=core.next_arrival(),
         load_peak_bytes=load_peak,
         steady_bytes=steady,
         gpus=gpus,
         uid=client.uid,
-        id=event.request,
-        wait_timeout_s=event.wait_timeout_s,
-        traceparent=event.traceparent,
+        id=asked.id,
+        wait_timeout_s=wanted.wait_timeout_s,
+        traceparent=asked.traceparent,
     )
     story = [(core.now, LeaseState.QUEUED, str(Why.ACQUIRED))]
     lease_id = core.next_lease_id()
-    lease = Lease(lease_id, event.spec, client.process, client.id, request, story=story)
+    lease = Lease(lease_id, spec, client.process, client.id, request, story=story)
     core.add(lease)
-    core.nonces[client.process, event.nonce] = lease.id
-    if event.spec.consumer in core.costs.reuse:
-        core.costs.wanted(event.spec.consumer, core.now)
+    core.nonces[client.process, wanted.nonce] = lease.id
+    if spec.consumer in core.costs.reuse:
+        core.costs.wanted(spec.consumer, core.now)
     core.turn.unanswered.append(lease)
     return lease
 
 
-def reacquire(core: Core, event: ev.Reacquired) -> None:
+def reacquire(core: Core, asked: ev.Asked, request: w.Reacquire) -> None:
     """Queue a lease that is away, or on its way there. Raises Refused."""
-    lease = lease_for(core, event)
-    if lease.process != core.clients[event.client].process:
+    lease = lease_for(core, request)
+    if lease.process != core.clients[asked.client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     if lease.state in AWAY:
-        standby.call_back(core, lease, event, lease.spec)
+        standby.call_back(core, lease, asked, request, lease.spec)
         return
     if lease.state is LeaseState.VERIFYING and lease.next_state is not None:
-        lease.request.traceparent = event.traceparent
+        lease.request.traceparent = asked.traceparent
         if lease.standby.recalled_at is None:
             lease.standby.recalled_at = core.now
-            lease.request.wait_timeout_s = event.wait_timeout_s
+            lease.request.wait_timeout_s = request.wait_timeout_s
     elif lease.state is not LeaseState.QUEUED:
         raise bad_state(lease, Misfit.NOT_AWAY)
-    core.hand_to(lease, event.client)
-    core.reply(event.client, event.request, AcquireReply("queued", status.view(core, lease)))
+    core.hand_to(lease, asked.client)
+    core.reply(asked.client, asked.id, AcquireReply("queued", status.view(core, lease)))
 
 
 def answer_queued(core: Core) -> None:
@@ -212,16 +221,16 @@ def answer_queued(core: Core) -> None:
         core.reply(lease.client, request.id, AcquireReply("queued", view))
 
 
-def cancel(core: Core, event: ev.CancelRequested) -> None:
+def cancel(core: Core, asked: ev.Asked, request: w.Cancel) -> None:
     """Give up a queued lease. One that was granted meanwhile must be released instead."""
-    lease = core.leases.get(event.lease)
+    lease = core.leases.get(request.lease_id)
     if lease is None:
-        ended = core.ended.get(event.lease)
+        ended = core.ended.get(request.lease_id)
         if ended is None or ended.state is not LeaseState.CANCELLED:
-            raise over(core, event.lease)
-        core.reply(event.client, event.request, StateReply(ended.state))
+            raise over(core, request.lease_id)
+        core.reply(asked.client, asked.id, StateReply(ended.state))
         return
-    if lease.process != core.clients[event.client].process:
+    if lease.process != core.clients[asked.client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     refusal = no.CancelledRequest(lease.id, Why.HOLDER_GAVE_UP)
     if standby.give_up(core, lease, LeaseState.CANCELLED, refusal):
@@ -231,7 +240,7 @@ def cancel(core: Core, event: ev.CancelRequested) -> None:
         cancel_waiter(core, lease, Why.HOLDER_GAVE_UP)
     else:
         raise bad_state(lease, Misfit.GRANTED)
-    core.reply(event.client, event.request, StateReply(lease.state))
+    core.reply(asked.client, asked.id, StateReply(lease.state))
 
 
 def cancel_waiter(core: Core, lease: Lease, why: Why, by: str = "") -> None:
@@ -251,14 +260,16 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
 
 
 # -- refused at once
-def note_refused(core: Core, event: ev.AcquireRequested | ev.Reacquired, refusal: Refusal) -> None:
+def note_refused(
+    core: Core, client: ClientId, request: w.Acquire | w.Reacquire, refusal: Refusal
+) -> None:
     """Note that a request for bytes was refused at once, by whom it was sent, and why.
 
     A process that asks and is refused thousands of times a second must not push everything else
     out of the history: beyond a number at once its refusals are counted, and the next note says how
     many were left out.
     """
-    process = core.clients[event.client].process
+    process = core.clients[client].process
     seen = newest(core.refusals, process, lambda: Refusals(core.now), PROCESSES_REMEMBERED)
     seen.noted = max(0.0, seen.noted - (core.now - seen.at))
     seen.at = core.now
@@ -266,25 +277,25 @@ def note_refused(core: Core, event: ev.AcquireRequested | ev.Reacquired, refusal
         seen.left_out += 1
         return
     seen.noted += 1
-    lease = None if isinstance(event, ev.AcquireRequested) else core.leases.get(event.lease)
-    consumer = event.spec.consumer if isinstance(event, ev.AcquireRequested) else ""
+    lease = None if isinstance(request, w.Acquire) else core.leases.get(request.lease_id)
+    consumer = request.spec.consumer if isinstance(request, w.Acquire) else ""
     core.note(RefusedNote(process.pid, refusal, consumer, seen.left_out), lease)
     seen.left_out = 0
 
 
 # -- holding
-def ready(core: Core, event: ev.ReadyReported) -> None:
+def ready(core: Core, asked: ev.Asked, request: w.Ready) -> None:
     """Mark a lease loaded: from now on its steady bytes are charged, or what its holder measured.
 
     A repeat is answered again.
     """
-    lease = own_lease(core, event)
+    lease = own_lease(core, asked.client, request)
     if lease.state not in (LeaseState.LOADING, LeaseState.HELD):
         raise bad_state(lease, Misfit.NOT_LOADING)
     repeated = lease.state is LeaseState.HELD
     if not repeated:
-        become_held(core, lease, event.measured_bytes)
-    core.reply(event.client, event.request, ReadyReply(status.view(core, lease)))
+        become_held(core, lease, request.measured_bytes)
+    core.reply(asked.client, asked.id, ReadyReply(status.view(core, lease)))
     if repeated:
         return
     core.record_lease(lease)
@@ -319,45 +330,43 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     core.wake(gpu)
 
 
-def renew(core: Core, event: ev.Renewed) -> None:
+def renew(core: Core, asked: ev.Asked, request: w.Renew) -> None:
     """Keep leases alive. One that expired stays expired; one that is queued needs no renewal."""
-    process = core.clients[event.client].process
+    process = core.clients[asked.client].process
     alive: list[str] = []
     gone: list[GoneLease] = []
-    for lease_id, token in event.leases:
-        lease = core.leases.get(lease_id)
+    for ref in request.leases:
+        lease = core.leases.get(ref.lease_id)
         try:
             if lease is None or lease.state is not LeaseState.QUEUED or lease.process != process:
-                lease = own_lease(
-                    core, ev.LeaseRequest(event.client, event.request, lease_id, token)
-                )
+                lease = own_lease(core, asked.client, ref)
                 if not lease.attached:  # its time to live runs on: saying "alive" would be untrue
                     raise bad_state(lease, Misfit.NOT_REATTACHED)
-            alive.append(lease_id)
+            alive.append(ref.lease_id)
         except Refused as refused:
-            gone.append(GoneLease(lease_id, refused.refusal.view()))
-    core.reply(event.client, event.request, RenewReply(tuple(alive), tuple(gone)))
+            gone.append(GoneLease(ref.lease_id, refused.refusal.view()))
+    core.reply(asked.client, asked.id, RenewReply(tuple(alive), tuple(gone)))
 
 
 # -- leaving
-def revoke_ack(core: Core, event: ev.RevokeAcknowledged) -> None:
+def revoke_ack(core: Core, asked: ev.Asked, request: w.RevokeAck) -> None:
     """Take down that a holder heard its revoke: it is not pushed again before the safe point."""
-    lease = own_lease(core, event)
-    asked = lease.departure.eviction
-    if asked is not None and asked.acked_at is None:
-        asked.acked_at = core.now
-        core.note(RevokeAckedNote(event.safe_point_eta_s, len(lease.uses)), lease)
-    core.reply(event.client, event.request, StateReply(lease.state, len(lease.uses)))
+    lease = own_lease(core, asked.client, request)
+    revoked = lease.departure.eviction
+    if revoked is not None and revoked.acked_at is None:
+        revoked.acked_at = core.now
+        core.note(RevokeAckedNote(request.safe_point_eta_s, len(lease.uses)), lease)
+    core.reply(asked.client, asked.id, StateReply(lease.state, len(lease.uses)))
 
 
-def unloading(core: Core, event: ev.UnloadStarted) -> None:
+def unloading(core: Core, asked: ev.Asked, request: w.Unloading) -> None:
     """Begin the unloading of a holder at its safe point; a repeat is answered again.
 
     Refused while the lease is in use: this is the safe-point rule.
     """
-    lease = own_lease(core, event)
+    lease = own_lease(core, asked.client, request)
     if lease.state is LeaseState.UNLOADING:
-        core.reply(event.client, event.request, StateReply(lease.state))
+        core.reply(asked.client, asked.id, StateReply(lease.state))
         return
     if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
         raise bad_state(lease, Misfit.NOT_UNLOADABLE)
@@ -370,45 +379,45 @@ def unloading(core: Core, event: ev.UnloadStarted) -> None:
     if departure.eviction is not None:
         departure.eviction.unloading_at = core.now
         core.costs.learn(lease.spec.consumer, "drain_s", core.now - departure.eviction.asked_at)
-    core.reply(event.client, event.request, StateReply(lease.state))
+    core.reply(asked.client, asked.id, StateReply(lease.state))
     core.note(UnloadingNote(asked=departure.eviction is not None), lease)
     core.wake(gpu)
 
 
-def release(core: Core, event: ev.ReleaseReported) -> None:
+def release(core: Core, asked: ev.Asked, request: w.Release) -> None:
     """Take a lease back from its holder. Its bytes stay charged until they are measured gone.
 
     A repeat is answered again; it never ends a lease that went on standby.
     """
-    process = core.clients[event.client].process
-    ended = core.ended.get(event.lease)
+    process = core.clients[asked.client].process
+    ended = core.ended.get(request.lease_id)
     if (
         ended is not None
         and ended.state is LeaseState.RELEASED
-        and (ended.token, ended.process) == (event.token, process)
+        and (ended.token, ended.process) == (request.token, process)
     ):
-        core.reply(event.client, event.request, ReleaseReply(ended.state, ended.state))
+        core.reply(asked.client, asked.id, ReleaseReply(ended.state, ended.state))
         return
-    lease = own_lease(core, event)
+    lease = own_lease(core, asked.client, request)
     if lease.gpu is not None and lease.state is not LeaseState.VERIFYING:
-        _decide_return(core, lease, event)
-        why = Why.EXITS if event.exiting else Why.LET_GO
-        released(core, lease, exiting=event.exiting, why=why)
+        _decide_return(core, lease, request)
+        why = Why.EXITS if request.exiting else Why.LET_GO
+        released(core, lease, exiting=request.exiting, why=why)
     after = lease.next_state or LeaseState.RELEASED
-    core.reply(event.client, event.request, ReleaseReply(lease.state, after))
+    core.reply(asked.client, asked.id, ReleaseReply(lease.state, after))
 
 
-def _decide_return(core: Core, lease: Lease, event: ev.ReleaseReported) -> None:
+def _decide_return(core: Core, lease: Lease, request: w.Release) -> None:
     """Decide whether a lease that is released parks, and whether it comes back by itself: only if
     the engine revoked it, no operator. Raises Refused."""
     count, ram, ahead = lease.spec.park_bytes, core.host_ram, lease.standby
-    if event.parked and (event.exiting or not count):
-        raise bad_state(lease, Misfit.EXITS if event.exiting else Misfit.NO_PARK_BYTES)
-    if event.parked and lease.id not in ram.booked and not ram.book(lease.id, count):
+    if request.parked and (request.exiting or not count):
+        raise bad_state(lease, Misfit.EXITS if request.exiting else Misfit.NO_PARK_BYTES)
+    if request.parked and lease.id not in ram.booked and not ram.book(lease.id, count):
         raise Refused(no.NoHostRam(count, ram.budget_bytes, ram.taken_bytes()))
     revoked = lease.departure.eviction is not None or lease.departure.revoked_before
     stays = lease.spec.standby and revoked and not ahead.dismissed
-    ahead.parks, ahead.comes_back = event.parked, stays and not event.exiting
+    ahead.parks, ahead.comes_back = request.parked, stays and not request.exiting
 
 
 def released(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
@@ -441,23 +450,23 @@ def note_ended(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> No
     core.note(UseEndedNote(use.id, use.label, ms, why, by), lease)
 
 
-def oom(core: Core, event: ev.OomReported) -> None:
+def oom(core: Core, asked: ev.Asked, request: w.Oom) -> None:
     """Learn from an allocation that failed, if its holder asked for more than it was granted."""
-    lease = own_lease(core, event)
+    lease = own_lease(core, asked.client, request)
     if lease.gpu is None:
         raise bad_state(lease, Misfit.HOLDS_NOTHING)
     gpu = core.gpu_of(lease)
     charge = gpu.ledger.charge_bytes(lease.id)
-    allocated = charge if event.allocated_bytes is None else event.allocated_bytes
-    wanted = min(allocated + event.requested_bytes, gpu.ledger.budget_bytes)
+    allocated = charge if request.allocated_bytes is None else request.allocated_bytes
+    wanted = min(allocated + request.requested_bytes, gpu.ledger.budget_bytes)
     learnt = wanted if wanted > charge else None
     if learnt is not None:
         core.footprints.out_of_memory(learning.model_name(lease.spec), learnt)
     core.want_sample(gpu, core.now)
-    core.reply(event.client, event.request, OomReply(learnt))
+    core.reply(asked.client, asked.id, OomReply(learnt))
     note = OomNote(
-        requested_bytes=event.requested_bytes,
-        allocated_bytes=event.allocated_bytes,
+        requested_bytes=request.requested_bytes,
+        allocated_bytes=request.allocated_bytes,
         charge_bytes=charge,
         learnt_load_peak_bytes=learnt,
     )

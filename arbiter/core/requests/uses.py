@@ -23,6 +23,7 @@ from vram_arbiter.arbiter.core.requests.requests import bad_state, lease_for, no
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, UseId
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.notes import UseBeganNote
 from vram_arbiter.schemas.wire.replies import UsesReply
@@ -31,20 +32,20 @@ FROM_JOURNAL: Final = ClientId("")
 """The client of a use that was marked before a restart, until its process says it again."""
 
 
-def begin(core: Core, event: ev.UseBegan) -> None:
+def begin(core: Core, asked: ev.Asked, request: w.UseBegin) -> None:
     """Mark a use. Refused once the holder is revoked.
 
     A repeat, perhaps on a new connection, is answered again: the use ends with that connection.
     """
-    client = core.clients[event.client]
-    lease = lease_for(core, event)
-    key = (client.process, event.use)
+    client = core.clients[asked.client]
+    lease = lease_for(core, request)
+    key = (client.process, request.use_id)
     known = lease.uses.get(key)
-    use = Use(event.use, client.id, client.process, event.label, core.now)
+    use = Use(request.use_id, client.id, client.process, request.label, core.now)
     use = use if known is None else replace(known, client=client.id)
     if known is not None:
         lease.uses[key] = use
-        core.reply(event.client, event.request, UsesReply(len(lease.uses)))
+        core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
         if known.client != FROM_JOURNAL:
             return
     else:
@@ -60,7 +61,7 @@ def begin(core: Core, event: ev.UseBegan) -> None:
             lease.departure.revoked_before = False  # its holder knows that it may stay
         if _is_kept(lease, use):
             core.record_lease(lease)  # before the reply: from then on its user counts on it
-        core.reply(event.client, event.request, UsesReply(len(lease.uses)))
+        core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
     core.note(UseBeganNote(use.id, use.label, len(lease.uses), known is not None), lease)
 
 
@@ -92,13 +93,13 @@ def _is_kept(lease: Lease, use: Use) -> bool:
     return use.process != lease.process and use in lease.users()
 
 
-def end(core: Core, event: ev.UseEnded) -> None:
+def end(core: Core, asked: ev.Asked, request: w.UseEnd) -> None:
     """End a use; one that is not there (any more) is fine."""
-    lease = lease_for(core, event)
-    use = lease.uses.get((core.clients[event.client].process, event.use))
+    lease = lease_for(core, request)
+    use = lease.uses.get((core.clients[asked.client].process, request.use_id))
     if use is not None:
         end_use(core, lease, use, Why.ENDED)
-    core.reply(event.client, event.request, UsesReply(len(lease.uses)))
+    core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
 
 
 def end_use(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> None:

@@ -24,6 +24,7 @@ from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import PingReply, StatusReply
+from vram_arbiter.schemas.wire.requests import Ping, Status
 
 CONNECT_S: Final = 1.0
 UNIT: Final = "vram-arbiter.service"
@@ -194,14 +195,13 @@ def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
 def ask_arbiter(endpoint: str) -> Arbiter:
     """Ask the arbiter, and the kernel for its pid and uid."""
     try:
-        status = request.ask("status", {}, endpoint)
+        status = request.ask(Status(), endpoint)
         pid, uid = _listener(endpoint)
         if not status.get("ok"):
             error = status["error"]
             view = ErrorView(error["code"], error["message"], error.get("hint", ""), {})
             return Arbiter(pid=pid, uid=uid, refusal=view)
-        ping = request.ask("ping", {}, endpoint)
-        server = from_map(PingReply, ping).server
+        server = from_map(PingReply, request.ask(Ping(), endpoint)).server
         return Arbiter(from_map(StatusReply, status), server, pid, uid)
     except VramError as error:
         return Arbiter(problem=error)

@@ -68,7 +68,7 @@ def from_history(wanted: Range, endpoint: str | None) -> Story:
     last_seq = int(_checked(history.page(NEVER, 1, (), endpoint))["last_seq"])
     start = history.first_since(begin, last_seq, endpoint)
     events = [one for one in _events(start, NEVER, (), endpoint) if one["at_wall_s"] >= begin]
-    status = from_map(StatusReply, _checked(all_pages("status", {}, endpoint)))
+    status = from_map(StatusReply, _checked(all_pages(endpoint)))
     end = time.time()
     earlier = _earlier(events, status.leases, begin, last_seq, endpoint)
     if not events and not status.leases:

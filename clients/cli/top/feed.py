@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.cli.top.gpus import Samples
@@ -20,6 +21,7 @@ from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.errors import NotPermitted, VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.requests import REQUESTS, Ping, Request
 
 HEARTBEAT_S = 2.0
 """Between two readings of the status while nothing happens."""
@@ -125,7 +127,7 @@ class Feed:
     async def _learn_role(self) -> None:
         """Ask whether this user may operate: the hello as operator is answered by that."""
         with contextlib.suppress(VramError):
-            reply = await self._ask("ping", {})
+            reply = await self._ask(Ping())
             if reply.get("ok"):
                 self.refusal = ""
             elif reply["error"]["code"] == NotPermitted.code:
@@ -133,9 +135,9 @@ class Feed:
 
     async def order(self, order: Order) -> tuple[bool, str]:
         """Have the arbiter follow an order. Returns whether it did, and what it says."""
-        fields = {"reason": order.reason} | ({"target": order.target} if order.target else {})
+        target = (order.target,) if order.target else ()
         try:
-            reply = await self._ask(order.action, fields)
+            reply = await self._ask(REQUESTS[order.action](order.reason, *target))
         except VramError as error:
             return False, str(error)
         self._happened.set()
@@ -143,8 +145,8 @@ class Feed:
             return False, _said(reply["error"])
         return True, " ".join(text.by_hand_lines(order.action, reply))
 
-    async def _ask(self, op: str, fields: JsonMap) -> Message:
-        question = partial(ask, op, fields, self.client.endpoint, role="operator")
+    async def _ask(self, request: Request[Any]) -> Message:
+        question = partial(ask, request, self.client.endpoint, role="operator")
         return await asyncio.to_thread(question)
 
 

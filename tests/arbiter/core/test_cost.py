@@ -21,6 +21,7 @@ from vram_arbiter.schemas.ids import (
     Token,
     UseId,
 )
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -76,7 +77,7 @@ class Counted:
     def hello(self, client: ClientId, process: ProcessKey, instance: str) -> None:
         self.tell(ev.ClientConnected(client, process, 0, str(client), instance))
 
-    def asking(self, client: ClientId) -> ev.AcquireRequested:
+    def asking(self, client: ClientId) -> ev.Asked:
         spec = LeaseSpec(
             consumer="small",
             model_id="m",
@@ -84,7 +85,8 @@ class Counted:
             ttl_s=1e9,
             min_residency_s=0.0,
         )
-        return ev.AcquireRequested(client, self.request(), f"n{self.requests}", spec, None)
+        number = self.request()
+        return ev.Asked(client, number, w.Acquire(f"n{number}", spec))
 
     def acquire(self, client: ClientId) -> tuple[LeaseId, Token]:
         effects = self.tell(self.asking(client))
@@ -95,7 +97,7 @@ class Counted:
         return LeaseId(lease.lease_id), lease.token
 
     def load(self, lease: tuple[LeaseId, Token], client: ClientId) -> None:
-        self.tell(ev.ReadyReported(client, self.request(), *lease, None))
+        self.tell(ev.Asked(client, self.request(), w.Ready(*lease)))
         self.tell(self.reading())
 
     def cycle(self) -> dict[str, int]:
@@ -105,11 +107,11 @@ class Counted:
         lease = max(self.core.inspect().leases.values(), key=lambda lease: lease.request.arrival)
         assert lease.token is not None
         one = (lease.id, lease.token)
-        found["ready"] = self.counted(ev.ReadyReported(client, self.request(), *one, None))
-        found["renew"] = self.counted(ev.Renewed(client, self.request(), (one,)))
-        found["release"] = self.counted(
-            ev.ReleaseReported(client, self.request(), *one, exiting=False)
+        found["ready"] = self.counted(ev.Asked(client, self.request(), w.Ready(*one)))
+        found["renew"] = self.counted(
+            ev.Asked(client, self.request(), w.Renew((w.LeaseRef(*one),)))
         )
+        found["release"] = self.counted(ev.Asked(client, self.request(), w.Release(*one)))
         found["tick"] = self.counted(ev.Tick())
         found["first reading"] = self.counted(self.reading())
         self.tell(ev.Tick())
@@ -140,8 +142,8 @@ def test_clients_come_and_go_at_no_cost_beside_leases_that_others_use() -> None:
         counted = Counted(leases, listed=True)
         for lease in list(counted.core.inspect().leases.values()):
             assert lease.token is not None
-            marking = (ClientId("idle0"), counted.request(), lease.id, lease.token)
-            counted.tell(ev.UseBegan(*marking, UseId("use"), "work"))
+            request = w.UseBegin(lease.id, lease.token, UseId("use"), "work")
+            counted.tell(ev.Asked(ClientId("idle0"), counted.request(), request))
         process = ProcessKey(300, 1)
         return [
             counted.counted(event)

@@ -7,7 +7,6 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
 from vram_arbiter.arbiter.core.effects import Push
-from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
@@ -42,7 +41,7 @@ def revoked_in_use(
 def evict(driver: CoreDriver, lease: LeaseId) -> None:
     """An operator's order."""
     ops = driver.consumer("ops")
-    driver.post(OperatorAsked(ops.client, driver.next_request(), "evict", lease, "ops", "test"))
+    ops.order("evict", lease)
 
 
 LEAVES: dict[str, Callable[[CoreDriver, Consumer, LeaseId], object]] = {
@@ -298,7 +297,7 @@ def test_of_two_gpus_emptied_for_one_waiter_each_holder_is_told_once() -> None:
 
 def drain(driver: CoreDriver) -> None:
     ops = driver.consumer("ops")
-    driver.post(OperatorAsked(ops.client, driver.next_request(), "drain", "", "ops", "test"))
+    ops.order("drain")
 
 
 def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too() -> None:

@@ -76,9 +76,11 @@ def test_the_first_divergence_is_shown_with_its_surroundings(log: Path) -> None:
 
 def test_another_input_is_another_decision(log: Path) -> None:
     lines = [json.loads(line) for line in log.read_text().splitlines()]
-    number = next(i for i, line in enumerate(lines[1:], 1) if line["event"] == "AcquireRequested")
+    number = next(
+        i for i, line in enumerate(lines[1:], 1) if "nonce" in line["data"].get("request", ())
+    )
     data = lines[number]["data"]
-    data["spec"]["footprint"]["load_peak_bytes"] = 1 << 40
+    data["request"]["spec"]["footprint"]["load_peak_bytes"] = 1 << 40
     tamper(log, number, data=data)
     found = runner.replay(runner.load(log))
     assert found.divergence is not None
@@ -129,7 +131,7 @@ def test_a_defect_that_is_new_is_a_divergence(log: Path) -> None:
     ("old", "new", "says"),
     [
         ('{"log"', 'hello\n{"log"', "no event log of an arbiter"),
-        ('"log":1', '"log":2', "a log of format 2"),
+        ('"log":2', '"log":9', "a log of format 9"),
         ('"epoch"', '"epoche"', "Header has no field epoche"),
         ('"event":"Tick"', '"event":"Tock"', "no event is called Tock"),
         ('"digest"', '"digits"', "not a line of an event log"),

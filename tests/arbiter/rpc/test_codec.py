@@ -13,11 +13,11 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import VALUES_MAX
 from vram_arbiter.schemas.errors import BadFrame, BadRequest, MessageTooLarge, UnknownOp
-from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.ids import RequestId, Token
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.pushes import RevokeWithdrawnPush
 from vram_arbiter.schemas.wire.replies import UsesReply
-from vram_arbiter.schemas.wire.requests import Acquire, Ping, Reattach
+from vram_arbiter.schemas.wire.requests import Acquire, Envelope, Ping, Reattach
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 LIMIT = 1 << 20
@@ -35,7 +35,7 @@ def pack(**message: Any) -> bytes:
 
 
 def test_a_request_is_read() -> None:
-    assert codec.decode(pack(op="ping", id=7), LIMIT) == Ping(op="ping", id=7)
+    assert codec.decode(pack(op="ping", id=7), LIMIT) == (Envelope(RequestId(7)), Ping())
 
 
 def test_a_nested_request_is_read() -> None:
@@ -44,7 +44,7 @@ def test_a_nested_request_is_read() -> None:
         "model_id": "m",
         "footprint": {"load_peak_bytes": 5, "steady_bytes": 4},
     }
-    request = codec.decode(pack(op="acquire", id=1, nonce="n", spec=spec), LIMIT)
+    _, request = codec.decode(pack(op="acquire", id=1, nonce="n", spec=spec), LIMIT)
     assert isinstance(request, Acquire)
     assert request.spec.footprint.load_peak_bytes == 5
 
@@ -125,6 +125,7 @@ def worst_leases(leases: int, **wrong: Any) -> list[dict[str, Any]]:
         {"op": "reattach", "id": 1, "leases": worst_leases(4, use_ids=["\x01"] * 200)},
         {"op": "history", "id": 1, "kinds": [0] * 256},
         {"op": "renew", "id": 1, "leases": [{}] * 64},
+        {"op": "status", "id": 1, "leases": [0] * d.STATUS_PAGE},
         {"op": "acquire", "id": 1, **{f"k{n}": 0 for n in range(codec.KEYS_MAX - 4)},
          "spec": {"footprint": {f"k{n}": 0 for n in range(codec.KEYS_MAX)}}},
     ],
@@ -156,7 +157,7 @@ def test_a_client_with_all_its_leases_and_many_uses_reattaches() -> None:
         {**lease, "use_ids": [f"use-{n}" for n in range(16)]}
         for _ in range(d.LEASES_PER_CLIENT_MAX)
     ]
-    request = codec.decode(pack(op="reattach", id=1, leases=leases), LIMIT)
+    _, request = codec.decode(pack(op="reattach", id=1, leases=leases), LIMIT)
     assert isinstance(request, Reattach)
     assert len(request.leases) == d.LEASES_PER_CLIENT_MAX
 

@@ -12,17 +12,12 @@ from typing import Protocol
 from tests.bench.policies.outcome import Tally
 from tests.bench.policies.scenarios import Job, Plan
 from vram_arbiter.arbiter.core.events import (
-    AcquireRequested,
+    Asked,
     ClientConnected,
     Event,
-    ReadyReported,
-    ReleaseReported,
-    RevokeAcknowledged,
-    UnloadStarted,
-    UseBegan,
-    UseEnded,
 )
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId, Token, UseId
+from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import (
     AnyPush,
     DeniedPush,
@@ -138,14 +133,15 @@ class Actor:
         self._using[use] = work
         request = self._stage.next_request()
         self._use_requests[request] = use
-        self._stage.post(UseBegan(self.client, request, self._lease, self._token, use, ""))
+        begin = w.UseBegin(self._lease, self._token, use)
+        self._stage.post(Asked(self.client, request, begin))
         self._stage.at(self._stage.now + work.job.use_s, _later(self._end_use, use, turn))
 
     def _end_use(self, use: UseId, turn: int) -> None:
         work = self._using.pop(use, None)
         if work is None or turn != self._round:
             return
-        self._say(UseEnded, use)
+        self._say(w.UseEnd, use)
         self._pass_on()
         if self._revoked:
             self._leave()
@@ -172,9 +168,8 @@ class Actor:
         self._state, self._job = "waiting", job
         self._asked = asked = self._stage.next_request()
         spec = replace(job.spec, ttl_s=FOREVER_S)
-        self._stage.post(
-            AcquireRequested(self.client, asked, f"n{asked}", spec, job.wait_timeout_s)
-        )
+        acquire = w.Acquire(f"n{asked}", spec, job.wait_timeout_s)
+        self._stage.post(Asked(self.client, asked, acquire))
 
     def answered(self, request: RequestId, lease: LeaseView | None) -> None:
         """Handle a reply. Only the reply of the acquire matters."""
@@ -203,7 +198,7 @@ class Actor:
                 self._give_up()
             case RevokePush(lease_id) if lease_id == self._lease and not self._revoked:
                 self._revoked = True
-                self._say(RevokeAcknowledged, None)
+                self._say(w.RevokeAck)
                 if not self._using:
                     self._leave()
             case RevokeWithdrawnPush(lease_id) if lease_id == self._lease and self._state == "held":
@@ -250,7 +245,7 @@ class Actor:
         steady = self._job.spec.footprint.steady_bytes
         self._stage.gpu.set(self._process, steady, self._stage.now)
         self._state, self._held_at = "held", self._stage.now
-        self._say(ReadyReported, None)
+        self._say(w.Ready)
         if self._revoked:
             self._leave()
         self._go()
@@ -260,7 +255,7 @@ class Actor:
         if self._state != "held" or self._job is None:
             return
         self._state, turn = "leaving", self._round
-        self._say(UnloadStarted)
+        self._say(w.Unloading)
         self._stage.at(self._stage.now + self._job.unload_s, lambda: self._unloaded(turn))
 
     def _unloaded(self, turn: int) -> None:
@@ -274,12 +269,12 @@ class Actor:
     def _release(self) -> None:
         self._round += 1
         self._revoked = False
-        self._say(ReleaseReported, False)
+        self._say(w.Release)
 
-    def _say(self, event: Callable[..., Event], *rest: object) -> None:
-        """Post an event about the lease."""
-        request = self._stage.next_request()
-        self._stage.post(event(self.client, request, self._lease, self._token, *rest))
+    def _say(self, kind: Callable[..., w.AnyRequest], *rest: object) -> None:
+        """Send a request about the lease."""
+        request = kind(self._lease, self._token, *rest)
+        self._stage.post(Asked(self.client, self._stage.next_request(), request))
 
 
 def _later[*T](call: Callable[[*T], None], *arguments: *T) -> Callable[[], None]:

@@ -34,16 +34,11 @@ from tests.bench.policies.simulator import World
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push, Refuse, Reply, Sample
 from vram_arbiter.arbiter.core.events import (
-    AcquireRequested,
+    Asked,
     ClientConnected,
     Event,
     MemorySampled,
-    ReadyReported,
-    ReleaseReported,
     Tick,
-    UnloadStarted,
-    UseBegan,
-    UseEnded,
 )
 from vram_arbiter.arbiter.core.model.refusals import Revoked, TooLarge
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
@@ -51,6 +46,7 @@ from vram_arbiter.schemas.ids import ClientId, LeaseId, Token
 from vram_arbiter.schemas.wire.notes import About, AnyNote, GrantedNote, RevokeAskedNote, SwitchNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush, RevokePush
 from vram_arbiter.schemas.wire.replies import AcquireReply, DoneReply
+from vram_arbiter.schemas.wire.requests import Acquire, Ready, Release, Unloading, UseBegin, UseEnd
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
 
@@ -96,32 +92,8 @@ class Rules(ABC):
         match event:
             case ClientConnected():
                 pass
-            case AcquireRequested():
+            case Asked():
                 self._asked(event)
-            case ReadyReported(client, request, lease):
-                model = self._models[lease]
-                model.state = "held"
-                self._out.append(Reply(client, request, DoneReply()))
-                self._note(self._switch(model), model)
-            case UseBegan(client, request, lease, _, use, _):
-                if self._models[lease].state == "leaving":
-                    self._out.append(
-                        Refuse(
-                            client,
-                            request,
-                            Revoked(self._models[lease].spec.consumer, "leaving"),
-                        )
-                    )
-                else:
-                    self._models[lease].uses.add(use)
-            case UseEnded(_, _, lease, _, use):
-                if (ending := self._models.get(lease)) is not None:
-                    ending.uses.discard(use)
-                    self._served(ending)
-            case UnloadStarted(_, _, lease):
-                self._models[lease].state = "leaving"
-            case ReleaseReported(_, _, lease):
-                self._gone(lease)
             case MemorySampled():
                 self._used_bytes = event.used_bytes
             case Tick() if self._timer is not None and self._timer <= now:
@@ -132,17 +104,40 @@ class Rules(ABC):
         return self._out
 
     # -- bookkeeping
-    def _asked(self, event: AcquireRequested) -> None:
+    def _asked(self, asked: Asked) -> None:
+        match asked.request:
+            case Acquire(spec=spec):
+                self._acquire(asked, spec)
+            case Ready(lease):
+                model = self._models[lease]
+                model.state = "held"
+                self._out.append(Reply(asked.client, asked.id, DoneReply()))
+                self._note(self._switch(model), model)
+            case UseBegin(lease, _, use):
+                if self._models[lease].state == "leaving":
+                    refusal = Revoked(self._models[lease].spec.consumer, "leaving")
+                    self._out.append(Refuse(asked.client, asked.id, refusal))
+                else:
+                    self._models[lease].uses.add(use)
+            case UseEnd(lease, _, use):
+                if (ending := self._models.get(lease)) is not None:
+                    ending.uses.discard(use)
+                    self._served(ending)
+            case Unloading(lease):
+                self._models[lease].state = "leaving"
+            case Release(lease):
+                self._gone(lease)
+
+    def _acquire(self, asked: Asked, spec: LeaseSpec) -> None:
         self._serial += 1
-        model = _Model(LeaseId(f"R-{self._serial}"), event.client, event.spec, self._now)
-        if event.spec.footprint.steady_bytes > self._gpu.capacity_bytes:
-            size, total = event.spec.footprint.steady_bytes, self._gpu.capacity_bytes
-            refusal = TooLarge(event.spec.consumer, size, size, total, 0)
-            self._out.append(Refuse(event.client, event.request, refusal))
+        model = _Model(LeaseId(f"R-{self._serial}"), asked.client, spec, self._now)
+        if spec.footprint.steady_bytes > self._gpu.capacity_bytes:
+            size, total = spec.footprint.steady_bytes, self._gpu.capacity_bytes
+            refusal = TooLarge(spec.consumer, size, size, total, 0)
+            self._out.append(Refuse(asked.client, asked.id, refusal))
             return
         self._queue.append(model)
-        reply = AcquireReply("queued", self._view(model))
-        self._out.append(Reply(event.client, event.request, reply))
+        self._out.append(Reply(asked.client, asked.id, AcquireReply("queued", self._view(model))))
 
     def _view(self, model: _Model) -> LeaseView:
         spec = model.spec

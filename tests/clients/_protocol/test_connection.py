@@ -5,12 +5,13 @@ from tests.support.protocol_wire import WELCOME, Wire, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S, SILENCE_BEATS
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VersionMismatch
+from vram_arbiter.schemas.wire.requests import AskWhy, Status
 
 
 # -- greeting
 def test_requests_before_the_greeting_are_sent_after_it() -> None:
     link = Wire()
-    request = link.connection.request("status", {}, link.now)
+    request = link.connection.ask(Status(), link.now)
     assert link.sent() == []
     link.greet()
     message = link.one("status")
@@ -57,7 +58,7 @@ def test_words_from_a_lost_connection_are_ignored(link: Wire) -> None:
 
 # -- requests
 def test_an_error_reply_is_the_typed_error(link: Wire) -> None:
-    request = link.connection.request("why", {"consumer": "x"}, link.now)
+    request = link.connection.ask(AskWhy("x"), link.now)
     link.refuse(link.one("why"), "limit_exceeded", limit="rate")
     (failed,) = link.told()
     assert isinstance(failed, r.Failed)
@@ -69,7 +70,7 @@ def test_an_error_reply_is_the_typed_error(link: Wire) -> None:
 
 
 def test_an_unanswered_request_ends_at_its_deadline(link: Wire) -> None:
-    request = link.connection.request("status", {}, link.now, timeout_s=1.5)
+    request = link.connection.ask(Status(), link.now, timeout_s=1.5)
     link.sent()
     link.tick(1.4)
     assert link.told() == []
@@ -91,14 +92,14 @@ def test_replies_nobody_asked_for_and_unknown_pushes_are_ignored(link: Wire) -> 
 
 
 def test_a_forgotten_request_tells_nobody(link: Wire) -> None:
-    request = link.connection.request("status", {}, link.now)
+    request = link.connection.ask(Status(), link.now)
     link.connection.forget(request)
     link.reply(link.one("status"))
     assert link.told() == []
 
 
 def test_requests_under_way_are_said_again_after_a_reconnect(link: Wire) -> None:
-    link.connection.request("status", {}, link.now)
+    link.connection.ask(Status(), link.now)
     first = link.one("status")
     link.connection.contact_lost("test")
     link.told()
@@ -107,7 +108,7 @@ def test_requests_under_way_are_said_again_after_a_reconnect(link: Wire) -> None
 
 
 def test_a_session_that_the_arbiter_forgot_is_made_anew(link: Wire) -> None:
-    link.connection.request("status", {}, link.now)
+    link.connection.ask(Status(), link.now)
     link.refuse(link.one("status"), "unknown_session")
     (lost,) = link.told()
     assert isinstance(lost, r.ContactLost)
@@ -145,7 +146,7 @@ def test_a_subscription_outlives_the_connection(link: Wire) -> None:
 
 def test_an_answer_of_another_shape_fails_its_request(link: Wire) -> None:
     """A reply without its fields ended in a KeyError somewhere in the client."""
-    request = link.connection.request("status", {}, link.now)
+    request = link.connection.ask(Status(), link.now)
     link.reply(link.one("status"), leases=[{"lease_id": "L1-1"}])
     (failed,) = link.told()
     assert isinstance(failed, r.Failed)

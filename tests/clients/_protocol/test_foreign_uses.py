@@ -3,10 +3,15 @@
 from tests.support.protocol_wire import Wire
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
+from vram_arbiter.schemas.ids import LeaseId, Token, UseId
+from vram_arbiter.schemas.wire.requests import UseBegin, UseEnd
+
+ON = (LeaseId("L9-1"), Token(9, 2), UseId("u1"))
+BEGIN, END = UseBegin(*ON, "goal"), UseEnd(*ON)
 
 
 def test_a_use_on_anothers_lease_is_begun_again_until_it_ends(link: Wire) -> None:
-    link.foreign_uses.begin("L9-1", (9, 2), "u1", "goal", link.now, REQUEST_TIMEOUT_S)
+    link.foreign_uses.begin(BEGIN, link.now, REQUEST_TIMEOUT_S)
     link.reply(link.one("use_begin"))
     link.connection.contact_lost("test")
     link.told()
@@ -14,7 +19,7 @@ def test_a_use_on_anothers_lease_is_begun_again_until_it_ends(link: Wire) -> Non
     again = link.one("use_begin")
     assert (again["use_id"], again["token"]) == ("u1", [9, 2])
     link.reply(again)
-    link.foreign_uses.end("L9-1", (9, 2), "u1", link.now)
+    link.foreign_uses.end(END, link.now)
     link.reply(link.one("use_end"))
     link.connection.contact_lost("test")
     link.told()
@@ -23,7 +28,7 @@ def test_a_use_on_anothers_lease_is_begun_again_until_it_ends(link: Wire) -> Non
 
 
 def test_a_use_that_cannot_be_begun_again_is_lost(link: Wire) -> None:
-    link.foreign_uses.begin("L9-1", (9, 2), "u1", "goal", link.now, REQUEST_TIMEOUT_S)
+    link.foreign_uses.begin(BEGIN, link.now, REQUEST_TIMEOUT_S)
     link.reply(link.one("use_begin"))
     link.connection.contact_lost("test")
     link.told()
@@ -35,9 +40,9 @@ def test_a_use_that_cannot_be_begun_again_is_lost(link: Wire) -> None:
 
 
 def test_a_use_ended_before_its_begin_was_answered_stays_ended(link: Wire) -> None:
-    link.foreign_uses.begin("L9-1", (9, 2), "u1", "goal", link.now, REQUEST_TIMEOUT_S)
+    link.foreign_uses.begin(BEGIN, link.now, REQUEST_TIMEOUT_S)
     begin = link.one("use_begin")
-    link.foreign_uses.end("L9-1", (9, 2), "u1", link.now)
+    link.foreign_uses.end(END, link.now)
     link.reply(link.one("use_end"))
     link.reply(begin)
     link.connection.contact_lost("test")

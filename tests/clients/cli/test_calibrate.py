@@ -497,9 +497,10 @@ HOLDING = """
 import os, time
 from pathlib import Path
 from vram_arbiter.clients.net.request import ask
+from vram_arbiter.schemas.wire.requests import Status
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
-(lease,) = ask("status", {})["leases"]
+(lease,) = ask(Status())["leases"]
 assert lease["state"] == "held" and lease["charge_bytes"] > 7 << 30, lease
 memory = FakeMemory(Path(os.environ["VRAM_FAKE_GPU"]), "program", 200 << 20)
 memory.allocate("weights", 700 << 20)

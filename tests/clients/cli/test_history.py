@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -17,6 +17,7 @@ from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.cli import history
 from vram_arbiter.clients.cli.history import Wanted, collect, parse_since
 from vram_arbiter.clients.sync import Client
+from vram_arbiter.schemas.wire.requests import History
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 PATIENCE_S = 60.0
@@ -96,11 +97,10 @@ class Archive:
         ]
         self.asked = 0
 
-    def ask(self, op: str, fields: Mapping[str, Any], endpoint: str | None) -> dict[str, Any]:
-        assert op == "history"
+    def ask(self, request: History, endpoint: str | None) -> dict[str, Any]:
         self.asked += 1
-        later = [event for event in self.events if int(str(event["seq"])) > fields["after"]]
-        return {"ok": True, "events": later[: fields["limit"]], "last_seq": self.events[-1]["seq"]}
+        later = [event for event in self.events if int(str(event["seq"])) > request.after]
+        return {"ok": True, "events": later[: request.limit], "last_seq": self.events[-1]["seq"]}
 
 
 @pytest.fixture

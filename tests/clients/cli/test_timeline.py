@@ -21,6 +21,7 @@ from vram_arbiter.clients.cli.timeline.story import GpuStory, Mark, Story, withi
 from vram_arbiter.clients.cli.timeline.trace import trace
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.wire.requests import Acquire
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 PHASES = ["revoke", "quiesce", "unload", "verify"]
@@ -53,19 +54,12 @@ def switched() -> Iterator[ArbiterProcess]:
             held = detector.acquire(spec("detector", 5))
             held.ready(5 * GIB)
             with held.use("detect"):
-                asked = {"spec": as_plain(spec("grab", 6)), "nonce": "grab"}
-                grab.ask("acquire", asked)
+                grab.ask(Acquire("grab", spec("grab", 6)))
             until_gone(detector)
             until(lambda: "loading" in logged_states(daemon).get("grab", []))
             yield daemon
     finally:
         daemon.close()
-
-
-def as_plain(wanted: LeaseSpec) -> dict[str, object]:
-    from vram_arbiter.schemas.codec import to_map
-
-    return to_map(wanted)
 
 
 def until_gone(client: Client) -> None:

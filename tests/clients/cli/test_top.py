@@ -34,6 +34,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.sync import Client, Lease
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.requests import Acquire
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 DEADLINE_S = 60.0
@@ -73,15 +74,8 @@ def held_detector(daemon: ArbiterProcess) -> Iterator[Lease]:
         lease.ready(5 * GIB)
         clients.enter_context(lease.use("detect"))
         for client, gib in zip(waiters, (6, 7), strict=True):
-            asked = {"spec": as_plain(lease_spec(client.name, gib)), "nonce": client.name}
-            client.ask("acquire", asked)
+            client.ask(Acquire(client.name, lease_spec(client.name, gib)))
         yield lease
-
-
-def as_plain(wanted: LeaseSpec) -> dict[str, object]:
-    from vram_arbiter.schemas.codec import to_map
-
-    return to_map(wanted)
 
 
 @asynccontextmanager
@@ -212,7 +206,7 @@ async def test_another_user_reads_why_it_may_not(
     daemon.runtime.chmod(0o755)
     (daemon.runtime / "arbiter.sock").chmod(0o666)
 
-    def ask_as_stranger(op: str, *_: object, **__: object) -> dict[str, object]:
+    def ask_as_stranger(*_: object, **__: object) -> dict[str, object]:
         words = ("drain", "-r", "why", "--json")
         done = vramctl(*words, user=STRANGER, environ=daemon.environ)
         return {"ok": False, **json.loads(done.stdout)}

@@ -29,6 +29,7 @@ from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.server import send
 from vram_arbiter.schemas.errors import ConfigError, UntrustedServer
+from vram_arbiter.schemas.wire.requests import Status
 
 pytestmark = pytest.mark.skipif(
     os.geteuid() != 0, reason="only root can start a server of another user"
@@ -167,7 +168,7 @@ def test_a_user_that_was_named_is_believed(
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_SERVER_USERS", "nobody")
     with false_server(short_folder, "s") as heard:
-        assert request.ask("status", {}, f"ipc://{short_folder}/s")["ok"]
+        assert request.ask(Status(), f"ipc://{short_folder}/s")["ok"]
         assert any("'op': 'hello'" in line for line in heard())
 
 
@@ -205,4 +206,4 @@ def test_what_has_no_user_is_not_connected_to(endpoint: str) -> None:
     with pytest.raises(ConfigError, match="refused"):
         asyncio.run(ask_arbiter(endpoint))
     with pytest.raises(ConfigError, match="refused"):
-        request.ask("status", {}, endpoint)
+        request.ask(Status(), endpoint)

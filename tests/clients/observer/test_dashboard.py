@@ -23,7 +23,7 @@ from tests.support import promql
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import GIB, held, sent_away
 from vram_arbiter.arbiter.core.effects import Effect, Note, Refuse
-from vram_arbiter.arbiter.core.events import OperatorAsked
+from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.clients.observer import names as own
@@ -32,6 +32,7 @@ from vram_arbiter.reasoner.llm import names as chats
 from vram_arbiter.schemas.ids import ProcessKey, Token
 from vram_arbiter.schemas.runtime.telemetry import names
 from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
+from vram_arbiter.schemas.wire.requests import Drain
 from vram_arbiter.schemas.wire.views import DaemonView
 
 GUIDE = ROOT / "docs" / "reference" / "metrics.md"
@@ -146,7 +147,7 @@ def hands_over(scene: Scene) -> None:
 def is_drained(scene: Scene) -> None:
     ops = scene.driver.consumer("ops")
     request = scene.driver.next_request()
-    scene.driver.post(OperatorAsked(ops.client, request, "drain", "", "ops", "maintenance"))
+    scene.driver.post(Asked(ops.client, request, Drain("maintenance"), operator="ops"))
 
 
 CAUSES: dict[str, Callable[[Scene], None]] = {

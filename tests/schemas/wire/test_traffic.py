@@ -16,7 +16,6 @@ from tests.support.wire import WireClient
 from vram_arbiter import schemas
 from vram_arbiter.schemas.wire import requests
 from vram_arbiter.schemas.wire.pushes import PUSHES
-from vram_arbiter.schemas.wire.replies import REPLIES
 
 jsonschema = pytest.importorskip("jsonschema")
 pytestmark = pytest.mark.e2e
@@ -24,11 +23,7 @@ pytestmark = pytest.mark.e2e
 GIB = 1 << 30
 WIRE = json.loads((Path(schemas.__file__).parent / "json/wire.json").read_text("utf-8"))
 ENVELOPE = frozenset({"re", "ok", "epoch"})
-REQUESTS = {
-    cls.model_fields["op"].annotation.__args__[0]: name
-    for name, cls in vars(requests).items()
-    if isinstance(cls, type) and "op" in getattr(cls, "model_fields", {})
-}
+REPLIES = {op: requests.REPLIES[cls] for op, cls in requests.REQUESTS.items()}
 
 
 class RecordedClient(WireClient):
@@ -48,7 +43,7 @@ class RecordedClient(WireClient):
         import msgpack
 
         request = msgpack.unpackb(payload)
-        self.messages.append((REQUESTS[request["op"]], request))
+        self.messages.append((requests.REQUESTS[request["op"]].__name__, request))
         super().send_raw(payload)
 
     def receive(self, timeout_s: float = 60.0) -> dict[str, Any] | None:

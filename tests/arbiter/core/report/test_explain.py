@@ -7,9 +7,10 @@ import pytest
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, why
 from vram_arbiter.arbiter.core.effects import Note
-from vram_arbiter.arbiter.core.events import AcquireRequested
+from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
+from vram_arbiter.schemas.wire.requests import Acquire
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -256,7 +257,7 @@ def test_a_lease_may_be_asked_about_by_its_id() -> None:
 def test_a_trace_is_carried_from_the_acquire_to_every_note() -> None:
     driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
-    event = AcquireRequested(det.client, driver.next_request(), "n", det.spec(1 * GIB), None)
+    event = Asked(det.client, driver.next_request(), Acquire("n", det.spec(1 * GIB)))
     effects = driver.post(replace(event, traceparent="00-abc-def-01"))
     (note,) = [effect for effect in effects if isinstance(effect, Note)]
     assert note.about is not None

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.core_driver import START_S, CoreDriver, answer, as_wire, refusal
 from tests.support.scenes import held, order, sent_away
-from vram_arbiter.arbiter.core.events import OperatorAsked, ProbeFailed
+from vram_arbiter.arbiter.core.events import ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -136,19 +136,14 @@ def test_refusals_of_operators_say_why() -> None:
     ops = driver.consumer("ops")
 
     def told(action: Any, target: LeaseId) -> str:
-        return refusal(
-            driver.post(
-                OperatorAsked(ops.client, driver.next_request(), action, target, "ops", "test")
-            )
-        ).message
+        return refusal(ops.order(action, target)).message
 
     assert told("release_dead", waiting) == f"{waiting} is queued: it has no holder"
     other = CoreDriver(8 * GIB)
     _, lease = held(other, "det", 5)
     order(other, "pin", lease)
     ops = other.consumer("ops")
-    evict = OperatorAsked(ops.client, other.next_request(), "evict", lease, "ops", "test")
-    assert refusal(other.post(evict)).message == f"{lease} is pinned: an operator pinned it"
+    assert refusal(ops.order("evict", lease)).message == f"{lease} is pinned: an operator pinned it"
 
 
 # -- the history
@@ -214,7 +209,7 @@ def test_orders_are_noted_by_their_name() -> None:
     driver = CoreDriver(8 * GIB)
     ops = driver.consumer("ops")
     for action in ("drain", "resume"):
-        driver.post(OperatorAsked(ops.client, driver.next_request(), action, "", "ops", "test"))
+        ops.order(action)
     assert [note["action"] for note in driver.notes("operator")] == ["drain", "resume"]
 
 

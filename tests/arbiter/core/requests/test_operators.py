@@ -7,7 +7,6 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
-from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -22,8 +21,7 @@ def ops(driver: CoreDriver) -> Consumer:
 
 
 def order_of(ops: Consumer, action: Any, target: str = "", reason: str = "test") -> list[Effect]:
-    event = OperatorAsked(ops.client, ops.driver.next_request(), action, target, BY, reason)
-    return ops.driver.post(event)
+    return ops.order(action, target, reason, BY)
 
 
 def held_bytes(driver: CoreDriver, name: str, count: int, **spec: Any) -> tuple[Consumer, LeaseId]:

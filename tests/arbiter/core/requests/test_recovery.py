@@ -6,16 +6,17 @@ from typing import Any
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import (
+    Asked,
     ClientConnected,
     ClientLeft,
     MemorySampled,
     Recovered,
-    UseBegan,
 )
 from vram_arbiter.arbiter.core.model.records import ResidueRecord
 from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
+from vram_arbiter.schemas.wire.requests import UseBegin
 
 GIB, MIB = d.GIB, d.MIB
 
@@ -87,7 +88,8 @@ def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> N
     driver.restart()
     second = ClientId("second")  # another connection of the holder's process
     driver.post(ClientConnected(second, det.process, 1000, "det", "det-second"))
-    driver.post(UseBegan(second, driver.next_request(), lease, token, UseId("sibling"), ""))
+    sibling = UseBegin(lease, token, UseId("sibling"))
+    driver.post(Asked(second, driver.next_request(), sibling))
     runner.connect()
     runner.use_begin(lease, "goal", token)
     det.connect()

@@ -7,12 +7,13 @@ import pytest
 
 from tests.support.core_driver import CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
-from vram_arbiter.arbiter.core.events import AcquireRequested
+from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.notes import GrantedNote, QueuedNote
+from vram_arbiter.schemas.wire.requests import Acquire
 
 GIB = d.GIB
 
@@ -122,7 +123,7 @@ def test_an_unknown_gpu_is_named(driver: CoreDriver) -> None:
 
 def test_a_connection_without_hello_is_refused(driver: CoreDriver) -> None:
     spec = driver.consumer("det").spec(1 * GIB)
-    event = AcquireRequested(ClientId("nobody"), RequestId(1), "n", spec, None)
+    event = Asked(ClientId("nobody"), RequestId(1), Acquire("n", spec))
     assert refusal(driver.post(event)).code == "unknown_session"
 
 

@@ -6,7 +6,6 @@ from vram_arbiter.arbiter.core.events import (
     ClientConnected,
     ClientLeft,
     JournalFailed,
-    OperatorAsked,
     ProcessDied,
 )
 from vram_arbiter.schemas import defaults as d
@@ -208,7 +207,7 @@ def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
     det, ops = driver.consumer("det"), driver.consumer("ops")
     loading = det.acquire(5 * GIB)
     driver.journal_failing = "disk full"
-    driver.post(OperatorAsked(ops.client, driver.next_request(), "pin", loading, "uid 0", "demo"))
+    ops.order("pin", loading, "demo", "uid 0")
     assert driver.notes("journal_failed")
     assert driver.state(loading) == "loading"
     assert driver.gpu()["charged_bytes"] == 5 * GIB

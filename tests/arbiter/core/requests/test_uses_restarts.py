@@ -9,7 +9,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import held, shown
 from vram_arbiter.arbiter.core.effects import Effect, JournalPut, Reply
-from vram_arbiter.arbiter.core.events import OperatorAsked, ProcessDied, Resumed
+from vram_arbiter.arbiter.core.events import ProcessDied, Resumed
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, Token
@@ -221,7 +221,7 @@ def _key(person: Consumer) -> tuple[int, int]:
 def test_whatever_is_written_of_a_lease_names_its_users() -> None:
     driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver)
-    driver.post(OperatorAsked(sidecar.client, driver.next_request(), "pin", lease, "ada", ""))
+    sidecar.order("pin", lease, "", "ada")
     assert writes(driver.effects)[-1] == ["goal"]
     runner.use_end(lease, "goal", token)
     sidecar.unload(lease)

@@ -8,7 +8,6 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer
 from tests.support.scenes import held, place
-from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 
@@ -58,7 +57,7 @@ def test_a_gpu_whose_pin_ended_is_a_place_for_who_waits(two_gpus: CoreDriver, en
 
 def order_lease(two_gpus: CoreDriver, action: str, lease: LeaseId) -> None:
     ops = two_gpus.consumer("ops")
-    two_gpus.post(OperatorAsked(ops.client, two_gpus.next_request(), action, lease, "ops", "test"))
+    ops.order(action, lease)
 
 
 def test_whoever_names_another_gpu_or_is_too_large_waits_only_where_it_may_be(

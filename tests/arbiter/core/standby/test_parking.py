@@ -10,7 +10,6 @@ from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.engine_state import state_of
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core import invariants
-from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.arbiter.core.ledger import HostRam
 from vram_arbiter.schemas import defaults as d
@@ -225,7 +224,7 @@ def test_an_operator_keeps_a_parked_one_from_coming_back_by_itself() -> None:
     driver = driver_with()
     vlm, lease, policy, wanted = parked(driver, standby=True)
     ops = driver.consumer("ops")
-    driver.post(OperatorAsked(ops.client, driver.next_request(), "evict", lease, "ops", "test"))
+    ops.order("evict", lease)
     assert driver.journal[f"lease:{lease}"].get("comes_back", False) is False
     policy.unload(wanted)
     driver.advance(20.0)

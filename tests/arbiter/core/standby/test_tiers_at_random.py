@@ -9,7 +9,6 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.full_check import check_arbiter
 from vram_arbiter.arbiter.core.effects import Note, Refuse
-from vram_arbiter.arbiter.core.events import OperatorAsked
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -117,8 +116,7 @@ class Crowd:
 
     def order(self, lease: LeaseId, action: str) -> None:
         ops = self.driver.consumer("ops")
-        asked = OperatorAsked(ops.client, self.driver.next_request(), action, lease, "ops", "test")
-        self.driver.post(asked)
+        ops.order(action, lease)
 
     def restart(self) -> None:
         known = {lease: (self.driver.view(lease), owner) for lease, owner in self.leases.items()}
