@@ -5,13 +5,15 @@ Permission: leases belong to a process, so a request on a lease must come from a
 process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
+from collections.abc import Mapping
+
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import eviction, learning, standby
+from vram_arbiter.arbiter.core import learning, standby
 from vram_arbiter.arbiter.core.learning import check_load, newest
 from vram_arbiter.arbiter.core.model import refusals as no
-from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
+from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState, Request, Use
 from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
-from vram_arbiter.arbiter.core.model.state import Client, Core, Refusals
+from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refusals
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.report.why import ahead_of, explain
 from vram_arbiter.arbiter.core.scheduling import admission
@@ -46,9 +48,9 @@ PROCESSES_REMEMBERED = 1024
 
 
 # -- leases
-def over(core: Core, lease_id: LeaseId) -> Refused:
+def over(known: Mapping[LeaseId, Ended], lease_id: LeaseId) -> Refused:
     """Return the answer to a message on a lease that is over, or never was."""
-    ended = core.ended.get(lease_id)
+    ended = known.get(lease_id)
     if ended is None:
         return Refused(no.NoLease(lease_id))
     return Refused(ended.error or no.LeaseOver(ended.lease, ended.state, ended.revoked))
@@ -58,7 +60,7 @@ def lease_for(core: Core, event: ev.LeaseRequest) -> Lease:
     """Return a live lease by its exact token. Raises Refused."""
     lease = core.leases.get(event.lease)
     if lease is None:
-        raise over(core, event.lease)
+        raise over(core.ended, event.lease)
     if lease.token is None:
         raise bad_state(lease, Misfit.STILL_QUEUED)
     if lease.token != event.token:
@@ -75,15 +77,8 @@ def own_lease(core: Core, event: ev.LeaseRequest) -> Lease:
     if lease.process != core.clients[event.client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     if lease.attached:
-        keep(core, lease)
+        core.keep(lease)
     return lease
-
-
-def keep(core: Core, lease: Lease, grace_s: float = 0.0) -> None:
-    """Let a lease that expires have its whole time to live from now on."""
-    if lease.state in EXPIRING:
-        lease.expires_at = core.now + lease.spec.ttl_s + grace_s
-        core.timers.set(("ttl", lease.id), lease.expires_at)
 
 
 def bad_state(lease: Lease, misfit: Misfit) -> Refused:
@@ -105,7 +100,8 @@ def acquire(core: Core, event: ev.AcquireRequested) -> None:
       6. The lease is new, and waits in the queues.
     """
     client, spec, known = core.clients[event.client], event.spec, _known_by(core, event)
-    away = standby.wanted(core, event, known)
+    mine = core.leases_of(client.process) if core.away else []
+    away = standby.wanted(mine, event, known) if mine else None
     if away is not None:  # 1
         standby.call_back(core, away, event, spec if known is None else away.spec)
         return
@@ -114,7 +110,7 @@ def acquire(core: Core, event: ev.AcquireRequested) -> None:
         return
     load_peak, steady = core.footprints.expected_bytes(spec)  # 3
     gpus = admission.places(core.gpus, spec, load_peak)
-    admission.check_waiters(core, client, spec.priority)  # 4
+    admission.check_waiters(core.settings, core.waiting, client, spec.priority)  # 4
     owned, most = len(core.of_client.get(client.id, ())), core.settings.leases_per_client_max
     admission.check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
     if core.costs.failures:  # 5
@@ -130,7 +126,7 @@ def _known_by(core: Core, event: ev.AcquireRequested) -> Lease | None:
         return None
     lease = core.leases.get(lease_id)
     if lease is None:
-        raise over(core, lease_id)
+        raise over(core.ended, lease_id)
     return lease
 
 
@@ -140,7 +136,7 @@ def _answer_again(core: Core, event: ev.AcquireRequested, lease: Lease) -> None:
     core.hand_to(lease, event.client)
     if lease.state is LeaseState.LOADING and not lease.attached:
         lease.attached = True  # its grant was lost in a restart: no holder has it to reattach
-        keep(core, lease)
+        core.keep(lease)
         core.recovering.discard(lease.id)
     state = lease.state if lease.state in (LeaseState.QUEUED, *AWAY) else LeaseState.LOADING
     core.reply(event.client, event.request, AcquireReply(str(state), status.view(core, lease)))
@@ -218,7 +214,7 @@ def cancel(core: Core, event: ev.CancelRequested) -> None:
     if lease is None:
         ended = core.ended.get(event.lease)
         if ended is None or ended.state is not LeaseState.CANCELLED:
-            raise over(core, event.lease)
+            raise over(core.ended, event.lease)
         core.reply(event.client, event.request, StateReply(ended.state))
         return
     if lease.process != core.clients[event.client].process:
@@ -247,7 +243,7 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
     lease = core.waiting[LeaseId(lease_id)]
     waited_s = core.now - lease.request.arrived_at
     why = explain(core, lease)
-    eviction.deny(core, lease, no.TimedOut(lease.spec.consumer, waited_s, why))
+    core.deny(lease, no.TimedOut(lease.spec.consumer, waited_s, why))
 
 
 # -- refused at once
@@ -315,8 +311,8 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     gpu.pending_free.give_up(lease.process, max(0, peak - steady), core.now)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
-    core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
-    core.wake(gpu)
+    gpu.want_sample(core.now, core.now)  # what it holds now is what has to come back one day
+    gpu.wake()
 
 
 def renew(core: Core, event: ev.Renewed) -> None:
@@ -372,7 +368,7 @@ def unloading(core: Core, event: ev.UnloadStarted) -> None:
         core.costs.learn(lease.spec.consumer, "drain_s", core.now - departure.eviction.asked_at)
     core.reply(event.client, event.request, StateReply(lease.state))
     core.note(UnloadingNote(asked=departure.eviction is not None), lease)
-    core.wake(gpu)
+    gpu.wake()
 
 
 def release(core: Core, event: ev.ReleaseReported) -> None:
@@ -425,7 +421,7 @@ def released(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
     begin_for_lease(core, gpu, lease, alive=True)
     core.record_lease(lease)
     core.note(ReleasedNote(exiting, before, why), lease)
-    core.wake(gpu)
+    gpu.wake()
 
 
 def end_uses(core: Core, lease: Lease, why: Why) -> None:
@@ -453,7 +449,7 @@ def oom(core: Core, event: ev.OomReported) -> None:
     learnt = wanted if wanted > charge else None
     if learnt is not None:
         core.footprints.out_of_memory(learning.model_name(lease.spec), learnt)
-    core.want_sample(gpu, core.now)
+    gpu.want_sample(core.now, core.now)
     core.reply(event.client, event.request, OomReply(learnt))
     note = OomNote(
         requested_bytes=event.requested_bytes,
