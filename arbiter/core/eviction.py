@@ -1,13 +1,12 @@
 """Eviction ladder of a revoked holder.
 
-| step      | when                                                   | what
-| | --------- | ------------------------------------------------------ |
-------------------------------- | | push      | at once, then every `revoke_resend_s` while the
-holder | `revoke`                        | |           | has not acknowledged, or is at its safe
-point          |                                 | | remind    | `revoke_remind_s` after the first
-push                 | a note                          | | deadline  | `revoke_deadline_s` after it,
-and again so long after  | a note; the bytes are not       | |           | the unloading began
-| counted on                      |
+| step      | when                                                   | what                            |
+| --------- | ------------------------------------------------------ | ------------------------------- |
+| push      | at once, then every `revoke_resend_s` while the holder | `revoke`                        |
+|           | has not acknowledged, or is at its safe point          |                                 |
+| remind    | `revoke_remind_s` after the first push                 | a note                          |
+| deadline  | `revoke_deadline_s` after it, and again so long after  | a note; the bytes are not       |
+|           | the unloading began                                    | counted on                      |
 
 A holder unloads by itself, at its safe point: `unloading` is refused before that. The engine waits;
 ending a stuck holder is a person's order (`operators.kill`). A revoke is for someone: when nothing

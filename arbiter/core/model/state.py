@@ -251,7 +251,9 @@ class Core:
         self.serving = True
         self.recovering: set[LeaseId] = set()
         # what was learned
-        self.footprints = Footprints(max(gpu.ledger.budget_bytes for gpu in self.gpus.values()))
+        self.footprints = Footprints(
+            max([gpu.ledger.budget_bytes for gpu in self.gpus.values()], default=0)
+        )
         self.footprints.restore(settings.footprints)
         self.costs = Costs(settings.learnt, settings.thrash_window_s)
 
