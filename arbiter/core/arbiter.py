@@ -12,11 +12,13 @@ It must not know how effects are performed, nor that a wire exists.
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import eviction, invariants, standby
-from vram_arbiter.arbiter.core.effects import Effect
+from vram_arbiter.arbiter.core.effects import Effect, Sample
+from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.arbiter.core.model.refusals import NoSession, Refused
 from vram_arbiter.arbiter.core.model.state import Core, Inspection, Turn
@@ -95,8 +97,9 @@ _DUE: Mapping[str, Callable[[Core, str], None]] = {
     "users": uses.on_users_due,
     "away": standby.on_away_due,
     "recover": Core.account_for,
-    "plan": grants.on_plan_due,
-    "return": grants.on_plan_due,
+    # a residency ended, a waiter aged, or the GPU has been quiet for long enough
+    "plan": lambda core, gpu: core.gpus[GpuId(gpu)].wake(),
+    "return": lambda core, gpu: core.gpus[GpuId(gpu)].wake(),
 }
 """By kind of timer."""
 
@@ -121,13 +124,20 @@ class Arbiter:
         else:
             _STEPS[type(event)](core, event)
         if not core.serving and not core.recovering:  # 2
-            recovery.serve(core)
-        if core.turn.dirty:  # 3
+            core.serve()
+        gpus = core.gpus.values()
+        if any(gpu.dirty for gpu in gpus):  # 3
             grants.schedule(core)
         if core.turn.unanswered:
             requests.answer_queued(core)
-        self._keep_reading()  # 4
+        for gpu in gpus:  # 4
+            if gpu.touched:
+                self._keep_reading(gpu)
+        core.turn.effects += map(Sample, core.readings)
+        core.readings.clear()
         invariants.check(core)  # 5
+        for gpu in gpus:
+            gpu.touched = False
         turn, core.turn = core.turn, Turn()
         return turn.effects
 
@@ -143,23 +153,29 @@ class Arbiter:
             if isinstance(request, (w.Acquire, w.Reacquire)):
                 requests.note_refused(core, asked.client, request, refused.refusal)
 
-    def _keep_reading(self) -> None:
-        """Plan the next reading of each GPU that the event touched, while a load or a client, a
-        lease or a waiter is there."""
-        core, settings = self._core, self._core.settings
-        for gpu in core.turn.touched.values():
-            lists = gpu.sample is not None and gpu.sample.processes is not None
-            if lists and gpu.residents.by_state[LeaseState.LOADING]:
-                core.read_again(gpu, settings.probe_load_s)
-            elif ("probe", gpu.info.id) not in core.timers and (
-                core.clients
-                or gpu.residents
-                or gpu.verifications
-                or gpu.queue.head
-                or core.recovering
-                or core.now - core.last_client_at <= IDLE_PROBE_S
-            ):
-                core.read_again(gpu, settings.probe_period_s)
+    def _keep_reading(self, gpu: Gpu) -> None:
+        """Plan the next poll of a GPU, and its next reading while a load or a client, a lease or a
+        waiter is there."""
+        core, timers, settings = self._core, self._core.timers, self._core.settings
+        probe, poll, due_at = ("probe", gpu.info.id), ("verify", gpu.info.id), inf
+        if gpu.verifications:
+            timers.set(poll, min([v.next_poll_at for v in gpu.verifications.values()]))
+        elif poll in timers:
+            timers.cancel(poll)
+        lists = gpu.sample is not None and gpu.sample.processes is not None
+        if lists and gpu.residents.by_state[LeaseState.LOADING]:
+            due_at = core.now + settings.probe_load_s
+        elif probe not in timers and (
+            core.clients
+            or gpu.residents
+            or gpu.verifications
+            or gpu.queue.head
+            or core.recovering
+            or core.now - core.last_client_at <= IDLE_PROBE_S
+        ):
+            due_at = core.now + settings.probe_period_s
+        if due_at < timers.get(probe, inf):
+            timers.set(probe, due_at)
 
     # -- questions
     def inspect(self) -> Inspection:

@@ -13,8 +13,7 @@ ending a stuck holder is a person's order (`operators.kill`). A revoke is for so
 wants the bytes any more and the holder has not begun to unload, it is withdrawn.
 
 Public: `ask` revokes a holder; `push_revoke` repeats that at once; `take_back` and `settle`
-withdraw revokes that nothing wants (`is_wanted`); `deny` ends a wait with an error; `on_ladder_due`
-serves the timer.
+withdraw revokes that nothing wants (`is_wanted`); `on_ladder_due` serves the timer.
 """
 
 from collections.abc import Container
@@ -25,15 +24,13 @@ from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Order, RevokeCause, Why
-from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.notes import (
     DeadlinePassedNote,
-    DeniedNote,
     RemindedNote,
     RevokeAskedNote,
     RevokeWithdrawnNote,
 )
-from vram_arbiter.schemas.wire.pushes import DeniedPush, RevokePush, RevokeWithdrawnPush
+from vram_arbiter.schemas.wire.pushes import RevokePush, RevokeWithdrawnPush
 
 
 def ask(
@@ -69,7 +66,7 @@ def ask(
     if core.host_ram.book(holder.id, holder.spec.park_bytes) or holder.spec.standby:
         # a restart must not take a release that was asked for as one that was wished for
         core.record_lease(holder)
-    core.want_sample(gpu, core.now)
+    gpu.want_sample(core.now, core.now)
     push_revoke(core, holder)
     asked = RevokeAskedNote(
         wanted_by=why.wanted_by,
@@ -110,8 +107,9 @@ def take_back(core: Core, gpu: Gpu) -> None:
 def settle(core: Core) -> None:
     """Tell each holder that was not revoked again that it may stay; for the others the
     acknowledgement counts that they gave. Forget evictions whose waiter is gone."""
-    for gpu in core.turn.touched.values():
-        gpu.evictions = [one for one in gpu.evictions if one.wanted_by in core.waiting]
+    for gpu in core.gpus.values():
+        if gpu.touched:
+            gpu.evictions = [one for one in gpu.evictions if one.wanted_by in core.waiting]
     for lease_id, asked in core.turn.taken_back.items():
         holder = core.leases[lease_id]
         if (anew := holder.departure.eviction) is not None:
@@ -172,47 +170,32 @@ def _next_steps(holder: Lease, eviction: Eviction, settings: Settings) -> list[f
 def on_ladder_due(core: Core, lease_id: str) -> None:
     """Take the steps of the ladder that are due.
 
-    A holder that unloads is pushed nothing more, and has a whole deadline for it.
+    A holder that unloads is pushed nothing more, and has a whole deadline for it. A late holder is
+    noted, and other victims and other GPUs are looked for; its `revoke` stands.
     """
     holder = core.leases[LeaseId(lease_id)]
     eviction, settings = holder.departure.eviction, core.settings
-    if holder.state is LeaseState.UNLOADING:
+    late = holder.state is LeaseState.UNLOADING
+    revoking = eviction is not None and holder.state is LeaseState.REVOKING
+    if late:
         holder.departure.hangs = True
-        if eviction is not None:
-            eviction.overdue = True
-        _pass_deadline(core, holder, eviction)
-    if eviction is None or holder.state is not LeaseState.REVOKING:
-        return
-    if core.now >= eviction.next_push_at:
-        eviction.next_push_at = core.now + settings.revoke_resend_s
-        if eviction.acked_at is None or not holder.uses:
-            push_revoke(core, holder)
-    if not eviction.reminded and core.now >= eviction.asked_at + settings.revoke_remind_s:
-        eviction.reminded = True
-        core.note(RemindedNote(len(holder.uses), eviction.acked_at is not None), holder)
-    if not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s:
+    if eviction is not None and revoking:
+        if core.now >= eviction.next_push_at:
+            eviction.next_push_at = core.now + settings.revoke_resend_s
+            if eviction.acked_at is None or not holder.uses:
+                push_revoke(core, holder)
+        if not eviction.reminded and core.now >= eviction.asked_at + settings.revoke_remind_s:
+            eviction.reminded = True
+            core.note(RemindedNote(len(holder.uses), eviction.acked_at is not None), holder)
+        late = not eviction.overdue and core.now >= eviction.asked_at + settings.revoke_deadline_s
+    if late:
+        wanted_by = "" if eviction is None else eviction.why.wanted_by
+        core.note(DeadlinePassedNote(len(holder.uses), wanted_by), holder)
+        core.gpu_of(holder).wake()
+    if late and eviction is not None:
         eviction.overdue = True
-        _pass_deadline(core, holder, eviction)
-    core.timers.set_first(("revoke", holder.id), _next_steps(holder, eviction, core.settings))
-
-
-def _pass_deadline(core: Core, holder: Lease, eviction: Eviction | None) -> None:
-    """Note a late holder, and look for other victims and other GPUs. The `revoke` stands."""
-    wanted_by, consumer = (eviction.wanted_by, eviction.why.wanted_by) if eviction else (None, "")
-    core.note(DeadlinePassedNote(len(holder.uses), consumer), holder)
-    core.wake(core.gpu_of(holder))
-    waiter = None if wanted_by is None else core.waiting.get(wanted_by)
-    if waiter is not None:
-        core.wake_candidates(waiter)  # it may be served on another GPU now
-
-
-def deny(core: Core, waiter: Lease, refusal: Refusal) -> None:
-    """End a waiter's wait with a refusal."""
-    core.move(waiter, LeaseState.DENIED, refusal.code)
-    core.dequeue(waiter)
-    if waiter.request.answered or waiter.request.id is None:
-        core.push(waiter, DeniedPush(waiter.id, refusal.view()))
-    else:  # it has only just asked
-        core.refuse(waiter.client, waiter.request.id, refusal)
-    core.note(DeniedNote(refusal), waiter)
-    core.end(waiter, refusal)
+        if eviction.wanted_by and (waiter := core.waiting.get(eviction.wanted_by)) is not None:
+            core.wake_candidates(waiter)  # another GPU may serve it now
+    if eviction is not None and revoking:
+        times = _next_steps(holder, eviction, settings)
+        core.timers.set_first(("revoke", holder.id), times)

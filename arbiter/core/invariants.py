@@ -38,7 +38,7 @@ class InvariantViolation(Exception):
 def check(core: Core) -> None:
     """Raise InvariantViolation if the event of this turn broke something."""
     granted_on = {gpu_id for _, gpu_id in core.turn.granted}
-    for gpu in core.turn.touched.values():
+    for gpu in [gpu for gpu in core.gpus.values() if gpu.touched]:
         if gpu.info.id in granted_on:
             _check_grant(gpu)
         _check_gpu(gpu)

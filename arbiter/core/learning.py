@@ -6,12 +6,13 @@ counts for the next loads whatever they measure. A footprint changes no charge: 
 next acquire on. In the order of a lease's life:
 
 1. `Footprints.expected_bytes`: what a request is charged (`grants.settle_for_less`: where that is
-too much). 2. `on_evidence`: a reading shows a lease. While it loads, its GPU is read often
-(`probe_load_s`), so that the peak between two readings is short; a sampled peak is a lower bound
-all the same, so only one above the declared is drift. A resident is followed until it leaves. A
-process with several leases on one GPU shows one sum, of which nothing is learned. 3. `on_ready`,
-`on_leaving`, `on_verdict`: load peak, steady bytes and retained bytes of one life. 4.
-`drift_bytes`, `footprint`: declared beside measured, for `status` and `why`.
+   too much).
+2. `on_evidence`: a reading shows a lease. While it loads, its GPU is read often (`probe_load_s`),
+   so that the peak between two readings is short; a sampled peak is a lower bound all the same, so
+   only one above the declared is drift. A resident is followed until it leaves. A process with
+   several leases on one GPU shows one sum, of which nothing is learned.
+3. `on_ready`, `on_leaving`, `on_verdict`: load peak, steady bytes and retained bytes of one life.
+4. `drift_bytes`, `footprint`: declared beside measured, for `status` and `why`.
 
 Costs. Durations, returns and switches order victims that are otherwise alike, and stretch a
 residency within a cap: nothing learned can make a wait endless. A program that dies in its load is

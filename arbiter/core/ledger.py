@@ -112,8 +112,9 @@ class GpuLedger:
         if not 0 <= used <= total + self.tolerance_bytes:
             return f"impossible reading: {used} of {total} bytes are used"
         for use in reading.processes or ():
-            if not 0 <= use.held_bytes <= total + self.tolerance_bytes:
-                told = f"process {use.process.pid} holds {use.held_bytes} of {total} bytes"
+            held_bytes = use.used_bytes or 0
+            if not 0 <= held_bytes <= total + self.tolerance_bytes:
+                told = f"process {use.process.pid} holds {held_bytes} of {total} bytes"
                 return f"impossible reading: {told}"
         return ""
 

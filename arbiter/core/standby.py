@@ -13,22 +13,22 @@ it, and waits in the queues like any other.
   queued: its holder wants it back (`wanted`, `call_back`)
   loading: it was granted, or came back by itself (`first_to_return`)
   held: its weights are resident, its RAM is free
-Its ends: `dismiss` by an operator, `give_up` by its holder, `end`.
+Its ends: `dismiss` by an operator, `give_up` by its holder, `Core.end_away`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import AWAY, NONCES_MAX, Departure, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import AWAY, Departure, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.refusals import End
-from vram_arbiter.arbiter.core.model.state import Client, Core
+from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
-from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId
+from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Order, Why
-from vram_arbiter.schemas.wire.notes import CancelledNote, LostNote, ParkedNote, StandbyNote
+from vram_arbiter.schemas.wire.notes import ParkedNote, StandbyNote
 from vram_arbiter.schemas.wire.pushes import LostPush
 from vram_arbiter.schemas.wire.requests import Acquire, Reacquire
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -40,7 +40,7 @@ def go_away(core: Core, lease: Lease, to: LeaseState, verdict: str) -> None:
     gpu, request, standby = core.gpu_of(lease), lease.request, lease.standby
     core.move(lease, to, verdict)
     gpu.residents.remove(lease)
-    core.wake(gpu)
+    gpu.wake()
     lease.departure = Departure()
     lease.gpu = lease.observed.reported_bytes = request.id = None
     request.gpus = tuple(gpu.info.id for gpu in admission.selected(core.gpus, lease.spec))
@@ -55,7 +55,7 @@ def go_away(core: Core, lease: Lease, to: LeaseState, verdict: str) -> None:
     core.note(note(standby.left_for, parked_bytes, standby.comes_back), lease)
     if standby.recalled_at is not None:
         asked_at, standby.recalled_at = standby.recalled_at, None
-        _queue(core, lease, lease.client, None, asked_at)
+        core.requeue(lease, lease.client, None, asked_at)
 
 
 # -- ends ------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def dismiss(core: Core, lease: Lease, order: Order) -> None:
         refusal = no.Lost(lease.id, Why.EVICTED, order=order)
         assert lease.token is not None, f"{lease.id} is away and was never granted"
         core.push(lease, LostPush(lease.id, lease.token, refusal.view()))
-        end(core, lease, LeaseState.CANCELLED, refusal)
+        core.end_away(lease, LeaseState.CANCELLED, refusal)
         return
     standby.dismissed = lease.state is not LeaseState.PARKED
     if lease.spec.standby or lease.state is LeaseState.PARKED:
@@ -81,7 +81,7 @@ def give_up(core: Core, lease: Lease, to: LeaseState, refusal: End) -> bool:
     """End a lease that is away. One that is on its way there ends with its verdict. Return whether
     it was either."""
     if lease.state in AWAY:
-        end(core, lease, to, refusal)
+        core.end_away(lease, to, refusal)
         return True
     if lease.state is not LeaseState.VERIFYING:
         return False
@@ -93,25 +93,17 @@ def give_up(core: Core, lease: Lease, to: LeaseState, refusal: End) -> bool:
     return leaves
 
 
-def end(core: Core, lease: Lease, to: LeaseState, refusal: End) -> None:
-    """End a lease that is away: nothing has to be measured."""
-    core.move(lease, to, refusal.why)
-    note = LostNote if to is LeaseState.LOST else CancelledNote
-    core.note(note(refusal.why), lease)
-    core.end(lease, refusal)
-
-
 def on_away_due(core: Core, lease_id: str) -> None:
     """A holder did not reattach after a restart."""
     lease = core.leases[LeaseId(lease_id)]
-    end(core, lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
+    core.end_away(lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
 
 
 # -- wanted by the holder --------------------------------------------------------------------------
-def wanted(core: Core, client: Client, request: Acquire, known: Lease | None) -> Lease | None:
+def wanted(mine: Iterable[Lease], request: Acquire, known: Lease | None) -> Lease | None:
     """Return the lease that is away and that an acquire wants back; None: there is none.
 
-    That is the one of its nonce (`known`), or the first of its process for the same model.
+    That is the one of its nonce (`known`), or the first of its process (`mine`) for the same model.
     """
     if known is not None:
         # a restart ended its wait, if the journal knows no grant since it was asked for; a late
@@ -119,10 +111,7 @@ def wanted(core: Core, client: Client, request: Acquire, known: Lease | None) ->
         waits = known.granted_at <= known.request.arrived_at
         waits = waits and request.nonce == known.request.nonce and known.state in AWAY
         return known if waits else None
-    if not core.away:
-        return None
     model = (request.spec.consumer, request.spec.model)
-    mine = core.leases_of(client.process)
     away = [lease for lease in mine if lease.state in AWAY]
     return next((one for one in away if (one.spec.consumer, one.spec.model) == model), None)
 
@@ -134,42 +123,17 @@ def call_back(
     client, request = core.clients[asked.client], lease.request
     load_peak, steady = core.footprints.expected_bytes(spec)
     gpus = admission.places(core.gpus, spec, load_peak)
-    admission.check_waiters(core, client, spec.priority)
+    admission.check_waiters(core.settings, core.waiting, client, spec.priority)
     request.load_peak_bytes, request.steady_bytes = load_peak, steady
     if isinstance(wish, Acquire) and wish.nonce != request.nonce:
-        _rename(core, lease, wish.nonce)
+        core.rename(lease, wish.nonce)
         lease.spec = spec
         core.record_lease(lease)  # still away: if a restart ends the wait, it comes back so
     request.traceparent, request.gpus, request.uid = asked.traceparent, gpus, client.uid
     request.wait_timeout_s = wish.wait_timeout_s
-    _queue(core, lease, asked.client, asked.id, core.now)
+    core.requeue(lease, asked.client, asked.id, core.now)
     core.costs.wanted(spec.consumer, core.now)
     core.turn.unanswered.append(lease)
-
-
-def _rename(core: Core, lease: Lease, nonce: str) -> None:
-    """Another acquire asks for a lease. The earlier ones are remembered, for their repeats."""
-    request = lease.request
-    if len(request.earlier_nonces) == NONCES_MAX:
-        core.nonces.pop((lease.process, request.earlier_nonces[0]), None)
-    request.earlier_nonces.append(request.nonce)
-    request.nonce = nonce
-    core.nonces[lease.process, nonce] = lease.id
-
-
-def _queue(
-    core: Core, lease: Lease, client: ClientId, asked: RequestId | None, asked_at: float
-) -> None:
-    """Queue a lease that is away. Without a request (`asked`) its grant is pushed."""
-    request = lease.request
-    core.move(lease, LeaseState.QUEUED, Why.WANTED)
-    core.timers.cancel(("away", lease.id))  # after a restart: its holder reattached
-    lease.attached = True
-    core.hand_to(lease, client)
-    request.id, request.answered = asked, asked is None
-    request.arrived_at, request.arrival = asked_at, core.next_arrival()
-    request.planned_gpu = None
-    core.enqueue(lease)
 
 
 # -- coming back by itself -------------------------------------------------------------------------

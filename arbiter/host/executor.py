@@ -3,30 +3,38 @@ event.
 
 Runs on the thread of the event loop and never blocks, except for journal writes (a local SQLite
 commit without fsync, tens of microseconds). Must not decide anything; sockets, files and threads
-are behind the protocols below.
+are behind the protocols below. Mints the ids of the daemon's spans (`SpanIds`).
 """
 
 import logging
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.host.span_ids import SpanIds
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import JournalUnavailable
-from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.telemetry.traceparent import read as read_traceparent
+from vram_arbiter.schemas.wire import notes
 from vram_arbiter.schemas.wire.errors import ErrorView, Refusal
-from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.pushes import AnyPush, RevokePush
 from vram_arbiter.schemas.wire.replies import AnyReply
 
 log = logging.getLogger(__name__)
 
 _RECORDS = (fx.JournalPut, fx.JournalDelete)
 _NOTHING: Mapping[str, JournalUnavailable] = {}
+
+OPEN_MAX = 32_768
+"""Waits that are open at a time, and as many evictions: twice the waiters that the default limits
+allow. The oldest is forgotten when one more begins."""
+_TRACE_BYTES, _SPAN_BYTES = 16, 8
+_NO_SPAN: Mapping[str, str] = {}
 
 
 class Outbox(Protocol):
@@ -51,6 +59,130 @@ class Chronicle(Protocol):
     """The history: gives a fact its number and time, and keeps it."""
 
     def append(self, kind: str, data: JsonMap) -> JsonMap: ...
+
+
+@dataclass(frozen=True, slots=True)
+class SpanId:
+    """One span in hexadecimal. `flags`: sampled (01) or not, as its trace began."""
+
+    trace: str
+    span: str
+    parent: str = ""
+    flags: str = "01"
+
+    @property
+    def traceparent(self) -> str:
+        return f"00-{self.trace}-{self.span}-{self.flags}"
+
+
+class SpanIds:
+    """Ids of the daemon's spans. They are minted here and exported by an observer.
+
+    A wait (from the request to `ready`) and an eviction (from the first `revoke` to the verdict)
+    are a span each. Its ids are random numbers that are sent in the events about it, and an
+    eviction's in `revoke`: so a holder's unload is a child of its eviction, whether or not
+    somebody exports that one. They decide nothing, and change no effect but for the `traceparent`
+    of a `revoke`.
+
+    `outgoing` before a batch is performed, `revoke` for each push of it, `of` for each note.
+    """
+
+    def __init__(self, random: Callable[[int], bytes] = os.urandom) -> None:
+        self._random = random
+        self._waits: dict[LeaseId, SpanId] = {}
+        self._evictions: dict[LeaseId, SpanId] = {}
+
+    def outgoing(self, effects: Sequence[fx.Effect]) -> None:
+        """Mint the ids of evictions before their `revoke` is sent."""
+        asked = {
+            effect.about.lease_id: effect.body
+            for effect in effects
+            if isinstance(effect, fx.Note)
+            and isinstance(effect.body, notes.RevokeAskedNote)
+            and effect.about is not None
+        }
+        for effect in effects if asked else ():
+            match effect:
+                case fx.Push(_, RevokePush(lease_id=holder) as push) if LeaseId(holder) in asked:
+                    waiter = asked.pop(LeaseId(holder)).wanted_by_lease
+                    self._begin_eviction(LeaseId(holder), waiter, push.traceparent or None)
+
+    def revoke(self, body: AnyPush) -> AnyPush:
+        """Return a push as it is sent: a `revoke` names the span of its eviction."""
+        if not isinstance(body, RevokePush):
+            return body
+        eviction = self._evictions.get(LeaseId(body.lease_id))
+        return body if eviction is None else replace(body, traceparent=eviction.traceparent)
+
+    def of(self, note: fx.Note) -> Mapping[str, str]:
+        """Return `trace_id`, `span_id`, and of a first `revoke` `parent_id`, for a note's event."""
+        about = note.about
+        if about is None or about.lease_id is None:
+            return _NO_SPAN
+        lease, found = about.lease_id, None
+        match note.body:
+            case notes.QueuedNote():
+                found = self._wait(lease, about.traceparent)
+            case notes.GrantedNote(by_itself=by_itself):
+                found = self._wait(lease, None if by_itself else about.traceparent)
+            case notes.ReadyNote() | notes.DeniedNote() | notes.CancelledNote():
+                found = self._waits.pop(lease, None)
+            case notes.ReleasedNote() | notes.LostNote() | notes.ExpiredNote():
+                found = self._left(about, lease)
+            case notes.RevokeWithdrawnNote() | notes.VerifiedNote(resolved=True):
+                found = self._evictions.pop(lease, None)
+            case _:
+                found = self._evictions.get(lease)
+        return _NO_SPAN if found is None else _fields(found, note)
+
+    def _left(self, about: notes.About, lease: LeaseId) -> SpanId | None:
+        """A lease gives its bytes up, or had none."""
+        wait = self._waits.pop(lease, None)
+        return self._evictions.get(lease) if about.gpu is not None else wait
+
+    def _begin_eviction(
+        self, holder: LeaseId, waiter: LeaseId | None, traceparent: str | None
+    ) -> None:
+        """It belongs to the waiter's trace; under pressure it is a trace of its own."""
+        if waiter is None:
+            made = self._minted(None)
+        else:
+            above = self._wait(waiter, traceparent)
+            made = replace(above, span=self._hex(_SPAN_BYTES), parent=above.span)
+        self._evictions.pop(holder, None)
+        _keep(self._evictions, holder, made)
+
+    def _wait(self, lease: LeaseId, traceparent: str | None) -> SpanId:
+        if (found := self._waits.get(lease)) is None:
+            found = self._minted(traceparent)
+            _keep(self._waits, lease, found)
+        return found
+
+    def _minted(self, traceparent: str | None) -> SpanId:
+        """Return a child of a W3C traceparent, else the first span of a trace."""
+        span, given = self._hex(_SPAN_BYTES), read_traceparent(traceparent)
+        if given is None:
+            return SpanId(self._hex(_TRACE_BYTES), span)
+        _, trace, parent, flags = given.split("-")
+        return SpanId(trace, span, parent, flags)
+
+    def _hex(self, count: int) -> str:
+        return self._random(count).hex()
+
+
+def _keep(spans: dict[LeaseId, SpanId], lease: LeaseId, made: SpanId) -> None:
+    while len(spans) >= OPEN_MAX:
+        del spans[next(iter(spans))]
+    spans[lease] = made
+
+
+def _fields(found: SpanId, note: fx.Note) -> Mapping[str, str]:
+    ids = {"trace_id": found.trace, "span_id": found.span}
+    if found.parent and isinstance(note.body, notes.RevokeAskedNote):
+        ids["parent_id"] = found.parent
+    if found.flags != "01":
+        ids["trace_flags"] = found.flags
+    return ids
 
 
 @dataclass(slots=True)
@@ -111,12 +243,12 @@ class Executor:
         records = [effect for effect in effects if isinstance(effect, _RECORDS)]
         if records and (failed := self._write(records)):
             some = self._without(failed, effects)
-        notes: list[fx.Note] = []
+        facts: list[fx.Note] = []
         samples: list[fx.Sample] = []
         for effect in some:
             match effect:
                 case fx.Note():
-                    notes.append(effect)
+                    facts.append(effect)
                 case fx.Reply():
                     self._outbox.reply(effect.client, effect.request, effect.body)
                 case fx.Push(body=body):
@@ -128,7 +260,7 @@ class Executor:
                     self._outbox.refuse(effect.client, effect.request, error)
                 case fx.Signal():
                     self._signal(effect.process, effect.kind)
-        for note in notes:
+        for note in facts:
             told = {**self._words.event(note), **self._spans.of(note)}
             event = self._history.append(note.body.TAG[1], told)
             self._log_event(event)

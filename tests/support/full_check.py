@@ -35,8 +35,11 @@ def check_all(core: Core) -> None:
             if not in_use and (uses := len(lease.uses)):
                 raise InvariantViolation(3, f"{lease.id} is {lease.state} with {uses} uses")
     turn, core.turn = core.turn, Turn(granted=core.turn.granted)
-    core.turn.touched.update((gpu.info.index, gpu) for gpu in core.gpus.values())
+    for gpu in core.gpus.values():
+        gpu.touched = True
     invariants.check(core)
+    for gpu in core.gpus.values():
+        gpu.touched = False
     core.turn = turn
     unqueued = core.waiting.keys() - {lease.id for gpu in core.gpus.values() for lease in gpu.queue}
     if unqueued:
@@ -63,8 +66,8 @@ def owners_disagree(core: Core) -> str:
     owners = Counter(
         owner for lease in core.waiting.values() for owner in (lease.process, lease.request.uid)
     )
-    if owners != core.waiters_of:
-        return f"waiters are {owners}, kept as {core.waiters_of}"
+    if owners != core.waiting.of:
+        return f"waiters are {owners}, kept as {core.waiting.of}"
     connected: dict[ProcessKey, dict[ClientId, Client]] = {}
     for client in core.clients.values():
         connected.setdefault(client.process, {})[client.id] = client

@@ -16,8 +16,8 @@ from itertools import islice
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_by_process, bytes_of
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Eviction, Lease, LeaseState, Verification
-from vram_arbiter.arbiter.core.settings import GpuInfo
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 
 LEFT_KEPT = 64
@@ -232,6 +232,7 @@ class Gpu:
     info: GpuInfo
     ledger: GpuLedger
     queue: WaitQueue
+    readings: list[GpuId]  # of all GPUs, to be asked for at the end of the event
     residents: Residents = field(default_factory=Residents)
     verifications: dict[str, Verification] = field(default_factory=dict)
     evictions: list[Eviction] = field(default_factory=list)  # for waiters that still wait
@@ -248,6 +249,36 @@ class Gpu:
     changed_at: float = 0.0  # last grant, ready or verdict
     blocked: Block | None = None
     debts: set[LeaseId] = field(default_factory=set)  # charged, not resident; kept by `invariants`
+    # of the event that is handled
+    dirty: bool = True  # its queue must be served
+    touched: bool = True  # its records may have changed: reading and invariants follow
+
+    def wake(self) -> None:
+        """Serve its queue in this turn: something changed that a waiter here may wait for."""
+        self.dirty = self.touched = True
+
+    def want_sample(self, now: float, not_before: float) -> None:
+        """Ask for a reading that begins at `not_before` or later, unless such a one is under
+        way."""
+        if self.asked_at is None or self.asked_at < not_before:
+            self.asked_at = now
+            self.readings.append(self.info.id)
+
+    def verify(self, verification: Verification, now: float, settings: Settings) -> None:
+        """Begin polls and deadline of a verification, or begin them anew: time without readings
+        says nothing of the memory's return."""
+        self.verifications[verification.key] = verification
+        verification.paced_from = max(now, verification.not_before)
+        verification.deadline_at = verification.paced_from + settings.verify_timeout_s
+        verification.overdue = False
+        verification.verdict = None
+        self.read_soon(verification, now, settings)
+
+    def read_soon(self, verification: Verification, now: float, settings: Settings) -> None:
+        """Read at once and again soon: most memory is back when its holder reports the release."""
+        self.want_sample(now, now)
+        verification.next_poll_at = max(now + settings.verify_confirm_s, verification.paced_from)
+        self.touched = True
 
     def in_state(self, *states: LeaseState) -> list[Lease]:
         """Return its leases in these states, in the order in which they came to them."""

@@ -2,8 +2,8 @@
 other (`Turn`).
 
 Data and bookkeeping only: no decision is taken here. What an event changes goes through the verbs
-of `Core`, in this order: effects (`note`, `reply`, `push`), readings, numbers, clients, leases,
-uses, waits, the end of a lease, and the journal.
+of `Core`, in this order: effects (`note`, `reply`, `push`), numbers, clients, leases, uses, waits,
+the end of a lease, what grants wait for, and the journal.
 """
 
 from collections import OrderedDict
@@ -11,7 +11,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from hashlib import blake2b
 from heapq import heapify, heappop, heappush
-from math import inf
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -23,20 +22,35 @@ from vram_arbiter.arbiter.core.effects import (
     Push,
     Refuse,
     Reply,
-    Sample,
 )
 from vram_arbiter.arbiter.core.events import DOUBT_KEY
 from vram_arbiter.arbiter.core.learning import Costs, Footprints
 from vram_arbiter.arbiter.core.ledger import GpuLedger, HostRam
 from vram_arbiter.arbiter.core.model.gpu import Gpu, WaitQueue
-from vram_arbiter.arbiter.core.model.lease import AWAY, Eviction, Lease, LeaseState, Use
+from vram_arbiter.arbiter.core.model.lease import (
+    AWAY,
+    EXPIRING,
+    NONCES_MAX,
+    Eviction,
+    Lease,
+    LeaseState,
+    Use,
+)
 from vram_arbiter.arbiter.core.model.records import AnyRecord, ResidueRecord
+from vram_arbiter.arbiter.core.model.refusals import End
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
-from vram_arbiter.schemas.wire.codes import Order, RevokeCause
+from vram_arbiter.schemas.wire.codes import Block, Order, RevokeCause, Why
 from vram_arbiter.schemas.wire.errors import Refusal
-from vram_arbiter.schemas.wire.notes import About, AnyNote
-from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.notes import (
+    About,
+    AnyNote,
+    CancelledNote,
+    DeniedNote,
+    LostNote,
+    ServingNote,
+)
+from vram_arbiter.schemas.wire.pushes import AnyPush, DeniedPush
 from vram_arbiter.schemas.wire.replies import AnyReply
 
 ENDED_REMEMBERED = 1024
@@ -87,6 +101,27 @@ class Refusals:
     at: float
     noted: float = 0.0
     left_out: int = 0
+
+
+class Waiting(dict[LeaseId, Lease]):
+    """Requests that wait, and how many of each process and user."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.of: dict[ProcessKey | int, int] = {}  # how many, by process and by uid
+
+    def add(self, lease: Lease) -> None:
+        self[lease.id] = lease
+        for owner in (lease.process, lease.request.uid):
+            self.of[owner] = self.of.get(owner, 0) + 1
+
+    def discard(self, lease: Lease) -> None:
+        """Take a request out, if it is here."""
+        if self.pop(lease.id, None) is not None:
+            for owner in (lease.process, lease.request.uid):
+                self.of[owner] -= 1
+                if not self.of[owner]:
+                    del self.of[owner]
 
 
 class Timers(dict[TimerKey, float]):
@@ -145,12 +180,6 @@ class Turn:
 
     effects: list[Effect] = field(default_factory=list)
     """To be performed, in this order."""
-    dirty: dict[int, Gpu] = field(default_factory=dict)
-    """GPUs by index whose queue must be served."""
-    touched: dict[int, Gpu] = field(default_factory=dict)
-    """GPUs by index whose records may have changed: their next reading is planned, their invariants
-    are checked.
-    """
     unanswered: list[Lease] = field(default_factory=list)
     """Leases of this event's acquire; one that is not granted at once is answered `queued`."""
     granted: list[tuple[Token, GpuId]] = field(default_factory=list)
@@ -187,11 +216,13 @@ class Core:
         self.started_at = now
         self.now = now
         self.turn = Turn()
+        self.readings: list[GpuId] = []  # to be asked for at the end of the event
         self.gpus: dict[GpuId, Gpu] = {
             info.id: Gpu(
                 info,
                 GpuLedger(info, settings.verify_tolerance_bytes),
                 WaitQueue(settings.ageing_s_per_point),
+                self.readings,
             )
             for info in sorted(settings.gpus, key=lambda info: info.index)
         }
@@ -208,8 +239,7 @@ class Core:
         self.refusals: dict[ProcessKey, Refusals] = {}  # the latest last
         self.terminated: set[ProcessKey] = set()  # told to end by an operator, and alive
         # waits, uses, and leases without bytes on a GPU in the order of their leaving
-        self.waiting: dict[LeaseId, Lease] = {}
-        self.waiters_of: dict[ProcessKey | int, int] = {}  # how many, by process and by uid
+        self.waiting = Waiting()
         self.users: dict[ProcessKey, dict[_UseKey, Lease]] = {}  # leases that a process uses
         self.away: dict[LeaseId, Lease] = {}
         self.host_ram = HostRam(settings.host_ram_budget_bytes)
@@ -221,11 +251,11 @@ class Core:
         self.serving = True
         self.recovering: set[LeaseId] = set()
         # what was learned
-        self.footprints = Footprints(max(gpu.ledger.budget_bytes for gpu in self.gpus.values()))
+        self.footprints = Footprints(
+            max([gpu.ledger.budget_bytes for gpu in self.gpus.values()], default=0)
+        )
         self.footprints.restore(settings.footprints)
         self.costs = Costs(settings.learnt, settings.thrash_window_s)
-        for gpu in self.gpus.values():
-            self.wake(gpu)
 
     # -- effects
     def reply(self, client: ClientId, request: RequestId, body: AnyReply) -> None:
@@ -251,19 +281,6 @@ class Core:
 
     def forget(self, key: str) -> None:
         self.turn.effects.append(JournalDelete(key))
-
-    def want_sample(self, gpu: Gpu, not_before: float) -> None:
-        """Ask for a reading that begins at `not_before` or later, unless such a one is
-        under way."""
-        if gpu.asked_at is None or gpu.asked_at < not_before:
-            gpu.asked_at = self.now
-            self.turn.effects.append(Sample(gpu.info.id))
-
-    def read_again(self, gpu: Gpu, after_s: float) -> None:
-        """The next background reading comes in `after_s` at the latest."""
-        key, due_at = ("probe", gpu.info.id), self.now + after_s
-        if self.timers.get(key, inf) > due_at:
-            self.timers.set(key, due_at)
 
     # -- bookkeeping
     def next_lease_id(self) -> LeaseId:
@@ -291,15 +308,10 @@ class Core:
         assert lease.gpu is not None, f"{lease.id} has no GPU"
         return self.gpus[lease.gpu]
 
-    def wake(self, gpu: Gpu) -> None:
-        """Serve the queue of a GPU in this turn: something changed that a waiter there may wait
-        for."""
-        self.turn.dirty[gpu.info.index] = self.turn.touched[gpu.info.index] = gpu
-
     def wake_candidates(self, lease: Lease) -> None:
         """Serve the queues of every GPU that a request may be granted on."""
         for gpu_id in lease.request.gpus:
-            self.wake(self.gpus[gpu_id])
+            self.gpus[gpu_id].wake()
 
     def join(self, client: Client) -> None:
         """A connection begins."""
@@ -315,6 +327,12 @@ class Core:
         self.leases[lease.id] = lease
         self._of_process.setdefault(lease.process, {})[lease.id] = lease
         self.of_client.setdefault(lease.client, {})[lease.id] = lease
+
+    def keep(self, lease: Lease, grace_s: float = 0.0) -> None:
+        """Let a lease that expires have its whole time to live from now on."""
+        if lease.state in EXPIRING:
+            lease.expires_at = self.now + lease.spec.ttl_s + grace_s
+            self.timers.set(("ttl", lease.id), lease.expires_at)
 
     def hand_to(self, lease: Lease, client: ClientId) -> None:
         """Another connection of its process speaks for a lease from now on."""
@@ -358,26 +376,61 @@ class Core:
         """A request waits in the queue of every candidate GPU."""
         request = lease.request
         if lease.id not in self.waiting:
-            self.waiting[lease.id] = lease
-            for owner in (lease.process, request.uid):
-                self.waiters_of[owner] = self.waiters_of.get(owner, 0) + 1
+            self.waiting.add(lease)
             if request.wait_timeout_s is not None:
                 self.timers.set(("wait", lease.id), request.arrived_at + request.wait_timeout_s)
         for gpu_id in request.gpus:
             self.gpus[gpu_id].queue.add(lease)
-            self.wake(self.gpus[gpu_id])
+            self.gpus[gpu_id].wake()
+
+    def rename(self, lease: Lease, nonce: str) -> None:
+        """Another acquire asks for a lease. The earlier ones are remembered, for their repeats."""
+        request = lease.request
+        if len(request.earlier_nonces) == NONCES_MAX:
+            self.nonces.pop((lease.process, request.earlier_nonces[0]), None)
+        request.earlier_nonces.append(request.nonce)
+        request.nonce = nonce
+        self.nonces[lease.process, nonce] = lease.id
+
+    def requeue(
+        self, lease: Lease, client: ClientId, asked: RequestId | None, asked_at: float
+    ) -> None:
+        """Queue a lease that is away. Without a request (`asked`) its grant is pushed."""
+        request = lease.request
+        self.move(lease, LeaseState.QUEUED, Why.WANTED)
+        self.timers.cancel(("away", lease.id))  # after a restart: its holder reattached
+        lease.attached = True
+        self.hand_to(lease, client)
+        request.id, request.answered = asked, asked is None
+        request.arrived_at, request.arrival = asked_at, self.next_arrival()
+        request.planned_gpu = None
+        self.enqueue(lease)
 
     def dequeue(self, lease: Lease) -> None:
         """A request waits no more."""
-        if self.waiting.pop(lease.id, None) is not None:
-            for owner in (lease.process, lease.request.uid):
-                self.waiters_of[owner] -= 1
-                if not self.waiters_of[owner]:
-                    del self.waiters_of[owner]
+        self.waiting.discard(lease)
         self.timers.cancel(("wait", lease.id))
         for gpu_id in lease.request.gpus:
             self.gpus[gpu_id].queue.discard(lease)
-            self.wake(self.gpus[gpu_id])
+            self.gpus[gpu_id].wake()
+
+    def deny(self, waiter: Lease, refusal: Refusal) -> None:
+        """End a wait with a refusal."""
+        self.move(waiter, LeaseState.DENIED, refusal.code)
+        self.dequeue(waiter)
+        if waiter.request.answered or waiter.request.id is None:
+            self.push(waiter, DeniedPush(waiter.id, refusal.view()))
+        else:  # it has only just asked
+            self.refuse(waiter.client, waiter.request.id, refusal)
+        self.note(DeniedNote(refusal), waiter)
+        self.end(waiter, refusal)
+
+    def end_away(self, lease: Lease, to: LeaseState, refusal: End) -> None:
+        """End a lease that is away: nothing has to be measured."""
+        self.move(lease, to, refusal.why)
+        note = LostNote if to is LeaseState.LOST else CancelledNote
+        self.note(note(refusal.why), lease)
+        self.end(lease, refusal)
 
     def end(self, lease: Lease, error: Refusal | None) -> None:
         """Drop a lease that reached a terminal state; a bounded memory of it stays."""
@@ -390,7 +443,7 @@ class Core:
         if lease.gpu is not None:
             gpu = self.gpus[lease.gpu]
             gpu.residents.remove(lease)
-            self.wake(gpu)
+            gpu.wake()
         elif lease.token is not None:  # it was resident once: the journal knows it as away
             self.forget(f"lease:{lease.id}")
         request, eviction = lease.request, lease.departure.eviction
@@ -413,6 +466,27 @@ class Core:
             for name, table in tables.items()
         }
         return Inspection(**shown)
+
+    def blocked(self, gpu: Gpu) -> Block | None:
+        """Return why nothing can be granted on a GPU now, for any request; None: it can be."""
+        if not self.serving:
+            return Block.RECOVERING
+        if self.drain is not None:
+            return Block.DRAINED
+        if gpu.failed_at is not None:
+            return Block.UNREADABLE
+        if gpu.sample is None:
+            return Block.UNREAD
+        if gpu.residents.by_state[LeaseState.LOADING]:
+            return Block.LOADING
+        return Block.PRESSURE if gpu.ledger.pressed else None
+
+    def serve(self) -> None:
+        """Begin to grant: every holder is accounted for."""
+        self.serving = True
+        self.note(ServingNote(self.now - self.started_at))
+        for gpu in self.gpus.values():
+            gpu.wake()
 
     def account_for(self, lease_id: str) -> None:
         """Wait for one lease less before the first grant, or (EMPTY_JOURNAL) no longer for holders

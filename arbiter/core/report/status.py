@@ -15,7 +15,6 @@ from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.notes import EvictedLease, SwitchNote
@@ -80,7 +79,7 @@ def position(gpus: Mapping[GpuId, Gpu], lease: Lease) -> int:
     return min([gpus[gpu_id].queue.position(lease) for gpu_id in lease.request.gpus])
 
 
-def gpu_view(core: Core, gpu: Gpu) -> GpuView:
+def gpu_view(gpu: Gpu, block: BlockView | None, now: float) -> GpuView:
     """A GPU: what is charged, measured and blocked."""
     ledger = gpu.ledger
     sample, known = gpu.sample, gpu.failed_at is None
@@ -94,16 +93,16 @@ def gpu_view(core: Core, gpu: Gpu) -> GpuView:
         charged_bytes=ledger.charged_bytes,
         stowaway_bytes=ledger.stowaway_bytes,
         measured_used_bytes=sample.used_bytes if known and sample is not None else None,
-        sample_age_s=None if sample is None else core.now - sample.taken_at,
+        sample_age_s=None if sample is None else now - sample.taken_at,
         pressure_bytes=ledger.pressure_bytes(),
-        blocked=block_view(core, gpu),
+        blocked=block,
         processes=tuple(_processes(gpu)),
     )
 
 
 def block_view(core: Core, gpu: Gpu) -> BlockView | None:
     """Why nothing is granted on a GPU now, with its values; None if grants are possible."""
-    code = admission.blocked(core, gpu) or gpu.blocked
+    code = core.blocked(gpu) or gpu.blocked
     match code:
         case None:
             return None
@@ -168,7 +167,7 @@ def status(
         epoch=core.settings.epoch,
         phase="serving" if core.serving else "recovering",
         uptime_s=core.now - core.started_at,
-        gpus=tuple(gpu_view(core, gpu) for gpu in core.gpus.values()),
+        gpus=tuple(gpu_view(gpu, block_view(core, gpu), core.now) for gpu in core.gpus.values()),
         leases=tuple(
             shown if reader in (None, lease.process) else replace(shown, token=None)
             for lease in leases

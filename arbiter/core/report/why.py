@@ -77,7 +77,7 @@ def explain(core: Core, lease: Lease, *, plan: bool = False, brief: bool = False
     `brief`: without the blockers of a request behind others, which are the head's own.
     """
     gpu, away = _gpu_of(core.gpus, lease), lease.state in AWAY
-    block = admission.blocked(core, gpu)
+    block = core.blocked(gpu)
     told = Explanation(
         lease_id=lease.id,
         consumer=lease.spec.consumer,

@@ -7,7 +7,7 @@ reason; a pin and a drain are journaled, so they outlive the daemon. The role wa
 request came in.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Final, Literal
 
@@ -15,6 +15,7 @@ from vram_arbiter.arbiter.core import eviction, standby
 from vram_arbiter.arbiter.core.effects import Signal
 from vram_arbiter.arbiter.core.events import DRAIN_KEY, Asked, SettingsChanged
 from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.records import DrainRecord
 from vram_arbiter.arbiter.core.model.refusals import Impractical, Refused
@@ -66,7 +67,7 @@ def find(core: Core, target: str) -> Lease:
     if resident:
         raise Refused(no.Ambiguous(target, tuple(lease.id for lease in resident)))
     if target in core.ended:
-        raise Refused(no.TargetOver.of(over(core, LeaseId(target)).refusal))
+        raise Refused(no.TargetOver.of(over(core.ended, LeaseId(target)).refusal))
     raise Refused(no.NoTarget(target))
 
 
@@ -144,7 +145,7 @@ def unpin(core: Core, lease: Lease, order: Order) -> None:
 def _set_pin(core: Core, lease: Lease, pinned: Order | None) -> None:
     lease.pinned = pinned
     if lease.gpu is not None:
-        core.wake(core.gpu_of(lease))
+        core.gpu_of(lease).wake()
     if lease.gpu is not None or lease.state in AWAY:
         core.record_lease(lease)
 
@@ -169,7 +170,7 @@ def drain(core: Core, order: Order) -> None:
     reason."""
     core.drain = order
     core.journal(DRAIN_KEY, DrainRecord(order.by, order.reason))
-    _wake_all(core)
+    _wake_all(core.gpus.values())
     core.note(OperatorNote("drain", order.by, order.reason))
 
 
@@ -178,13 +179,13 @@ def resume(core: Core, order: Order) -> None:
     if core.drain is not None:
         core.drain = None
         core.forget(DRAIN_KEY)
-        _wake_all(core)
+        _wake_all(core.gpus.values())
     core.note(OperatorNote("resume", order.by, order.reason))
 
 
-def _wake_all(core: Core) -> None:
-    for gpu in core.gpus.values():
-        core.wake(gpu)
+def _wake_all(gpus: Iterable[Gpu]) -> None:
+    for gpu in gpus:
+        gpu.wake()
 
 
 def _impractical(lease: Lease, problem: Impractical, silent_s: float | None = None) -> Refused:

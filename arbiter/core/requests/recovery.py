@@ -5,10 +5,11 @@ not count until holders and readings say it again.
    that it is gone, dies, or its time is over.
 2. `on_reattached`: holders come back and say what they hold. A journal in doubt names some leases
    at best: its holders are believed, and grants wait as long as any holder may keep what it has.
-3. `account_for`, `serve`: nothing is granted until every recovered lease is accounted for
+3. `Core.account_for`, `Core.serve`: nothing is granted until every recovered lease is accounted for
    (reattached, given up, its process dead, or its GPU read as empty).
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from vram_arbiter.arbiter.core import events as ev
@@ -26,14 +27,14 @@ from vram_arbiter.arbiter.core.model.refusals import Refused
 from vram_arbiter.arbiter.core.model.state import EMPTY_JOURNAL, Client, Core, Ended
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.requests import uses
-from vram_arbiter.arbiter.core.requests.requests import become_held, keep, over, released
+from vram_arbiter.arbiter.core.requests.requests import become_held, over, released
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.settings import Settings
-from vram_arbiter.arbiter.core.verification.schedule import begin_again, begin_for_lease
+from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Order, Why
-from vram_arbiter.schemas.wire.notes import ReattachedNote, RecoveredNote, ResumedNote, ServingNote
+from vram_arbiter.schemas.wire.notes import ReattachedNote, RecoveredNote, ResumedNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import ReattachedView, ReattachReply
 from vram_arbiter.schemas.wire.requests import Reattach, ReattachLease
@@ -44,7 +45,8 @@ def on_recovered(core: Core, event: ev.Recovered) -> None:
     """Restore what the journal names, then wait for the holders. Records of a GPU that is gone are
     dropped."""
     core.serving = False
-    core.turn.touched.update((gpu.info.index, gpu) for gpu in core.gpus.values())
+    for gpu in core.gpus.values():
+        gpu.touched = True
     doubt: DoubtRecord | None = None
     held = 0
     for key, record in sorted(event.records.items()):  # a doubt first, residues after leases
@@ -90,7 +92,10 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
     4. The bytes of a lease that is verified are measured away.
     5. Every other holder has its time to reattach. What others use stays in use.
     """
-    lease, grace_s = _found(core, record, why), core.settings.fence_grace_s
+    grace_s = core.settings.fence_grace_s
+    named = tuple(gpu.info.id for gpu in admission.selected(core.gpus, record.spec))
+    lease = _found(record, named, core.next_arrival(), core.now, why)
+    core.nonces[lease.process, record.nonce] = lease.id
     gpu = None if lease.gpu is None else core.gpus[lease.gpu]
     if gpu is not None:
         _charge(gpu, lease, record.charge_bytes, core.now)  # 1
@@ -112,30 +117,27 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
     if lease.state is LeaseState.VERIFYING:  # 4
         begin_for_lease(core, gpu, lease, alive=True)
         return lease
-    keep(core, lease, grace_s)  # 5
+    core.keep(lease, grace_s)  # 5
     if lease.state is LeaseState.HELD:
         uses.restore(core, lease, record.users)
     core.recovering.add(lease.id)
     return lease
 
 
-def _found(core: Core, record: LeaseRecord, why: Why) -> Lease:
-    """Return the lease of a record, known by its nonce; it is not charged yet."""
-    spec, gpus = (
-        record.spec,
-        tuple(gpu.info.id for gpu in admission.selected(core.gpus, record.spec)),
-    )
+def _found(
+    record: LeaseRecord, named: tuple[GpuId, ...], arrival: int, now: float, why: Why
+) -> Lease:
+    """Return the lease of a record, which is not charged yet. `named`: GPUs that its spec names."""
+    sizes = record.spec.footprint
     request = Request(
         nonce=record.nonce,
-        arrived_at=core.now,
-        arrival=core.next_arrival(),
+        arrived_at=now,
+        arrival=arrival,
         load_peak_bytes=record.load_peak_bytes,
-        steady_bytes=max(spec.footprint.steady_bytes, spec.footprint.residue_bytes),
-        gpus=gpus if record.gpu is None else (GpuId(record.gpu),),
+        steady_bytes=max(sizes.steady_bytes, sizes.residue_bytes),
+        gpus=named if record.gpu is None else (GpuId(record.gpu),),
     )
-    lease = Lease.recovered(record, request, core.now, why)
-    core.nonces[lease.process, record.nonce] = lease.id
-    return lease
+    return Lease.recovered(record, request, now, why)
 
 
 def _charge(gpu: Gpu, lease: Lease, charge_bytes: int, now: float) -> None:
@@ -192,8 +194,13 @@ def _reattach(core: Core, client: Client, item: ReattachLease) -> Lease:
     lease = core.leases.get(item.lease_id)  # 1
     if lease is None:
         if item.lease_id in core.ended:
-            raise over(core, item.lease_id)
-        lease = _adopt(core, client, item)
+            raise over(core.ended, item.lease_id)
+        if core.serving or item.token.epoch >= core.settings.epoch:
+            raise Refused(no.Lost(item.lease_id, Why.UNKNOWN))
+        sizes = core.footprints.expected_bytes(item.spec)
+        lease = _restore(core, _adopted(core.gpus, client, item, *sizes), Why.ADOPTED)
+        lease.request.steady_bytes = sizes[1]
+        core.record_lease(lease)
     elif lease.token != item.token:
         in_doubt = EMPTY_JOURNAL in core.recovering and item.token.epoch < core.settings.epoch
         if _knows_newer(lease, client, item, in_doubt=in_doubt):
@@ -215,7 +222,7 @@ def _reattach(core: Core, client: Client, item: ReattachLease) -> Lease:
         core.record_lease(lease)
     if lease.gpu is not None:
         _restore_uses(core, lease, client, item)
-    keep(core, lease)  # 4
+    core.keep(lease)  # 4
     core.account_for(lease.id)
     core.note(ReattachedNote(len(lease.uses), lease.state), lease)
     return lease
@@ -275,26 +282,23 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachLease)
     if lease.departure.eviction is not None:
         lease.departure.eviction.acked_at = None  # it was heard on another connection
         eviction.push_revoke(core, lease)
-    core.wake(core.gpu_of(lease))
+    core.gpu_of(lease).wake()
 
 
-def _adopt(core: Core, client: Client, item: ReattachLease) -> Lease:
-    """Return a lease that the journal does not know, by its holder's word. Raises Refused.
-
-    Its token is of an earlier epoch, and the engine recovers: else there is no such lease.
-    """
-    if core.serving or item.token.epoch >= core.settings.epoch:
-        raise Refused(no.Lost(item.lease_id, Why.UNKNOWN))
-    gpus, spec = admission.selected(core.gpus, item.spec), item.spec
-    if not gpus:
-        raise Refused(no.UnknownGpu(spec.gpu, tuple(core.gpus)))
+def _adopted(
+    gpus: Mapping[GpuId, Gpu], client: Client, item: ReattachLease, peak: int, steady: int
+) -> LeaseRecord:
+    """Return the record of a lease that the journal does not know, by its holder's word. Its token
+    is of an earlier epoch, and the engine recovers: else there is no such lease. Raises Refused."""
+    named, spec = admission.selected(gpus, item.spec), item.spec
+    if not named:
+        raise Refused(no.UnknownGpu(spec.gpu, tuple(gpus)))
     # the journal that knew its GPU is lost: it is where most of the process's bytes are seen
-    gpu = max(gpus, key=lambda gpu: (gpu.shown_bytes(client.process) or 0, -gpu.info.index))
-    peak, steady = core.footprints.expected_bytes(spec)
+    gpu = max(named, key=lambda gpu: (gpu.shown_bytes(client.process) or 0, -gpu.info.index))
     charge = steady if item.state == "held" else peak
     if item.state == "held" and item.measured_bytes is not None:
         charge = max(item.measured_bytes, spec.footprint.residue_bytes)
-    record = LeaseRecord(
+    return LeaseRecord(
         lease_id=item.lease_id,
         token=(item.token.epoch, item.token.serial),
         state=item.state,
@@ -311,10 +315,6 @@ def _adopt(core: Core, client: Client, item: ReattachLease) -> Lease:
         parks=item.state == "parked",
         parked_bytes=spec.park_bytes if item.state == "parked" else 0,
     )
-    lease = _restore(core, record, Why.ADOPTED)
-    lease.request.steady_bytes = steady
-    core.record_lease(lease)
-    return lease
 
 
 # -- end of a recovery
@@ -334,14 +334,6 @@ def account_for_the_empty(core: Core, gpu: Gpu, sample: ev.MemorySampled) -> Non
         core.account_for(EMPTY_JOURNAL)
 
 
-def serve(core: Core) -> None:
-    """Begin to grant: every holder is accounted for."""
-    core.serving = True
-    core.note(ServingNote(core.now - core.started_at))
-    for gpu in core.gpus.values():
-        core.wake(gpu)
-
-
 # -- resume from suspend
 def on_resumed(core: Core, event: ev.Resumed) -> None:
     """Let no reading count that began before the machine was suspended, such as by a laptop's lid.
@@ -352,7 +344,7 @@ def on_resumed(core: Core, event: ev.Resumed) -> None:
     """
     core.note(ResumedNote(event.slept_s))
     for lease in core.leases.values():
-        keep(core, lease, 0.0 if lease.attached else core.settings.fence_grace_s)
+        core.keep(lease, 0.0 if lease.attached else core.settings.fence_grace_s)
         if ("users", lease.id) in core.timers:
             uses.await_users(core, lease)
     if ("recover", EMPTY_JOURNAL) in core.timers:
@@ -361,6 +353,8 @@ def on_resumed(core: Core, event: ev.Resumed) -> None:
         gpu.before_sleep = gpu.sample or gpu.before_sleep
         gpu.sample = None
         gpu.read_from = core.now
-        core.want_sample(gpu, core.now)
-        begin_again(core, gpu)
-        core.wake(gpu)
+        gpu.want_sample(core.now, core.now)
+        for verification in gpu.verifications.values():
+            verification.confirmed_at, verification.last_used_bytes = core.now, None
+            gpu.verify(verification, core.now, core.settings)
+        gpu.wake()

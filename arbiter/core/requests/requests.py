@@ -5,15 +5,16 @@ Permission: leases belong to a process, so a request on a lease must come from a
 process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.core import eviction, learning, standby
+from vram_arbiter.arbiter.core import learning, standby
 from vram_arbiter.arbiter.core.learning import check_load, newest
 from vram_arbiter.arbiter.core.model import refusals as no
-from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, Lease, LeaseState, Request, Use
+from vram_arbiter.arbiter.core.model.lease import AWAY, Lease, LeaseState, Request, Use
 from vram_arbiter.arbiter.core.model.refusals import Misfit, Refused, Share
-from vram_arbiter.arbiter.core.model.state import Client, Core, Refusals
+from vram_arbiter.arbiter.core.model.state import Client, Core, Ended, Refusals
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.report.why import ahead_of, explain
 from vram_arbiter.arbiter.core.scheduling import admission
@@ -52,9 +53,9 @@ PROCESSES_REMEMBERED = 1024
 
 
 # -- leases
-def over(core: Core, lease_id: LeaseId) -> Refused:
+def over(known: Mapping[LeaseId, Ended], lease_id: LeaseId) -> Refused:
     """Return the answer to a message on a lease that is over, or never was."""
-    ended = core.ended.get(lease_id)
+    ended = known.get(lease_id)
     if ended is None:
         return Refused(no.NoLease(lease_id))
     return Refused(ended.error or no.LeaseOver(ended.lease, ended.state, ended.revoked))
@@ -64,7 +65,7 @@ def lease_for(core: Core, on: OnLease) -> Lease:
     """Return a live lease by its exact token. Raises Refused."""
     lease = core.leases.get(on.lease_id)
     if lease is None:
-        raise over(core, on.lease_id)
+        raise over(core.ended, on.lease_id)
     if lease.token is None:
         raise bad_state(lease, Misfit.STILL_QUEUED)
     if lease.token != on.token:
@@ -81,15 +82,8 @@ def own_lease(core: Core, client: ClientId, on: OnLease) -> Lease:
     if lease.process != core.clients[client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     if lease.attached:
-        keep(core, lease)
+        core.keep(lease)
     return lease
-
-
-def keep(core: Core, lease: Lease, grace_s: float = 0.0) -> None:
-    """Let a lease that expires have its whole time to live from now on."""
-    if lease.state in EXPIRING:
-        lease.expires_at = core.now + lease.spec.ttl_s + grace_s
-        core.timers.set(("ttl", lease.id), lease.expires_at)
 
 
 def bad_state(lease: Lease, misfit: Misfit) -> Refused:
@@ -112,7 +106,8 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
     """
     client, spec = core.clients[asked.client], request.spec
     known = _known_by(core, client, request.nonce)
-    away = standby.wanted(core, client, request, known)
+    mine = core.leases_of(client.process) if core.away else []
+    away = standby.wanted(mine, request, known) if mine else None
     if away is not None:  # 1
         spec = spec if known is None else away.spec
         standby.call_back(core, away, asked, request, spec)
@@ -122,7 +117,7 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
         return
     load_peak, steady = core.footprints.expected_bytes(spec)  # 3
     gpus = admission.places(core.gpus, spec, load_peak)
-    admission.check_waiters(core, client, spec.priority)  # 4
+    admission.check_waiters(core.settings, core.waiting, client, spec.priority)  # 4
     owned, most = len(core.of_client.get(client.id, ())), core.settings.leases_per_client_max
     admission.check_shares("leases_per_client_max", (Share.CONNECTION, owned, most))
     if core.costs.failures:  # 5
@@ -138,7 +133,7 @@ def _known_by(core: Core, client: Client, nonce: str) -> Lease | None:
         return None
     lease = core.leases.get(lease_id)
     if lease is None:
-        raise over(core, lease_id)
+        raise over(core.ended, lease_id)
     return lease
 
 
@@ -148,7 +143,7 @@ def _answer_again(core: Core, asked: ev.Asked, lease: Lease) -> None:
     core.hand_to(lease, asked.client)
     if lease.state is LeaseState.LOADING and not lease.attached:
         lease.attached = True  # its grant was lost in a restart: no holder has it to reattach
-        keep(core, lease)
+        core.keep(lease)
         core.recovering.discard(lease.id)
     state = lease.state if lease.state in (LeaseState.QUEUED, *AWAY) else LeaseState.LOADING
     core.reply(asked.client, asked.id, AcquireReply(str(state), status.view(core, lease)))
@@ -227,7 +222,7 @@ def cancel(core: Core, asked: ev.Asked, request: w.Cancel) -> None:
     if lease is None:
         ended = core.ended.get(request.lease_id)
         if ended is None or ended.state is not LeaseState.CANCELLED:
-            raise over(core, request.lease_id)
+            raise over(core.ended, request.lease_id)
         core.reply(asked.client, asked.id, StateReply(ended.state))
         return
     if lease.process != core.clients[asked.client].process:
@@ -256,7 +251,7 @@ def on_wait_timeout(core: Core, lease_id: str) -> None:
     lease = core.waiting[LeaseId(lease_id)]
     waited_s = core.now - lease.request.arrived_at
     why = explain(core, lease)
-    eviction.deny(core, lease, no.TimedOut(lease.spec.consumer, waited_s, why))
+    core.deny(lease, no.TimedOut(lease.spec.consumer, waited_s, why))
 
 
 # -- refused at once
@@ -326,8 +321,8 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     gpu.pending_free.give_up(lease.process, max(0, peak - steady), core.now)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
-    core.want_sample(gpu, core.now)  # what it holds now is what has to come back one day
-    core.wake(gpu)
+    gpu.want_sample(core.now, core.now)  # what it holds now is what has to come back one day
+    gpu.wake()
 
 
 def renew(core: Core, asked: ev.Asked, request: w.Renew) -> None:
@@ -381,7 +376,7 @@ def unloading(core: Core, asked: ev.Asked, request: w.Unloading) -> None:
         core.costs.learn(lease.spec.consumer, "drain_s", core.now - departure.eviction.asked_at)
     core.reply(asked.client, asked.id, StateReply(lease.state))
     core.note(UnloadingNote(asked=departure.eviction is not None), lease)
-    core.wake(gpu)
+    gpu.wake()
 
 
 def release(core: Core, asked: ev.Asked, request: w.Release) -> None:
@@ -434,7 +429,7 @@ def released(core: Core, lease: Lease, *, exiting: bool, why: Why) -> None:
     begin_for_lease(core, gpu, lease, alive=True)
     core.record_lease(lease)
     core.note(ReleasedNote(exiting, before, why), lease)
-    core.wake(gpu)
+    gpu.wake()
 
 
 def end_uses(core: Core, lease: Lease, why: Why) -> None:
@@ -462,7 +457,7 @@ def oom(core: Core, asked: ev.Asked, request: w.Oom) -> None:
     learnt = wanted if wanted > charge else None
     if learnt is not None:
         core.footprints.out_of_memory(learning.model_name(lease.spec), learnt)
-    core.want_sample(gpu, core.now)
+    gpu.want_sample(core.now, core.now)
     core.reply(asked.client, asked.id, OomReply(learnt))
     note = OomNote(
         requested_bytes=request.requested_bytes,

@@ -13,6 +13,7 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core import standby
 from vram_arbiter.arbiter.core.learning import model_name
 from vram_arbiter.arbiter.core.model import refusals as no
+from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import EXPIRING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core
 from vram_arbiter.arbiter.core.requests.requests import cancel_waiter, released
@@ -42,9 +43,9 @@ def on_connected(core: Core, event: ev.ClientConnected) -> None:
     core.join(Client(event.client, event.process, event.name, event.instance, event.uid))
     core.last_client_at = core.now
     for gpu in core.gpus.values():
-        core.turn.touched[gpu.info.index] = gpu
+        gpu.touched = True
         if gpu.sample is None or core.now - gpu.sample.taken_at > core.settings.sample_max_age_s:
-            core.want_sample(gpu, core.now - core.settings.sample_max_age_s)
+            gpu.want_sample(core.now, core.now - core.settings.sample_max_age_s)
 
 
 def on_left(core: Core, event: ev.ClientLeft) -> None:
@@ -96,7 +97,7 @@ def on_died(core: Core, event: ev.ProcessDied) -> None:
         core.last_client_at = core.now
     for gpu in core.gpus.values():
         if process in gpu.ledger.accounts:
-            on_process_died(core, gpu, process)
+            on_process_died(gpu, process, core.now, core.settings)
     for lease in _by_arrival(core.leases_of(process), core.used_by(process)):
         for use in [use for use in lease.uses.values() if use.process == process]:
             end_use(core, lease, use, Why.PROCESS_DIED)
@@ -129,7 +130,7 @@ def expire(core: Core, lease_id: str, order: Order | None = None) -> None:
     # after a restart the deadline has the grace in it
     grace_s = core.settings.fence_grace_s if lease.attached else 0.0
     fenced_at = lease.expires_at + grace_s
-    weight_bytes = _most_held_bytes(core, lease) - lease.spec.footprint.residue_bytes
+    weight_bytes = _most_held_bytes(core.gpu_of(lease), lease) - lease.spec.footprint.residue_bytes
     # too few bytes for a reading to tell
     tiny = weight_bytes <= 2 * core.settings.verify_tolerance_bytes
     if lease.state is LeaseState.LOADING or tiny:
@@ -139,10 +140,9 @@ def expire(core: Core, lease_id: str, order: Order | None = None) -> None:
     lose(core, lease, refusal, grace_s, fenced_at)
 
 
-def _most_held_bytes(core: Core, lease: Lease) -> int:
+def _most_held_bytes(gpu: Gpu, lease: Lease) -> int:
     """Return the most that a lease may hold: its charge, or less where the newest reading shows
     less. A lease that never filled its charge has nothing that a reading could see leave."""
-    gpu = core.gpu_of(lease)
     charge_bytes = gpu.ledger.charge_bytes(lease.id)
     if gpu.sample is None:
         return charge_bytes

@@ -112,7 +112,7 @@ def end_use(core: Core, lease: Lease, use: Use, why: Why, by: str = "") -> None:
     note_ended(core, lease, use, why, by)
     if not lease.uses:
         eviction.push_revoke(core, lease)
-        core.wake(core.gpu_of(lease))
+        core.gpu_of(lease).wake()
 
 
 # -- after a restart

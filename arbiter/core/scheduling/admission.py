@@ -10,29 +10,29 @@ from collections.abc import Callable, Collection, Mapping, Set
 from vram_arbiter.arbiter.core.ledger import NOTHING
 from vram_arbiter.arbiter.core.model import refusals as no
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState
+from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease
 from vram_arbiter.arbiter.core.model.refusals import Limit, LimitReached, Refused, Share
-from vram_arbiter.arbiter.core.model.state import Client, Core
+from vram_arbiter.arbiter.core.model.state import Client, Waiting
+from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
-from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
 # -- places that processes and users share
-def check_waiters(core: Core, client: Client, priority: int) -> None:
+def check_waiters(settings: Settings, waiting: Waiting, client: Client, priority: int) -> None:
     """Refuse one waiter too many of a client, of its user or of all.
 
     The last places are kept for requests above the default priority, of each user's share too.
     """
-    settings, places, taken = core.settings, core.settings.waiters_max, core.waiters_of
+    places, taken = settings.waiters_max, waiting.of
     mine, users = taken.get(client.process, 0), taken.get(client.uid, 0)
     kept = 0.0 if priority > defaults.PRIORITY else settings.priority_reserve
     check_shares(
         "waiters_max",
         (Share.PROCESS, mine, places * settings.process_share),
         (Share.USER, users, places * (settings.user_share * (1 - kept))),
-        (Share.ALL, len(core.waiting), places * (1 - kept)),
+        (Share.ALL, len(waiting), places * (1 - kept)),
         uid=client.uid,
     )
 
@@ -99,21 +99,6 @@ def front(gpus: Mapping[GpuId, Gpu], gpu: Gpu) -> Lease | None:
 
 
 # -- what a GPU can grant
-def blocked(core: Core, gpu: Gpu) -> Block | None:
-    """Return why nothing can be granted on a GPU now, for any request; None: it can be."""
-    if not core.serving:
-        return Block.RECOVERING
-    if core.drain is not None:
-        return Block.DRAINED
-    if gpu.failed_at is not None:
-        return Block.UNREADABLE
-    if gpu.sample is None:
-        return Block.UNREAD
-    if gpu.residents.by_state[LeaseState.LOADING]:
-        return Block.LOADING
-    return Block.PRESSURE if gpu.ledger.pressed else None
-
-
 def leaving(gpu: Gpu) -> dict[LeaseId, int]:
     """Return leases whose bytes are pending free, with what each retains; not the late ones."""
     going: dict[LeaseId, int] = {}

@@ -26,7 +26,6 @@ from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.scheduling.victims import Choice, in_use
-from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.wire.codes import Block, Wait, Why
 from vram_arbiter.schemas.wire.notes import GrantedNote
 from vram_arbiter.schemas.wire.pushes import GrantedPush
@@ -37,28 +36,28 @@ def schedule(core: Core) -> None:
     """Serve every dirty GPU, in turn, until none is dirty: a grant on one may free a waiter's place
     on another.
     """
-    dirty, last = core.turn.dirty, -1
-    while dirty:
-        for gpu in dirty.values():  # first: a choice among GPUs must not count on room of such
+    last = -1
+    while dirty := [gpu for gpu in core.gpus.values() if gpu.dirty]:
+        for gpu in dirty:  # first: a choice among GPUs must not count on room of such
             if (note := gpu.ledger.note_pressure()) is not None:
                 core.note(note)
-            gpu.blocked = admission.blocked(core, gpu)
+            gpu.blocked = core.blocked(gpu)
             eviction.take_back(core, gpu)  # 0
-        last = min([index for index in dirty if index > last] or dirty)
-        _serve(core, dirty.pop(last))
+        gpu = next((gpu for gpu in dirty if gpu.info.index > last), dirty[0])
+        last, gpu.dirty = gpu.info.index, False
+        _serve(core, gpu)
     eviction.settle(core)
-
-
-def on_plan_due(core: Core, gpu_id: str) -> None:
-    """Look at a GPU again: a residency ended, a waiter aged, or the GPU has been quiet for long
-    enough.
-    """
-    core.wake(core.gpus[GpuId(gpu_id)])
 
 
 def _serve(core: Core, gpu: Gpu) -> None:
     if gpu.ledger.pressed and core.serving:  # 1
-        _relieve(core, gpu)
+        leaving = admission.leaving(gpu)
+        over_bytes = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
+        if over_bytes > 0:
+            choice = Choice.of(core)
+            for victim in choice.relief(gpu, leaving, over_bytes):
+                eviction.ask(core, gpu, victim, None)
+            core.timers.set_first(("plan", gpu.info.id), choice.ask_times(gpu, None))
         return
     if gpu.blocked:  # 2
         if core.turn.taken_back:
@@ -79,16 +78,6 @@ def _serve(core: Core, gpu: Gpu) -> None:
         later = choose_later(gpu, head, planned=planned)
         if later is not None:
             grant_if_measured(core, gpu, later)
-
-
-def _relieve(core: Core, gpu: Gpu) -> None:
-    leaving = admission.leaving(gpu)
-    over = gpu.ledger.total_if(leaving) - gpu.ledger.budget_bytes
-    if over > 0:
-        choice = Choice.of(core)
-        for victim in choice.relief(gpu, leaving, over):
-            eviction.ask(core, gpu, victim, None)
-        core.timers.set_first(("plan", gpu.info.id), choice.ask_times(gpu, None))
 
 
 def _bring_back(core: Core, gpu: Gpu) -> None:
@@ -132,7 +121,7 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     plan = choice.victims(gpu, head, leaving)
     if plan is None:
         request.reason = Wait.NO_VICTIM
-        if not settle_for_less(core, head):
+        if not settle_for_less([core.gpus[gpu_id] for gpu_id in request.gpus], head):
             core.timers.set_first(("plan", gpu.info.id), choice.ask_times(gpu, head))
         return False
     if not _is_best_place(core, choice, gpu, head, plan):
@@ -142,18 +131,18 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
         eviction.ask(core, gpu, victim, head)
     for gpu_id in request.gpus:
         if gpu_id != gpu.info.id:  # requests behind `head` on its other GPUs may now proceed
-            core.wake(core.gpus[gpu_id])
+            core.gpus[gpu_id].wake()
     return True
 
 
-def settle_for_less(core: Core, lease: Lease) -> bool:
+def settle_for_less(gpus: Sequence[Gpu], lease: Lease) -> bool:
     """Charge a waiter less than was learned, though not less than it declares, if no candidate GPU
     could hold that even once every other lease has left. Return whether it is charged less now.
 
     What live processes retain and stowaways hold may stay for good, and those processes may
     themselves wait behind this request. Nothing is settled while bytes are being measured.
     """
-    request, gpus = lease.request, [core.gpus[gpu_id] for gpu_id in lease.request.gpus]
+    request = lease.request
     if any(gpu.verifications for gpu in gpus):
         return False
     excess = min(admission.excess_bytes_alone(gpu, lease) for gpu in gpus)
@@ -165,7 +154,7 @@ def settle_for_less(core: Core, lease: Lease) -> bool:
     request.load_peak_bytes, request.steady_bytes = less, min(request.steady_bytes, less)
     for gpu in gpus:
         gpu.queue.add(lease)
-        core.wake(gpu)
+        gpu.wake()
     return True
 
 
@@ -180,7 +169,7 @@ def _is_best_place(
         other = core.gpus[gpu_id]
         if other is gpu or other.queue.head is not waiter:
             continue
-        going, block = admission.leaving(other), admission.blocked(core, other)
+        going, block = admission.leaving(other), core.blocked(other)
         if block is Block.LOADING and not other.ledger.pressed:
             (load,) = other.residents.by_state[LeaseState.LOADING].values()
             load_ends_by = load.granted_at + core.settings.revoke_deadline_s
@@ -195,7 +184,7 @@ def _is_best_place(
         if rival is not None and _place_cost(other, rival) < best_cost:
             best, best_cost = other, _place_cost(other, rival)
     if best is not gpu:
-        core.wake(best)
+        best.wake()
     return best is gpu
 
 
@@ -220,7 +209,7 @@ def grant_if_measured(core: Core, gpu: Gpu, lease: Lease) -> None:
         lease.request.reason, gpu.blocked = Wait.NOT_FREE, Block.NOT_FREE
     else:
         lease.request.reason = Wait.READING
-        core.want_sample(gpu, max(gpu.changed_at, oldest))
+        gpu.want_sample(core.now, max(gpu.changed_at, oldest))
 
 
 def grant(core: Core, gpu: Gpu, lease: Lease) -> None:

@@ -1,6 +1,6 @@
 """Course of a verification from its begin to its verdict: when the GPU is read, what follows.
 
-1. begin: `begin_for_lease`, `on_process_died`, `begin_again` set its clock and read at once;
+1. begin: `begin_for_lease`, `on_process_died` set its clock (`Gpu.verify`) and read at once;
 2. polls: `on_poll_due` reads again, densely at first, and declares it overdue at its deadline;
 3. readings: `on_reading` takes the evidence of each (stowaways, retained bytes, pressure, never a
    charge) and hands it to `judge`; one on target has to be confirmed by another;
@@ -17,7 +17,7 @@ from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
 from vram_arbiter.arbiter.core.ledger import bytes_of
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import LEAVING, Lease, LeaseState, Verdict, Verification
-from vram_arbiter.arbiter.core.model.state import Core, Timers
+from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification.judge import Judgement, judge, others_since
 from vram_arbiter.schemas.defaults import VERIFY_READING_SHARE
@@ -51,7 +51,7 @@ def begin_for_lease(
     for drift in learning.on_leaving(core.footprints, gpu, lease):
         core.note(drift, lease)
     vanishes = lease.departure.exiting or not alive
-    gpu.verifications[lease.id] = Verification(
+    verification = Verification(
         key=lease.id,
         process=lease.process,
         lease=lease.id,
@@ -67,10 +67,10 @@ def begin_for_lease(
         vanishes=vanishes,
         exclusive=lease.spec.exclusive,
     )
-    _start_clock(core, gpu, gpu.verifications[lease.id])
+    gpu.verify(verification, core.now, core.settings)
 
 
-def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
+def on_process_died(gpu: Gpu, process: ProcessKey, now: float, settings: Settings) -> None:
     """A process with an account on this GPU died: nothing may stay, and memory returns from now.
     What is charged stays until it is measured gone."""
     account = gpu.ledger.accounts[process]
@@ -79,14 +79,14 @@ def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
         if verification.process == process:
             verification.alive, verification.vanishes = False, True
             verification.retained_bytes = 0
-            verification.not_before = min(verification.not_before, core.now)
-            verification.paced_from = core.now
-            _read_soon(core, gpu, verification)
+            verification.not_before = min(verification.not_before, now)
+            verification.paced_from = now
+            gpu.read_soon(verification, now, settings)
     key = f"residue:{process}"
     if account.charges or key in gpu.verifications:
         return
     baseline = gpu.sample or gpu.before_sleep
-    retained = gpu.verifications[key] = Verification(
+    retained = Verification(
         key=key,
         process=process,
         lease=None,
@@ -95,66 +95,33 @@ def on_process_died(core: Core, gpu: Gpu, process: ProcessKey) -> None:
         retained_bytes=0,
         baseline=baseline,
         baseline_comparable=baseline is not None and baseline.taken_at > account.changed_at,
-        confirmed_at=core.now,
-        not_before=core.now,
+        confirmed_at=now,
+        not_before=now,
         alive=False,
         vanishes=True,
     )
-    _start_clock(core, gpu, retained)
-
-
-def begin_again(core: Core, gpu: Gpu) -> None:
-    """Restart the verifications of a GPU: readings before now no longer count."""
-    for verification in gpu.verifications.values():
-        verification.confirmed_at = core.now
-        verification.last_used_bytes = None
-        _start_clock(core, gpu, verification)
-
-
-def _start_clock(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """Begin polls and deadline, or begin them anew: time without readings says nothing of the
-    memory's return."""
-    core.turn.touched[gpu.info.index] = gpu
-    verification.paced_from = max(core.now, verification.not_before)
-    verification.deadline_at = verification.paced_from + core.settings.verify_timeout_s
-    verification.overdue = False
-    verification.verdict = None
-    _read_soon(core, gpu, verification)
-
-
-def _read_soon(core: Core, gpu: Gpu, verification: Verification) -> None:
-    """Read at once and again soon: most memory is back when its holder reports the release."""
-    core.want_sample(gpu, core.now)
-    soon = core.now + core.settings.verify_confirm_s
-    verification.next_poll_at = max(soon, verification.paced_from)
-    _set_poll(core.timers, gpu)
-
-
-def _set_poll(timers: Timers, gpu: Gpu) -> None:
-    timer = ("verify", gpu.info.id)
-    if gpu.verifications:
-        timers.set(timer, min([v.next_poll_at for v in gpu.verifications.values()]))
-    else:
-        timers.cancel(timer)
+    gpu.verify(retained, now, settings)
 
 
 # -- 2. polls --------------------------------------------------------------------------------------
 def on_poll_due(core: Core, gpu_id: str) -> None:
     """Read the GPU for its due verifications; the verdict is `stale` where no reading came."""
     gpu = core.gpus[GpuId(gpu_id)]
+    gpu.touched = True  # its next poll is planned
     due = [v for v in gpu.verifications.values() if v.next_poll_at <= core.now]
     for verification in due:
         if core.now >= verification.deadline_at and not verification.overdue:
             verification.overdue = True
-            core.wake(gpu)
+            gpu.wake()
             if verification.last_used_bytes is None:
-                _announce(core, gpu, verification, Judgement(Verdict.STALE, False, 0))
+                stale_one = Judgement(Verdict.STALE, False, 0)
+                core.turn.effects += _verified(gpu, verification, stale_one, None, core.now)
         usual_s = core.costs.learnt_s(verification.consumer, "verify_s") or 0.0
         verification.next_poll_at = _next_poll_at(
             verification, core.settings, core.now, usual_s, gpu.reading_s
         )
-    core.want_sample(gpu, max([verification.confirmed_at for verification in due]))
-    _set_poll(core.timers, gpu)
+    if due:  # else this event has put its polls off
+        gpu.want_sample(core.now, max([verification.confirmed_at for verification in due]))
 
 
 def _next_poll_at(
@@ -181,8 +148,8 @@ def on_probe_due(core: Core, gpu_id: str) -> None:
     """Take a background reading; `Arbiter.handle` plans the next one while the GPU is in demand."""
     gpu = core.gpus[GpuId(gpu_id)]
     gpu.asked_at = None  # a reading that never came must not silence the next one
-    core.want_sample(gpu, core.now)
-    core.wake(gpu)  # the last reading may be too old to carry a grant
+    gpu.want_sample(core.now, core.now)
+    gpu.wake()  # the last reading may be too old to carry a grant
 
 
 def stale(gpus: Iterable[Gpu], oldest: float) -> list[GpuId]:
@@ -219,9 +186,9 @@ def on_reading(core: Core, reading: MemorySampled) -> None:
     for verification in list(gpu.verifications.values()):
         if reading.taken_at > verification.confirmed_at:
             if answers_again or verification.verdict is Verdict.STALE:
-                _start_clock(core, gpu, verification)
+                gpu.verify(verification, core.now, core.settings)
             _weigh(core, gpu, verification, reading)
-    core.wake(gpu)
+    gpu.wake()
 
 
 def _take_evidence(core: Core, gpu: Gpu, reading: MemorySampled) -> None:
@@ -273,7 +240,7 @@ def on_probe_failed(core: Core, event: ProbeFailed) -> None:
     if gpu.failed_at is None:
         core.note(ProbeFailedNote(event.gpu, event.reason))
     gpu.failed_at, gpu.failure = event.at, event.reason
-    core.wake(gpu)
+    gpu.wake()
 
 
 def _weigh(core: Core, gpu: Gpu, verification: Verification, reading: MemorySampled) -> None:
@@ -290,24 +257,23 @@ def _weigh(core: Core, gpu: Gpu, verification: Verification, reading: MemorySamp
     elif judgement is not None and on_target and not judgement.resolved:
         confirm_at = reading.taken_at + settings.verify_confirm_s
         verification.next_poll_at = max(core.now, confirm_at)
-        _set_poll(core.timers, gpu)
     elif judgement is not None:
-        _announce(core, gpu, verification, judgement, reading)
+        core.turn.effects += _verified(gpu, verification, judgement, reading, core.now)
         if judgement.resolved:
             _resolve(core, gpu, verification, judgement)
 
 
 # -- 4. verdict ------------------------------------------------------------------------------------
-def _announce(
-    core: Core,
+def _verified(
     gpu: Gpu,
     verification: Verification,
     judgement: Judgement,
-    reading: MemorySampled | None = None,
-) -> None:
-    """Note a verdict; an unresolved one that repeats is noted once."""
+    reading: MemorySampled | None,
+    now: float,
+) -> list[Note]:
+    """Return the note of a verdict; an unresolved one that repeats is noted once."""
     if verification.verdict is judgement.verdict and not judgement.resolved:
-        return
+        return []
     verification.verdict = judgement.verdict
     residue_bytes = judgement.residue_bytes
     if reading is not None and (shown := bytes_of(reading, verification.process)) is not None:
@@ -315,23 +281,21 @@ def _announce(
     verified = VerifiedNote(
         verdict=judgement.verdict,
         resolved=judgement.resolved,
-        ms=(core.now - verification.confirmed_at) * 1e3,
+        ms=(now - verification.confirmed_at) * 1e3,
         before_bytes=None if verification.baseline is None else verification.baseline.used_bytes,
         after_bytes=None if reading is None else reading.used_bytes,
         residue_bytes=residue_bytes,
         culprits=judgement.culprits,
     )
-    about = About(verification.lease, verification.consumer, gpu.info.id)
-    core.turn.effects.append(Note(verified, about))
+    return [Note(verified, About(verification.lease, verification.consumer, gpu.info.id))]
 
 
 def _resolve(core: Core, gpu: Gpu, verification: Verification, judgement: Judgement) -> None:
     """Free the charge except for retained bytes, and tell everything that waits for it."""
     # 1. the bytes
     del gpu.verifications[verification.key]
-    _set_poll(core.timers, gpu)
     gpu.changed_at = core.now
-    core.wake(gpu)
+    gpu.wake()
     process, lease_id = verification.process, verification.lease
     account = gpu.ledger.accounts[process]
     held_bytes = account.charged_bytes

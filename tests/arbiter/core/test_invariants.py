@@ -167,7 +167,7 @@ def test_a_broken_state_is_found(
 ) -> None:
     broken = Broken()
     breaks(broken)
-    broken.core.turn.touched[broken.gpu.info.index] = broken.gpu
+    broken.gpu.touched = True
     with pytest.raises(InvariantViolation, match=says) as caught:
         check(broken.core)
     assert caught.value.number == number
@@ -214,7 +214,7 @@ def user_off(b: Broken) -> None:
 
 
 def waiters_off(b: Broken) -> None:
-    b.core.waiters_of[b.held.process] = 1
+    b.core.waiting.of[b.held.process] = 1
 
 
 @pytest.mark.parametrize(

@@ -396,7 +396,7 @@ class Leases(RuleBasedStateMachine):
         core = state_of(self.driver.arbiter)
         (gpu,) = core.gpus.values()
         head = gpu.queue.head
-        if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
+        if head is None or core.blocked(gpu) or gpu.asked_at is not None:
             return
         room = admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s)
         assert not (

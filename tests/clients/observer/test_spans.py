@@ -20,7 +20,7 @@ from tests.support.core_driver import START_S, CoreDriver
 from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push
-from vram_arbiter.arbiter.host.span_ids import SpanIds
+from vram_arbiter.arbiter.host.executor import SpanIds
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.clients.observer import metrics as observer_metrics
 from vram_arbiter.clients.observer import spans as otel

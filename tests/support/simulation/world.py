@@ -307,7 +307,7 @@ class World:
         core = state_of(daemon.core)
         for gpu in core.gpus.values():
             head = gpu.queue.head
-            if head is None or admission.blocked(core, gpu) or gpu.asked_at is not None:
+            if head is None or core.blocked(gpu) or gpu.asked_at is not None:
                 continue
             room = admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s)
             if (

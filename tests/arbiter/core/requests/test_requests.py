@@ -57,7 +57,7 @@ def test_who_has_to_wait_is_told_why_and_hears_of_the_grant_by_push(driver: Core
     assert block is not None
     assert (block.code, block.names) == (Block.LOADING, ("det",))
     waiting = LeaseId(answer(effects)["lease"]["lease_id"])
-    assert kinds(det.release(first)) == ["Sample", "JournalPut", "Note:released", "Reply"]
+    assert kinds(det.release(first)) == ["JournalPut", "Note:released", "Reply", "Sample"]
     driver.until(lambda: driver.state(waiting) == "loading")
     (granted,) = driver.pushes("granted")
     assert granted["lease"]["lease_id"] == waiting
@@ -198,7 +198,7 @@ def test_ready_charges_the_steady_bytes_or_what_was_measured(driver: CoreDriver)
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, 4 * GIB)
     effects = det.load(lease)
-    assert kinds(effects) == ["Sample", "Reply", "JournalPut", "Note:ready", "Note:switch"]
+    assert kinds(effects) == ["Reply", "JournalPut", "Note:ready", "Note:switch", "Sample"]
     assert answer(effects)["lease"]["charge_bytes"] == 4 * GIB
     assert kinds(det.ready(lease)) == ["Reply"], "a repeat changes nothing"
     vlm = driver.consumer("vlm")
@@ -312,7 +312,7 @@ def test_an_out_of_memory_raises_the_learnt_peak_of_its_model(driver: CoreDriver
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
     effects = det.oom(lease, 1 * GIB)
-    assert kinds(effects) == ["Sample", "Reply", "Note:oom"]
+    assert kinds(effects) == ["Reply", "Note:oom", "Sample"]
     assert answer(effects)["learnt_load_peak_bytes"] == 3 * GIB
     det.release(lease)
     driver.advance(1.0)

@@ -219,7 +219,7 @@ def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
     core = state_of(driver.arbiter)
     gpu = next(iter(core.gpus.values()))
     assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) is None
-    assert admission.blocked(core, gpu) == Block.UNREAD
+    assert core.blocked(gpu) == Block.UNREAD
     driver.advance(0.01)
     assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) == 8 * GIB
     core.now += 5.0
