@@ -86,6 +86,7 @@ class LeaseRef:
     """A lease by its exact token."""
 
     __pydantic_config__: ClassVar = STRICT
+    WHOLE: ClassVar = True
 
     lease_id: LeaseIdText
     token: TokenPair
@@ -184,11 +185,14 @@ class Reacquire(OnLease[r.AcquireReply]):
 
 
 @dataclass(frozen=True, slots=True)
-class ReattachLease(LeaseRef):
+class ReattachLease:
     """A lease that a client still holds. On standby or parked, `token` is the last one."""
 
+    __pydantic_config__: ClassVar = STRICT
     WHOLE: ClassVar = True
 
+    lease_id: LeaseIdText
+    token: TokenPair
     spec: LeaseSpec
     state: Literal["loading", "held", "standby", "parked"]
     measured_bytes: Bytes | None = None
