@@ -44,7 +44,6 @@ SILENCE_BEATS = 3  # heartbeats without a word mean lost contact
 REQUEST_TIMEOUT_S = 30.0  # a restart of the daemon takes a few seconds: a request outlives it
 WAIT_SLACK_S = 5.0  # the arbiter ends waits; we only do if it does not
 
-
 type Kinds = tuple[type[w.OnLease[Any]], ...]
 
 
@@ -156,7 +155,6 @@ class Connection:
         return request_id
 
     # -- for what is above -------------------------------------------------------------------------
-
     def awaits(self, request_id: int | None) -> bool:
         """Return whether the reply is missing; then the request is sent again after a reconnect."""
         return request_id in self._pending

@@ -53,7 +53,7 @@ class Request[R]:
 
 
 class Question[R](Request[R]):
-    """A request that changes nothing in the engine: all that an observer may send."""
+    """A request that the session answers by itself: all that an observer may send."""
 
     __slots__ = ()
 
@@ -389,8 +389,6 @@ REQUESTS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {cls.TAG[1]: cls for cls in get_args(AnyRequest.__value__)}
 )
 """By their ops."""
-
-
 REPLIES: Final[Mapping[type, type[Any]]] = MappingProxyType(
     {cls: get_args(cls.__orig_bases__[0])[0] for cls in REQUESTS.values()}
 )
