@@ -18,6 +18,7 @@ from vram_arbiter.clients._protocol.records import LeaseRecord
 from vram_arbiter.clients.handlers import Handler, call
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, VramError
 from vram_arbiter.schemas.wire.replies import AnyReply
+from vram_arbiter.schemas.wire.requests import Unloading
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -250,12 +251,12 @@ class Departure:
         """Report `unloading`. False: another process uses the lease, or contact is lost."""
         if self.own_will and not self._driver.connected:
             return True  # no arbiter, so no process can begin a use or be granted the room
-        request = self._driver.protocol.holdings.unloading(
-            self._record, self._driver.now(), ANNOUNCE_TIMEOUT_S
-        )
+        record, driver = self._record, self._driver
+        unloading = Unloading(record.lease_id, record.token)
+        asked = driver.protocol.holdings.ask(record, unloading, driver.now(), ANNOUNCE_TIMEOUT_S)
         self._committed = True
         try:
-            await self._driver.reply(request)
+            await driver.reply(asked)
         except BadState as error:
             if error.details.get("uses"):
                 self._committed = False

@@ -18,7 +18,7 @@ from vram_arbiter.clients.handlers import Handlers, call
 from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
 from vram_arbiter.schemas.ids import Token, UseId
 from vram_arbiter.schemas.wire.pushes import RevokePush
-from vram_arbiter.schemas.wire.requests import UseBegin, UseEnd
+from vram_arbiter.schemas.wire.requests import Oom, RevokeAck, UseBegin, UseEnd
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
@@ -145,11 +145,9 @@ class AsyncLease:
 
     async def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
         """Report an allocation that failed: the arbiter raises the model's learned footprint."""
-        await self._driver.reply(
-            self._driver.protocol.holdings.oom(
-                self._record, requested_bytes, allocated_bytes, self._driver.now()
-            )
-        )
+        record, driver = self._record, self._driver
+        request = Oom(record.lease_id, record.token, requested_bytes, allocated_bytes)
+        await driver.reply(driver.protocol.holdings.ask(record, request, driver.now()))
 
     async def park(self) -> None:
         """Leave the GPU at the safe point and keep the weights in host RAM; `reacquire` returns.
@@ -219,10 +217,9 @@ class AsyncLease:
     # -- the arbiter's part (called by the client) -------------------------------------------------
     def _revoke_asked(self, push: RevokePush) -> None:
         if not self._departure.gone:
-            eta = self._handlers.safe_point_eta_s
-            self._driver.protocol.holdings.revoke_ack(
-                self._record, eta() if eta else None, self._driver.now()
-            )
+            eta, record = self._handlers.safe_point_eta_s, self._record
+            ack = RevokeAck(record.lease_id, record.token, eta() if eta else None)
+            self._driver.protocol.holdings.ask(record, ack, self._driver.now(), quiet=True)
             with traces.joined(push.traceparent):  # the trace of the request that needs room
                 if not self._departure.asked:
                     self._notify(self._handlers.on_revoke, "on_revoke", Eviction.of(push))

@@ -19,7 +19,7 @@ from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas.codec import encoders
 from vram_arbiter.schemas.errors import BadRequest, UnknownOp, VramError
 from vram_arbiter.schemas.ids import RequestId
-from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
 from vram_arbiter.schemas.runtime.telemetry import traceparent
 from vram_arbiter.schemas.wire.errors import ErrorView
@@ -64,38 +64,17 @@ def decode(payload: bytes | bytearray | memoryview, size_max: int) -> tuple[Enve
         message = unpack_map(payload, _limits(size_max))
     except VramError as error:
         raise Undecodable(error, None) from error
-    request_id = _id(message)
-    try:
-        return _envelope(message, request_id), _request(message)
-    except VramError as error:
-        raise Undecodable(error, request_id) from error.__cause__ or error
-
-
-def _envelope(message: JsonObject, request_id: int | None) -> Envelope:
-    """Take what is not the request's own out of a message. Raises BadRequest, UnknownOp."""
-    op = message.get("op")
-    if not isinstance(op, str):
-        raise BadRequest(
-            "the request has no op",
-            details={"fields": [{"field": "op", "problem": "missing or no text"}]},
-        )
-    if op not in _VALIDATE:
-        raise UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(_VALIDATE)})
-    if request_id is None:
-        problem = "expected a whole number below 2^53" if "id" in message else "Field required"
-        raise _bad_request(op, [("id", problem)], 1)
-    del message["id"]
-    return Envelope(RequestId(request_id), traceparent.read(message.pop("traceparent", None)))
-
-
-def _request(message: JsonObject) -> AnyRequest:
-    """Validate the rest. Raises BadRequest."""
-    op = message.pop("op")
+    op, request_id = message.get("op"), _id(message)
+    if request_id is None or type(op) is not str or op not in _VALIDATE:
+        raise Undecodable(_unreadable(message, op), request_id)
+    del message["op"], message["id"]
+    trace = message.pop("traceparent", None)
     try:
         request: AnyRequest = _VALIDATE[op](message)
     except ValidationError as error:
-        raise _invalid(op, error) from error
-    return request
+        raise Undecodable(_invalid(op, error), request_id) from error
+    read = None if trace is None else traceparent.read(trace)
+    return Envelope(RequestId(request_id), read), request
 
 
 def id_of(payload: bytes | bytearray | memoryview, size_max: int) -> int | None:
@@ -115,6 +94,19 @@ def _limits(size_max: int) -> UnpackLimits:
 def _id(message: Mapping[Any, Any]) -> int | None:
     found = message.get("id")
     return found if type(found) is int and 0 <= found < 1 << 53 else None
+
+
+def _unreadable(message: JsonMap, op: object) -> VramError:
+    """Return the error of a message that does not say which request it is, or with which id."""
+    if not isinstance(op, str):
+        return BadRequest(
+            "the request has no op",
+            details={"fields": [{"field": "op", "problem": "missing or no text"}]},
+        )
+    if op not in _VALIDATE:
+        return UnknownOp(f"unknown op {op[:64]!r}", details={"known": list(_VALIDATE)})
+    problem = "expected a whole number below 2^53" if "id" in message else "Field required"
+    return _bad_request(op, [("id", problem)], 1)
 
 
 def _invalid(op: str, error: ValidationError) -> BadRequest:

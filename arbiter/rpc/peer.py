@@ -7,12 +7,9 @@ Must not know sessions or requests.
 import grp
 import os
 import pwd
-from typing import Literal
 
 from vram_arbiter.schemas.errors import ConfigError, NotPermitted
 from vram_arbiter.schemas.runtime.peercred import Peer
-
-Role = Literal["client", "observer", "operator"]
 
 
 def check_visible(peer: Peer) -> None:

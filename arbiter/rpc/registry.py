@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.rpc.peer import Role, check_visible, how_to_operate, is_operator
+from vram_arbiter.arbiter.rpc.peer import check_visible, how_to_operate, is_operator
 from vram_arbiter.schemas.errors import LimitExceeded, NotPermitted
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
 from vram_arbiter.schemas.runtime.peercred import Peer
@@ -110,7 +110,7 @@ class Session:
     client: ClientId
     connection: PeerConnection
     peer: Peer
-    role: Role
+    role: w.Role
     name: str
     instance: str
     heard_at: float

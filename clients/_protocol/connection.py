@@ -44,7 +44,6 @@ SILENCE_BEATS = 3  # heartbeats without a word mean lost contact
 REQUEST_TIMEOUT_S = 30.0  # a restart of the daemon takes a few seconds: a request outlives it
 WAIT_SLACK_S = 5.0  # the arbiter ends waits; we only do if it does not
 
-
 type Kinds = tuple[type[w.OnLease[Any]], ...]
 
 
@@ -156,27 +155,28 @@ class Connection:
         return request_id
 
     # -- for what is above -------------------------------------------------------------------------
-
     def awaits(self, request_id: int | None) -> bool:
         """Return whether the reply is missing; then the request is sent again after a reconnect."""
         return request_id in self._pending
 
     def drop_unsent(self, lease_id: str, kinds: Kinds) -> None:
         """Drop requests on a lease that were not sent yet and have no meaning any more."""
-        for request_id in self._unsent(lease_id, kinds):
-            del self._pending[request_id]
+        for pending in self._unsent(lease_id):
+            if isinstance(pending.request, kinds):
+                del self._pending[pending.id]
 
-    def fail_unsent(self, lease_id: str, kinds: Kinds, error: VramError, now: float) -> None:
-        """End requests on a lease that were not sent yet: the lease is over."""
-        for request_id in self._unsent(lease_id, kinds):
-            self._fail(request_id, error, now)
+    def fail_unsent(self, lease_id: str, kept: Kinds, error: VramError, now: float) -> None:
+        """End requests on a lease that were not sent yet, but for some: the lease is over."""
+        for pending in self._unsent(lease_id):
+            if not isinstance(pending.request, kept):
+                self._fail(pending.id, error, now)
 
-    def _unsent(self, lease_id: str, kinds: Kinds) -> list[int]:
+    def _unsent(self, lease_id: str) -> list[Pending]:
         return [
-            pending.id
+            pending
             for pending in self._pending.values()
             if pending.sent_at is None
-            and isinstance(pending.request, kinds)
+            and isinstance(pending.request, w.OnLease)
             and pending.request.lease_id == lease_id
         ]
 

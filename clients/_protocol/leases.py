@@ -47,8 +47,9 @@ GONE_CODES = frozenset({"lease_lost", "lease_expired", "unknown_lease", "stale_t
 AWAY = ("standby", "parked")
 _MEANINGLESS = (w.RevokeAck, w.UseEnd)
 """Requests that are dropped with their lease."""
-_AWAITED = (w.Ready, w.UseBegin, w.Oom)
-"""Requests whose caller waits for the arbiter while it holds the lease, and not longer."""
+_LEAVING = (w.Unloading, w.Release, w.Reacquire)
+"""Requests whose caller waits for the arbiter after the lease is over; of any other only while it
+holds the lease."""
 
 
 class Holdings:
@@ -60,12 +61,36 @@ class Holdings:
         self._connection = connection
 
     # -- requests of the holder --------------------------------------------------------------------
+    def ask[R](
+        self,
+        record: LeaseRecord,
+        request: w.OnLease[R],
+        now: float,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+        *,
+        on_reply: Callable[[R, float], None] | None = None,
+        on_error: OnError | None = None,
+        quiet: bool = False,
+    ) -> int:
+        """Queue a request on a lease; an answer that this client no longer holds it ends it."""
+        token = record.token
+
+        def refused(error: VramError, at: float) -> None:
+            if on_error is not None:
+                on_error(error, at)
+            if record.token == token and error.code in GONE_CODES:
+                self._gone(record, error)
+
+        return self._connection.ask(
+            request, now, timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet
+        )
+
     def ready(self, record: LeaseRecord, measured_bytes: int | None, now: float) -> int:
         def held(_: ReadyReply, __: float) -> None:
             record.held, record.measured_bytes = True, measured_bytes
 
         request = w.Ready(record.lease_id, record.token, measured_bytes)
-        return self._ask(record, request, now, on_reply=held)
+        return self.ask(record, request, now, on_reply=held)
 
     def use_begin(self, record: LeaseRecord, use_id: UseId, label: str, now: float) -> int:
         """The use counts from now on, so that a reattachment on the way names it."""
@@ -76,27 +101,12 @@ class Holdings:
                 record.uses.discard(use_id)
 
         request = w.UseBegin(record.lease_id, record.token, use_id, label)
-        return self._ask(record, request, now, on_error=refused)
+        return self.ask(record, request, now, on_error=refused)
 
     def use_end(self, record: LeaseRecord, use_id: UseId, now: float) -> int:
         record.uses.discard(use_id)
         request = w.UseEnd(record.lease_id, record.token, use_id)
         return self._connection.ask(request, now, quiet=True)
-
-    def oom(
-        self, record: LeaseRecord, requested_bytes: int, allocated_bytes: int | None, now: float
-    ) -> int:
-        request = w.Oom(record.lease_id, record.token, requested_bytes, allocated_bytes)
-        return self._ask(record, request, now)
-
-    def revoke_ack(self, record: LeaseRecord, eta_s: float | None, now: float) -> int:
-        request = w.RevokeAck(record.lease_id, record.token, eta_s)
-        return self._ask(record, request, now, quiet=True)
-
-    def unloading(
-        self, record: LeaseRecord, now: float, timeout_s: float = REQUEST_TIMEOUT_S
-    ) -> int:
-        return self._ask(record, w.Unloading(record.lease_id, record.token), now, timeout_s)
 
     def release(
         self,
@@ -236,7 +246,7 @@ class Holdings:
                 details={"lease_id": record.lease_id, "silent_s": silent_s},
             )
             self._gone(record, error, fenced=True)
-            self._connection.fail_unsent(record.lease_id, _AWAITED, error, now)
+            self._connection.fail_unsent(record.lease_id, _LEAVING, error, now)
 
     def end_overdue(self, now: float) -> None:
         """End waits for a return that are over while the arbiter cannot be reached."""
@@ -256,30 +266,6 @@ class Holdings:
     # -- steps -------------------------------------------------------------------------------------
     def _record(self, lease_id: str) -> LeaseRecord | None:
         return self.held.get(lease_id) or self.asleep.get(lease_id)
-
-    def _ask[R](
-        self,
-        record: LeaseRecord,
-        request: w.OnLease[R],
-        now: float,
-        timeout_s: float = REQUEST_TIMEOUT_S,
-        *,
-        on_reply: Callable[[R, float], None] | None = None,
-        on_error: OnError | None = None,
-        quiet: bool = False,
-    ) -> int:
-        """Queue a request on a lease; an answer that this client no longer holds it ends it."""
-        token = record.token
-
-        def refused(error: VramError, at: float) -> None:
-            if on_error is not None:
-                on_error(error, at)
-            if record.token == token and error.code in GONE_CODES:
-                self._gone(record, error)
-
-        return self._connection.ask(
-            request, now, timeout_s, on_reply=on_reply, on_error=refused, quiet=quiet
-        )
 
     def _say_asleep(
         self,

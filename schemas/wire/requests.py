@@ -53,7 +53,7 @@ class Request[R]:
 
 
 class Question[R](Request[R]):
-    """A request that changes nothing in the engine: all that an observer may send."""
+    """A request that the session answers by itself: all that an observer may send."""
 
     __slots__ = ()
 
@@ -86,6 +86,7 @@ class LeaseRef:
     """A lease by its exact token."""
 
     __pydantic_config__: ClassVar = STRICT
+    WHOLE: ClassVar = True
 
     lease_id: LeaseIdText
     token: TokenPair
@@ -184,11 +185,14 @@ class Reacquire(OnLease[r.AcquireReply]):
 
 
 @dataclass(frozen=True, slots=True)
-class ReattachLease(LeaseRef):
+class ReattachLease:
     """A lease that a client still holds. On standby or parked, `token` is the last one."""
 
+    __pydantic_config__: ClassVar = STRICT
     WHOLE: ClassVar = True
 
+    lease_id: LeaseIdText
+    token: TokenPair
     spec: LeaseSpec
     state: Literal["loading", "held", "standby", "parked"]
     measured_bytes: Bytes | None = None
@@ -385,8 +389,6 @@ REQUESTS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {cls.TAG[1]: cls for cls in get_args(AnyRequest.__value__)}
 )
 """By their ops."""
-
-
 REPLIES: Final[Mapping[type, type[Any]]] = MappingProxyType(
     {cls: get_args(cls.__orig_bases__[0])[0] for cls in REQUESTS.values()}
 )

@@ -32,7 +32,7 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.schemas.wire.replies import AnyReply
-from vram_arbiter.schemas.wire.requests import Acquire, Evict, Status
+from vram_arbiter.schemas.wire.requests import Acquire, Evict, Status, Unloading
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import Totals
 from vram_arbiter.sidecars.device.fake import FakeMemory
@@ -387,11 +387,12 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         said: list[int] = []
-        unloading, reply = client._session.protocol.holdings.unloading, client._session.reply
+        ask, reply = client._session.protocol.holdings.ask, client._session.reply
 
-        def counted(*arguments: Any) -> int:
-            said.append(unloading(*arguments))
-            return said[-1]
+        def counted(record: Any, request: Any, *arguments: Any, **options: Any) -> int:
+            number = ask(record, request, *arguments, **options)
+            said.extend([number] if isinstance(request, Unloading) else [])
+            return number
 
         async def refused_once(number: int) -> AnyReply:
             answer = await reply(number)
@@ -399,7 +400,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
                 raise LimitExceeded("too many messages", hint="wait")
             return answer
 
-        monkeypatch.setattr(client._session.protocol.holdings, "unloading", counted)
+        monkeypatch.setattr(client._session.protocol.holdings, "ask", counted)
         monkeypatch.setattr(client._session, "reply", refused_once)
         async with (
             AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other,

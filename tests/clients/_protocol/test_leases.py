@@ -11,6 +11,7 @@ from vram_arbiter.schemas.errors import (
     LeaseLost,
     StaleToken,
 )
+from vram_arbiter.schemas.wire.requests import Unloading
 
 
 def test_renewal_every_third_of_the_shortest_ttl(link: Wire) -> None:
@@ -93,7 +94,7 @@ def test_lost_push(link: Wire) -> None:
 
 def test_an_operation_on_a_lease_that_is_gone_tells_both(link: Wire) -> None:
     record = link.hold()
-    link.holdings.unloading(record, link.now)
+    link.holdings.ask(record, Unloading(record.lease_id, record.token), link.now)
     link.refuse(link.one("unloading"), "stale_token")
     gone, failed = link.told()
     assert isinstance(gone, r.Gone)
@@ -218,7 +219,7 @@ def test_a_ready_on_the_way_is_said_again_and_counts_only_then(link: Wire) -> No
 
 def test_bad_state_is_no_loss(link: Wire) -> None:
     record = link.hold()
-    link.holdings.unloading(record, link.now)
+    link.holdings.ask(record, Unloading(record.lease_id, record.token), link.now)
     link.refuse(link.one("unloading"), "bad_state", uses=1)
     (failed,) = link.told()
     assert isinstance(failed, r.Failed)
