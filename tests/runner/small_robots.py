@@ -24,6 +24,15 @@ def robot_of(*joints: str) -> RobotDescription:
     return RobotDescription("this world", free, {})
 
 
+def moving(**targets: float) -> Action:
+    """An action of joint targets, rad."""
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION,
+        joint_targets=(tuple(targets.values()),),
+        joint_names=tuple(targets),
+    )
+
+
 class FedCamera(SlotReader):
     """Its source is the test:
 
