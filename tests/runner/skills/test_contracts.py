@@ -784,7 +784,7 @@ def test_cartesian_commands_without_the_solver_are_refused(
 def test_a_state_of_the_base_alone_needs_scipy_before_the_first_tick(
     monkeypatch: pytest.MonkeyPatch, panda: Bench
 ) -> None:
-    """Regression: where only the base's pose was read, SciPy was imported, or missing, in a tick."""
+    """Regression: where only the base's pose was read, a tick imported SciPy, or missed it."""
     monkeypatch.setitem(sys.modules, "scipy.spatial.transform", None)
     based = skill(
         JOINTS + "state_contract:\n  parts:\n"
