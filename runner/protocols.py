@@ -373,8 +373,8 @@ class Work(Protocol):
 class InferenceRunner(Protocol):
     """A loop that turns observations into actions at a rate, on hardware or in a simulator.
 
-    `control.loop.ControlLoop` implements it. `post` to its mailbox whatever is not said to be for any
-    thread; `caption` and what it tells are replaced whole, so that any thread may read them.
+    `control.loop.ControlLoop` implements it. `post` to its mailbox whatever is not said to be for
+    any thread; `caption` and what it tells are replaced whole, so that any thread may read them.
     """
 
     caption: tuple[str, ...]

@@ -329,8 +329,10 @@ class DatasetRecorder:
         self._writer.close()
 
     def _next(self) -> _Tick | _End | _Ask | None:
-        """Return what is to be done next; None: the recording is over. Also without work a writer that
-        dies is noticed."""
+        """Return what is to be done next; None: the recording is over.
+
+        A writer that dies is noticed without work for it, too.
+        """
         while True:
             try:
                 item = self._queue.get(timeout=LOOK_S)

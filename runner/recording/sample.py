@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from vram_arbiter.runner.protocols import Goal, GoalTick, InferenceRunner, Picture
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, TickResult
+from vram_arbiter.runner.protocols import Goal, GoalTick, InferenceRunner
+from vram_arbiter.runner.sensors.pictures import rgb_frame
+from vram_arbiter.schemas.world import TickResult
 
 MAX_AGE_S = 60.0  # its size counts, not what it shows
 
@@ -16,9 +17,8 @@ def sample_of(runner: InferenceRunner) -> GoalTick | None:
     """
     if (world := runner.world) is None:
         return None
-    frames = {
-        name: _frame(name, runner.snapshot(name, MAX_AGE_S)) for name in runner.camera_names()
-    }
+    taken = {name: runner.snapshot(name, MAX_AGE_S) for name in runner.camera_names()}
+    frames = {name: rgb_frame(name, one.rgb, one.stamp_ns, 0) for name, one in taken.items()}
     joints = world.joint_state
     return GoalTick(
         Goal("", ""),
@@ -26,17 +26,4 @@ def sample_of(runner: InferenceRunner) -> GoalTick | None:
         TickResult(stamp_ns=world.stamp_ns, tick_idx=0, tick_ms=0.0),
         dict(zip(joints.name, joints.position, strict=True)),
         None if world.base_pose is None else (0.0, 0.0, 0.0),
-    )
-
-
-def _frame(camera: str, picture: Picture) -> SensorFrame:
-    height, width = picture.rgb.shape[:2]
-    return SensorFrame(
-        sensor_id=camera,
-        stamp_monotonic_ns=picture.stamp_ns,
-        stamp_wall_ns=0,
-        encoding=FrameEncoding.RGB8,
-        width=int(width),
-        height=int(height),
-        data=picture.rgb.tobytes(),
     )

@@ -179,8 +179,10 @@ class EpisodeWriter:
 
 
 def serve(peer: Connection) -> int:
-    """Write until the runner ends or disappears. Returns 0 if everything that came is finished, 1 if
-    not, 2 if it cannot begin."""
+    """Write until the runner ends or disappears.
+
+    Returns 0 if everything that came is finished, 1 if not, 2 if it cannot begin.
+    """
     said = peer.recv()
     root = Path(said["root"])
     with contextlib.ExitStack() as stack:

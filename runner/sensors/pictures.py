@@ -72,6 +72,20 @@ def as_rgb(frame: SensorFrame) -> Any:
             raise ModelError(f"a frame of {encoding} from {frame.sensor_id} has no colors")
 
 
+def rgb_frame(camera: str, rgb: Any, stamp_ns: int, wall_ns: int) -> SensorFrame:
+    """Return a picture (`as_rgb`) as a frame."""
+    height, width = rgb.shape[:2]
+    return SensorFrame(
+        sensor_id=camera,
+        stamp_monotonic_ns=stamp_ns,
+        stamp_wall_ns=wall_ns,
+        encoding=FrameEncoding.RGB8,
+        width=int(width),
+        height=int(height),
+        data=rgb.tobytes(),
+    )
+
+
 def scaled_down(frame: SensorFrame, width: int) -> SensorFrame:
     """Return a frame of at most `width`, in its proportions; a narrower one as it is.
 

@@ -228,13 +228,6 @@ class SimEnv:
         """Measured arm joint velocities in rad/s, by name."""
         return {n: float(self._data.qvel[v]) for n, v in zip(ARM_JOINTS, self._arm_v, strict=True)}
 
-    def joint_limits(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest joint target in rad, by name."""
-        return {
-            n: (float(low), float(high))
-            for n, (low, high) in zip(ARM_JOINTS, self._arm_range, strict=True)
-        }
-
     def base_pose(self) -> tuple[float, float, float]:
         """Odometry: x, y (m) and yaw (rad) of the base in the map frame."""
         x, y, yaw = (float(self._data.qpos[q]) for q in self._base_q)

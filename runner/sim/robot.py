@@ -24,7 +24,7 @@ from vram_arbiter.runner.protocols import (
     SkillEnded,
     Stepped,
 )
-from vram_arbiter.runner.sensors.pictures import Snapshot
+from vram_arbiter.runner.sensors.pictures import Snapshot, rgb_frame
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.video import VideoRecorder
 from vram_arbiter.schemas.errors import (
@@ -35,7 +35,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
-from vram_arbiter.schemas.world import Action, FrameEncoding, SensorFrame, WorldState
+from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -152,7 +152,12 @@ class SimRobot:
             return None
         with tracing.span(telemetry.SPAN_SENSORS):
             wanted = self.env.cameras if followed else skill.cameras
-            return {camera: self._sensor_frame(self._render(camera)) for camera in wanted}
+            frames = {}
+            for camera in wanted:
+                taken = self._render(camera)
+                now_ns = self._clock.wall_ns()
+                frames[camera] = rgb_frame(camera, taken.rgb, taken.stamp_ns, now_ns)
+            return frames
 
     def apply(self, action: Action | None, *, skill_active: bool) -> Applied:
         """Step the world. Raises EnvironmentFailed, which ends the run."""
@@ -217,18 +222,6 @@ class SimRobot:
         snapshot = Snapshot(camera, rgb, self._clock.now_ns(), arm.camera_model(camera))
         self._snapshots[camera] = snapshot
         return snapshot
-
-    def _sensor_frame(self, taken: Snapshot) -> SensorFrame:
-        height, width = taken.rgb.shape[:2]
-        return SensorFrame(
-            sensor_id=taken.camera,
-            stamp_monotonic_ns=taken.stamp_ns,
-            stamp_wall_ns=self._clock.wall_ns(),
-            encoding=FrameEncoding.RGB8,
-            width=int(width),
-            height=int(height),
-            data=taken.rgb.tobytes(),
-        )
 
 
 class EpisodeVideo:

@@ -78,18 +78,15 @@ class Robot:
         return Outcome("succeeded", "there")
 
 
-def test_a_cancel_passes_a_planner_that_hangs() -> None:
-    async def story() -> Result:
-        planner, inbox = Planner(lambda episode: None), Inbox()
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
-        await planner.hanging.wait()
-        inbox.put(Cancel("enough"))
-        result = await episode
-        await asyncio.sleep(0)
-        assert planner.dropped == 1
-        return result
-
-    assert play(story)["reason"] == "canceled: enough"
+async def test_a_cancel_passes_a_planner_that_hangs() -> None:
+    planner, inbox = Planner(lambda episode: None), Inbox()
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
+    await planner.hanging.wait()
+    inbox.put(Cancel("enough"))
+    result = await episode
+    await asyncio.sleep(0)
+    assert planner.dropped == 1
+    assert result["reason"] == "canceled: enough"
 
 
 async def test_a_danger_ends_the_goal_and_the_episode_while_the_planner_hangs() -> None:
@@ -100,7 +97,7 @@ async def test_a_danger_ends_the_goal_and_the_episode_while_the_planner_hangs() 
     inbox.put(Said("careful"))
     await planner.hanging.wait()
     inbox.put(Danger("emergency stop: by hand", stop=True))
-    result, robot = await episode, robot
+    result = await episode
     assert (result["reason"], result["stopped"]) == ("stopped: emergency stop: by hand", True)
     assert robot.cancelled
     assert result["steps"][0]["status"] == "canceled"
@@ -120,7 +117,7 @@ async def test_a_result_passes_a_planner_that_hangs_and_makes_it_think_again() -
     inbox.put(Said("how is it going?"))
     await planner.hanging.wait()
     robot.end.set()
-    result, planner, robot = await episode, planner, robot
+    result = await episode
     assert result["status"] == "success"
     assert planner.dropped == 1
     assert not robot.cancelled
@@ -135,74 +132,67 @@ async def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
     episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
     await planner.hanging.wait()
     inbox.put(Said("leave it"))
-    result, planner = await episode, planner
+    result = await episode
     assert result["reason"] == "told to leave it"
     assert (len(planner.asked), planner.dropped) == (2, 1)
 
 
-def test_a_danger_that_stops_nothing_is_told_to_a_thinking_planner() -> None:
-    async def story() -> Result:
-        inbox = Inbox()
-        planner = Planner(
-            lambda episode: Finish(False, episode.notes[0].source) if episode.notes else None
-        )
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
-        await planner.hanging.wait()
-        inbox.put(Danger("the front camera is stale", stop=False))
-        return await episode
-
-    assert play(story)["reason"] == "safety"
+async def test_a_danger_that_stops_nothing_is_told_to_a_thinking_planner() -> None:
+    inbox = Inbox()
+    planner = Planner(
+        lambda episode: Finish(False, episode.notes[0].source) if episode.notes else None
+    )
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
+    await planner.hanging.wait()
+    inbox.put(Danger("the front camera is stale", stop=False))
+    result = await episode
+    assert result["reason"] == "safety"
 
 
-def test_a_long_talk_is_forgotten_from_its_beginning() -> None:
-    async def story() -> Result:
-        robot, inbox = Robot(), Inbox()
+async def test_a_long_talk_is_forgotten_from_its_beginning() -> None:
+    robot, inbox = Robot(), Inbox()
 
-        def decide(episode: Episode) -> ToolCall | Finish:
-            if episode.running:
-                return WaitOn()
-            return Finish(True, "done") if episode.steps else GRAB
+    def decide(episode: Episode) -> ToolCall | Finish:
+        if episode.running:
+            return WaitOn()
+        return Finish(True, "done") if episode.steps else GRAB
 
-        planner = Planner(decide)
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
-        await robot.begun.wait()
-        for number in range(looping.NOTES_MAX + 9):
-            asked = len(planner.asked)
-            inbox.put(Said(str(number)))
-            while len(planner.asked) == asked:
-                await asyncio.sleep(0)
-        robot.end.set()
-        return await episode
-
-    assert [note["text"] for note in play(story)["notes"]] == [
+    planner = Planner(decide)
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, robot, inbox=inbox))
+    await robot.begun.wait()
+    for number in range(looping.NOTES_MAX + 9):
+        asked = len(planner.asked)
+        inbox.put(Said(str(number)))
+        while len(planner.asked) == asked:
+            await asyncio.sleep(0)
+    robot.end.set()
+    result = await episode
+    assert [note["text"] for note in result["notes"]] == [
         str(n) for n in range(9, looping.NOTES_MAX + 9)
     ]
 
 
-def test_whoever_speaks_all_the_time_does_not_keep_the_planner_from_deciding() -> None:
-    async def story() -> Planner:
-        inbox = Inbox()
-        released = asyncio.Event()
+async def test_whoever_speaks_all_the_time_does_not_keep_the_planner_from_deciding() -> None:
+    inbox = Inbox()
+    released = asyncio.Event()
 
-        class Slow(Planner):
-            async def decide(self, episode: Episode) -> ToolCall | Finish:
-                self.asked.append(episode)
-                if len(self.asked) > looping.SUPERSEDED_MAX:
-                    released.set()
-                    await asyncio.sleep(0)
-                    return Finish(True, "decided")
-                inbox.put(Said("more"))
-                await NEVER().wait()
-                raise AssertionError("never set")
+    class Slow(Planner):
+        async def decide(self, episode: Episode) -> ToolCall | Finish:
+            self.asked.append(episode)
+            if len(self.asked) > looping.SUPERSEDED_MAX:
+                released.set()
+                await asyncio.sleep(0)
+                return Finish(True, "decided")
+            inbox.put(Said("more"))
+            await NEVER().wait()
+            raise AssertionError("never set")
 
-        planner = Slow(lambda episode: None)
-        episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
-        await released.wait()
-        inbox.put(Said("and more"))
-        assert (await episode)["status"] == "success"
-        return planner
-
-    assert len(play(story).asked) == looping.SUPERSEDED_MAX + 1
+    planner = Slow(lambda episode: None)
+    episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
+    await released.wait()
+    inbox.put(Said("and more"))
+    assert (await episode)["status"] == "success"
+    assert len(planner.asked) == looping.SUPERSEDED_MAX + 1
 
 
 @pytest.mark.parametrize(
@@ -241,13 +231,11 @@ async def test_beside_a_goal_it_goes_on_unless_the_planner_clearly_stops_it(
     assert result["reason"] == reason
 
 
-def test_a_planner_that_never_decides_is_given_up() -> None:
-    async def story() -> Result:
-        return await run_episode(
-            "x", Planner(lambda episode: None), PALETTE, Robot(), think_max_s=0.05
-        )
-
-    assert play(story)["reason"] == "the planner failed: no decision within 0.05 s"
+async def test_a_planner_that_never_decides_is_given_up() -> None:
+    result = await run_episode(
+        "x", Planner(lambda episode: None), PALETTE, Robot(), think_max_s=0.05
+    )
+    assert result["reason"] == "the planner failed: no decision within 0.05 s"
 
 
 async def test_an_emergency_stop_is_not_discussed_with_the_planner() -> None:
@@ -255,24 +243,19 @@ async def test_an_emergency_stop_is_not_discussed_with_the_planner() -> None:
         return Outcome("failed", "the stop is latched", "estop_requested")
 
     planner = Planner(lambda episode: GRAB)
-    result, planner = await run_episode("x", planner, PALETTE, stopped), planner
+    result = await run_episode("x", planner, PALETTE, stopped)
     assert (result["reason"], result["stopped"]) == ("stopped: the stop is latched", True)
     assert len(planner.asked) == 1
 
 
-def test_an_episode_that_is_cancelled_takes_its_goal_with_it() -> None:
-    async def story() -> Robot:
-        robot = Robot()
-        episode = asyncio.create_task(
-            run_episode("x", Planner(lambda episode: GRAB), PALETTE, robot)
-        )
-        await robot.begun.wait()
-        episode.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await episode
-        return robot
-
-    assert play(story).cancelled
+async def test_an_episode_that_is_cancelled_takes_its_goal_with_it() -> None:
+    robot = Robot()
+    episode = asyncio.create_task(run_episode("x", Planner(lambda episode: GRAB), PALETTE, robot))
+    await robot.begun.wait()
+    episode.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await episode
+    assert robot.cancelled
 
 
 def test_refusals_looks_and_steps_have_limits() -> None:

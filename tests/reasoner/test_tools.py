@@ -70,7 +70,6 @@ async def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
             await runner.end(status, code=code)
             outcome = await doing
             found.append((outcome.status, outcome.code))
-    found = found
     assert found == [
         ("succeeded", ""),
         ("failed", "oom"),
@@ -235,17 +234,15 @@ async def looking(
         (WaitTimeout("busy"), "error"),
     ],
 )
-def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
+async def test_a_model_that_did_not_look_never_says_that_nothing_is_there(
     a_runner: Any, a_sidecar: Any, error: VramError, status: str
 ) -> None:
     """The defect of the field: an evicted detector answered `found: false`."""
 
-    async def story() -> list[Any]:
-        async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
-            sidecar.error = error
-            return [await tools(LOOK), await tools(ASK)]
-
-    for outcome in play(story):
+    async with looking(a_runner, a_sidecar) as (_, sidecar, _, tools):
+        sidecar.error = error
+        result = [await tools(LOOK), await tools(ASK)]
+    for outcome in result:
         assert (outcome.status, outcome.code) == (status, error.code)
 
 
@@ -346,7 +343,7 @@ async def test_a_picture_that_waited_for_the_gpu_is_not_looked_at_and_a_new_one_
         sidecar.late = late
         outcome = await tools(call)
         limits = [message["fresh_s"] for message in sidecar.messages if "fresh_s" in message]
-        found, limits = outcome.status, limits
+        found = outcome.status
     assert (found, len(limits)) == (
         "no_frame" if late == LOOKS_MAX else looked,
         min(late + 1, LOOKS_MAX),
@@ -452,7 +449,7 @@ async def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_side
         await runner.end()
         after = [(await tools(call)).status for call in calls]
         assert asked == []
-        beside, after, asked = beside, after, [op for op in sidecar.asked if op != "ping"]
+        asked = [op for op in sidecar.asked if op != "ping"]
     assert beside == ["refused", "refused", "refused", "done"]
     assert after == ["done"] * 4
     assert asked == ["load", "unload", "unload"]
@@ -557,7 +554,7 @@ async def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
         outcome = await Tools(client, None, None, goal_grace_s=0.0)(
             ExecuteRskill(rskill_id="lab/grab", deadline_s=0.2)
         )
-        outcome, cancelled = outcome, runner.cancelled
+        cancelled = runner.cancelled
     assert (outcome.status, outcome.code) == ("failed", "wait_timeout")
     assert len(cancelled) == 1
 

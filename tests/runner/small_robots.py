@@ -5,6 +5,7 @@ bus can fail, a skill that nods.
 import asyncio
 import math
 from collections.abc import Callable
+from typing import Any
 
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.protocols import Act, Done, Goal, Joint, RobotDescription, StepOutcome
@@ -22,6 +23,30 @@ def robot_of(*joints: str) -> RobotDescription:
     """A robot of which only the names of its joints are known."""
     free = tuple(Joint(name, -math.inf, math.inf, math.inf) for name in joints)
     return RobotDescription("this world", free, {})
+
+
+def moving(**targets: float) -> Action:
+    """An action of joint targets, rad."""
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION,
+        joint_targets=(tuple(targets.values()),),
+        joint_names=tuple(targets),
+    )
+
+
+def frame_at(stamp_ns: int, camera: str = "front", **changes: Any) -> SensorFrame:
+    """A gray picture of one pixel."""
+    given: dict[str, Any] = {
+        "sensor_id": camera,
+        "stamp_monotonic_ns": stamp_ns,
+        "stamp_wall_ns": stamp_ns,
+        "encoding": FrameEncoding.MONO8,
+        "width": 1,
+        "height": 1,
+        "channels": 1,
+        "data": b"x",
+    }
+    return SensorFrame(**given | changes)
 
 
 class FedCamera(SlotReader):

@@ -16,6 +16,8 @@ from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Step
 from vram_arbiter.schemas.errors import ConfigError, LlmError
 from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, StopGoal, WaitOn
 
+pytestmark = pytest.mark.anyio
+
 pytest.importorskip("httpx", reason="needs the reasoner extra")
 
 
@@ -273,16 +275,14 @@ def test_nobody_there_is_a_typed_error(api: Any) -> None:
 
 
 # -- what only one of the two does
-def test_the_messages_api_gets_what_it_demands(stand_in: Any) -> None:
+async def test_the_messages_api_gets_what_it_demands(stand_in: Any) -> None:
     stand_in.json(Anthropic.says(("locate_in_view", "{}")))
     stand_in.json(Anthropic.says(("locate_in_view", '{"query": "cube"}')))
     steps = [Step(QueryScene(question="?"), Outcome("answered", "Yes."))]
 
-    async def ask() -> Any:
-        async with AnthropicPlanner(LlmConfig(stand_in.url + "/v1", "m", KEY), PALETTE) as planner:
-            return await planner.decide(Episode("x", steps, [Note("operator", "go on", 1)]))
-
-    assert asyncio.run(ask()) == LocateInView(query="cube")
+    async with AnthropicPlanner(LlmConfig(stand_in.url + "/v1", "m", KEY), PALETTE) as planner:
+        result = await planner.decide(Episode("x", steps, [Note("operator", "go on", 1)]))
+    assert result == LocateInView(query="cube")
     body = stand_in.asked[1]
     assert stand_in.paths[0] == "/v1/messages"
     assert stand_in.headers[0]["x-api-key"] == KEY

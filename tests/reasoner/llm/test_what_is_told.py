@@ -1,6 +1,5 @@
 """What both APIs are told of this robot, and what is written down of their answers."""
 
-import asyncio
 import base64
 import dataclasses
 import json
@@ -120,7 +119,7 @@ def test_an_answer_without_its_end_says_what_to_raise(api: Any, stand_in: Any, d
         decide()
 
 
-def test_tokens_and_rejected_answers_are_written_down(
+async def test_tokens_and_rejected_answers_are_written_down(
     api: Any, stand_in: Any, tmp_path: Path
 ) -> None:
     stand_in.json(api.says(("locate_in_view", "{}")))
@@ -128,16 +127,14 @@ def test_tokens_and_rejected_answers_are_written_down(
     file = tmp_path / "transcript.jsonl"
     seen = Step(Look(), Outcome("shown", "front", picture=PICTURE))
 
-    async def once() -> Any:
-        config = LlmConfig(stand_in.url + api.base, "m", KEY)
-        transcript = Transcript(file)
-        async with api.planner(config, SEEING, transcript=transcript) as planner:
-            with pytest.raises(LlmError):
-                await planner.decide(Episode("find it", [seen]))
-            transcript.close()
-            return planner.tally.as_result("m")
-
-    assert asyncio.run(once()) == {
+    config = LlmConfig(stand_in.url + api.base, "m", KEY)
+    transcript = Transcript(file)
+    async with api.planner(config, SEEING, transcript=transcript) as planner:
+        with pytest.raises(LlmError):
+            await planner.decide(Episode("find it", [seen]))
+        transcript.close()
+        result = planner.tally.as_result("m")
+    assert result == {
         "model": "m",
         "requests": 2,
         "failed": 1,

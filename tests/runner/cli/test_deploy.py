@@ -10,7 +10,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from tests.support import prepared
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.cli.deploy import claim
 from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
-from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, InternalError, UnknownSkill
+from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, InternalError
 
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e]
 
@@ -85,15 +85,13 @@ def start(tmp_path: Path, video: Path) -> Iterator[Start]:
         process.communicate()
 
 
-def with_client(tmp_path: Path, body: Callable[[RunnerClient], Any]) -> None:
-    async def bounded() -> None:
-        async with (
-            asyncio.timeout(120),
-            RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client,
-        ):
-            await body(client)
-
-    asyncio.run(bounded())
+@contextlib.asynccontextmanager
+async def client_of(tmp_path: Path) -> AsyncIterator[RunnerClient]:
+    async with (
+        asyncio.timeout(120),
+        RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client,
+    ):
+        yield client
 
 
 async def under_way(client: RunnerClient, ticks: int = 5) -> Any:
@@ -127,12 +125,12 @@ async def stopped(client: RunnerClient, reason: str) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_cancels_the_goal_and_ends_in_order(
+async def test_a_signal_cancels_the_goal_and_ends_in_order(
     start: Start, tmp_path: Path, how: signal.Signals
 ) -> None:
     process = start()
 
-    async def body(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         assert (await client.call("ping"))["robot"] == "bench"
         picture = await client.frame(max_age_ms=5000, encoding="png")
         assert (picture["camera"], picture["width"], picture["height"]) == ("front", WIDTH, HEIGHT)
@@ -142,7 +140,6 @@ def test_a_signal_cancels_the_goal_and_ends_in_order(
         process.send_signal(how)
         assert (await goal.result(60))["status"] == "canceled"
 
-    with_client(tmp_path, body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "so101 is disconnected" in err
@@ -184,34 +181,26 @@ def test_a_run_without_a_task_ends_after_its_ticks(start: Start) -> None:
     assert json.loads(out)["n_ticks"] == 30
 
 
-def test_a_camera_file_that_ends_withholds_and_fails_the_goal(start: Start, tmp_path: Path) -> None:
+async def test_a_camera_file_that_ends_withholds_and_fails_the_goal(
+    start: Start, tmp_path: Path
+) -> None:
     start(loop=False, fps=10)  # three seconds: long enough for the runner to have seen it
 
-    async def body(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         goal = await client.send_goal(RSKILL, prompt="nod")
         result = await goal.result(60)
         assert (result["status"], result["code"]) == ("failed", "frame_stale")
         assert result["data"]["withheld"] > 0
         assert (await client.state())["world"]["diagnostics"]["front"] == "stale"
 
-    with_client(tmp_path, body)
 
-
-def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:
+async def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:
     process = start()
 
-    async def body(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         goal = await under_way(client)
-        argv = [
-            sys.executable,
-            "-m",
-            "vram_arbiter.runner",
-            "estop",
-            "--reason",
-            "test",
-            "--endpoint",
-            client.endpoint,
-        ]
+        words = ("estop", "--reason", "test", "--endpoint", client.endpoint)
+        argv = [sys.executable, "-m", "vram_arbiter.runner", *words]
         said, complaint = b"", b"has not obeyed"
         while (
             b"has not obeyed" in complaint
@@ -227,18 +216,17 @@ def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> N
             await client.send_goal(RSKILL)
         process.send_signal(signal.SIGTERM)
 
-    with_client(tmp_path, body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "emergency stop: test" in json.loads(out)["metadata"]["estop"]
 
 
-def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_connected(
+async def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_connected(
     start: Start, tmp_path: Path
 ) -> None:
     process = start(more=TASK)
 
-    async def body(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         await client.ping(timeout_s=60)
         while (await client.state())["goal"] is None:
             pass
@@ -251,23 +239,21 @@ def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_con
         assert "emergency stop: test" in state["estop"]
         process.send_signal(signal.SIGTERM)
 
-    with_client(tmp_path, body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 2, err  # systemd's RestartPreventExitStatus
     assert json.loads(out)["success"] is False
 
 
-def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_restarted(
+async def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_restarted(
     start: Start, tmp_path: Path
 ) -> None:
     """Regression: the latch was kept in memory only, and systemd restarts a killed runner."""
     mark = tmp_path / "robot-bench.estop"
     first = start()
 
-    async def stop(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         await stopped(client, "a hand is in the way")
 
-    with_client(tmp_path, stop)
     assert "a hand is in the way" in mark.read_text()
     first.kill()  # as the kernel does when memory is short; systemd starts it again
     first.communicate(timeout=60)
@@ -279,11 +265,10 @@ def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_r
     mark.unlink()
     third = start()
 
-    async def stop_and_end(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         await stopped(client, "again")
         third.send_signal(signal.SIGTERM)
 
-    with_client(tmp_path, stop_and_end)
     third.communicate(timeout=60)
     assert not mark.exists()  # a person ended it
 
@@ -310,17 +295,15 @@ async def test_a_port_has_one_runner_whatever_its_robots_are_called(
         claim(robot("other", tmp_path / "ttyACM1"), stack)
 
 
-def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
+async def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
     first = start()
 
-    async def body(client: RunnerClient) -> None:
+    async with client_of(tmp_path) as client:
         await client.ping(timeout_s=60)
         second = start("--endpoint", f"ipc://{tmp_path}/second.sock")
         _, err = await asyncio.to_thread(second.communicate, timeout=60)
         assert second.returncode == 1
         assert f"(pid {first.pid}) already uses robot bench" in err
-
-    with_client(tmp_path, body)
 
 
 def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_path: Path) -> None:
@@ -340,13 +323,3 @@ def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_
             _, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "stopped before anything moved" in err
-
-
-def test_what_the_robot_does_not_offer_is_refused(start: Start, tmp_path: Path) -> None:
-    start()
-
-    async def body(client: RunnerClient) -> None:
-        with pytest.raises(UnknownSkill, match="so101-navigate"):
-            await client.send_goal("no/such")
-
-    with_client(tmp_path, body)

@@ -24,6 +24,9 @@ NAVIGATE = ROOT / "configs/rskills/so101-navigate/rskill.yaml"
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
 TWIN_FILE = ROOT / "configs/robots/so101-twin.yaml"
 TWIN = "robot_id: bench\nhal: {adapter: so101_kinematic}\n"
+CAMERAS = "sensors:\n" + "".join(
+    f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
+)
 GRAB_TASK = "task: {id: grab, instruction: grab it}\nvla: {id: vram-arbiter/so101-grab}\n"
 
 DryRun = Callable[..., tuple[int, str, str]]
@@ -55,14 +58,17 @@ def dry_run(
     return run
 
 
-def licensed(tmp_path: Path, licence: str, manifest: Path = NAVIGATE) -> Path:
-    folder = tmp_path / "skills" / licence
-    folder.mkdir(parents=True)
-    text = re.sub(
-        r'license: "[^"]+"', f'license: "{licence}"', manifest.read_text(encoding="utf-8")
-    )
+def installed(tmp_path: Path, text: str) -> Path:
+    """A folder with one skill."""
+    folder = tmp_path / "skills"
+    folder.mkdir()
     (folder / "rskill.yaml").write_text(text, encoding="utf-8")
     return folder
+
+
+def licensed(tmp_path: Path, licence: str) -> Path:
+    text = re.sub(r'license: "[^"]+"', f'license: "{licence}"', GRAB.read_text(encoding="utf-8"))
+    return installed(tmp_path, text)
 
 
 def test_a_new_file_can_be_tried_dry_beside_the_running_robot(
@@ -127,18 +133,11 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
     """Regression: only the deployment file's own block was searched for limits that cannot be
     kept.
     """
-    folder = tmp_path / "skills" / "careful"
-    folder.mkdir(parents=True)
     text = (
         GRAB.read_text(encoding="utf-8")
         + "envelope: {human_in_loop_required: [grasp], max_force_n: 5}\n"
     )
-    (folder / "rskill.yaml").write_text(text, encoding="utf-8")
-    sensors = (
-        "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, "
-        "backend_params: {device: 1}}]\n"
-    )
-    _, out, err = dry_run(TWIN + sensors, skills=folder)
+    _, out, err = dry_run(TWIN + CAMERAS, skills=installed(tmp_path, text))
     assert err == ""
     said = [line for line in out.splitlines() if line.startswith("NOT KEPT")]
     assert any("human_in_loop_required" in line and "so101-grab" in line for line in said)
@@ -155,14 +154,8 @@ def test_each_misfit_of_the_tasks_skill_is_a_line_of_its_own(
         "    - {range: [3, 5], control_mode: joint_torque}"
     )
     manifest = GRAB.read_text(encoding="utf-8").replace("action_contract:\n  dim: 6", slots)
-    folder = tmp_path / "skills" / "odd"
-    folder.mkdir(parents=True)
-    (folder / "rskill.yaml").write_text(manifest, encoding="utf-8")
-    sensors = (
-        "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, "
-        "backend_params: {device: 1}}]\n"
-    )
-    code, out, err = dry_run(TWIN + sensors + GRAB_TASK, "--check", skills=folder)
+    folder = installed(tmp_path, manifest)
+    code, out, err = dry_run(TWIN + CAMERAS + GRAB_TASK, "--check", skills=folder)
     assert (code, out) == (2, "")
     said = [line for line in err.splitlines() if "action_contract" in line]
     assert len(said) == 2, err
@@ -171,11 +164,7 @@ def test_each_misfit_of_the_tasks_skill_is_a_line_of_its_own(
 
 
 def test_a_policys_vectors_are_told_where_it_fits(dry_run: DryRun) -> None:
-    sensors = (
-        "sensors: [{sensor_id: front, backend_params: {device: 0}}, {sensor_id: wrist, "
-        "backend_params: {device: 1}}]\n"
-    )
-    code, out, err = dry_run(TWIN + sensors, skills=GRAB)
+    code, out, err = dry_run(TWIN + CAMERAS, skills=GRAB)
     assert (code, err) == (0, "")
     assert "contract  vram-arbiter/so101-grab: 6 actions from a state of 6" in out
 
@@ -288,19 +277,11 @@ def test_a_task_needs_the_cameras_that_its_skill_looks_at(dry_run: DryRun) -> No
 
 
 def test_a_task_that_fits_passes(dry_run: DryRun) -> None:
-    cameras = "".join(
-        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
-    )
-    code, out, err = dry_run(TWIN + "sensors:\n" + cameras + GRAB_TASK, skills=GRAB)
+    code, out, err = dry_run(TWIN + CAMERAS + GRAB_TASK, skills=GRAB)
     assert code == 0, err
     assert "task      grab: vram-arbiter/so101-grab 'grab it'" in out
     assert re.search(r"sidecar +of vram-arbiter/so101-grab at ipc://.*/grab\.sock", out), out
     assert "camera    front by opencv_thread, at most 100 ms old" in out
-
-
-CAMERAS = "sensors:\n" + "".join(
-    f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
-)
 
 
 def test_the_fields_own_files_are_read_as_the_field_means_them(dry_run: DryRun) -> None:
@@ -340,11 +321,8 @@ def test_the_fields_own_files_are_read_as_the_field_means_them(dry_run: DryRun) 
 def test_the_file_cannot_ask_for_other_weights_than_are_installed(
     dry_run: DryRun, field: str
 ) -> None:
-    cameras = "".join(
-        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
-    )
     task = f"task: {{id: grab}}\nvla:\n  id: vram-arbiter/so101-grab\n  {field}\n"
-    code, _, err = dry_run(TWIN + "sensors:\n" + cameras + task, skills=GRAB)
+    code, _, err = dry_run(TWIN + CAMERAS + task, skills=GRAB)
     assert code == 2
     assert re.search(rf"robot\.yaml:9: vla\.{field.partition(':')[0]}: .* is not what", err), err
 
@@ -355,18 +333,15 @@ def test_the_file_cannot_ask_for_other_weights_than_are_installed(
 def test_a_licence_that_forbids_commercial_use_stops_the_task(
     dry_run: DryRun, tmp_path: Path, licence: str
 ) -> None:
-    skills = licensed(tmp_path, licence, GRAB)
+    skills = licensed(tmp_path, licence)
     code, _, err = dry_run(TWIN + GRAB_TASK, skills=skills)
     assert code == 2
     assert re.search(rf"robot\.yaml:4: vla\.id: .*{licence}.*--allow-noncommercial", err), err
 
 
 def test_a_licence_may_be_overruled_by_a_flag(dry_run: DryRun, tmp_path: Path) -> None:
-    cameras = "".join(
-        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
-    )
-    text = TWIN + "sensors:\n" + cameras + GRAB_TASK
-    skills = licensed(tmp_path, "nvidia_non_commercial", GRAB)
+    text = TWIN + CAMERAS + GRAB_TASK
+    skills = licensed(tmp_path, "nvidia_non_commercial")
     code, out, _ = dry_run(text, "--allow-noncommercial", skills=skills)
     assert code == 0
     assert "so101-grab 0.1.0 (nvidia_non_commercial)" in out
@@ -375,7 +350,7 @@ def test_a_licence_may_be_overruled_by_a_flag(dry_run: DryRun, tmp_path: Path) -
 def test_serving_goals_offers_only_what_is_licensed_and_fits(
     dry_run: DryRun, tmp_path: Path
 ) -> None:
-    code, out, _ = dry_run(TWIN, skills=licensed(tmp_path, "unknown", GRAB))
+    code, out, _ = dry_run(TWIN, skills=licensed(tmp_path, "unknown"))
     assert code == 0
     assert re.search(
         r"skill +vram-arbiter/so101-grab is not offered: its license \(unknown\)", out
@@ -395,16 +370,9 @@ def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(
     """By tag, and by the value of a capability; the file may say more of the robot than its adapter
     does.
     """
-    folder = tmp_path / "skills"
-    folder.mkdir()
     needs = "capabilities_required: {can_lift_kg: 0.5, has_vision: true}\nkind: "
-    (folder / "rskill.yaml").write_text(
-        GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1)
-    )
-    cameras = "".join(
-        f"  - {{sensor_id: {name}, backend_params: {{device: 0}}}}\n" for name in ("front", "wrist")
-    )
-    text = TWIN + "sensors:\n" + cameras + GRAB_TASK
+    folder = installed(tmp_path, GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1))
+    text = TWIN + CAMERAS + GRAB_TASK
     code, _, err = dry_run(text, skills=folder)
     assert code == 2
     assert "robot.yaml:7: vla.id: " in err
@@ -480,13 +448,9 @@ def test_any_value_in_a_deployment_is_taken_or_found_fault_with(
 
 def test_a_continuous_detector_is_checked_against_the_installed_ones(dry_run: DryRun) -> None:
     skills = ROOT / "configs/rskills/so101-detector"
-    cameras = (
-        "sensors:\n  - {sensor_id: front, backend_params: {device: 0}}\n"
-        "  - {sensor_id: wrist, backend_params: {device: 1}}\n"
-    )
 
     def text(detector: str) -> str:
-        return f"{TWIN}{cameras}detectors:\n  - {{{detector}, sensor_id: front}}\n"
+        return f"{TWIN}{CAMERAS}detectors:\n  - {{{detector}, sensor_id: front}}\n"
 
     watched = text("id: vram-arbiter/so101-detector, mode: continuous, queries: [red cube]")
     code, out, err = dry_run(watched, skills=skills)
@@ -507,7 +471,7 @@ def test_a_continuous_detector_is_checked_against_the_installed_ones(dry_run: Dr
         assert expected in err
     twice = watched + "  - {id: vram-arbiter/so101-detector, sensor_id: front}\n"
     assert "one detector a camera; given twice: front" in dry_run(twice, skills=skills)[2]
-    blind = f"{TWIN}{cameras}detectors:\n  - {{id: a/b, sensor_id: rear}}\n"
+    blind = f"{TWIN}{CAMERAS}detectors:\n  - {{id: a/b, sensor_id: rear}}\n"
     assert "detectors look at cameras that are not there: rear" in dry_run(blind)[2]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Nod, Twin
+from tests.runner.small_robots import FedCamera, Nod, Twin, moving
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, Hold, SafetyGate, Skill, SkillEnded
@@ -27,7 +27,6 @@ from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors import Feed
 from vram_arbiter.runner.skills.base import SkillState
 from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadRequest,
     Cancelled,
@@ -40,7 +39,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
-from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
+from vram_arbiter.schemas.world import SensorFrame, WorldState
 
 CONFIGS = Path(__file__).parents[3] / "configs/rskills"
 PERIOD_S = 1 / 30
@@ -75,6 +74,16 @@ def make_runner(clock: Any, twin: Twin) -> MakeRunner:
 
 
 @pytest.fixture
+def started(make_runner: MakeRunner) -> MakeRunner:
+    def begin(*args: Any, **options: Any) -> HardwareRunner:
+        runner = make_runner(*args, **options)
+        runner.activate()
+        return runner
+
+    return begin
+
+
+@pytest.fixture
 def nod(navigate_manifest: Any) -> Callable[..., Nod]:
     def active(**options: Any) -> Nod:
         skill = Nod(load_manifest(navigate_manifest), **options)
@@ -98,11 +107,10 @@ def begin(runner: HardwareRunner, skill: Nod, **goal: Any) -> list[SkillEnded]:
 
 
 def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
-    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
     seen: list[WorldState] = []
-    runner = make_runner([front])
-    runner.activate()
+    runner = started([front])
     ended = begin(runner, nod(cameras=("front",), steps=3, on_step=seen.append))
     result = tick(runner, clock)
     assert result.action_applied
@@ -120,11 +128,10 @@ def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
 
 
 def test_what_a_skill_cannot_carry_out_is_withheld_and_fails_the_goal_if_it_lasts(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     """A tool step that the arm cannot reach is as good as one that the gate forbids."""
-    runner = make_runner()
-    runner.activate()
+    runner = started()
     skill = nod()
     skill._step = lambda world: Hold("the hand stops 9 mm short", withheld=True)
     ended = begin(runner, skill)
@@ -147,7 +154,7 @@ class Slide:
 
 
 def test_withheld_actions_are_reported_by_their_first_cause(
-    make_runner: MakeRunner, twin: Twin, clock: Any, caplog: pytest.LogCaptureFixture
+    started: MakeRunner, twin: Twin, clock: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Regression: a trajectory that left the workspace by 2 mm failed as too fast: its targets
     moved on while the arm stood still, and the error had the last cause. The log said nothing.
@@ -161,15 +168,8 @@ def test_withheld_actions_are_reported_by_their_first_cause(
         envelopes={"safety": box},
         now_ns=clock.now_ns,
     )
-    runner = make_runner(make_gate=lambda skill: own)
-    runner.activate()
-    twin.send_action(
-        Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=((0.0,),),
-            joint_names=("elbow_flex",),
-        )
-    )
+    runner = started(make_gate=lambda skill: own)
+    twin.send_action(moving(elbow_flex=0.0))
     clock.advance(5.0)
     skill = FollowJointTrajectory(manifest, own.limits, period_s=PERIOD_S)
     points = [{"positions": [0.6], "time_from_start": {"sec": 3}}]
@@ -189,10 +189,9 @@ def test_withheld_actions_are_reported_by_their_first_cause(
 
 
 def test_one_line_says_that_actions_pass_again(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any, caplog: pytest.LogCaptureFixture
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    runner = make_runner(deadline_policy=DeadlinePolicy.DROP)
-    runner.activate()
+    runner = started(deadline_policy=DeadlinePolicy.DROP)
     slow = iter([True, False, True, True, True] + 20 * [False])
     begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S) if next(slow) else None))
     with caplog.at_level("WARNING", "vram_arbiter.runner.control.withheld"):
@@ -207,10 +206,9 @@ def test_one_line_says_that_actions_pass_again(
 
 @pytest.mark.parametrize("cause", ["hangs", "ends", "is not there"])
 def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
-    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any, cause: str
+    started: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any, cause: str
 ) -> None:
-    runner = make_runner([front])
-    runner.activate()
+    runner = started([front])
     skill = nod(cameras=("rear",) if cause == "is not there" else ("front",))
     ended = begin(runner, skill)
     if cause != "is not there":
@@ -235,10 +233,9 @@ def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
 
 
 def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
-    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner([front])
-    runner.activate()
+    runner = started([front])
     ended = begin(runner, nod(cameras=("front",)))
     front.always = False
     clock.advance(0.2)
@@ -251,10 +248,9 @@ def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
 
 
 def test_a_camera_that_no_skill_looks_at_stops_nobody(
-    make_runner: MakeRunner, front: FedCamera, nod: Any, clock: Any
+    started: MakeRunner, front: FedCamera, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner([front])
-    runner.activate()
+    runner = started([front])
     begin(runner, nod())
     front.stop()
     clock.advance(0.2)
@@ -264,10 +260,9 @@ def test_a_camera_that_no_skill_looks_at_stops_nobody(
 
 
 def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner()
-    runner.activate()
+    runner = started()
     ended = begin(runner, nod())
     tick(runner, clock)
     twin.silent = True
@@ -286,10 +281,9 @@ def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
 
 
 def test_what_cannot_be_sent_fails_the_goal(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner()
-    runner.activate()
+    runner = started()
     ended = begin(runner, nod())
     twin.deaf = True
     assert not tick(runner, clock).action_applied
@@ -298,7 +292,7 @@ def test_what_cannot_be_sent_fails_the_goal(
 
 
 def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     asked: list[Skill] = []
 
@@ -306,8 +300,7 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
         asked.append(skill)
         return JointRanges({"wrist_flex": (-0.1, 0.1)})
 
-    runner = make_runner(make_gate=narrow)
-    runner.activate()
+    runner = started(make_gate=narrow)
     skill = nod()
     begin(runner, skill)
     result = tick(runner, clock)
@@ -317,12 +310,11 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
     assert not twin.sent
 
 
-def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make_runner: MakeRunner, nod: Any) -> None:
+def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(started: MakeRunner, nod: Any) -> None:
     def broken(skill: Skill) -> SafetyGate:
         raise LimitExceeded("the envelope is empty")
 
-    runner = make_runner(make_gate=broken)
-    runner.activate()
+    runner = started(make_gate=broken)
     with pytest.raises(LimitExceeded):
         begin(runner, nod())
     assert runner.progress.state == "idle"
@@ -330,11 +322,10 @@ def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(make_runner: MakeRunner
 
 
 def test_the_emergency_stop_comes_before_anything_else(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     told: list[str] = []
-    runner = make_runner(on_estop=told.append)
-    runner.activate()
+    runner = started(on_estop=told.append)
     skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
     ended = begin(runner, skill)
     assert not tick(
@@ -355,11 +346,10 @@ def test_the_emergency_stop_comes_before_anything_else(
 
 
 def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     told: list[str] = []
-    runner = make_runner(on_estop=told.append)
-    runner.activate()
+    runner = started(on_estop=told.append)
     ended = begin(runner, nod())
     with pytest.raises(EstopRequested):
         twin.estop("its button")
@@ -372,10 +362,9 @@ def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
 
 
 def test_a_late_action_is_withheld_under_drop(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner(deadline_policy=DeadlinePolicy.DROP)
-    runner.activate()
+    runner = started(deadline_policy=DeadlinePolicy.DROP)
     begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S)))
     result = tick(runner, clock)
     assert (result.action_applied, result.deadline_missed) == (False, True)
@@ -383,11 +372,10 @@ def test_a_late_action_is_withheld_under_drop(
 
 
 def test_a_goal_whose_actions_all_come_too_late_fails(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     """Regression: under `drop` such a goal succeeded without one command to a motor."""
-    runner = make_runner(deadline_policy=DeadlinePolicy.DROP)
-    runner.activate()
+    runner = started(deadline_policy=DeadlinePolicy.DROP)
     ended = begin(runner, nod(steps=100, on_step=lambda world: clock.advance(2 * PERIOD_S)))
     tick(runner, clock, 30)
     assert not twin.sent
@@ -397,12 +385,11 @@ def test_a_goal_whose_actions_all_come_too_late_fails(
 
 
 def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
-    make_runner: MakeRunner, twin: Twin, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:
     """Regression: the gate judged the state's age by its stamp and not by the clock."""
     own = RobotGate(twin.description, rate_hz=30.0, now_ns=clock.now_ns)
-    runner = make_runner(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
-    runner.activate()
+    runner = started(make_gate=lambda skill: own)  # under WARN: what is merely late is sent
     begin(runner, nod(on_step=lambda world: clock.advance(0.5)))
     result = tick(runner, clock)
     assert not result.action_applied
@@ -411,10 +398,9 @@ def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
 
 
 def test_a_tick_says_where_its_time_went(
-    make_runner: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
+    started: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner([front])
-    runner.activate()
+    runner = started([front])
     begin(runner, nod(on_step=lambda world: clock.advance(0.004)))
     result = runner.tick()
     assert result.inference_ms == pytest.approx(4.0)
@@ -428,10 +414,9 @@ def test_a_tick_says_where_its_time_went(
 
 
 def test_a_goal_ends_after_as_many_ticks_as_it_may_take(
-    make_runner: MakeRunner, nod: Any, clock: Any
+    started: MakeRunner, nod: Any, clock: Any
 ) -> None:
-    runner = make_runner()
-    runner.activate()
+    runner = started()
     ended = begin(runner, nod(), max_ticks=5)
     tick(runner, clock, 8)
     assert isinstance(ended[0].error, LimitExceeded)
@@ -440,10 +425,9 @@ def test_a_goal_ends_after_as_many_ticks_as_it_may_take(
 
 @pytest.mark.heavy
 def test_pictures_for_others_come_in_their_colours_and_never_too_old(
-    make_runner: MakeRunner, front: FedCamera, clock: Any
+    started: MakeRunner, front: FedCamera, clock: Any
 ) -> None:
-    runner = make_runner([front])
-    runner.activate()
+    runner = started([front])
     assert runner.snapshot("front", 0.1).rgb.tolist() == [[[0, 0, 255], [255, 0, 0]]]
     front.always = False
     clock.advance(0.5)
@@ -467,14 +451,13 @@ def test_it_does_not_start_on_a_camera_that_shows_nothing(
 
 
 def test_everything_is_stopped_whatever_one_of_them_raises(
-    make_runner: MakeRunner, twin: Twin, front: FedCamera, clock: Any
+    started: MakeRunner, twin: Twin, front: FedCamera, clock: Any
 ) -> None:
     class Stubborn(FedCamera):
         def _run_ends(self) -> None:
             raise OSError("the driver hangs")
 
-    runner = make_runner([front, Stubborn("wrist", clock)])
-    runner.activate()
+    runner = started([front, Stubborn("wrist", clock)])
     with pytest.raises(OSError, match="hangs"):
         runner.deactivate()
     assert twin.story == ["connect", "disconnect"]
@@ -558,11 +541,10 @@ def test_it_does_not_start_on_a_robot_that_says_nothing(
 
 
 def test_a_robot_whose_first_answer_is_lost_starts(
-    make_runner: MakeRunner, twin: Twin, clock: Any
+    started: MakeRunner, twin: Twin, clock: Any
 ) -> None:
     twin.answers_lost = FIRST_STATE_TRIES - 1
-    runner = make_runner()
-    runner.activate()
+    runner = started()
     assert runner.world is not None
     assert runner.world.stale == ()
     runner.deactivate()

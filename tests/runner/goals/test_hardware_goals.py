@@ -304,7 +304,7 @@ async def test_whoever_names_no_endpoint_stops_the_system_service_too(
     assert "cut its power" in said.err
 
 
-async def test_a_runtime_folder_that_cannot_be_one_does_not_keep_the_system_service_from_being_stopped(
+async def test_a_wrong_runtime_folder_does_not_keep_the_system_service_from_being_stopped(
     b: Bench, client: RunnerClient, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: the path was checked before anything was stopped."""

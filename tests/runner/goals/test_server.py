@@ -38,6 +38,9 @@ from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 pytestmark = pytest.mark.anyio
 
 
+GOAL = {"op": "goal", "id": 1, "goal_id": "g"}
+
+
 @pytest.fixture
 def bench(
     make_runner: Callable[..., SimRunner], env: Any, endpoint: str, navigate_manifest: Path
@@ -177,22 +180,15 @@ async def test_cancel_takes_the_arm_back(b: Bench, client: RunnerClient, prompt:
 
 
 async def test_cancel_right_behind_the_goal_still_gives_a_result(b: Bench, endpoint: str) -> None:
-    socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
-    try:
+    with zmq.asyncio.Context.instance().socket(zmq.DEALER) as socket:
         socket.connect(endpoint)
-        await socket.send(
-            msgpack.packb(
-                {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": RSKILL, "prompt": "hang"}
-            )
-        )
+        await socket.send(msgpack.packb({**GOAL, "rskill_id": RSKILL, "prompt": "hang"}))
         await socket.send(msgpack.packb({"op": "cancel", "id": 2, "goal_id": "g"}))
         results = []
         while not results:
             message = msgpack.unpackb(await socket.recv())
             results += [message] if message.get("push") == "result" else []
         assert results[0]["status"] == "canceled"
-    finally:
-        socket.close(0)
 
 
 @pytest.mark.parametrize("prompt", ["forever", "hang"])
@@ -319,38 +315,27 @@ async def test_reads(client: RunnerClient, bench: Any) -> None:
     ("message", "code"),
     [
         (b"\xc1\xc1", "bad_frame"),
-        (msgpack.packb([1, 2]), "bad_frame"),
-        (msgpack.packb({"op": "dance", "id": 1}), "unknown_op"),
-        (msgpack.packb({"id": 1}), "unknown_op"),
-        (msgpack.packb({"op": "goal", "id": 1, "goal_id": "g"}), "bad_request"),
-        (
-            msgpack.packb(
-                {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "x", "deadline_s": -1}
-            ),
-            "bad_request",
-        ),
-        (
-            msgpack.packb({"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}),
-            "unknown_skill",
-        ),
-        (msgpack.packb({"op": "ping", "id": 1, "extra": 1}), "bad_request"),
-        (msgpack.packb({"op": "ping", "id": "one"}), "bad_request"),
-        (msgpack.packb({"op": "cancel", "id": 1, "goal_id": "none"}), "bad_request"),
-        (msgpack.packb({"op": "result", "id": 1, "goal_id": "none"}), "bad_request"),
+        ([1, 2], "bad_frame"),
+        ({"op": "dance", "id": 1}, "unknown_op"),
+        ({"id": 1}, "unknown_op"),
+        (GOAL, "bad_request"),
+        ({**GOAL, "rskill_id": "x", "deadline_s": -1}, "bad_request"),
+        ({**GOAL, "rskill_id": "a/b"}, "unknown_skill"),
+        ({"op": "ping", "id": 1, "extra": 1}, "bad_request"),
+        ({"op": "ping", "id": "one"}, "bad_request"),
+        ({"op": "cancel", "id": 1, "goal_id": "none"}, "bad_request"),
+        ({"op": "result", "id": 1, "goal_id": "none"}, "bad_request"),
     ],
 )
 async def test_bad_input_gets_an_answer_and_harms_nothing(
-    client: RunnerClient, endpoint: str, message: bytes, code: str
+    client: RunnerClient, endpoint: str, message: Any, code: str
 ) -> None:
-    socket = zmq.asyncio.Context.instance().socket(zmq.DEALER)
-    try:
+    with zmq.asyncio.Context.instance().socket(zmq.DEALER) as socket:
         socket.connect(endpoint)
-        await socket.send(message)
+        await socket.send(message if isinstance(message, bytes) else msgpack.packb(message))
         reply = msgpack.unpackb(await socket.recv())
         assert reply["error"]["code"] == code
         assert reply["error"]["message"]
-    finally:
-        socket.close(0)
     assert (await client.ping(timeout_s=60))["ok"]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("cv2", reason="needs the runner extra")
 
-from tests.runner.small_robots import FedCamera, Twin
+from tests.runner.small_robots import FedCamera, Twin, frame_at
 from vram_arbiter.runner.cli.recording import check_recording
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
@@ -16,7 +16,7 @@ from vram_arbiter.runner.recording.sample import sample_of
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.schemas.world import FrameEncoding
 
 
 def runner_with(camera: FedCamera) -> HardwareRunner:
@@ -45,17 +45,8 @@ def test_a_camera_without_colors_is_refused_before_a_goal() -> None:
     class Depth(FedCamera):
         def show(self) -> None:
             if self.feed is not None:
-                frame = SensorFrame(
-                    sensor_id=self.sensor_id,
-                    stamp_monotonic_ns=self.clock.now_ns(),
-                    stamp_wall_ns=0,
-                    encoding=FrameEncoding.DEPTH16,
-                    width=2,
-                    height=1,
-                    channels=1,
-                    data=bytes(4),
-                )
-                self.deliver(self.feed, frame)
+                depth = {"encoding": FrameEncoding.DEPTH16, "data": bytes(2)}
+                self.deliver(self.feed, frame_at(self.clock.now_ns(), self.sensor_id, **depth))
 
     async def start() -> None:
         runner = runner_with(Depth("depth", SystemClock()))

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import moving
 from vram_arbiter.runner.protocols import Hal, RobotDescription
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.so101_kinematics import So101Kinematics, kinematics_for
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.schemas.config.robot import HalConfig
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
-from vram_arbiter.schemas.world import Action, WorldState
+from vram_arbiter.schemas.world import WorldState
 
 pytestmark = pytest.mark.heavy
 
@@ -48,11 +48,7 @@ def drive(
         states.append(dict(zip(state.name, state.position, strict=True)))
         for name, value in wanted.items():
             step[name] += min(max(value - step[name], -0.08), 0.08)
-        action = Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(tuple(step[n] for n in names),),
-            joint_names=names,
-        )
+        action = moving(**{name: step[name] for name in names})
         allowed, problems = gate.check(
             action, WorldState(stamp_ns=clock.now_ns(), joint_state=state)
         )
@@ -124,11 +120,7 @@ def test_a_table_is_not_pressed_into(hal: Hal, clock: Any) -> None:
         efforts.append(abs(state.effort[names.index("shoulder_lift")]))
         step["shoulder_lift"] = min(step["shoulder_lift"] + 0.03, 1.4)
         step["elbow_flex"] = max(step["elbow_flex"] - 0.02, 0.2)
-        action = Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(tuple(step[n] for n in names),),
-            joint_names=names,
-        )
+        action = moving(**{name: step[name] for name in names})
         allowed, _ = gate.check(action, WorldState(stamp_ns=clock.now_ns(), joint_state=state))
         if allowed is not None:
             hal.send_action(allowed)

@@ -11,14 +11,13 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import moving
 from vram_arbiter.runner.protocols import EndEffector
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.lerobot_robot import LerobotHal
 from vram_arbiter.runner.skills.kinematics import ArmModel
 from vram_arbiter.schemas.config.robot import HalConfig
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ConfigError, EstopRequested, RobotFault
-from vram_arbiter.schemas.world import Action
 
 pytestmark = pytest.mark.heavy
 
@@ -29,14 +28,6 @@ JOINTS: dict[str, Any] = {
     "motor_3": {**RANGE, "gripper": True},
 }
 Make = Callable[..., LerobotHal]
-
-
-def to(**targets: float) -> Action:
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION,
-        joint_targets=(tuple(targets.values()),),
-        joint_names=tuple(targets),
-    )
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +70,7 @@ def test_it_reads_in_rad_what_lerobot_says_in_its_units(make_robot: Make, clock:
 def test_it_sends_in_lerobots_units_what_is_said_in_rad(make_robot: Make) -> None:
     hal = make_robot()
     hal.connect()
-    hal.send_action(to(motor_1=-math.pi / 4, motor_2=1.0, motor_3=1.0))
+    hal.send_action(moving(motor_1=-math.pi / 4, motor_2=1.0, motor_3=1.0))
     assert robot_of(hal).sent[-1] == pytest.approx(
         {"motor_1": -45.0, "motor_2": 100.0, "motor_3": 100.0}
     )
@@ -89,20 +80,20 @@ def test_it_sends_in_lerobots_units_what_is_said_in_rad(make_robot: Make) -> Non
 def test_joints_that_are_left_out_stay_where_they_were_sent(make_robot: Make) -> None:
     hal = make_robot(values=[10.0, 20.0, 30.0])
     hal.connect()
-    hal.send_action(to(motor_1=0.1))
+    hal.send_action(moving(motor_1=0.1))
     assert robot_of(hal).sent[-1] == pytest.approx(
         {"motor_1": math.degrees(0.1), "motor_2": 20, "motor_3": 30}
     )
-    hal.send_action(to(motor_2=0.0))
+    hal.send_action(moving(motor_2=0.0))
     assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(math.degrees(0.1))
 
 
 def test_a_shortened_step_is_remembered_as_it_was_made(make_robot: Make) -> None:
     hal = make_robot(max_relative_target=5.0)
     hal.connect()
-    hal.send_action(to(motor_1=1.0))
+    hal.send_action(moving(motor_1=1.0))
     assert hal.sent()["motor_1"] == pytest.approx(math.radians(5.0))
-    hal.send_action(to(motor_2=0.0))  # motor_1 was left out: it does not creep on to 1.0 rad
+    hal.send_action(moving(motor_2=0.0))  # motor_1 was left out: it does not creep on to 1.0 rad
     assert hal.read_state().position[0] == pytest.approx(math.radians(5.0))
 
 
@@ -114,7 +105,7 @@ def test_the_files_word_goes_before_lerobots(make_robot: Make) -> None:
     hal = make_robot({"joints": joints}, values=[0.25, 0.0, 0.0])
     hal.connect()
     assert hal.read_state().position[0] == pytest.approx(0.25)
-    hal.send_action(to(motor_1=0.5))
+    hal.send_action(moving(motor_1=0.5))
     assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(0.0)
 
 
@@ -226,7 +217,7 @@ def test_faults_of_the_bus_are_typed(make_robot: Make, fault: Exception) -> None
     with pytest.raises(RobotFault, match="does not answer"):
         hal.read_state()
     with pytest.raises(RobotFault, match="does not move"):
-        hal.send_action(to(motor_1=0.1))
+        hal.send_action(moving(motor_1=0.1))
     hal.disconnect()  # a cable that is out does not keep the program from ending
     assert not robot_of(hal).is_connected
 
@@ -254,7 +245,7 @@ def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
 ) -> None:
     hal = make_robot({"joints": JOINTS, "estop": how}, values=[10.0, 0.0, 50.0])
     hal.connect()
-    hal.send_action(to(motor_1=1.0))
+    hal.send_action(moving(motor_1=1.0))
     robot_of(hal).values["motor_1"] = 40.0  # it is still on its way
     with pytest.raises(EstopRequested):
         hal.estop("test")
@@ -264,7 +255,7 @@ def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
             40.0
         )  # here, not where it was going
     with pytest.raises(EstopRequested):
-        hal.send_action(to(motor_1=0.0))
+        hal.send_action(moving(motor_1=0.0))
 
 
 def test_a_stop_that_cannot_hold_switches_off(make_robot: Make) -> None:
@@ -298,7 +289,7 @@ def test_a_cable_that_is_pulled_is_a_fault_whatever_the_serial_port_makes_of_it(
     with pytest.raises(RobotFault, match="Input/output error"):
         hal.read_state()
     with pytest.raises(RobotFault):
-        hal.send_action(to(motor_1=0.1))
+        hal.send_action(moving(motor_1=0.1))
     with pytest.raises(EstopRequested, match="the motors are off"):
         hal.estop("smoke")
     hal.disconnect()

@@ -10,13 +10,12 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import moving
 from vram_arbiter.runner.protocols import Hal
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.so101 import RANGES_RAD
 from vram_arbiter.schemas.config.robot import HalConfig
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import EstopRequested, RobotFault
-from vram_arbiter.schemas.world import Action
 
 from .servo_bus import PRESENT, ServoBus
 
@@ -74,14 +73,6 @@ def config(bus: ServoBus, folder: Path, **params: Any) -> HalConfig:
     return HalConfig(adapter="lerobot:so101_follower", transport=transport, params=params)
 
 
-def to(**targets: float) -> Action:
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION,
-        joint_targets=(tuple(targets.values()),),
-        joint_names=tuple(targets),
-    )
-
-
 def test_the_description_is_the_arms(hal: Hal) -> None:
     assert hal.description.name == "so101"
     assert not hal.description.simulated
@@ -99,7 +90,7 @@ def test_angles_are_read_from_the_servos_counts(hal: Hal, bus: ServoBus) -> None
 
 
 def test_targets_reach_the_servos(hal: Hal, bus: ServoBus) -> None:
-    hal.send_action(to(elbow_flex=-0.5, gripper=RANGES_RAD["gripper"][0]))
+    hal.send_action(moving(elbow_flex=-0.5, gripper=RANGES_RAD["gripper"][0]))
     assert hal.read_state().position[2] == pytest.approx(
         -0.5, abs=0.002
     )  # answered after the writes before it
@@ -118,21 +109,21 @@ def test_a_range_that_the_file_narrows_limits_a_joint_and_does_not_stretch_it(
     hal.connect()
     assert hal.description.joints[5].upper_rad == 0.8
     low, high = RANGES_RAD["gripper"]
-    hal.send_action(to(gripper=0.8))
+    hal.send_action(moving(gripper=0.8))
     assert hal.read_state().position[5] == pytest.approx(0.8, abs=0.002)
     assert bus.get(6, PRESENT) == pytest.approx(4095 * (0.8 - low) / (high - low), abs=2)
     hal.disconnect()
 
 
 def test_the_stop_holds_and_the_end_lets_go(hal: Hal, bus: ServoBus) -> None:
-    hal.send_action(to(shoulder_pan=0.3))
+    hal.send_action(moving(shoulder_pan=0.3))
     with pytest.raises(EstopRequested, match="hold the present pose"):
         hal.estop("test")
     assert hal.read_state().position[0] == pytest.approx(0.3, abs=0.002)
     assert all(bus.torque(servo) for servo in range(1, 7))
     assert bus.get(1, PRESENT) == pytest.approx(2047 + 0.3 * COUNTS_PER_RAD, abs=2)
     with pytest.raises(EstopRequested):
-        hal.send_action(to(shoulder_pan=0.0))
+        hal.send_action(moving(shoulder_pan=0.0))
     hal.disconnect()
     assert not any(bus.torque(servo) for servo in range(1, 7))
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import moving
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.schemas.config.robot import HalConfig
@@ -20,14 +21,6 @@ BOTH = pytest.mark.parametrize(
     "adapter", ["so101_kinematic", pytest.param("so101_mujoco", marks=HEAVY)]
 )
 MakeHal = Callable[..., HalBase]
-
-
-def to_targets(**targets: float) -> Action:
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION,
-        joint_targets=(tuple(targets.values()),),
-        joint_names=tuple(targets),
-    )
 
 
 def positions(hal: HalBase) -> dict[str, float]:
@@ -51,7 +44,7 @@ def test_nothing_is_read_or_sent_without_a_connection(adapter: str, clock: Any) 
     with pytest.raises(BadState, match="not connected"):
         hal.read_state()
     with pytest.raises(BadState, match="not connected"):
-        hal.send_action(to_targets(gripper=0.0))
+        hal.send_action(moving(gripper=0.0))
     hal.disconnect()  # harmless
     hal.connect()
     hal.connect()
@@ -80,7 +73,7 @@ def test_a_named_joint_moves_and_the_others_stay(
     hal = make_twin(adapter)
     before = positions(hal)
     for _ in range(90):
-        hal.send_action(to_targets(shoulder_pan=0.8))
+        hal.send_action(moving(shoulder_pan=0.8))
         clock.advance(1 / 30)
     after = positions(hal)
     assert after["shoulder_pan"] == pytest.approx(0.8, abs=0.02)
@@ -94,10 +87,10 @@ def test_a_named_joint_moves_and_the_others_stay(
 def test_what_was_sent_is_known(adapter: str, make_twin: MakeHal) -> None:
     hal = make_twin(adapter)
     assert hal.sent() == {}
-    hal.send_action(to_targets(shoulder_pan=0.4))
-    hal.send_action(to_targets(gripper=0.2))
+    hal.send_action(moving(shoulder_pan=0.4))
+    hal.send_action(moving(gripper=0.2))
     with pytest.raises(InternalError):
-        hal.send_action(to_targets(gripper=0.9, tail=0.0))
+        hal.send_action(moving(gripper=0.9, tail=0.0))
     assert hal.sent() == {"shoulder_pan": 0.4, "gripper": 0.2}
     hal.disconnect()
     hal.connect()
@@ -107,7 +100,7 @@ def test_what_was_sent_is_known(adapter: str, make_twin: MakeHal) -> None:
 @BOTH
 def test_it_moves_on_between_the_calls(adapter: str, make_twin: MakeHal, clock: Any) -> None:
     hal = make_twin(adapter)
-    hal.send_action(to_targets(shoulder_pan=1.5))
+    hal.send_action(moving(shoulder_pan=1.5))
     clock.advance(0.1)
     first = hal.read_state()
     clock.advance(0.1)
@@ -118,7 +111,7 @@ def test_it_moves_on_between_the_calls(adapter: str, make_twin: MakeHal, clock: 
 
 def test_a_kinematic_joint_keeps_its_greatest_speed(make_twin: MakeHal, clock: Any) -> None:
     hal = make_twin("so101_kinematic", start_pose_rad={"shoulder_pan": 1.0})
-    hal.send_action(to_targets(shoulder_pan=-1.0, gripper=0.6))
+    hal.send_action(moving(shoulder_pan=-1.0, gripper=0.6))
     clock.advance(0.1)
     state = hal.read_state()
     assert state.position[0] == pytest.approx(1.0 - 0.47)
@@ -129,14 +122,14 @@ def test_a_kinematic_joint_keeps_its_greatest_speed(make_twin: MakeHal, clock: A
 @BOTH
 def test_an_emergency_stop_latches(adapter: str, make_twin: MakeHal, clock: Any) -> None:
     hal = make_twin(adapter)
-    hal.send_action(to_targets(shoulder_pan=1.5))
+    hal.send_action(moving(shoulder_pan=1.5))
     clock.advance(0.1)
     with pytest.raises(EstopRequested, match="emergency stop: hand in the way"):
         hal.estop("hand in the way")
     clock.advance(0.3)  # the physical arm has to brake first
     still = positions(hal)["shoulder_pan"]
     with pytest.raises(EstopRequested, match="hand in the way"):
-        hal.send_action(to_targets(shoulder_pan=1.5))
+        hal.send_action(moving(shoulder_pan=1.5))
     with pytest.raises(EstopRequested, match="hand in the way"):
         hal.estop("another reason")
     clock.advance(1.0)
@@ -158,7 +151,7 @@ def test_an_emergency_stop_latches(adapter: str, make_twin: MakeHal, clock: Any)
             joint_names=("gripper",),
         ),
         Action(control_mode=ControlMode.BODY_TWIST, body_twist=((0.1, 0.0, 0.0, 0.0, 0.0, 0.0),)),
-        to_targets(sixth_finger=1.0),
+        moving(sixth_finger=1.0),
         Action(control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0, 1.0),)),
     ],
 )
@@ -193,7 +186,7 @@ def test_the_description_is_that_of_the_published_model() -> None:
 def test_physics_tells_efforts_and_a_table_stops_the_arm(make_twin: MakeHal, clock: Any) -> None:
     hal = make_twin("so101_mujoco")
     for _ in range(60):  # down through the table top
-        hal.send_action(to_targets(shoulder_lift=1.2, elbow_flex=0.2, wrist_flex=1.0))
+        hal.send_action(moving(shoulder_lift=1.2, elbow_flex=0.2, wrist_flex=1.0))
         clock.advance(1 / 30)
     state = hal.read_state()
     lift = state.name.index("shoulder_lift")
@@ -205,7 +198,7 @@ def test_physics_tells_efforts_and_a_table_stops_the_arm(make_twin: MakeHal, clo
 @HEAVY
 def test_a_long_pause_is_not_simulated_second_by_second(make_twin: MakeHal, clock: Any) -> None:
     hal = make_twin("so101_mujoco")
-    hal.send_action(to_targets(shoulder_pan=0.5))
+    hal.send_action(moving(shoulder_pan=0.5))
     clock.advance(3600.0)
     assert positions(hal)["shoulder_pan"] == pytest.approx(0.5, abs=0.1)
     assert hal.read_state().stamp_ns == clock.now_ns()

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.small_robots import frame_at
 from tests.support.dds import NETWORK
 from tests.support.waiting import until
 from vram_arbiter.runner.control.clock import SystemClock
@@ -295,10 +296,10 @@ def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: 
     until_s = clock.now_s() + 60
     while slot._frame is None:
         assert clock.now_s() < until_s, "no picture within a minute"
-        publisher.publish(plain(clock.wall_ns(), data=b"a"))
+        publisher.publish(frame_at(clock.wall_ns(), data=b"a"))
         waitset.wait(duration(milliseconds=100))
         reader._attend(feed, source)
-    publisher.publish(plain(clock.wall_ns(), data=b"z"))
+    publisher.publish(frame_at(clock.wall_ns(), data=b"z"))
     while not source.read(1):
         assert clock.now_s() < until_s, "the last picture did not come"
         waitset.wait(duration(milliseconds=100))
@@ -367,32 +368,17 @@ def test_the_frames_of_any_reader_can_be_published(
     assert sum(data) / len(data) == pytest.approx(200, abs=3)
 
 
-def plain(
-    stamp_ns: int, encoding: FrameEncoding = FrameEncoding.MONO8, **where: Any
-) -> SensorFrame:
-    return SensorFrame(
-        sensor_id="front",
-        stamp_monotonic_ns=stamp_ns,
-        stamp_wall_ns=stamp_ns,
-        encoding=encoding,
-        width=1,
-        height=1,
-        channels=1,
-        **(where or {"data": b"x"}),
-    )
-
-
 def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: str) -> None:
     publisher = RosImagePublisher(topic, int(DOMAIN), rate_hz=10.0)
     for at_ms in range(1000, 2000, 33):
-        publisher.publish(plain(at_ms * 1_000_000))
+        publisher.publish(frame_at(at_ms * 1_000_000))
     assert (publisher.published, publisher.dropped) == (10, 0)
-    publisher.publish(plain(3_000_000_000, topic="/elsewhere"))
-    publisher.publish(plain(3_000_000_000, FrameEncoding.RAW))
-    publisher.publish(plain(3_000_000_000, FrameEncoding.JPEG))
+    publisher.publish(frame_at(3_000_000_000, data=None, topic="/elsewhere"))
+    publisher.publish(frame_at(3_000_000_000, encoding=FrameEncoding.RAW))
+    publisher.publish(frame_at(3_000_000_000, encoding=FrameEncoding.JPEG))
     assert (publisher.published, publisher.dropped) == (10, 3)
     publisher.close()
-    publisher.publish(plain(4_000_000_000))
+    publisher.publish(frame_at(4_000_000_000))
     assert publisher.published == 11
     publisher.close()
 
@@ -415,16 +401,8 @@ def test_what_is_published_is_read_as_it_was(
     publisher = RosImagePublisher(topic, int(DOMAIN))
     slot, clock = reader.slot, SystemClock()
     for _ in range(300):
-        frame = SensorFrame(
-            sensor_id="other",
-            stamp_monotonic_ns=clock.now_ns(),
-            stamp_wall_ns=clock.wall_ns(),
-            encoding=encoding,
-            width=4,
-            height=3,
-            channels=1,
-            data=data,
-        )
+        shown = {"encoding": encoding, "width": 4, "height": 3, "data": data}
+        frame = frame_at(clock.now_ns(), "other", stamp_wall_ns=clock.wall_ns(), **shown)
         publisher.publish(frame)
         with slot._changed:
             if slot._changed.wait_for(lambda: slot._frame is not None, 0.2):

@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.runner.small_robots import frame_at
+
 pytestmark = pytest.mark.heavy
 pytest.importorskip("cyclonedds")
 
@@ -22,7 +24,7 @@ from vram_arbiter.runner.sensors.ros2_messages import (  # noqa: E402
     message_of,
     picture_of,
 )
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame  # noqa: E402
+from vram_arbiter.schemas.world import FrameEncoding  # noqa: E402
 
 stamps = st.integers(0, (2**31 - 1) * 10**9)
 names = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
@@ -165,16 +167,9 @@ def test_frames_become_the_messages_that_they_came_from(encoding: str) -> None:
     per_pixel = {"mono8": 1, "16UC1": 2}.get(encoding, 3)
     message = image(encoding=encoding, step=3 * per_pixel, data=bytes(6 * per_pixel))
     picture = picture_of(message)
-    frame = SensorFrame(
-        sensor_id="cam",
-        stamp_monotonic_ns=1,
-        stamp_wall_ns=5,
-        encoding=picture.encoding,
-        width=picture.width,
-        height=picture.height,
-        channels=picture.channels,
-        data=picture.data,
-    )
+    names = ("encoding", "width", "height", "channels", "data")
+    shown = {name: getattr(picture, name) for name in names}
+    frame = frame_at(1, "cam", stamp_wall_ns=5, **shown)
     assert message_of(frame) == message
     with pytest.raises(ValueError, match="no name in ROS"):
         message_of(frame.model_copy(update={"encoding": FrameEncoding.RAW}))

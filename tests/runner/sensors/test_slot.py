@@ -8,24 +8,16 @@ from typing import Any
 
 import pytest
 
+from tests.runner import small_robots
 from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.protocols import SensorReader
 from vram_arbiter.runner.sensors import Feed, LatestSlot, SlotReader
 from vram_arbiter.schemas.errors import FrameStale
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.schemas.world import SensorFrame
 
 
 def frame_at(stamp_ns: int, value: int = 0, sensor_id: str = "front") -> SensorFrame:
-    return SensorFrame(
-        sensor_id=sensor_id,
-        stamp_monotonic_ns=stamp_ns,
-        stamp_wall_ns=stamp_ns,
-        encoding=FrameEncoding.MONO8,
-        width=1,
-        height=1,
-        channels=1,
-        data=bytes([value]),
-    )
+    return small_robots.frame_at(stamp_ns, sensor_id, data=bytes([value]))
 
 
 class Pushed(SlotReader):

@@ -3,14 +3,14 @@
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Twin
+from tests.runner.small_robots import FedCamera, Twin, frame_at
 from tests.support.waiting import until
 from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.synced import read_together
 from vram_arbiter.schemas.config.robot import SyncConfig
 from vram_arbiter.schemas.errors import FrameStale
-from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
+from vram_arbiter.schemas.world import SensorFrame
 
 MS = 1_000_000
 
@@ -32,15 +32,7 @@ class Film:
     def read_synced(self, deadline_ns: int, after_ns: int | None = None) -> SensorFrame:
         for taken_ns in self.taken_ns:
             if (after_ns or 0) < taken_ns <= deadline_ns:
-                return SensorFrame(
-                    sensor_id=self.sensor_id,
-                    stamp_monotonic_ns=taken_ns,
-                    stamp_wall_ns=0,
-                    encoding=FrameEncoding.MONO8,
-                    width=1,
-                    height=1,
-                    data=b"x",
-                )
+                return frame_at(taken_ns, self.sensor_id)
         raise FrameStale(f"{self.sensor_id} took no new picture")
 
 

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.runner.small_robots import frame_at
 from vram_arbiter.runner.sensors.world_state import (
     FUTURE_TOLERANCE_MS,
     JOINT_STATE,
@@ -13,7 +14,7 @@ from vram_arbiter.runner.sensors.world_state import (
     WorldStateAggregator,
 )
 from vram_arbiter.schemas.errors import StateStale
-from vram_arbiter.schemas.world import FrameEncoding, JointState, SensorFrame
+from vram_arbiter.schemas.world import JointState
 
 MS = 1_000_000
 START_NS = 10_000 * MS
@@ -23,25 +24,13 @@ def joint_state(stamp_ns: int, position: float = 0.5) -> JointState:
     return JointState(name=("a",), position=(position,), stamp_ns=stamp_ns)
 
 
-def frame(stamp_ns: int, camera: str = "front") -> SensorFrame:
-    return SensorFrame(
-        sensor_id=camera,
-        stamp_monotonic_ns=stamp_ns,
-        stamp_wall_ns=0,
-        encoding=FrameEncoding.RGB8,
-        width=1,
-        height=1,
-        data=b"\x01\x02\x03",
-    )
-
-
 @pytest.fixture
 def aggregator() -> WorldStateAggregator:
     return WorldStateAggregator({"front": 100.0, "wrist": 300.0}, topics={"front": "/front"})
 
 
 def test_without_a_joint_state_there_is_no_world_state(aggregator: WorldStateAggregator) -> None:
-    aggregator.update_image_frame(frame(START_NS), START_NS)
+    aggregator.update_image_frame(frame_at(START_NS), START_NS)
     aggregator.note(JOINT_STATE, "the bus is silent")
     with pytest.raises(StateStale, match="the bus is silent"):
         aggregator.snapshot(START_NS)
@@ -49,11 +38,11 @@ def test_without_a_joint_state_there_is_no_world_state(aggregator: WorldStateAgg
 
 def test_what_is_fresh_is_shown_with_its_frame_inline(aggregator: WorldStateAggregator) -> None:
     aggregator.update_joint_state(joint_state(START_NS), START_NS)
-    aggregator.update_image_frame(frame(START_NS), START_NS)
+    aggregator.update_image_frame(frame_at(START_NS), START_NS)
     seen = aggregator.snapshot(START_NS + 99 * MS)
     assert seen.diagnostics == {"front": "ok", "wrist": "stale", JOINT_STATE: "ok"}
     assert seen.image_frames is not None
-    assert seen.image_frames["front"].data == b"\x01\x02\x03"
+    assert seen.image_frames["front"].data == b"x"
     assert (seen.images, seen.joint_state.position) == ({"front": "/front"}, (0.5,))
     assert "nothing has come" in aggregator.why("wrist")
 
@@ -63,17 +52,17 @@ def test_an_old_frame_is_not_served_and_returns_only_after_several_fresh_ones(
 ) -> None:
     now = START_NS
     aggregator.update_joint_state(joint_state(now), now)
-    aggregator.update_image_frame(frame(now), now)
+    aggregator.update_image_frame(frame_at(now), now)
     now += 101 * MS
     seen = aggregator.snapshot(now)
     assert seen.diagnostics["front"] == "stale"
     assert seen.image_frames == {}
     for _ in range(RECOVERY_UPDATES - 1):
         now += 30 * MS
-        aggregator.update_image_frame(frame(now), now)
+        aggregator.update_image_frame(frame_at(now), now)
         assert aggregator.snapshot(now).image_frames == {}
     now += 30 * MS
-    aggregator.update_image_frame(frame(now), now)
+    aggregator.update_image_frame(frame_at(now), now)
     assert set(aggregator.snapshot(now).image_frames or {}) == {"front"}
 
 
@@ -82,7 +71,7 @@ def test_the_same_frame_again_is_no_fresh_one(aggregator: WorldStateAggregator) 
     aggregator.lose("front", "the cable is out")
     now = START_NS + 10 * MS
     for _ in range(2 * RECOVERY_UPDATES):
-        aggregator.update_image_frame(frame(START_NS), now)
+        aggregator.update_image_frame(frame_at(START_NS), now)
     assert aggregator.snapshot(now).diagnostics["front"] == "stale"
     assert aggregator.why("front") == "the cable is out"
 
@@ -96,10 +85,10 @@ def test_a_gap_during_recovery_begins_it_anew(aggregator: WorldStateAggregator) 
         aggregator.snapshot(
             now
         )  # the loop goes on, and sees that the second one has become too old
-        aggregator.update_image_frame(frame(now), now)
+        aggregator.update_image_frame(frame_at(now), now)
         assert aggregator.snapshot(now).diagnostics["front"] == "stale"
     now += 30 * MS
-    aggregator.update_image_frame(frame(now), now)
+    aggregator.update_image_frame(frame_at(now), now)
     assert aggregator.snapshot(now).diagnostics["front"] == "ok"
 
 
@@ -133,7 +122,7 @@ def test_a_stamp_of_another_clock_is_refused(aggregator: WorldStateAggregator) -
 
 def test_a_camera_of_unknown_age_is_refused(aggregator: WorldStateAggregator) -> None:
     with pytest.raises(KeyError):
-        aggregator.update_image_frame(frame(START_NS, "rear"), START_NS)
+        aggregator.update_image_frame(frame_at(START_NS, "rear"), START_NS)
     with pytest.raises(ValueError, match=JOINT_STATE):
         WorldStateAggregator({JOINT_STATE: 100.0})
 
@@ -164,7 +153,7 @@ def test_no_history_serves_a_frame_older_than_allowed(story: list[tuple[int, int
         aggregator.update_joint_state(joint_state(now), now)
         if lost:
             aggregator.lose("front", "lost")
-        aggregator.update_image_frame(frame(now - age_ms * MS), now)
+        aggregator.update_image_frame(frame_at(now - age_ms * MS), now)
         seen = aggregator.snapshot(now)
         shown = (seen.image_frames or {}).get("front")
         assert (shown is not None) == (seen.diagnostics["front"] == "ok")

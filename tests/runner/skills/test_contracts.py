@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, robot_of
+from tests.runner.small_robots import FedCamera, moving, robot_of
 from tests.support.deployment import load_robot
 from tests.support.paths import ROOT
 from vram_arbiter.runner.protocols import Goal, MobileBase, RobotDescription, SkillEnded
@@ -29,7 +29,6 @@ from vram_arbiter.runner.skills.motion import joint_positions
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers, turn
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.wiring import Wiring, wire_up
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ModelError, StateStale
 from vram_arbiter.schemas.manifest import (
     Kind,
@@ -40,7 +39,7 @@ from vram_arbiter.schemas.manifest import (
 )
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
 from vram_arbiter.schemas.manifest.vocabulary import Rotation
-from vram_arbiter.schemas.world import Action, WorldState
+from vram_arbiter.schemas.world import WorldState
 
 np: Any = pytest.importorskip("numpy")  # the base install has none
 pytestmark = pytest.mark.heavy  # MuJoCo, mink
@@ -147,12 +146,8 @@ class Bench:
             if step.withheld:
                 self.clock.advance(1 / HZ)
                 continue
-            action = Action(
-                control_mode=ControlMode.JOINT_POSITION,
-                joint_targets=(tuple(step.targets.values()),),
-                joint_names=tuple(step.targets),
-                body_twist=None if step.twist is None else (step.twist,),
-            )
+            twist = None if step.twist is None else (step.twist,)
+            action = moving(**step.targets).model_copy(update={"body_twist": twist})
             allowed, problems = self.gate.check(action, world)
             self.said += problems
             if allowed is not None:
@@ -242,13 +237,7 @@ def test_joints_in_the_policys_order_in_degrees_with_a_gripper_in_percent() -> N
     assert targets["shoulder_pan"] == pytest.approx(math.radians(10.0))
     hal = make_hal(load_robot("robot_id: a\nhal: {adapter: so101_kinematic}", "r").hal, clock=clock)
     hal.connect()
-    hal.send_action(
-        Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(row,),
-            joint_names=wiring.joints,
-        )
-    )
+    hal.send_action(moving(**targets))
     clock.advance(5.0)
     world = WorldState(stamp_ns=clock.now_ns(), joint_state=hal.read_state())
     measured = joint_positions(world, robot.joint_names)
@@ -795,7 +784,7 @@ def test_cartesian_commands_without_the_solver_are_refused(
 def test_a_state_of_the_base_alone_needs_scipy_before_the_first_tick(
     monkeypatch: pytest.MonkeyPatch, panda: Bench
 ) -> None:
-    """Regression: where only the base's pose was read, SciPy was imported, or missing, in a tick."""
+    """Regression: where only the base's pose was read, a tick imported SciPy, or missed it."""
     monkeypatch.setitem(sys.modules, "scipy.spatial.transform", None)
     based = skill(
         JOINTS + "state_contract:\n  parts:\n"
