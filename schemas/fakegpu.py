@@ -154,9 +154,8 @@ class GpuState:
     config: FakeGpuConfig
     processes: Mapping[str, ProcessFile]
     seq: int = 0
-    logged_bytes: int = (
-        0  # used bytes by the log; differs from `used_bytes` only after a file was edited by hand
-    )
+    logged_bytes: int = 0
+    """Used bytes by the log; differ from `used_bytes` only after a file was edited by hand."""
 
     @property
     def used_bytes(self) -> int:
@@ -236,11 +235,8 @@ def read_gpu(texts: Mapping[str, str], log_tail: str) -> Change:
                 ) from None
     newest = _last_line(log_tail)
     logged = int(newest.get("seq", 0))
-    missing = [
-        p.last
-        for p in processes.values()
-        if p.last is not None and int(p.last.get("seq", 0)) > logged
-    ]
+    lasts = [process.last for process in processes.values()]
+    missing = [last for last in lasts if last is not None and int(last.get("seq", 0)) > logged]
     torn = bool(log_tail) and not log_tail.endswith("\n")
     steps: tuple[Edit, ...] = ()
     if torn or missing:
@@ -278,6 +274,11 @@ def _first(error: ValidationError) -> str:
 
 
 # -- transitions
+_NOTHING: JsonObject = dict.fromkeys(
+    ("context_bytes", "allocated_bytes", "cached_bytes", "leaked_bytes"), 0
+)
+
+
 def settle(gpu: GpuState, now: float, alive: Alive) -> Change:
     """Let time pass: notice edits by hand and deaths, and let what is due come back. Comes before
     every other transition."""
@@ -287,10 +288,9 @@ def settle(gpu: GpuState, now: float, alive: Alive) -> Change:
             process = process.model_copy(update={"died_at_s": now})
             change = change.then(_step(name, process, now, "died", process.on_gpu_bytes, 0))
         if process.died_at_s is not None and now >= process.died_at_s + gpu.config.release_lag_s:
-            change = change.then(_return(name, process, now, process.on_gpu_bytes, {
-                "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0,
-                "returning": (),
-            })).then(_remove(name))  # fmt: skip
+            update = _NOTHING | {"returning": ()}
+            change = change.then(_return(name, process, now, process.on_gpu_bytes, update))
+            change = change.then(_remove(name))
             continue
         due = sum(part.bytes for part in process.returning if part.due_s <= now)
         if due:
@@ -379,10 +379,8 @@ def leave(gpu: GpuState, key: ProcessKey, now: float) -> Change:
     if process is None or not process.own_bytes:
         return Change(gpu)
     freed = process.own_bytes
-    after = process.model_copy(update={
-        "context_bytes": 0, "allocated_bytes": 0, "cached_bytes": 0, "leaked_bytes": 0,
-        "returning": _later(process, freed, gpu, now),
-    })  # fmt: skip
+    update = _NOTHING | {"returning": _later(process, freed, gpu, now)}
+    after = process.model_copy(update=update)
     return _step(file_name(key), after, now, "free", freed, 0)(gpu)
 
 
@@ -489,21 +487,15 @@ def plan_folder(
     if existing is None:
         return FolderPlan({GPU_FILE: dump_config(wanted)}, processes, fresh_log=True)
     current = parse_config(existing)
+    fresh = {GPU_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))}
     if current.boot_id != wanted.boot_id:
-        return FolderPlan(
-            {GPU_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))},
-            processes,
-            fresh_log=True,
-        )
+        return FolderPlan(fresh, processes, fresh_log=True)
     if current.capacity_bytes == wanted.capacity_bytes:
         return FolderPlan()
     if processes:
         raise ConfigError(
             f"a simulated GPU of {format_bytes(current.capacity_bytes)} is in use here, not one "
-            "of "
-            f"{format_bytes(wanted.capacity_bytes)}",
+            f"of {format_bytes(wanted.capacity_bytes)}",
             hint="stop the processes that use it, or choose another runtime folder",
         )
-    return FolderPlan(
-        {GPU_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))}, fresh_log=True
-    )
+    return FolderPlan(fresh, fresh_log=True)

@@ -6,14 +6,13 @@ environment are wrong: a person has to act.
 
 import argparse
 import asyncio
-import contextlib
 import functools
 import json
 import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from vram_arbiter.clients.configs import configs_folder, shipped
@@ -32,6 +31,7 @@ from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
 from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.replaced import replaced
 from vram_arbiter.sidecars.settings import (
     NICE,
     REQUEST_TIMEOUT_S,
@@ -78,12 +78,11 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             need_precision(manifest, settings.device)
         from vram_arbiter.sidecars.host import SidecarHost
 
-        with (
-            command(
-                service, "serve", serves=True, attributes={telemetry.ATTR_CONSUMER: flags.name}
-            ),
-            _temporary_files_in(os.path.dirname(path_of(settings.endpoint))),
-        ):
+        about = {telemetry.ATTR_CONSUMER: flags.name}
+        # the socket of the imports' server lies beside the sidecar's own (`weights_keeper`): a
+        # killed program leaves nothing in the machine's temporary folder
+        beside = replaced(tempfile, tempdir=os.path.dirname(path_of(settings.endpoint)))
+        with command(service, "serve", serves=True, attributes=about), beside:
             asyncio.run(SidecarHost(settings, adapter_for, set_up_log).serve())
     except VramError as error:
         if flags.as_json:
@@ -92,18 +91,6 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
             terminal.complain("vram-sidecar", error)
         return 2 if isinstance(error, (ConfigError, ManifestError)) else 1
     return 0
-
-
-@contextlib.contextmanager
-def _temporary_files_in(folder: str) -> Iterator[None]:
-    """Let the socket of the imports' server lie beside the sidecar's own (`weights_keeper`): a
-    killed program leaves nothing in the machine's temporary folder."""
-    before = tempfile.tempdir
-    tempfile.tempdir = folder
-    try:
-        yield
-    finally:
-        tempfile.tempdir = before
 
 
 def settings_from(flags: argparse.Namespace) -> Settings:

@@ -8,7 +8,7 @@ import contextlib
 import importlib.util
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_
 from vram_arbiter.sidecars.device.capacity import capacities
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.quantization import check_precision
+from vram_arbiter.sidecars.replaced import replaced
 from vram_arbiter.sidecars.settings import DECLARED, FootprintEntry, lease_footprint, read_model
 from vram_arbiter.sidecars.weights import Weights, cached
 
@@ -152,18 +153,16 @@ def _weights(
     place = weights if weights.local else cached(weights)
     if place is None:
         at = f" --revision {weights.revision}" if weights.revision else ""
-        return [
-            Finding(
-                "weights",
-                False,
-                f"weights are not here: `hf download {weights.source}{at}` fetches them",
-            )
-        ]
+        says = f"weights are not here: `hf download {weights.source}{at}` fetches them"
+        return [Finding("weights", False, says)]
     if adapter_for is None:
         return [Finding("weights", None, f"{NOT_COMPARED}: see above")]
     try:
+        from huggingface_hub import constants
+
+        offline = replaced(constants, HF_HUB_OFFLINE=True)  # nothing is downloaded
         # what the loaders print is not the answer
-        with contextlib.redirect_stdout(sys.stderr), _offline():
+        with contextlib.redirect_stdout(sys.stderr), offline:
             adapter = adapter_for(manifest, place)
             adapter.prepare()
             adapter.load("meta")
@@ -193,19 +192,6 @@ def _features(adapter: ModelAdapter) -> list[Finding]:
     return [Finding("features", not wrong, says)]
 
 
-@contextlib.contextmanager
-def _offline() -> Iterator[None]:
-    """Keep the libraries from downloading what is not in the hub's cache."""
-    from huggingface_hub import constants
-
-    before = constants.HF_HUB_OFFLINE
-    constants.HF_HUB_OFFLINE = True
-    try:
-        yield
-    finally:
-        constants.HF_HUB_OFFLINE = before
-
-
 def _bytes(manifest: RSkillManifest, wanted: Wanted) -> list[Finding]:
     """Compare the lease with the GPU's capacity less what the arbiter keeps free by default."""
     findings, needed = [], None
@@ -213,14 +199,11 @@ def _bytes(manifest: RSkillManifest, wanted: Wanted) -> list[Finding]:
         entry = wanted.footprint(manifest)
         lease = lease_footprint(entry.on_wire(), entry.inference_peak)
         needed = lease.load_peak_bytes
-        findings.append(
-            Finding(
-                "footprint",
-                True,
-                f"load peak {format_bytes(needed)}, charged {format_bytes(lease.steady_bytes)} "
-                f"while resident{', as ' + DECLARED if entry.source == DECLARED else ''}",
-            )
+        says = (
+            f"load peak {format_bytes(needed)}, charged {format_bytes(lease.steady_bytes)} "
+            f"while resident{', as ' + DECLARED if entry.source == DECLARED else ''}"
         )
+        findings.append(Finding("footprint", True, says))
     except ConfigError as error:
         findings.append(_bad("footprint", error))
     if wanted.device == "none":

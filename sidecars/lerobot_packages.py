@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from typing import Final, Literal
 
 from vram_arbiter.sidecars.quantization import load_bitsandbytes
+from vram_arbiter.sidecars.replaced import replaced
 
 _FLAGS: Final[Mapping[str, tuple[str, ...]]] = {
     "diffusers": ("_diffusers_available",),
@@ -24,11 +25,5 @@ def import_policies(without: Sequence[Literal["diffusers", "peft"]]) -> None:
 
     if len(without) < len(_FLAGS) and find_spec("bitsandbytes") is not None:
         load_bitsandbytes()
-    known = {flag: getattr(import_utils, flag) for name in without for flag in _FLAGS[name]}
-    for flag in known:
-        setattr(import_utils, flag, False)
-    try:
+    with replaced(import_utils, **{flag: False for name in without for flag in _FLAGS[name]}):
         importlib.import_module("lerobot.policies.factory")
-    finally:
-        for flag, value in known.items():
-            setattr(import_utils, flag, value)

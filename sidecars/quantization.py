@@ -20,6 +20,7 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype, QuantizationBackend
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.sidecars.device.capacity import capabilities
+from vram_arbiter.sidecars.replaced import replaced
 
 if TYPE_CHECKING:
     import torch
@@ -349,13 +350,11 @@ def load_bitsandbytes() -> Any:
     logging.getLogger("bitsandbytes.backends.cpu.ops").setLevel(logging.ERROR)
     import torch
 
-    cuda: Any = torch.cuda
-    own = cuda.get_device_capability
-    cuda.get_device_capability = lambda device=None: max(capabilities("cuda"), default=(0, 0))
-    try:
+    def capability(device: object = None) -> tuple[int, int]:
+        return max(capabilities("cuda"), default=(0, 0))
+
+    with replaced(torch.cuda, get_device_capability=capability):
         import bitsandbytes
-    finally:
-        cuda.get_device_capability = own
     return bitsandbytes
 
 

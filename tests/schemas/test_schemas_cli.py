@@ -16,6 +16,14 @@ SAMPLES = sorted((Path(__file__).parent / "manifest/samples").glob("*.yaml"))
 EXPORTED = Path(schemas.__file__).parent / "json"
 
 
+def changed(folder: Path, kind: str, old: str, new: str, more: str = "") -> Path:
+    """Write a sample of a kind with a change in it."""
+    text = next(path for path in SAMPLES if path.stem == kind).read_text(encoding="utf-8")
+    assert old in text
+    (folder / "rskill.yaml").write_text(text.replace(old, new) + more, encoding="utf-8")
+    return folder / "rskill.yaml"
+
+
 def test_check_says_ok_for_good_files() -> None:
     result = subprocess.run(
         [sys.executable, "-m", "vram_arbiter.schemas", "check", *map(str, SAMPLES)],
@@ -30,11 +38,7 @@ def test_check_says_ok_for_good_files() -> None:
 def test_check_names_every_wrong_field_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    wrong = tmp_path / "rskill.yaml"
-    text = SAMPLES[0].read_text(encoding="utf-8")
-    wrong.write_text(
-        text.replace("chunk_size: 1", "chunk_size: 0") + "colour: red\n", encoding="utf-8"
-    )
+    wrong = changed(tmp_path, "detector", "chunk_size: 1", "chunk_size: 0", "colour: red\n")
     assert main(["check", str(tmp_path), str(SAMPLES[1])]) == 1
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -51,10 +55,7 @@ def test_check_refuses_a_policy_that_sees_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Regression: it said ok, and every runner refused the skill."""
-    text = next(path for path in SAMPLES if path.stem == "vla").read_text(encoding="utf-8")
-    camera = ', vla_feature_key: "observation.images.front"'
-    assert camera in text
-    (tmp_path / "rskill.yaml").write_text(text.replace(camera, ""), encoding="utf-8")
+    changed(tmp_path, "vla", ', vla_feature_key: "observation.images.front"', "")
     assert main(["check", str(tmp_path)]) == 1
     said = capsys.readouterr().out
     assert "rskill.yaml: sensors_required: names no camera: give a sensor of modality rgb" in said
@@ -69,13 +70,10 @@ def test_check_of_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_warnings_go_beside_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = next(path for path in SAMPLES if path.stem == "vlm").read_text(encoding="utf-8")
-    (tmp_path / "rskill.yaml").write_text(
-        text.replace('role: "s2"', 'role: "s1"'), encoding="utf-8"
-    )
+    written = changed(tmp_path, "vlm", 'role: "s2"', 'role: "s1"')
     assert main(["check", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
-    assert out == f"{tmp_path / 'rskill.yaml'}: ok\n"
+    assert out == f"{written}: ok\n"
     assert err.startswith("warning: ")
     assert "role: " in err
 

@@ -54,17 +54,6 @@ def test_it_loads_on_the_first_request_and_not_before(box, arbiter):
     }  # fmt: skip
 
 
-def test_unload_leaves_nothing_on_the_gpu_and_the_next_request_loads_again(box, arbiter):
-    sidecar = box.start("detector")
-    sidecar.detect()
-    assert sidecar.ask("unload")["ok"]
-    assert sidecar.state() == "unloaded"
-    until(lambda: leases(arbiter) == {})
-    until(lambda: box.used() == 0)
-    assert sidecar.ask("unload")["ok"], "twice is once"
-    assert sidecar.detect()["ok"]
-
-
 def test_a_callers_use_on_the_lease_keeps_the_model_until_it_ends(box, arbiter):
     policy = box.start("policy", "--min-residency-s", "0", footprint="5GB,5GB,100MB")
     other = box.start("other", footprint="5GB,5GB,100MB")
@@ -272,22 +261,6 @@ def test_a_stuck_model_does_not_keep_the_program_from_ending(box):
     assert sidecar.terminate() == 0
 
 
-def test_a_model_that_dies_while_it_works_is_an_error_and_its_lease_ends(box, arbiter):
-    sidecar = box.start("detector")
-    sidecar.detect()
-    running = sidecar.hold()
-    os.kill(sidecar.model_pid(), signal.SIGKILL)
-    answer = sidecar.client.reply(running, PATIENCE_S)
-    assert (answer["code"], answer["ok"]) == ("model_error", False)
-    assert "process ended by SIGKILL" in answer["error"]
-    until(lambda: leases(arbiter) == {})
-    identity = sidecar.ask("ping")
-    assert (identity["state"], identity["token"]) == ("unloaded", None)
-    assert "model_error" in identity["last_error"]
-    (sidecar.folder / "holding").unlink()
-    assert sidecar.detect()["ok"]
-
-
 def test_the_request_after_a_killed_model_reads_no_weights(box):
     """Regression: the weights were dropped with the model's process, so the next request read them
     again, and imported everything where their keeper had died too: 35 s under load, with a lease
@@ -315,21 +288,6 @@ def test_after_a_killed_keeper_the_model_is_read_before_a_lease_is_asked_for(box
     assert leases(arbiter) == {}
     (sidecar.folder / "slow_prepare").unlink()
     assert sidecar.client.reply(waiting, PATIENCE_S)["ok"]
-
-
-def test_a_model_that_dies_while_it_loads_is_an_error(box, arbiter):
-    (box.runtime / "detector-model").mkdir()
-    switch = box.runtime / "detector-model" / "slow_load"
-    switch.touch()
-    sidecar = box.start("detector")
-    waiting = sidecar.send_detect()
-    until(lambda: box.used() > 0)
-    os.kill(sidecar.model_pid(), signal.SIGKILL)
-    answer = sidecar.client.reply(waiting, PATIENCE_S)
-    assert (answer["code"], answer["ok"]) == ("model_error", False)
-    until(lambda: leases(arbiter) == {})
-    switch.unlink()
-    assert sidecar.detect()["ok"]
 
 
 def test_a_model_dies_with_its_host(box):

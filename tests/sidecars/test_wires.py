@@ -257,34 +257,6 @@ def test_clients_of_the_field_get_their_familys_shapes():
 
 # -- on a real socket
 @pytest.mark.e2e
-def test_a_real_sidecar_survives_what_strangers_send(lone_box):
-    sidecar = lone_box.start("detector", "--no-arbiter", device="none")
-    for payload in (
-        b"",
-        b"\xc1",
-        b"\x80" * 3,
-        msgpack.packb([1]),
-        msgpack.packb("x"),
-        msgpack.packb({1: 2}),
-        b"\xdf\xff\xff\xff\xff",
-    ):
-        sidecar.client.send_raw(payload)
-        reply = sidecar.client.receive()
-        assert reply is not None, payload
-        assert reply["ok"] is False, payload
-    sidecar.client.send_frames([b"one", b"two", b"three"])
-    sidecar.client.send_raw(
-        msgpack.packb({"op": "detect", "image": bytes(17 * 2**20), "query": "x"})
-    )
-    codes = set()
-    while "message_too_large" not in codes:
-        reply = sidecar.client.receive()
-        assert reply is not None, codes
-        codes.add(reply["code"])
-    assert sidecar.detect()["ok"]
-
-
-@pytest.mark.e2e
 def test_req_clients_of_the_field_are_answered(lone_box):
     """Strict ones, and those that number their requests, which waited for ever; on a port, which is
     all that the field's clients can be told."""

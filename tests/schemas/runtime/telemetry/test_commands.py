@@ -19,6 +19,23 @@ TRACE, PARENT = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 WAIT_S = 60.0
 
 
+def ran(*arguments: str, **environ: str) -> "subprocess.CompletedProcess[str]":
+    """Run an interpreter to its end."""
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **environ},
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+    )
+
+
+def port_of(taken: socket.socket) -> dict[str, str]:
+    """Return the variables that ask for Prometheus on a port."""
+    port = str(taken.getsockname()[1])
+    return {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": port}
+
+
 def program(lines: str, collector: Collector | None, **environ: str) -> "subprocess.Popen[str]":
     """A program of these lines inside `command("tool", "do")`; `serves` and `sys` are at hand."""
     body = "\n".join(f"    {line}" for line in lines.splitlines())
@@ -87,18 +104,17 @@ def test_nobody_asked_nothing_is_imported_or_changed() -> None:
 
 def test_variables_that_make_no_sense_are_told_in_one_line(tmp_path: Path) -> None:
     """Each program says it before it does anything."""
-    nowhere = {"OTEL_TRACES_EXPORTER": "smoke", "VRAM_ARBITER_RUNTIME": str(tmp_path)}
-    for argv, code in (
-        (["vram_arbiter.clients", "history"], 2),
-        (["vram_arbiter.reasoner", "--say", "x"], 2),
-        (["vram_arbiter.runner", "replay", "--dataset", "x", "--frame", "0"], 2),
+    for argv in (
+        ("clients", "history"),
+        ("reasoner", "--say", "x"),
+        ("runner", "replay", "--dataset", "x", "--frame", "0"),
     ):
-        done = subprocess.run(
-            [sys.executable, "-m", *argv],
-            env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **nowhere},
-            capture_output=True, text=True, timeout=WAIT_S,
-        )  # fmt: skip
-        assert done.returncode == code, done.stderr
+        done = ran(
+            *("-m", f"vram_arbiter.{argv[0]}", *argv[1:]),
+            OTEL_TRACES_EXPORTER="smoke",
+            VRAM_ARBITER_RUNTIME=str(tmp_path),
+        )
+        assert done.returncode == 2, done.stderr
         assert "OTEL_" in done.stderr
         assert "Traceback" not in done.stderr
 
@@ -107,26 +123,13 @@ def test_a_command_goes_on_where_a_server_has_the_port(tmp_path: Path) -> None:
     """A variable for all programs of the machine: `vramctl evict` and `vram-runner goal` were
     refused for the port that the runner serves its metrics on."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        environ = {
-            "PYTHONPATH": f"{ROOT}/src:{ROOT}",
-            "PATH": "/usr/bin",
-            "VRAM_ARBITER_RUNTIME": str(tmp_path),
-            "OTEL_METRICS_EXPORTER": "prometheus",
-            "OTEL_EXPORTER_PROMETHEUS_PORT": str(taken.getsockname()[1]),
-        }
+        environ = {"VRAM_ARBITER_RUNTIME": str(tmp_path), **port_of(taken)}
         for argv, code, answer in (
-            (["clients", "drain", "--reason", "x"], 3, "no arbiter"),
-            (
-                ["runner", "goal", "vram-arbiter/so101-grab", "grab", "--wait", "0.1"],
-                1,
-                "no runner",
-            ),
-            (["reasoner", "serve"], 2, "no Prometheus endpoint"),
+            (("clients", "drain", "--reason", "x"), 3, "no arbiter"),
+            (("runner", "goal", "a/grab", "grab", "--wait", "0.1"), 1, "no runner"),
+            (("reasoner", "serve"), 2, "no Prometheus endpoint"),
         ):
-            done = subprocess.run(
-                [sys.executable, "-m", f"vram_arbiter.{argv[0]}", *argv[1:]],
-                env=environ, capture_output=True, text=True, timeout=WAIT_S,
-            )  # fmt: skip
+            done = ran("-m", f"vram_arbiter.{argv[0]}", *argv[1:], **environ)
             assert (done.returncode, answer in done.stderr) == (code, True), done.stderr
 
 
@@ -134,19 +137,9 @@ def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path
     """A variable for all programs of the machine; and the port that it names is the runner's own,
     whose robot shall stop."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        for said in (
-            {"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"},
-            {
-                "OTEL_METRICS_EXPORTER": "prometheus",
-                "OTEL_EXPORTER_PROMETHEUS_PORT": str(taken.getsockname()[1]),
-            },
-        ):
-            done = subprocess.run(
-                [sys.executable, "-m", "vram_arbiter.runner", "estop", "--endpoint",
-                f"ipc://{tmp_path}/runner.sock"],
-                env={"PYTHONPATH": f"{ROOT}/src:{ROOT}", "PATH": "/usr/bin", **said},
-                capture_output=True, text=True, timeout=WAIT_S,
-            )  # fmt: skip
+        for said in ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector"}, port_of(taken)):
+            estop = ("estop", "--endpoint", f"ipc://{tmp_path}/runner.sock")
+            done = ran("-m", "vram_arbiter.runner", *estop, **said)
             assert done.returncode == 1, done.stderr
             assert "no runner stops at" in done.stderr, "it asked"
 
@@ -154,12 +147,6 @@ def test_an_emergency_stop_is_not_refused_for_the_telemetrys_sake(tmp_path: Path
 def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> None:
     """`vramctl status` is typed and polled too often to pay for an SDK."""
     with Collector() as collector:
-        environ = {
-            "PYTHONPATH": f"{ROOT}/src:{ROOT}",
-            "PATH": "/usr/bin",
-            "VRAM_ARBITER_RUNTIME": str(tmp_path),
-            **collector.environ(),
-        }
         lines = (
             "import sys\nfrom vram_arbiter.clients.cli.main import main\nsys.argv = ['vramctl', "
             "*sys.argv[1:]]\n"
@@ -168,13 +155,8 @@ def test_the_quick_commands_send_nothing_and_the_others_do(tmp_path: Path) -> No
         )
         said = {}
         for name in ("status", "doctor"):
-            done = subprocess.run(
-                [sys.executable, "-c", lines, name],
-                env=environ,
-                capture_output=True,
-                text=True,
-                timeout=WAIT_S,
-            )
+            environ = {"VRAM_ARBITER_RUNTIME": str(tmp_path), **collector.environ()}
+            done = ran("-c", lines, name, **environ)
             said[name] = (done.returncode, done.stderr.splitlines()[-1])
         spans = collector.spans()
     assert said == {"status": (3, "[]"), "doctor": (3, "['opentelemetry']")}

@@ -27,11 +27,18 @@ needs_sdk = pytest.mark.skipif(
 BASE = "http://collector:4318"
 
 
+PRELUDE = """
+import sys, threading
+import vram_arbiter.schemas.runtime.telemetry.setup as o
+from vram_arbiter.schemas.errors import ConfigError
+"""
+
+
 def run_program(code: str, environ: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
     """In a process of its own: an SDK is installed once per process."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OTEL_")}
     return subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", PRELUDE + code],
         env={**kept, **environ},
         cwd=ROOT,
         capture_output=True,
@@ -116,10 +123,7 @@ def test_the_environment_says_which_exporters_are_wanted(
 )
 def test_an_exporter_that_cannot_be_made_is_named(environ: dict[str, str], words: str) -> None:
     said = run_program(
-        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
-        "from vram_arbiter.schemas.errors import ConfigError\n"
-        "try: o.set_up('robot')\n"
-        "except ConfigError as error: print(error)\n",
+        "try: o.set_up('robot')\nexcept ConfigError as error: print(error)\n",
         environ,
     )
     assert words in said.stdout, said.stderr
@@ -128,7 +132,6 @@ def test_an_exporter_that_cannot_be_made_is_named(environ: dict[str, str], words
 # -- off
 def test_off_imports_nothing_of_opentelemetry_and_starts_nothing() -> None:
     result = run_program(
-        "import sys, threading, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
         "t()\n"
         "assert not t.on\n"
@@ -148,7 +151,6 @@ def test_packages_that_are_missing_are_asked_for() -> None:
         "        if name.startswith('{}'): raise ModuleNotFoundError('No module named ' + "
         "repr(name))\n"
         "sys.meta_path.insert(0, Hidden())\n"
-        "import threading, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "try: o.set_up('robot')\n"
         "except Exception as e: print(type(e).__name__, e, threading.active_count())\n"
     )
@@ -166,7 +168,7 @@ def test_packages_that_are_missing_are_asked_for() -> None:
 
 # -- on
 PROGRAM = """
-import logging, sys, vram_arbiter.schemas.runtime.telemetry.setup as o
+import logging
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry, spans as tracing
 from vram_arbiter.schemas.errors import RobotFault
 from opentelemetry import metrics
@@ -260,7 +262,7 @@ def free_port() -> str:
 def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
     port = free_port()
     result = run_program(
-        "import http.client, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
+        "import http.client\n"
         "from vram_arbiter.schemas.runtime.telemetry import names as n\n"
         "t = o.set_up('vram-runner')\n"
         "from vram_arbiter.schemas.runtime.telemetry import meters\n"
@@ -291,7 +293,6 @@ def test_a_taken_port_is_named() -> None:
         taken.listen()
         port = str(taken.getsockname()[1])
         said = run_program(
-            "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
             "try: o.set_up('robot')\n"
             "except Exception as error: print(error)\n"
             "assert o.set_up('robot', port_required=False) is not None\n",
@@ -329,7 +330,6 @@ def test_a_collector_that_is_away_is_complained_of_once_and_holds_up_no_end() ->
         deaf.listen()
         result = run_program(
             "import logging; logging.basicConfig(format='%(message)s')\n"
-            "import time, vram_arbiter.schemas.runtime.telemetry.setup as o\n"
             "from vram_arbiter.schemas.runtime.telemetry import spans as tracing\n"
             "t = o.set_up('robot')\n"
             "from opentelemetry import trace\n"
@@ -378,8 +378,6 @@ def test_what_the_sdk_refuses_is_the_operators_error_and_leaves_no_half(
     """Regression: a bad number in an `OTEL_` variable ended programs with a traceback and left half
     a set-up."""
     result = run_program(
-        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
-        "from vram_arbiter.schemas.errors import ConfigError\n"
         "try:\n    o.set_up('robot')\n"
         "except ConfigError as error:\n    print(error)\n"
         "from opentelemetry import metrics, trace\n"
@@ -404,7 +402,6 @@ def test_an_operators_time_limits_win_over_ours() -> None:
     """Regression: a limit for one signal was overridden by our 3 s."""
     result = run_program(
         "import gc\n"
-        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "t = o.set_up('robot')\n"
         "from opentelemetry.exporter.otlp.common.http import _OTLPHTTPClient as C\n"
         "print({c._kind: c._timeout for c in gc.get_objects() if isinstance(c, C)})\n"
@@ -422,9 +419,7 @@ def test_no_secret_stands_in_a_message() -> None:
     address as given."""
     result = run_program(
         "import logging; logging.basicConfig()\n"
-        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "import os\n"
-        "from vram_arbiter.schemas.errors import ConfigError\n"
         "t = o.set_up('robot')\n"
         "for url in ('htps://me:geheim@host', 'htps://host/?key=geheim'):\n"
         "    try:\n        o.wanted({'OTEL_EXPORTER_OTLP_ENDPOINT': url})\n"
@@ -443,7 +438,6 @@ def test_a_full_queue_of_spans_is_complained_of_as_seldom_as_its_collector() -> 
     """Regression: only the exporters were quietened: "Queue full" was logged every 20 s."""
     result = run_program(
         "import logging; logging.basicConfig(format='%(message)s')\n"
-        "import vram_arbiter.schemas.runtime.telemetry.setup as o\n"
         "o.set_up('robot')\n"
         "sdk = logging.getLogger('opentelemetry.sdk._shared_internal')\n"
         "for n in range(3):\n"
