@@ -375,6 +375,7 @@ def test_a_signal_ends_it_with_a_report_of_what_was_played(tmp_path: Path) -> No
 # -- environments of lerobot
 @pytest.mark.heavy
 @pytest.mark.timeout(600)
+@pytest.mark.nightly  # its programs import lerobot twice more
 def test_lerobot_eval_plays_a_checkpoint_in_an_environment_of_lerobot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
