@@ -36,14 +36,18 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 LONGEST = (
     "tests/e2e/test_demo.py",
-    "tests/sidecars/test_",
     "tests/packaging/test_readme.py",
     "tests/runner/recording/",
     "tests/e2e/",
     "tests/sidecars/",
     "tests/packaging/",
+    "tests/runner/sensors/test_gstreamer.py",
+    "tests/runner/skills/test_policies_as_lerobot.py",
+    "tests/runner/robots/test_lerobot_robot.py",
     "tests/runner/cli/",
+    "tests/runner/sim/test_benchmark.py",
     "tests/bench/",
+    "tests/arbiter/core/test_machine.py",
     "tests/arbiter/test_",
 )
 """Where the longest tests are: begun last, one worker would end minutes after the other."""

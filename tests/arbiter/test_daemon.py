@@ -198,15 +198,6 @@ def test_an_orderly_stop(make_arbiter: Make, number: str) -> None:
     assert "Traceback" not in arbiter.log
 
 
-def test_the_stale_socket_of_a_killed_daemon_is_replaced(make_arbiter: Make) -> None:
-    arbiter = make_arbiter().start()
-    arbiter.kill()
-    assert (arbiter.runtime / "arbiter.sock").exists()
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
-        assert client.hello().ask("ping")["ok"]
-
-
 def test_the_watchdog_is_fed_and_the_status_tells(make_arbiter: Make) -> None:
     arbiter = make_arbiter().start({"WATCHDOG_USEC": "300000"})
     for _ in range(3):

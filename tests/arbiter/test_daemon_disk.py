@@ -11,13 +11,12 @@ import resource
 import shutil
 import sqlite3
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -142,11 +141,7 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
             "journal cannot be written" in problem for problem in client.ask("status")["problems"]
         )
         on_small_disk.wait_for("journal cannot be written", PATIENCE_S)
-        doctor = subprocess.run(
-            [sys.executable, "-m", "vram_arbiter.clients", "doctor"],
-            env=on_small_disk.environ, capture_output=True, text=True, timeout=PATIENCE_S,
-            check=False,
-        )  # fmt: skip
+        doctor = vramctl("doctor", environ=on_small_disk.environ)
         assert doctor.returncode == 1, "a daemon that can grant nothing is not healthy"
         assert "ERROR    daemon.files" in doctor.stdout
         assert sorted(consumers(client)) == ["goes", "stays"]

@@ -42,7 +42,7 @@ def quick_reader(
 
 
 @pytest.fixture
-def observer(quick_reader: ArbiterProcess) -> Iterator[WireClient]:
+def watcher(quick_reader: ArbiterProcess) -> Iterator[WireClient]:
     """A connected client: the GPU is read in the background while there is one."""
     with WireClient(quick_reader.endpoint) as client:
         yield client.hello("watcher", role="observer")
@@ -70,27 +70,27 @@ def job(
         process.stdout.close()
 
 
-def gpu_when(observer: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+def gpu_when(watcher: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """The GPU's view as soon as it is like that. Every answer of the daemon paces the questions;
     raises TimeoutError."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
-        gpu: dict[str, Any] = observer.ask("status")["gpus"][0]
+        gpu: dict[str, Any] = watcher.ask("status")["gpus"][0]
         if when(gpu):
             return gpu
-        observer.receive(0.05)
+        watcher.receive(0.05)
     raise TimeoutError(f"the GPU stays {gpu}")
 
 
-def told(observer: WireClient, *kinds: str) -> list[dict[str, Any]]:
-    events: list[dict[str, Any]] = observer.ask("history", kinds=list(kinds))["events"]
+def told(watcher: WireClient, *kinds: str) -> list[dict[str, Any]]:
+    events: list[dict[str, Any]] = watcher.ask("history", kinds=list(kinds))["events"]
     return events
 
 
 def wait_told(
-    observer: WireClient, kind: str, where: Callable[[dict[str, Any]], bool]
+    watcher: WireClient, kind: str, where: Callable[[dict[str, Any]], bool]
 ) -> dict[str, Any]:
-    event: dict[str, Any] = observer.push(
+    event: dict[str, Any] = watcher.push(
         "event", PATIENCE_S, lambda push: push["event"]["kind"] == kind and where(push["event"])
     )["event"]
     return event
@@ -101,12 +101,12 @@ THROUGH_SHELL = ["sh", "-c", '"$@"; exit $?', "sh"]
 
 @pytest.mark.parametrize("through", [[], THROUGH_SHELL], ids=["child", "grandchild"])
 def test_the_bytes_of_a_child_are_those_of_the_lease(
-    quick_reader: ArbiterProcess, observer: WireClient, through: list[str]
+    quick_reader: ArbiterProcess, watcher: WireClient, through: list[str]
 ) -> None:
-    assert observer.ask("subscribe")["ok"]
+    assert watcher.ask("subscribe")["ok"]
     with job(quick_reader, 4 * GIB, *through) as (vramctl, child):
         gpu = gpu_when(
-            observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"])
+            watcher, lambda gpu: any(process["used_bytes"] for process in gpu["processes"])
         )
         (process,) = gpu["processes"]
         assert child != vramctl.pid
@@ -121,37 +121,37 @@ def test_the_bytes_of_a_child_are_those_of_the_lease(
             0,
             0,
         )
-    verified = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
+    verified = wait_told(watcher, "verified", lambda event: event["consumer"] == "job")
     assert (verified["verdict"], verified["before_bytes"]) == ("verified", 4 * GIB)
-    gpu = gpu_when(observer, lambda gpu: not gpu["charged_bytes"])
+    gpu = gpu_when(watcher, lambda gpu: not gpu["charged_bytes"])
     assert gpu["stowaway_bytes"] == 0
-    assert told(observer, "stowaway", "pressure", "lost") == []
+    assert told(watcher, "stowaway", "pressure", "lost") == []
     assert vramctl.returncode == 0
 
 
 @pytest.mark.parametrize("quick_reader", [2], indirect=True)
 def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
-    quick_reader: ArbiterProcess, observer: WireClient
+    quick_reader: ArbiterProcess, watcher: WireClient
 ) -> None:
     """The program itself dies with `vramctl`, here a shell; what it started does not."""
-    assert observer.ask("subscribe")["ok"]
+    assert watcher.ask("subscribe")["ok"]
     with job(quick_reader, 4 * GIB, *THROUGH_SHELL) as (vramctl, child):
-        gpu_when(observer, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
+        gpu_when(watcher, lambda gpu: any(process["used_bytes"] for process in gpu["processes"]))
         vramctl.send_signal(signal.SIGKILL)
-        stowaway = wait_told(observer, "stowaway", lambda event: event["pid"] == child)
+        stowaway = wait_told(watcher, "stowaway", lambda event: event["pid"] == child)
         assert (stowaway["name"], stowaway["used_bytes"]) == ("job", 4 * GIB)
-        verdict = wait_told(observer, "verified", lambda event: event["consumer"] == "job")
+        verdict = wait_told(watcher, "verified", lambda event: event["consumer"] == "job")
         assert verdict["verdict"] == "contested"
         assert verdict["culprits"] == [{"pid": child, "name": "job", "bytes": 4 * GIB}]
-        gpu = gpu_when(observer, lambda gpu: not gpu["charged_bytes"])
+        gpu = gpu_when(watcher, lambda gpu: not gpu["charged_bytes"])
         assert gpu["stowaway_bytes"] == 4 * GIB, (
             "charged once: the debt is over, the orphan is still there"
         )
-    gpu_when(observer, lambda gpu: not gpu["stowaway_bytes"])
+    gpu_when(watcher, lambda gpu: not gpu["stowaway_bytes"])
 
 
 def test_what_the_child_of_an_observer_holds_is_not_hidden(
-    quick_reader: ArbiterProcess, observer: WireClient
+    quick_reader: ArbiterProcess, watcher: WireClient
 ) -> None:
     """This very process is connected and the child's parent."""
     with subprocess.Popen(
@@ -160,6 +160,6 @@ def test_what_the_child_of_an_observer_holds_is_not_hidden(
     ) as child:  # fmt: skip
         assert child.stdout is not None
         assert int(child.stdout.readline()) == child.pid
-        gpu = gpu_when(observer, lambda gpu: bool(gpu["stowaway_bytes"]))
+        gpu = gpu_when(watcher, lambda gpu: bool(gpu["stowaway_bytes"]))
         assert [process["pid"] for process in gpu["processes"]] == [child.pid]
         child.communicate("\n", PATIENCE_S)

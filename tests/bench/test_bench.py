@@ -105,10 +105,9 @@ def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> 
     assert jitter["ok"] == (float(str(jitter["p99_us"])) < 2000)
 
 
-@pytest.mark.parametrize("kind", COSTLY)
-def test_a_costly_message_is_decoded_or_refused(kind: str) -> None:
+def test_a_costly_message_is_timed() -> None:
     """The row called a function that had changed, and no test ran it."""
-    assert cost_us(COSTLY[kind]) > 0
+    assert cost_us(COSTLY["a long key"]) > 0
 
 
 def test_decisions_of_the_engine_alone_are_timed() -> None:

@@ -54,7 +54,7 @@ async def live(name: str, size: int, gpu_folder: Path, residue: int) -> None:
     async with AsyncClient(name=name, connect_timeout_s=60.0) as client:
         say("waiting")
         lease = await client.acquire(spec, unload=unload)
-        say("loading", token=list(lease.token))
+        say("loading", lease_id=lease.lease_id, token=list(lease.token))
         await go()
         block = memory.allocate(name, size - residue)
         await lease.ready(memory.used_bytes())

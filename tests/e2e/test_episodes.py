@@ -12,16 +12,15 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AsyncExitStack
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.runner.small_robots import robot_of
+from tests.support.chat_server import chat_server
 from tests.support.fakegpu_check import check_log
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
@@ -458,13 +457,13 @@ async def canceled_while_loading(stage: Stage) -> None:
 
 async def reasoner_killed(stage: Stage) -> None:
     """The goal does not depend on who asked for it, and neither does the detector's return."""
-    server = Script({"prompt": "hold still"}, f"execute_rskill__{SKILL.replace('/', '__')}")
-    with server:
+    call = (f"execute_rskill__{SKILL.replace('/', '__')}", {"prompt": "hold still"})
+    with chat_server(lambda asked: call) as url:
         stage.programs.tell("hold", True)
         stage.programs.start(
             "reasoner", "--task", "hold still", "--planner",
             "openai", "--detector", "none", "--scene-vlm", "none",
-            VRAM_REASONER_LLM_BASE_URL=server.url, VRAM_REASONER_LLM_MODEL="m",
+            VRAM_REASONER_LLM_BASE_URL=url, VRAM_REASONER_LLM_MODEL="m",
         )  # fmt: skip
         await stage.until("use_began", "policy", BOOT_S)
         await stage.holding()
@@ -634,40 +633,3 @@ async def slow_start(stage: Stage) -> None:
 
 def test_no_goal_runs_before_its_policy_is_ready(episode_programs: Programs) -> None:
     assert episode_programs.play(slow_start) == []
-
-
-class Script:
-    """A language model's server that says the same call whenever it is asked."""
-
-    def __init__(self, arguments: dict[str, Any], name: str) -> None:
-        function = {"name": name, "arguments": json.dumps(arguments)}
-        call = {"id": "c", "type": "function", "function": function}
-        said = {
-            "choices": [{"message": {"role": "assistant", "content": None, "tool_calls": [call]}}]
-        }
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                self.rfile.read(int(self.headers["Content-Length"]))
-                self.send_response(200)
-                self.end_headers()
-                self.wfile.write(json.dumps(said).encode())
-
-            def log_message(self, format: str, *args: Any) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.02}
-        )
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
-
-    def __enter__(self) -> "Script":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()

@@ -13,17 +13,16 @@ from typing import Any
 
 import pytest
 
-from tests.support.fakegpu_check import check_log
-from tests.support.forkserver import Child, ForkServer
-from tests.support.process import ArbiterProcess
+from tests.support.forkserver import Child
+from tests.support.process import ArbiterProcess, vramctl
+from tests.support.stage import GIB, LAG_S, PATIENCE_S
+from tests.support.stage import Stage as OneDaemon
 from tests.support.wire import WireClient
 from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.schemas import fakegpu
 
 pytestmark = pytest.mark.e2e
-GIB, MIB = 1 << 30, 1 << 20
-RESIDUE = 256 * MIB
-PATIENCE_S = 60.0
+RESIDUE = GIB // 4
 CONFIG = """
 probe: {period_s: 0.1}
 verify: {timeout_s: 5, slow_poll_s: 0.1}
@@ -39,106 +38,26 @@ sys.stdin.readline()
 """
 
 
-class Stage:
-    """One daemon, one GPU and one fork server for all tests of this file."""
-
-    def __init__(self) -> None:
-        self.arbiter = ArbiterProcess(config=CONFIG, prepared=True).start()
-        self.configure(release_lag_s=0.15)
-        program = Path(__file__).with_name("neighbour.py")
-        self.forks = ForkServer(program, self.arbiter.environ, self.arbiter.runtime / "errors.log")
-        self.children: list[Child] = []
-        self.watcher: WireClient | None = None
-
-    def configure(self, **changes: Any) -> None:
-        path = self.arbiter.gpu_folder / fakegpu.GPU_FILE
-        config = fakegpu.parse_config(path.read_text()).model_copy(update=changes)
-        temporary = path.with_name(".new")
-        temporary.write_text(fakegpu.dump_config(config))
-        temporary.rename(path)
-
-    def watch(self) -> WireClient:
-        """A fresh subscriber: its first events are those from now on."""
-        if self.watcher is not None:
-            self.watcher.close()
-        self.watcher = WireClient(self.arbiter.endpoint).hello("watcher", role="observer")
-        assert self.watcher.ask("subscribe")["ok"]
-        return self.watcher
-
-    def event(self, kind: str, **facts: Any) -> dict[str, Any]:
-        assert self.watcher is not None
-        push = self.watcher.push(
-            "event", PATIENCE_S,
-            lambda p: p["event"]["kind"] == kind and facts.items() <= p["event"].items(),
-        )  # fmt: skip
-        event: dict[str, Any] = push["event"]
-        return event
+class Stage(OneDaemon):
+    """Its consumers have habits."""
 
     def spawn(self, name: str, gib: float, **habits: Any) -> Child:
-        child = self.forks.spawn(
-            name, str(int(gib * GIB)), str(self.arbiter.gpu_folder), json.dumps(habits), name=name
-        )
-        self.children.append(child)
-        return child
+        return self.begin(name, int(gib * GIB), json.dumps(habits))
 
     def vramctl(self, *arguments: str) -> str:
-        """What an operator sees, who asks again where nobody answered in the seconds that he is
-        made to wait."""
+        """Return what an operator sees, who asks again where the daemon did not answer in time."""
         for _ in range(20):
-            done = subprocess.run(
-                [sys.executable, "-m", "vram_arbiter.clients", *arguments],
-                env=self.arbiter.environ, capture_output=True, text=True, timeout=PATIENCE_S,
-                check=False,
-            )  # fmt: skip
+            done = vramctl(*arguments, environ=self.arbiter.environ)
             if done.returncode != UNREACHABLE:
                 break
         return done.stdout + done.stderr
 
-    def used_when(self, name: str) -> int:
-        """Bytes on the GPU, of everybody, in the moment before `name` touched it first."""
-        used = 0
-        for line in map(
-            json.loads, (self.arbiter.gpu_folder / fakegpu.LOG_FILE).read_text().splitlines()
-        ):
-            if line["name"] == name:
-                return used
-            used = line["used_after"]
-        raise AssertionError(f"{name} never touched the GPU")
-
-    def end_case(self) -> None:
-        """Everybody dies; nothing of them stays with the daemon."""
-        for child in self.children:
-            child.close()
-        self.children.clear()
-        self.configure(faults=fakegpu.Faults())
-        watcher = self.watch()
-        while not self._clean(watcher.ask("status")):
-            watcher.receive(0.02)  # the next event; the GPU is being read meanwhile
-
-    @staticmethod
-    def _clean(status: dict[str, Any]) -> bool:
-        (gpu,) = status["gpus"]
-        return status["leases"] == [] and all(
-            gpu[what] == 0 for what in ("charged_bytes", "stowaway_bytes", "measured_used_bytes")
-        )
-
-    def close(self) -> str:
-        if self.watcher is not None:
-            self.watcher.close()
-        self.forks.close()
-        log = (self.arbiter.gpu_folder / fakegpu.LOG_FILE).read_text()
-        self.arbiter.close()
-        return log
-
 
 @pytest.fixture(scope="module")
 def all_cases() -> Iterator[Stage]:
-    made = Stage()
+    made = Stage(Path(__file__).with_name("neighbour.py"), CONFIG)
     yield made
-    report = check_log(made.close())
-    assert not report.problems
-    assert report.oom_events == 0, "nobody ran out of memory in any of these"
-    assert report.peak_bytes <= 8 * GIB
+    made.close()
 
 
 @pytest.fixture
@@ -169,7 +88,7 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
         "nothing but the context that the first one keeps"
     )
     assert stage.event("verified", consumer="first-1")["verdict"] == "verified"
-    stage.configure(release_lag_s=0.15)
+    stage.configure(release_lag_s=LAG_S)
 
 
 def test_1_while_the_gpu_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
@@ -271,7 +190,6 @@ def test_12_the_running_manager_has_no_bytes_on_the_gpu_and_no_cuda_in_it(stage:
     stage.spawn("user-12", 1).until("ready")
     maps = Path(f"/proc/{stage.arbiter.pid}/maps").read_text()
     assert not [word for word in ("libcuda", "libcudart", "libtorch", "libnvrtc") if word in maps]
-    assert stage.watcher is not None
     processes = stage.watcher.ask("status")["gpus"][0]["processes"]
     assert stage.arbiter.pid not in [process["pid"] for process in processes]
 
@@ -337,7 +255,7 @@ def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_gpu_for_each_s
     working.until("ready")
     again = stage.spawn("crashes", 5)
     again.wait()
-    assert "LoadFailing" in (stage.arbiter.runtime / "errors.log").read_text()
+    assert "LoadFailing" in stage.errors.read_text()
     assert working.alive
     assert "held, idle" in stage.vramctl("status")
 

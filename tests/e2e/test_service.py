@@ -5,9 +5,7 @@ had without a manager. Real processes; no systemd is run.
 
 import ctypes
 import grp
-import json
 import os
-import select
 import shlex
 import shutil
 import signal
@@ -22,6 +20,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.forkserver import ForkServer
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 
@@ -30,7 +29,7 @@ PATIENCE_S = 60
 GIB = 1 << 30
 TREE = Path(__file__).parents[2]
 UNIT = TREE / "configs" / "systemd" / "system" / "vram-arbiter.service"
-CONSUMER = Path(__file__).with_name("consumer.py")
+STEPPER = Path(__file__).with_name("stepper.py")
 
 
 class Service(ArbiterProcess):
@@ -111,40 +110,6 @@ def test_a_mistake_in_the_configuration_folder_ends_it_for_good(service: Service
 
 
 # -- a manager stops, restarts and kills it
-class Holder:
-    """A real consumer process with a lease and bytes on the GPU."""
-
-    def __init__(self, service: Service) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, str(CONSUMER), "holder", str(3 * GIB), str(service.gpu_folder),
-            str(GIB // 2)],
-            env=service.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
-        )  # fmt: skip
-        self._said = b""
-
-    def until(self, event: str) -> dict[str, Any]:
-        """Read its lines until an event comes. Not through a buffered file: what that holds back,
-        `select` does not see."""
-        assert self.process.stdout is not None
-        while True:
-            line, newline, rest = self._said.partition(b"\n")
-            if newline:
-                self._said = rest
-                found: dict[str, Any] = json.loads(line)
-                if found["event"] == event:
-                    return found
-                continue
-            readable, _, _ = select.select([self.process.stdout], [], [], PATIENCE_S)
-            assert readable, f"no {event} from the holder"
-            more = os.read(self.process.stdout.fileno(), 65_536)
-            assert more, f"the holder ended with {self.process.wait()} before {event}"
-            self._said += more
-
-    def tell(self, command: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{command}\n".encode())
-
-
 def status_when(service: Service, good: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     deadline = time.monotonic() + PATIENCE_S
     with WireClient(service.endpoint) as client:
@@ -164,29 +129,28 @@ def test_a_holder_outlives_the_service_with_its_lease(
     service: Service, number: signal.Signals
 ) -> None:
     service.start()
-    holder = Holder(service)
-    try:
-        granted = holder.until("granted")
+    with ForkServer(STEPPER, service.environ, service.runtime / "errors.log") as forks:
+        holder = forks.spawn("holder", str(3 * GIB), str(service.gpu_folder), str(GIB // 2))
+        granted = holder.until("loading")
+        holder.tell("go")
         holder.until("ready")
         holder.tell("use")
         holder.until("in_use")
         assert service.process is not None
         service.process.send_signal(number)
         service.process.wait(PATIENCE_S)
-        assert holder.process.poll() is None
+        assert holder.alive
         assert (service.runtime / "run").exists()
 
         service.start()
         status = status_when(service, lambda s: s["phase"] == "serving" and bool(s["leases"]))
         (lease,) = status["leases"]
         assert (lease["lease_id"], lease["token"]) == (granted["lease_id"], granted["token"])
-        assert (lease["state"], lease["uses"], lease["pid"]) == ("held", 1, holder.process.pid)
-        holder.tell("end")
+        assert (lease["state"], lease["uses"], lease["pid"]) == ("held", 1, holder.pid)
+        holder.tell("go")
         holder.until("idle")
-        assert holder.process.poll() is None, "neither lost nor fenced"
-    finally:
-        holder.process.kill()
-        holder.process.wait(PATIENCE_S)
+        assert holder.alive, "neither lost nor fenced"
+        holder.close()
 
 
 # -- what the unit forbids

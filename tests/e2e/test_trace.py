@@ -8,14 +8,11 @@ SIGTERM, which has to lose nothing.
 """
 
 import asyncio
-import json
 import re
 import signal
 import subprocess
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +22,7 @@ import yaml
 pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
 
 from tests.support import promql
+from tests.support.chat_server import chat_server
 from tests.support.collector import Collector, ReceivedSpan
 from tests.support.observer import ObserverProcess
 from tests.support.prepared import Forked, start
@@ -63,38 +61,10 @@ DECISIONS = (
 """In their order; asked again while the last one is carried out, it says that again."""
 
 
-@contextmanager
-def language_model() -> Iterator[str]:
-    """An OpenAI-compatible server that decides by what was done so far. Yields its URL."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-            done = sum(message["role"] == "tool" for message in asked["messages"])
-            name, arguments = DECISIONS[min(done, len(DECISIONS) - 1)]
-            function = {"name": name, "arguments": json.dumps(arguments)}
-            call = {"id": "c", "type": "function", "function": function}
-            message = {"role": "assistant", "content": None, "tool_calls": [call]}
-            answer = {"message": message, "finish_reason": "tool_calls"}
-            usage = {"prompt_tokens": 1200, "completion_tokens": 34}
-            body = json.dumps({"choices": [answer], "usage": usage}).encode()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+def decide(asked: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Decide by what was done so far."""
+    done = sum(message["role"] == "tool" for message in asked["messages"])
+    return DECISIONS[min(done, len(DECISIONS) - 1)]
 
 
 class Programs:
@@ -135,7 +105,7 @@ def test_one_trace_runs_from_the_decision_to_the_first_action(
     with ExitStack() as stack:
         collector = stack.enter_context(Collector())
         llm = {
-            "VRAM_REASONER_LLM_BASE_URL": stack.enter_context(language_model()),
+            "VRAM_REASONER_LLM_BASE_URL": stack.enter_context(chat_server(decide)),
             "VRAM_REASONER_LLM_MODEL": "m",
         }
         arbiter = make_arbiter().start()

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.mutation import mutation_run as mutants_run
+
 SOURCE = '''
 class Gate:
     def __init__(self, width: int) -> None:
@@ -35,18 +37,13 @@ def load_runner(path: Path) -> Any:
 
 
 @pytest.fixture
-def mutants_run() -> Any:
-    return load_runner(Path(__file__).with_name("mutation_run.py"))
-
-
-@pytest.fixture
 def gates(tmp_path: Path) -> ModuleType:
     path = tmp_path / "gates.py"
     path.write_text(SOURCE)
     return load_runner(path)
 
 
-def test_whoever_imported_the_function_has_the_mutant(mutants_run: Any, gates: Any) -> None:
+def test_whoever_imported_the_function_has_the_mutant(gates: Any) -> None:
     fits, gate = gates.fits, gates.Gate(4)
     assert mutants_run.swap(gates, SOURCE.replace("<=", "<")) == 1
     assert not fits(gate, 4)
@@ -57,11 +54,11 @@ def test_whoever_imported_the_function_has_the_mutant(mutants_run: Any, gates: A
     assert not gate.wide
 
 
-def test_a_change_that_changes_no_bytecode_has_no_effect(mutants_run: Any, gates: Any) -> None:
+def test_a_change_that_changes_no_bytecode_has_no_effect(gates: Any) -> None:
     assert mutants_run.swap(gates, "\n" + SOURCE) == 0
 
 
-def test_mutants_have_names_lines_and_diffs(mutants_run: Any, tmp_path: Path) -> None:
+def test_mutants_have_names_lines_and_diffs(tmp_path: Path) -> None:
     pytest.importorskip("mutmut", reason="make mutation installs it")
     (tmp_path / "gates.py").write_text(SOURCE)
     existing, mutants = mutants_run.choose(0, 0, {}, tmp_path)
@@ -75,7 +72,7 @@ def test_mutants_have_names_lines_and_diffs(mutants_run: Any, tmp_path: Path) ->
     assert mutants_run.choose(2, 5, {}, tmp_path)[1] == mutants_run.choose(2, 5, {}, tmp_path)[1]
 
 
-def test_only_the_very_change_that_was_judged_counts_as_equivalent(mutants_run: Any) -> None:
+def test_only_the_very_change_that_was_judged_counts_as_equivalent() -> None:
     def tried(diff: str, outcome: str) -> Any:
         return mutants_run.Mutant("gates.fits:1", "gates", [12], diff, "", outcome)
 

@@ -1,15 +1,10 @@
 """The night's walk itself: it counts, it tells a failure with the line that walks it again, and the
 same seed finds it again."""
 
-import importlib.util
-import sys
-from pathlib import Path
-from typing import Any
-
 import hypothesis.strategies as st
-import pytest
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
+from tests.nightly import nightly_run as night_run
 from tests.support.machines import walk
 
 
@@ -28,19 +23,7 @@ class Broken(RuleBasedStateMachine):
 Sound.TestCase.settings = Broken.TestCase.settings = walk(5)
 
 
-@pytest.fixture
-def night_run() -> Any:
-    path = Path(__file__).with_name("nightly_run.py")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_histories_are_split_evenly_under_seeds_of_their_own(night_run: Any) -> None:
+def test_the_histories_are_split_evenly_under_seeds_of_their_own() -> None:
     todo = night_run.portions(["a", "b"], 5000, 70)
     assert sum(portion.wanted for portion in todo) == 5000
     assert {machine: sum(p.wanted for p in todo if p.machine == machine) for machine in "ab"} == {
@@ -50,12 +33,12 @@ def test_the_histories_are_split_evenly_under_seeds_of_their_own(night_run: Any)
     assert [portion.seed for portion in todo] == list(range(70, 70 + len(todo)))
 
 
-def test_every_machine_is_there(night_run: Any) -> None:
+def test_every_machine_is_there() -> None:
     for machine in night_run.MACHINES:
         assert issubclass(night_run.load(machine), RuleBasedStateMachine)
 
 
-def test_a_sound_machine_is_counted(night_run: Any) -> None:
+def test_a_sound_machine_is_counted() -> None:
     done = night_run.walk(night_run.Portion("sound", 1, 20), Sound)
     assert not done.failure
     assert done.histories >= 20
@@ -64,7 +47,7 @@ def test_a_sound_machine_is_counted(night_run: Any) -> None:
     assert not report["failures"]
 
 
-def test_a_failure_is_told_shrunk_and_found_again(night_run: Any) -> None:
+def test_a_failure_is_told_shrunk_and_found_again() -> None:
     done = night_run.walk(night_run.Portion("broken", 3, 20), Broken)
     assert "state.step(n=50)" in done.failure
     (failure,) = night_run.summary([done], 1.0)["failures"]

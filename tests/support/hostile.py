@@ -1,7 +1,7 @@
 """What nobody should send: valid requests of every op, drawn from the wire's own schema, and
 everything that can be made of them.
 
-One generator for the property tests, the fuzzer and the hostile clients. It draws from a
+One generator for the property tests and the hostile clients. It draws from a
 `random.Random` that it is given (Hypothesis hands one in whose draws it can shrink). Must not know
 sessions, sockets or the core.
 """

@@ -13,7 +13,6 @@ import pytest
 
 from vram_arbiter.arbiter.host import history as module
 from vram_arbiter.arbiter.host.history import (
-    BUFFER_MAX,
     CLEAN_END,
     QUESTIONS_MAX,
     RING_EVENTS,
@@ -258,31 +257,6 @@ class HangingDisk:
 
     def close(self) -> None:
         pass
-
-
-def test_a_disk_that_hangs_lets_no_more_pile_up_than_the_bound() -> None:
-    """Regression: the bound held for the next batch and not for batches that waited for the hanging
-    thread."""
-    disk = HangingDisk()
-
-    async def run() -> None:
-        history = History(cast(Any, disk), 0)
-        history.start(asyncio.get_running_loop())
-        history.append("operator", {})
-        assert await asyncio.to_thread(disk.hangs.wait, PATIENCE_S)
-        for _ in range(4 * BUFFER_MAX):
-            history.append("operator", {})  # each asks to be written at once
-        assert "does not answer" in history.problem
-        disk.goes_on.set()
-        newest = history.last_seq
-        async with asyncio.timeout(PATIENCE_S):
-            while not disk.written or disk.written[-1] != newest or history.problem:
-                await asyncio.sleep(0.01)
-        history.close()
-        assert len(disk.written) <= 2 * BUFFER_MAX + 1
-        assert disk.written == sorted(disk.written), "in order, with a gap in their numbers"
-
-    asyncio.run(run())
 
 
 def test_who_asks_a_disk_that_hangs_hears_so_beyond_the_bound() -> None:

@@ -17,7 +17,7 @@ PATIENCE_S = 60.0
 
 
 @pytest.fixture
-def children() -> Iterator[Callable[[], "subprocess.Popen[bytes]"]]:
+def idle_programs() -> Iterator[Callable[[], "subprocess.Popen[bytes]"]]:
     """Makes processes that wait for their stdin to close."""
     made: list[subprocess.Popen[bytes]] = []
 
@@ -62,13 +62,13 @@ def watched() -> int:
 
 
 def test_a_process_is_watched_by_the_descriptor_of_its_connection(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
     """Between a connection's accept and its hello the process may die and its pid be reused: the
     pidfd still names the first one."""
 
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        child = children()
+        child = idle_programs()
         key, pidfd = key_of(child), os.pidfd_open(child.pid)
         child.kill()
         child.communicate()  # reaped: nothing has this pid now, or something else has
@@ -84,10 +84,10 @@ def test_a_process_is_watched_by_the_descriptor_of_its_connection(
 
 
 def test_a_process_that_is_dropped_is_not_reported(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        dropped, other = children(), children()
+        dropped, other = idle_programs(), idle_programs()
         before = watched()
         watch.add(key_of(dropped))
         watch.add(key_of(other))
@@ -105,10 +105,10 @@ def test_a_process_that_is_dropped_is_not_reported(
 
 
 def test_a_killed_process_is_reported_once_before_it_is_reaped(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        child, other = children(), children()
+        child, other = idle_programs(), idle_programs()
         watch.add(key_of(child))
         watch.add(key_of(child))
         watch.add(key_of(other))
@@ -123,10 +123,10 @@ def test_a_killed_process_is_reported_once_before_it_is_reaped(
 
 
 def test_a_process_that_is_dead_already_is_reported_but_not_from_inside_add(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        child = children()
+        child = idle_programs()
         key = key_of(child)
         child.kill()
         child.communicate()
@@ -140,10 +140,10 @@ def test_a_process_that_is_dead_already_is_reported_but_not_from_inside_add(
 
 
 def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        child = children()
+        child = idle_programs()
         earlier = ProcessKey(child.pid, key_of(child).start_ticks - 100)
         watch.add(earlier)
         assert await died.get() == earlier
@@ -153,10 +153,10 @@ def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(
 
 
 def test_an_unknown_start_time_is_watched_by_pid(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        child = children()
+        child = idle_programs()
         watch.add(ProcessKey(child.pid, 0))
         child.kill()
         assert await died.get() == ProcessKey(child.pid, 0)
@@ -164,9 +164,11 @@ def test_an_unknown_start_time_is_watched_by_pid(
     watching(test)
 
 
-def test_no_descriptor_is_left_behind(children: Callable[[], "subprocess.Popen[bytes]"]) -> None:
+def test_no_descriptor_is_left_behind(
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
+) -> None:
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
-        made = [children() for _ in range(5)]
+        made = [idle_programs() for _ in range(5)]
         keys = [key_of(child) for child in made]
         before = watched()
         for key in keys:
@@ -186,9 +188,9 @@ def test_no_descriptor_is_left_behind(children: Callable[[], "subprocess.Popen[b
 
 @pytest.mark.parametrize(("kind", "number"), [("term", signal.SIGTERM), ("kill", signal.SIGKILL)])
 def test_a_signal_goes_through_the_descriptor(
-    children: Callable[[], "subprocess.Popen[bytes]"], kind: str, number: signal.Signals
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"], kind: str, number: signal.Signals
 ) -> None:
-    child = children()
+    child = idle_programs()
     key = key_of(child)
 
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
@@ -201,9 +203,9 @@ def test_a_signal_goes_through_the_descriptor(
 
 
 def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
-    child = children()
+    child = idle_programs()
 
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
         watch.signal(key_of(child), "kill")
@@ -219,9 +221,9 @@ def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(
 
 
 def test_a_signal_that_comes_too_late_is_no_error(
-    children: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
 ) -> None:
-    child = children()
+    child = idle_programs()
 
     async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
         key = key_of(child)

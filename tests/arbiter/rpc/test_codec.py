@@ -4,7 +4,7 @@ from typing import Any
 
 import msgpack
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -187,40 +187,6 @@ def outcome(payload: bytes) -> codec.Undecodable | None:
 def test_any_bytes_are_a_request_or_a_typed_error(payload: bytes) -> None:
     bad = outcome(payload)
     assert bad is None or codec.refusal(bad.request_id, 1, bad.error.view())
-
-
-_VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(1 << 63), (1 << 64) - 1)
-    | st.floats()
-    | st.text()
-    | st.binary(),
-    lambda inner: (
-        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
-    ),
-    max_leaves=10,
-)
-_OPS = st.sampled_from(
-    ["hello", "acquire", "renew", "history", "release", "reattach", "oom", "use_begin"]
-)
-_FIELDS = st.dictionaries(
-    st.sampled_from(
-        ["spec", "nonce", "lease_id", "token", "leases", "use_id", "after", "version", "name"]
-    ),
-    _VALUES,
-)
-
-
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(_OPS, st.integers(0, 100), _FIELDS)
-def test_any_fields_are_a_request_or_a_typed_error(
-    op: str, request_id: int, fields: dict[str, Any]
-) -> None:
-    bad = outcome(pack(**{**fields, "op": op, "id": request_id}))
-    if bad is not None:
-        assert bad.request_id == request_id
-        assert codec.refusal(bad.request_id, 1, bad.error.view())
 
 
 def test_replies_have_the_shape_of_the_wire() -> None:

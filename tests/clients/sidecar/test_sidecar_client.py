@@ -39,7 +39,7 @@ type Start = Callable[[], Forked]
 
 
 @pytest.fixture
-def spawn(endpoint: str) -> Iterator[Start]:
+def start_sidecar(endpoint: str) -> Iterator[Start]:
     """Start the sidecar."""
     started: list[Forked] = []
 
@@ -54,17 +54,17 @@ def spawn(endpoint: str) -> Iterator[Start]:
 
 
 @pytest.fixture
-async def detector(endpoint: str, spawn: Start) -> AsyncIterator[DetectorClient]:
-    spawn()
+async def detector(endpoint: str, start_sidecar: Start) -> AsyncIterator[DetectorClient]:
+    start_sidecar()
     async with DetectorClient(endpoint, timeout_s=60.0, connect_timeout_s=60.0) as client:
         yield client
 
 
 # -- life of a server
 async def test_a_sidecar_that_starts_is_waited_for_and_left_running(
-    endpoint: str, spawn: Start
+    endpoint: str, start_sidecar: Start
 ) -> None:
-    process = spawn()
+    process = start_sidecar()
     client = DetectorClient(endpoint, connect_timeout_s=60.0)
     found = await client.detect(PNG, "red cube")
     assert found == [Detection("b", 0.9, (1, 1, 3, 3)), Detection("a", 0.2, (0, 0, 2, 4))]
@@ -77,17 +77,17 @@ async def test_a_sidecar_that_starts_is_waited_for_and_left_running(
 
 
 async def test_a_dead_sidecar_is_reported_at_once_and_its_successor_used(
-    endpoint: str, spawn: Start
+    endpoint: str, start_sidecar: Start
 ) -> None:
     """Its successor starts once the process has ended: the kernel may close the connection before
     the lock of the socket, and the successor would end with "already uses"."""
-    first = spawn()
+    first = start_sidecar()
     async with DetectorClient(endpoint, timeout_s=60.0, connect_timeout_s=60.0) as detector:
         await detector.detect(PNG, "x")
         with pytest.raises(SidecarUnavailable, match="hung up"):
             await detector.detect(PNG, "die")
         assert first.wait(60.0) == 9
-        second = spawn()
+        second = start_sidecar()
         await detector.detect(PNG, "x")
         assert detector.identity is not None
         assert detector.identity["pid"] == second.pid
@@ -129,8 +129,8 @@ async def test_a_failure_without_a_code_is_a_model_error(detector: DetectorClien
         await detector.detect(PNG, "wrong")
 
 
-async def test_the_token_travels_with_the_call(endpoint: str, spawn: Start) -> None:
-    spawn()
+async def test_the_token_travels_with_the_call(endpoint: str, start_sidecar: Start) -> None:
+    start_sidecar()
     async with SceneVlmClient(endpoint, connect_timeout_s=60.0) as client:
         assert await client.query(PNG, "held?", token=(3, 7)) == "held? [3, 7]"
         loaded = await client.load(timeout_s=60.0)
@@ -159,10 +159,10 @@ async def test_pictures_and_a_video_travel_in_one_query(
 
 
 @pytest.mark.heavy
-async def test_arrays_there_and_back(endpoint: str, spawn: Start) -> None:
+async def test_arrays_there_and_back(endpoint: str, start_sidecar: Start) -> None:
     import numpy
 
-    spawn()
+    start_sidecar()
     async with PolicyClient(endpoint, connect_timeout_s=60.0) as client:
         assert (await client.reset({"seed": 3}))["seed"] == 3
         state = numpy.arange(6, dtype=numpy.float32).reshape(2, 3)

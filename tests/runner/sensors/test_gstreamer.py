@@ -429,6 +429,7 @@ def fresh(code: str) -> str:
     return result.stdout
 
 
+@pytest.mark.nightly  # other libraries' doing; each imports torch once more
 @pytest.mark.parametrize(
     "order", ["import torch, cv2\n{}", "{}\nimport cv2, torch\ncv2.setNumThreads(1)\n{}"]
 )

@@ -1,0 +1,102 @@
+"""One daemon, one simulated GPU of 8 GiB and one fork server of consumers, for all tests of a file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.support.fakegpu_check import check_log
+from tests.support.forkserver import Child, ForkServer
+from tests.support.process import ArbiterProcess
+from tests.support.wire import WireClient
+from vram_arbiter.schemas import fakegpu
+
+GIB = 1 << 30
+CAPACITY = 8 * GIB
+LAG_S = 0.15
+PATIENCE_S = 60.0
+
+
+class Stage:
+    """`program`: what its consumers run (`tests.support.forkserver`). A watcher subscribes to the
+    events of the present case."""
+
+    def __init__(self, program: Path, config: str) -> None:
+        self.arbiter = ArbiterProcess(config=config, prepared=True).start()
+        self.configure(release_lag_s=LAG_S)
+        self.errors = self.arbiter.runtime / "errors.log"
+        self.forks = ForkServer(program, self.arbiter.environ, self.errors)
+        self.children: list[Child] = []
+        self.watcher = self._subscribed()
+
+    def configure(self, **changes: Any) -> None:
+        """Change the simulated GPU."""
+        path = self.arbiter.gpu_folder / fakegpu.GPU_FILE
+        config = fakegpu.parse_config(path.read_text()).model_copy(update=changes)
+        temporary = path.with_name(".new")
+        temporary.write_text(fakegpu.dump_config(config))
+        temporary.rename(path)
+
+    def watch(self) -> WireClient:
+        """Return a fresh subscriber: its first events are those from now on."""
+        self.watcher.close()
+        self.watcher = self._subscribed()
+        return self.watcher
+
+    def event(self, kind: str, **facts: Any) -> dict[str, Any]:
+        """Wait for an event with these facts."""
+        push = self.watcher.push(
+            "event",
+            PATIENCE_S,
+            lambda p: p["event"]["kind"] == kind and facts.items() <= p["event"].items(),
+        )
+        event: dict[str, Any] = push["event"]
+        return event
+
+    def begin(self, name: str, size: int, habits: str) -> Child:
+        """Fork a consumer."""
+        arguments = (name, str(size), str(self.arbiter.gpu_folder), habits)
+        self.children.append(self.forks.spawn(*arguments, name=name))
+        return self.children[-1]
+
+    def used_when(self, name: str) -> int:
+        """Return the bytes on the GPU, of all processes, before `name` touched it first."""
+        used = 0
+        for line in map(json.loads, self._log().splitlines()):
+            if line["name"] == name:
+                return used
+            used = line["used_after"]
+        raise AssertionError(f"{name} never touched the GPU")
+
+    def end_case(self) -> None:
+        """Kill all consumers, and wait until the daemon has nothing of them."""
+        for child in self.children:
+            child.close()
+        self.children.clear()
+        self.configure(faults=fakegpu.Faults())
+        watcher = self.watch()
+        while not _clean(watcher.ask("status")):
+            watcher.receive(0.02)  # the next event; the GPU is being read meanwhile
+
+    def close(self) -> None:
+        """End all, and check the GPU's log."""
+        self.watcher.close()
+        self.forks.close()
+        report = check_log(self._log())
+        self.arbiter.close()
+        assert not report.problems
+        assert report.oom_events == 0
+        assert report.peak_bytes <= CAPACITY
+
+    def _log(self) -> str:
+        return (self.arbiter.gpu_folder / fakegpu.LOG_FILE).read_text()
+
+    def _subscribed(self) -> WireClient:
+        watcher = WireClient(self.arbiter.endpoint).hello("watcher", role="observer")
+        assert watcher.ask("subscribe")["ok"]
+        return watcher
+
+
+def _clean(status: dict[str, Any]) -> bool:
+    (gpu,) = status["gpus"]
+    kept = ("charged_bytes", "stowaway_bytes", "measured_used_bytes")
+    return status["phase"] == "serving" and not (status["leases"] or any(gpu[of] for of in kept))
