@@ -109,7 +109,8 @@ def _add_eviction(parser: argparse.ArgumentParser) -> None:
         default="end",
         metavar="ACTION",
         help="end: end the program for good; stop: end it, and start it again when there is room; "
-        "http: POST to --url to free and to --restore-url to restore; vllm, ollama, llama.cpp, comfyui: "
+        "http: POST to --url to free and to --restore-url to restore; vllm, ollama, llama.cpp, "
+        "comfyui: "
         "call that server's own API at --url; cuda-checkpoint: suspend its CUDA processes, and "
         "resume them (default: %(default)s)",
     )

@@ -116,9 +116,11 @@ class Files:
             return Step("new", str(path), perform=put)
         if there == text:
             return Step("same", str(path), perform=partial(self._note, path, text))
-        changes = _diff(there, text)
-        if self.record.files.get(path) == _digest(there):
+        changes, written = _diff(there, text), self.record.files.get(path)
+        if written == _digest(there):
             return Step("replace", str(path), changes, put)
+        if written in (None, _digest(text)):
+            return Step("keep", f"{path}: changed by hand")
         return Step("keep", f"{path}: changed by hand; remove it to get this version", changes)
 
     def _removal(self, path: Path, *, purge: bool) -> Step:

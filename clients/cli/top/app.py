@@ -11,7 +11,7 @@ from textual.widgets import Static
 
 from vram_arbiter.clients.cli.text import duration, plural
 from vram_arbiter.clients.cli.top import gpus
-from vram_arbiter.clients.cli.top.dialogs import Confirm, Help
+from vram_arbiter.clients.cli.top.dialogs import Confirm
 from vram_arbiter.clients.cli.top.feed import Feed, Order
 from vram_arbiter.clients.cli.top.gpus import Samples
 from vram_arbiter.clients.cli.top.leases import Leases
@@ -42,7 +42,6 @@ class Top(App[None]):
         Binding("e", "evict", "evict"),
         Binding("p", "pin", "pin"),
         Binding("d", "drain", "drain"),
-        Binding("question_mark", "help", "keys"),
     ]
 
     def __init__(self, feed: Feed) -> None:
@@ -128,7 +127,7 @@ class Top(App[None]):
         if self._feed.refusal:
             orders = [("", "e p d: operators only")]
         sort = f"sort {self._order}" if wide else "sort"
-        for key, what in [("s", sort), *orders, ("?", "keys"), ("q", "quit")]:
+        for key, what in [("s", sort), *orders, ("q", "quit")]:
             shown.append(f"{key} " if key else "", "bold").append(f"{what}  ", "" if key else "dim")
         return shown
 
@@ -141,9 +140,6 @@ class Top(App[None]):
         names = list(ORDERS)
         self._order = names[(names.index(self._order) + 1) % len(names)]
         self._say(f"sorted by {self._order}", "bold")
-
-    def action_help(self) -> None:
-        self.push_screen(Help(self._feed.refusal))
 
     def action_evict(self) -> None:
         if (row := self._selected()) is None:

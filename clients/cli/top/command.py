@@ -11,7 +11,7 @@ from vram_arbiter.schemas.errors import ConfigError
 
 DESCRIPTIONS = {
     "top": "Show GPUs, leases, waiters with their reasons, and events live on a terminal. Keys: s "
-    "sort, e evict, p pin, d drain, ? all keys, q quit. Orders need a confirmation and "
+    "sort, e evict, p pin, d drain, q quit. Orders need a confirmation and "
     "an operator. NO_COLOR turns colors off."
 }
 

@@ -1,4 +1,4 @@
-"""Dialogs of `vramctl top`: the confirmation of an order, and the page of keys."""
+"""The confirmation of an order in `vramctl top`."""
 
 from typing import ClassVar
 
@@ -64,41 +64,4 @@ class Confirm(ModalScreen[str | None]):
         self.dismiss(reason or REASON)
 
     def action_no(self) -> None:
-        self.dismiss(None)
-
-
-KEYS = (
-    ("s", "sort by the next column"),
-    ("e", "evict the selected lease; a use in flight finishes first"),
-    ("p", "pin the selected lease, or undo an operator's pin"),
-    ("d", "drain: grant nothing new; again: resume"),
-    ("↑ ↓ j k", "select a lease; its reason in full is below the list"),
-    ("?", "this page"),
-    ("q", "quit"),
-)
-
-
-class Help(ModalScreen[None]):
-    """The keys, and why some are not available."""
-
-    DEFAULT_CSS = """
-    Help { align: center middle; }
-    Help > Static {
-        width: 72; max-width: 96%; height: auto; border: round $primary; padding: 0 1;
-        background: $surface;
-    }
-    """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,question_mark,enter", "close")]
-
-    def __init__(self, refusal: str | None) -> None:
-        super().__init__()
-        self._refusal = refusal
-
-    def compose(self) -> ComposeResult:
-        lines = [f"{key:<8} {what}" for key, what in KEYS]
-        if self._refusal:
-            lines += ["", f"e, p and d are not available to you: {self._refusal}"]
-        yield Static(Text("\n".join(lines)))
-
-    def action_close(self) -> None:
         self.dismiss(None)

@@ -117,6 +117,8 @@ def test_a_changed_file_is_kept_and_the_difference_shown(
     assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
     (root / SIDECAR).write_text("# the operator's\n")
     capsys.readouterr()
+    assert vramctl(root, "install", "--prefix", "/opt/one", "--yes") == 0
+    assert f"/{SIDECAR}: changed by hand\n" in capsys.readouterr().out, "there is no other version"
     assert vramctl(root, "install", "--prefix", "/opt/two", "--yes") == 0
     said = capsys.readouterr().out
     assert f"keep    /{SIDECAR}: changed by hand; remove it to get this version" in said

@@ -408,7 +408,6 @@ def grab_of(folder: Path, weights: str) -> Path:
 
 @pytest.mark.heavy
 @pytest.mark.timeout(600)
-@pytest.mark.nightly  # its programs import lerobot twice more
 def test_lerobot_eval_plays_a_pinned_checkpoint_in_an_environment_of_lerobot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
