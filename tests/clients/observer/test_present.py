@@ -1,8 +1,6 @@
 """One question serves all; of many leases those that changed are asked for alone."""
 
 import asyncio
-from collections.abc import Mapping
-from typing import Any
 
 import pytest
 
@@ -11,8 +9,8 @@ from vram_arbiter.clients.observer import present
 from vram_arbiter.clients.observer.present import Look, Present
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import ArbiterUnreachable
-from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.requests import Status
 
 
 class Client:
@@ -22,22 +20,21 @@ class Client:
 
     def __init__(self, driver: CoreDriver) -> None:
         self.driver = driver
-        self.asked: list[Mapping[str, Any]] = []
+        self.asked: list[Status] = []
         self.away = False
 
-    async def ask(self, op: str, fields: Mapping[str, Any], **_: object) -> StatusReply:
-        assert op == "status"
-        self.asked.append(fields)
+    async def ask(self, request: Status, **_: object) -> StatusReply:
+        self.asked.append(request)
         await asyncio.sleep(0)
         if self.away:
             raise ArbiterUnreachable("gone")
         engine, now = self.driver.arbiter, self.driver.now
-        if fields.get("leases"):
-            return engine.leases(map(LeaseId, fields["leases"]), now)
+        if request.leases:
+            return engine.leases(request.leases, now)
         return engine.status(now)
 
     async def status(self) -> StatusReply:
-        return await self.ask("status", {})
+        return await self.ask(Status())
 
 
 def test_questions_at_a_time_are_one_and_a_silent_arbiter_is_told(driver: CoreDriver) -> None:
@@ -85,11 +82,11 @@ def test_of_many_leases_those_that_changed_are_asked_for(
         added = driver.consumer("new").acquire(64 * MIB)
         touched = [leases[0], leases[1], added]
         found = states(await asking.look(touched=touched))
-        assert client.asked[1:] == [{"leases": touched}]
+        assert client.asked[1:] == [Status(leases=tuple(touched))]
         assert set(found) == {*leases, added} - {leases[1]}
         assert found[added] == "loading"
         monkeypatch.setattr(present, "WHOLE_S", 0.0)
         assert states(await asking.look(touched=touched)) == found
-        assert {} in client.asked[2:], "all of them again"
+        assert Status() in client.asked[2:], "all of them again"
 
     asyncio.run(story())
