@@ -16,7 +16,7 @@ SAMPLES = sorted((Path(__file__).parent / "manifest/samples").glob("*.yaml"))
 EXPORTED = Path(schemas.__file__).parent / "json"
 
 
-def changed(folder: Path, kind: str, old: str, new: str, more: str = "") -> Path:
+def write_changed(folder: Path, kind: str, old: str, new: str, more: str = "") -> Path:
     """Write a sample of a kind with a change in it."""
     text = next(path for path in SAMPLES if path.stem == kind).read_text(encoding="utf-8")
     assert old in text
@@ -38,7 +38,7 @@ def test_check_says_ok_for_good_files() -> None:
 def test_check_names_every_wrong_field_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    wrong = changed(tmp_path, "detector", "chunk_size: 1", "chunk_size: 0", "colour: red\n")
+    wrong = write_changed(tmp_path, "detector", "chunk_size: 1", "chunk_size: 0", "colour: red\n")
     assert main(["check", str(tmp_path), str(SAMPLES[1])]) == 1
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -55,7 +55,7 @@ def test_check_refuses_a_policy_that_sees_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Regression: it said ok, and every runner refused the skill."""
-    changed(tmp_path, "vla", ', vla_feature_key: "observation.images.front"', "")
+    write_changed(tmp_path, "vla", ', vla_feature_key: "observation.images.front"', "")
     assert main(["check", str(tmp_path)]) == 1
     said = capsys.readouterr().out
     assert "rskill.yaml: sensors_required: names no camera: give a sensor of modality rgb" in said
@@ -70,7 +70,7 @@ def test_check_of_a_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_warnings_go_beside_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    written = changed(tmp_path, "vlm", 'role: "s2"', 'role: "s1"')
+    written = write_changed(tmp_path, "vlm", 'role: "s2"', 'role: "s1"')
     assert main(["check", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
     assert out == f"{written}: ok\n"

@@ -1,5 +1,7 @@
-"""Names of spans, span events, metrics and attributes, and the units of metrics. Those of the arbiter
-are in `clients.observer.names`, those of language models in `reasoner.llm.names`.
+"""Names of spans, span events, metrics and attributes, and the units of metrics.
+
+Those of the arbiter are in `clients.observer.names`, those of language models in
+`reasoner.llm.names`.
 
 Nothing is recorded here. Durations are in seconds and sizes in bytes; Prometheus appends
 `_seconds`, `_bytes` and `_total` to the names. Labels are listed in docs/reference/metrics.md.

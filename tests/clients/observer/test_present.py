@@ -75,7 +75,7 @@ def test_of_many_leases_those_that_changed_are_asked_for(
     async def story() -> None:
         asking = Present(client, lambda _: None)  # type: ignore[arg-type]
         assert set(states(await asking.look())) == set(leases)
-        assert client.asked == [{}]
+        assert client.asked == [Status()]
         people[0].use_begin(leases[0])
         people[1].unload(leases[1])
         driver.advance(1.0)
