@@ -141,13 +141,14 @@ def _install(args: argparse.Namespace, site: Site, before: Installed | None) -> 
     changing = any(step.changes for step in steps)
     if (code := _confirm(args, steps)) is not None:
         return code
+    system = site.layout.system
+    runs = site.live and before is not None and is_active(ARBITER, system=system)
     try:
         _perform(steps)
     finally:
         if record != before:
             Files(site, record).store()
-    system = site.layout.system
-    if site.live and changing and before is not None and is_active(ARBITER, system=system):
+    if runs and changing:
         user = "" if system else "--user "
         print(f"next: systemctl {user}restart vram-arbiter (holders keep their leases)")
     return OK
