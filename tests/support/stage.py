@@ -1,4 +1,4 @@
-"""One daemon, one simulated GPU of 8 GiB and one fork server of consumers, for all tests of a file."""
+"""One daemon, a simulated GPU of 8 GiB and a fork server of consumers, for all tests of a file."""
 
 import json
 from pathlib import Path

@@ -21,7 +21,7 @@ def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:
         yield made
 
 
-def served(context: "zmq.Context[zmq.Socket[bytes]]", path: Path) -> "zmq.Socket[bytes]":
+def bound(context: "zmq.Context[zmq.Socket[bytes]]", path: Path) -> "zmq.Socket[bytes]":
     server = context.socket(zmq.ROUTER)
     server.bind(f"ipc://{path}")
     server.setsockopt(zmq.RCVTIMEO, int(1000 * DEADLINE_S))
@@ -33,7 +33,7 @@ def test_the_last_words_before_a_hang_up_are_heard(
 ) -> None:
     """libzmq's own way of not reconnecting discards what was received and not read: a goal's result
     was lost with it."""
-    server = served(context, tmp_path / "s")
+    server = bound(context, tmp_path / "s")
     link = Link(context, f"ipc://{tmp_path}/s", "runner")
     try:
         assert link.wait(time.monotonic() + DEADLINE_S) == "open"
@@ -60,14 +60,14 @@ def test_a_link_is_for_one_server(
     context: "zmq.Context[zmq.Socket[bytes]]", tmp_path: Path
 ) -> None:
     """What was queued for the first is not sent to the second, whatever user serves then."""
-    server = served(context, tmp_path / "s")
+    server = bound(context, tmp_path / "s")
     link = Link(context, f"ipc://{tmp_path}/s", "runner")
     try:
         assert link.wait(time.monotonic() + DEADLINE_S) == "open"
         server.close(0)
         assert link.monitor.poll(1000 * DEADLINE_S)
         assert link.send(b"token")  # it does not know yet
-        server = served(context, tmp_path / "s")
+        server = bound(context, tmp_path / "s")
         assert link.advance() == "ended"
         again = Link(context, f"ipc://{tmp_path}/s", "runner")
         assert again.wait(time.monotonic() + DEADLINE_S) == "open"

@@ -58,7 +58,7 @@ def dry_run(
     return run
 
 
-def installed(tmp_path: Path, text: str) -> Path:
+def manifest_in(tmp_path: Path, text: str) -> Path:
     """A folder with one skill."""
     folder = tmp_path / "skills"
     folder.mkdir()
@@ -68,7 +68,7 @@ def installed(tmp_path: Path, text: str) -> Path:
 
 def licensed(tmp_path: Path, licence: str) -> Path:
     text = re.sub(r'license: "[^"]+"', f'license: "{licence}"', GRAB.read_text(encoding="utf-8"))
-    return installed(tmp_path, text)
+    return manifest_in(tmp_path, text)
 
 
 def test_a_new_file_can_be_tried_dry_beside_the_running_robot(
@@ -137,7 +137,7 @@ def test_what_a_skill_asks_for_and_the_gate_does_not_keep_is_shown_before_the_ro
         GRAB.read_text(encoding="utf-8")
         + "envelope: {human_in_loop_required: [grasp], max_force_n: 5}\n"
     )
-    _, out, err = dry_run(TWIN + CAMERAS, skills=installed(tmp_path, text))
+    _, out, err = dry_run(TWIN + CAMERAS, skills=manifest_in(tmp_path, text))
     assert err == ""
     said = [line for line in out.splitlines() if line.startswith("NOT KEPT")]
     assert any("human_in_loop_required" in line and "so101-grab" in line for line in said)
@@ -154,7 +154,7 @@ def test_each_misfit_of_the_tasks_skill_is_a_line_of_its_own(
         "    - {range: [3, 5], control_mode: joint_torque}"
     )
     manifest = GRAB.read_text(encoding="utf-8").replace("action_contract:\n  dim: 6", slots)
-    folder = installed(tmp_path, manifest)
+    folder = manifest_in(tmp_path, manifest)
     code, out, err = dry_run(TWIN + CAMERAS + GRAB_TASK, "--check", skills=folder)
     assert (code, out) == (2, "")
     said = [line for line in err.splitlines() if "action_contract" in line]
@@ -371,7 +371,7 @@ def test_a_skill_for_another_robot_or_beyond_this_one_is_refused(
     does.
     """
     needs = "capabilities_required: {can_lift_kg: 0.5, has_vision: true}\nkind: "
-    folder = installed(tmp_path, GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1))
+    folder = manifest_in(tmp_path, GRAB.read_text(encoding="utf-8").replace("kind: ", needs, 1))
     text = TWIN + CAMERAS + GRAB_TASK
     code, _, err = dry_run(text, skills=folder)
     assert code == 2

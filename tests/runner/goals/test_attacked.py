@@ -30,7 +30,7 @@ RSKILL = "vram-arbiter/so101-navigate"
 
 
 @asynccontextmanager
-async def serving(endpoint: str, manifest: Path) -> AsyncIterator[HardwareRunner]:
+async def hardware_serving(endpoint: str, manifest: Path) -> AsyncIterator[HardwareRunner]:
     clock = SystemClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     skill = Nod(load_manifest(manifest), steps=20)
@@ -75,7 +75,10 @@ async def test_goals_ticks_and_the_stop_of_an_attacked_runner(
     connects ended the process at 1,024, and MORE took memory without end.
     """
 
-    async with serving(endpoint, navigate_manifest) as runner, RunnerClient(endpoint) as client:
+    async with (
+        hardware_serving(endpoint, navigate_manifest) as runner,
+        RunnerClient(endpoint) as client,
+    ):
         await client.ping(timeout_s=60.0)
         async with (
             attacked(endpoint, mode),

@@ -123,7 +123,7 @@ async def serving(
 
 
 @pytest.fixture
-def b(serving: tuple[Bench, RunnerClient]) -> Bench:
+def made(serving: tuple[Bench, RunnerClient]) -> Bench:
     return serving[0]
 
 
@@ -154,14 +154,14 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("prompt", ["nod", "hang in the start"])
 async def test_the_stop_fails_the_goal_and_refuses_new_ones(
-    b: Bench, client: RunnerClient, prompt: str
+    made: Bench, client: RunnerClient, prompt: str
 ) -> None:
     goal = await client.send_goal(RSKILL, prompt=prompt)
-    await b.skill.begun.wait()
+    await made.skill.begun.wait()
     reply = await client.estop("a hand is in the way")
     assert "a hand is in the way; all joints stand still" in reply.message
-    assert b.twin.story == ["connect", "halt"]
-    sent = len(b.twin.sent)
+    assert made.twin.story == ["connect", "halt"]
+    sent = len(made.twin.sent)
     result = await goal.result(60)
     assert (result["status"], result["success"], result["code"]) == (
         "failed",
@@ -175,41 +175,43 @@ async def test_the_stop_fails_the_goal_and_refuses_new_ones(
     await diagnosed(client, "ok")  # it can still be looked at
     again = await client.estop("once more")
     assert "a hand is in the way" in again.message
-    assert len(b.twin.sent) == sent
+    assert len(made.twin.sent) == sent
 
 
 async def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any) -> None:
-    async with bench(estop_s=0.5) as (b, client):
+    async with bench(estop_s=0.5) as (made, client):
         await client.send_goal(RSKILL, prompt="hang in the step")
-        await b.skill.begun.wait()
+        await made.skill.begun.wait()
         with pytest.raises(InternalError, match="cut the robot's power"):
             await client.estop("it hangs")
         with pytest.raises(EstopRequested):
             await client.send_goal(RSKILL)
-        b.skill.go_on.set()
+        made.skill.go_on.set()
         while "stand still" not in (await client.state())["estop"]:
             await asyncio.sleep(0.01)
-        assert b.twin.sent == []  # what the step came back with was not sent
+        assert made.twin.sent == []  # what the step came back with was not sent
 
 
-async def test_what_was_fresh_is_stale_while_the_loop_hangs(b: Bench, client: RunnerClient) -> None:
+async def test_what_was_fresh_is_stale_while_the_loop_hangs(
+    made: Bench, client: RunnerClient
+) -> None:
     """Regression: `state` showed the last world state, which was fresh when it was made."""
 
     await client.send_goal(RSKILL, prompt="hang in the step")
-    await b.skill.begun.wait()
+    await made.skill.begun.wait()
     await diagnosed(client, "stale")
-    b.skill.go_on.set()
+    made.skill.go_on.set()
     await diagnosed(client, "ok")
 
 
 @pytest.mark.usefixtures("patient")
 async def test_the_command_line_stops_the_robot(
-    b: Bench, endpoint: str, capfd: pytest.CaptureFixture[str]
+    made: Bench, endpoint: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
     assert await asyncio.to_thread(main, argv) == 0
-    assert b.runner.estop is not None
-    assert b.twin.story == ["connect", "halt"]
+    assert made.runner.estop is not None
+    assert made.twin.story == ["connect", "halt"]
     assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
 
 
@@ -218,7 +220,7 @@ async def test_the_command_line_stops_the_robot(
     "cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")]
 )
 async def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_again(
-    b: Bench,
+    made: Bench,
     client: RunnerClient,
     endpoint: str,
     capfd: pytest.CaptureFixture[str],
@@ -227,21 +229,21 @@ async def test_a_stop_that_did_not_reach_the_motors_is_no_success_and_is_tried_a
     """Regression: the runner counted the attempt as the stop: a lost packet left the motors running
     and the command exited 0."""
 
-    b.twin.halt_breaks = cause
+    made.twin.halt_breaks = cause
     goal = await client.send_goal(RSKILL, prompt="nod")
-    await b.skill.begun.wait()
+    await made.skill.begun.wait()
     argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
     assert await asyncio.to_thread(main, argv) == 1
     assert "cut the robot's power" in capfd.readouterr().err
     assert (await goal.result(60))["code"] == "estop_requested"
-    assert "halt" not in b.twin.story
-    b.twin.halt_breaks = None  # the bus is back: nobody has to ask again
-    while "halt" not in b.twin.story:
+    assert "halt" not in made.twin.story
+    made.twin.halt_breaks = None  # the bus is back: nobody has to ask again
+    while "halt" not in made.twin.story:
         await client.state()
     assert await asyncio.to_thread(main, argv) == 0
     said = capfd.readouterr().out
     assert "emergency stop: smoke; all joints stand still" in said
-    assert b.twin.story.count("halt") == 1
+    assert made.twin.story.count("halt") == 1
 
 
 async def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_being_read(
@@ -250,33 +252,33 @@ async def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_bein
     """Regression: requests that waited for a hanging control loop held all slots, so a stop was not
     read."""
 
-    async with bench(estop_s=0.5) as (b, client):
+    async with bench(estop_s=0.5) as (made, client):
         await client.send_goal(RSKILL, prompt="hang in the step")
-        await b.skill.begun.wait()
+        await made.skill.begun.wait()
         flood = [asyncio.create_task(client.frame("front", max_age_ms=60_000)) for _ in range(100)]
         await asyncio.wait(flood, return_when=asyncio.FIRST_COMPLETED)
         with pytest.raises(InternalError, match="cut the robot's power"):
             await client.estop("it hangs")
-        assert b.runner.estop is not None
-        b.skill.go_on.set()
+        assert made.runner.estop is not None
+        made.skill.go_on.set()
         answers = await asyncio.gather(*flood, return_exceptions=True)
         assert any(isinstance(answer, LimitExceeded) for answer in answers)
-        assert b.twin.sent == []
+        assert made.twin.sent == []
 
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
 async def test_a_stop_is_not_refused_for_its_words(
-    b: Bench, client: RunnerClient, reason: str
+    made: Bench, client: RunnerClient, reason: str
 ) -> None:
     """Regression: a reason of more than 500 characters made the runner refuse the stop."""
 
     assert "stand still" in (await client.estop(reason)).message
-    assert b.runner.estop is not None
-    assert b.twin.story == ["connect", "halt"]
+    assert made.runner.estop is not None
+    assert made.twin.story == ["connect", "halt"]
 
 
 async def test_whoever_names_no_endpoint_stops_the_system_service_too(
-    b: Bench,
+    made: Bench,
     client: RunnerClient,
     bench: Any,
     endpoint: str,
@@ -293,7 +295,7 @@ async def test_whoever_names_no_endpoint_stops_the_system_service_too(
     )
 
     assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
-    assert b.twin.story == ["connect", "halt"]
+    assert made.twin.story == ["connect", "halt"]
     (tmp_path / "of-this-login").mkdir()
     (
         tmp_path / "of-this-login" / "runner.sock"
@@ -305,7 +307,7 @@ async def test_whoever_names_no_endpoint_stops_the_system_service_too(
 
 
 async def test_a_wrong_runtime_folder_does_not_keep_the_system_service_from_being_stopped(
-    b: Bench, client: RunnerClient, endpoint: str, monkeypatch: pytest.MonkeyPatch
+    made: Bench, client: RunnerClient, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: the path was checked before anything was stopped."""
     monkeypatch.setenv("VRAM_ARBITER_RUNTIME", "not/absolute")
@@ -315,7 +317,7 @@ async def test_a_wrong_runtime_folder_does_not_keep_the_system_service_from_bein
     )
 
     assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
-    assert b.twin.story == ["connect", "halt"]
+    assert made.twin.story == ["connect", "halt"]
 
 
 def test_a_stop_does_not_wait_for_the_imports_of_other_commands(endpoint: str) -> None:
@@ -338,33 +340,33 @@ def test_a_stop_that_nobody_hears_is_an_error(
 
 
 async def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(
-    b: Bench, client: RunnerClient
+    made: Bench, client: RunnerClient
 ) -> None:
     goal = await client.send_goal(RSKILL, prompt="nod")
-    await b.skill.begun.wait()
+    await made.skill.begun.wait()
     await goal.cancel()
     assert (await goal.result(60))["status"] == "canceled"
-    sent = len(b.twin.sent)
+    sent = len(made.twin.sent)
     ticks = (await client.state())["ticks"]
     while (await client.state())["ticks"] < ticks + 5:
         pass
-    assert len(b.twin.sent) == sent
+    assert len(made.twin.sent) == sent
     assert (await client.state())["estop"] is None
 
 
-async def test_a_goal_is_limited_in_ticks(b: Bench, client: RunnerClient) -> None:
+async def test_a_goal_is_limited_in_ticks(made: Bench, client: RunnerClient) -> None:
     goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
     result = await goal.result(60)
     assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
     assert (
         result["data"]["ticks"] >= 4
     )  # more where the machine stood still, and the skill was not asked
-    assert b.skill.taken <= 4
+    assert made.skill.taken <= 4
 
 
 @pytest.mark.heavy
 async def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
-    b: Bench, client: RunnerClient
+    made: Bench, client: RunnerClient
 ) -> None:
     import cv2
     import numpy as np
@@ -372,6 +374,6 @@ async def test_pictures_go_out_in_their_colours_and_a_dead_camera_gives_none(
     reply = await client.frame("front", max_age_ms=60_000, encoding="png")
     picture = cv2.imdecode(np.frombuffer(reply["data"], dtype=np.uint8), cv2.IMREAD_COLOR)
     assert picture.tolist() == [[[255, 0, 0], [0, 0, 255]]]
-    b.camera.stop()
+    made.camera.stop()
     with pytest.raises(FrameStale, match="stopped"):
         await client.frame("front", max_age_ms=60_000)

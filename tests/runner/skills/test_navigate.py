@@ -58,7 +58,7 @@ def drive(skill: Navigate, env: Any, ticks: int = 600) -> tuple[StepOutcome, lis
     raise AssertionError("navigate did not end")
 
 
-def started(skill: Navigate, run_async: Run, **params: Any) -> None:
+def begun(skill: Navigate, run_async: Run, **params: Any) -> None:
     run_async(skill.start(Goal("g", "navigate", params=params)))
 
 
@@ -66,7 +66,7 @@ def test_stands_so_that_a_point_lies_on_the_grasp_spot(
     skill: Navigate, env: Any, run_async: Run
 ) -> None:
     env.reset(0)
-    started(skill, run_async, target_point={"x": 0.70, "y": 0.20, "z": 0.22})
+    begun(skill, run_async, target_point={"x": 0.70, "y": 0.20, "z": 0.22})
     done, modes = drive(skill, env)
     assert isinstance(done, Done)
     x, y, yaw = env.base_pose()
@@ -79,7 +79,7 @@ def test_stands_so_that_a_point_lies_on_the_grasp_spot(
 
 def test_turns_in_place(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
-    started(skill, run_async, turn_rad=-0.6)
+    begun(skill, run_async, turn_rad=-0.6)
     drive(skill, env)
     assert env.base_pose() == pytest.approx((0.0, 0.0, -0.6), abs=0.02)
 
@@ -100,14 +100,14 @@ def test_drives_to_a_pose_of_a_frame(
             "orientation": {"z": math.sin(0.25), "w": math.cos(0.25)},
         },
     }
-    started(skill, run_async, pose=pose)
+    begun(skill, run_async, pose=pose)
     drive(skill, env)
     assert env.base_pose() == pytest.approx(expected, abs=0.03)
 
 
 def test_without_parameters_nothing_drives(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
-    started(skill, run_async)
+    begun(skill, run_async)
     drive(skill, env)
     assert env.base_pose() == (0.0, 0.0, 0.0)
 
@@ -117,7 +117,7 @@ def test_folds_the_arm_first_and_keeps_the_gripper(
 ) -> None:
     env.reset(0)
     env.joints.update(shoulder_lift=0.3, gripper=0.1)
-    started(skill, run_async, turn_rad=0.3)
+    begun(skill, run_async, turn_rad=0.3)
     _, modes = drive(skill, env)
     assert modes.index(ControlMode.BODY_TWIST) == modes.count(ControlMode.JOINT_POSITION)
     rest = dict(zip(ARM_JOINTS, REST_POSE, strict=True)) | {"gripper": 0.1}
@@ -127,7 +127,7 @@ def test_folds_the_arm_first_and_keeps_the_gripper(
 def test_a_second_goal_starts_afresh(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
     for turn in (0.4, -0.4):
-        started(skill, run_async, turn_rad=turn)
+        begun(skill, run_async, turn_rad=turn)
         drive(skill, env)
         run_async(skill.finish())
     assert env.base_pose()[2] == pytest.approx(0.0, abs=0.04)
@@ -136,7 +136,7 @@ def test_a_second_goal_starts_afresh(skill: Navigate, env: Any, run_async: Run) 
 def test_fails_when_the_base_comes_no_closer(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
     far = {"header": {"frame_id": "map"}, "pose": {"position": {"x": 3.0, "y": 0.0}}}
-    started(skill, run_async, pose=far)
+    begun(skill, run_async, pose=far)
     with pytest.raises(GoalRejected, match="from its goal"):
         drive(skill, env)
     assert env.base_pose()[0] < CONFIG.table_edge_x_m
@@ -144,14 +144,14 @@ def test_fails_when_the_base_comes_no_closer(skill: Navigate, env: Any, run_asyn
 
 def test_no_odometry_no_drive(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
-    started(skill, run_async, turn_rad=0.1)
+    begun(skill, run_async, turn_rad=0.1)
     with pytest.raises(ModelError, match="base's pose"):
         skill.step(world(env).model_copy(update={"base_pose": None}))
 
 
 def test_no_joint_state_no_motion(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
-    started(skill, run_async, turn_rad=0.1)
+    begun(skill, run_async, turn_rad=0.1)
     with pytest.raises(ModelError, match="joint state is stale"):
         skill.step(world(env).model_copy(update={"diagnostics": {"joint_state": "stale"}}))
 
