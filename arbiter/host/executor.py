@@ -80,9 +80,8 @@ class SpanIds:
 
     A wait (from the request to `ready`) and an eviction (from the first `revoke` to the verdict)
     are a span each. Its ids are random numbers that are sent in the events about it, and an
-    eviction's in `revoke`: so a holder's unload is a child of its eviction, whether or not
-    somebody exports that one. They decide nothing, and change no effect but for the `traceparent`
-    of a `revoke`.
+    eviction's in `revoke`: a holder's unload is a child of its eviction, with or without an
+    observer. No decision reads them; of the effects they change the `traceparent` of a `revoke`.
 
     `outgoing` before a batch is performed, `revoke` for each push of it, `of` for each note.
     """

@@ -308,6 +308,11 @@ class Core:
         assert lease.gpu is not None, f"{lease.id} has no GPU"
         return self.gpus[lease.gpu]
 
+    def wake_all(self) -> None:
+        """Serve every queue."""
+        for gpu in self.gpus.values():
+            gpu.wake()
+
     def wake_candidates(self, lease: Lease) -> None:
         """Serve the queues of every GPU that a request may be granted on."""
         for gpu_id in lease.request.gpus:
@@ -485,8 +490,7 @@ class Core:
         """Begin to grant: every holder is accounted for."""
         self.serving = True
         self.note(ServingNote(self.now - self.started_at))
-        for gpu in self.gpus.values():
-            gpu.wake()
+        self.wake_all()
 
     def account_for(self, lease_id: str) -> None:
         """Wait for one lease less before the first grant, or (EMPTY_JOURNAL) no longer for holders

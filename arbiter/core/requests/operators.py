@@ -7,7 +7,7 @@ reason; a pin and a drain are journaled, so they outlive the daemon. The role wa
 request came in.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, Literal
 
@@ -15,7 +15,6 @@ from vram_arbiter.arbiter.core import eviction, standby
 from vram_arbiter.arbiter.core.effects import Signal
 from vram_arbiter.arbiter.core.events import DRAIN_KEY, Asked, SettingsChanged
 from vram_arbiter.arbiter.core.model import refusals as no
-from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import AWAY, EXPIRING, LEAVING, Lease, LeaseState
 from vram_arbiter.arbiter.core.model.records import DrainRecord
 from vram_arbiter.arbiter.core.model.refusals import Impractical, Refused
@@ -170,7 +169,7 @@ def drain(core: Core, order: Order) -> None:
     reason."""
     core.drain = order
     core.journal(DRAIN_KEY, DrainRecord(order.by, order.reason))
-    _wake_all(core.gpus.values())
+    core.wake_all()
     core.note(OperatorNote("drain", order.by, order.reason))
 
 
@@ -179,13 +178,8 @@ def resume(core: Core, order: Order) -> None:
     if core.drain is not None:
         core.drain = None
         core.forget(DRAIN_KEY)
-        _wake_all(core.gpus.values())
+        core.wake_all()
     core.note(OperatorNote("resume", order.by, order.reason))
-
-
-def _wake_all(gpus: Iterable[Gpu]) -> None:
-    for gpu in gpus:
-        gpu.wake()
 
 
 def _impractical(lease: Lease, problem: Impractical, silent_s: float | None = None) -> Refused:

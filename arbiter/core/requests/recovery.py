@@ -288,8 +288,8 @@ def _restore_uses(core: Core, lease: Lease, client: Client, item: ReattachLease)
 def _adopted(
     gpus: Mapping[GpuId, Gpu], client: Client, item: ReattachLease, peak: int, steady: int
 ) -> LeaseRecord:
-    """Return the record of a lease that the journal does not know, by its holder's word. Its token
-    is of an earlier epoch, and the engine recovers: else there is no such lease. Raises Refused."""
+    """Return the record of a lease that the journal does not know, by its holder's word; the caller
+    has seen that the engine recovers and that its token is of an earlier epoch. Raises Refused."""
     named, spec = admission.selected(gpus, item.spec), item.spec
     if not named:
         raise Refused(no.UnknownGpu(spec.gpu, tuple(gpus)))

@@ -344,7 +344,7 @@ def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(session_bench:
 
 
 def test_every_op_of_the_wire_is_dispatched(session_bench: Bench) -> None:
-    """A new op without a case in `_dispatch` or `event_of` would be answered by nothing."""
+    """A new op without a case in `_answer` or a row in `_REQUESTS` would get no answer."""
     on = {"lease_id": "L3-1", "token": [3, 7]}
     fields: dict[str, dict[str, Any]] = {
         "hello": {"version": d.WIRE_VERSION, "name": "n", "instance": "i-61"},

@@ -245,7 +245,7 @@ def test_no_event_is_lost_or_counted_twice_across_restarts_of_the_daemon(
     make_arbiter: Make, collector: Collector
 ) -> None:
     """The daemon is killed and stopped between handovers; each grant is one span and one count.
-    What a crash takes from the history nobody can read: the observer has read it before."""
+    What a crash takes from the history is lost to every reader: the observer has read it before."""
     arbiter = make_arbiter().start()
     with ObserverProcess(arbiter, environ=collector.environ()) as observer:
         hand_over(arbiter)
