@@ -2,8 +2,7 @@
 
 A file counts that names the request's class, the class of its reply where no other request has
 that, or imports from the wire and defines a function of the op's name. A program that only calls
-these is not counted. Of an older tree the names are given:
-`--root TREE --words Oom OomReported OomReply --functions oom`.
+these is not counted.
 """
 
 import argparse
@@ -17,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "src"))
 
 from vram_arbiter.schemas.wire.requests import REPLIES, REQUESTS
 
+ROOT = Path(__file__).parents[1]
 FOLDERS = ("arbiter", "clients", "schemas")
 OPS = ("prepare", "revoke_ack", "release_dead", "oom", "reacquire")
 """One that the session answers, two of few words, and two with more about them."""
@@ -32,7 +32,7 @@ def classes_of(op: str) -> set[str]:
 def named(tree: ast.AST) -> Iterator[str]:
     """Yield every name of a module, and the functions that one of the wire defines."""
     modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    of_wire = any(".schemas.wire" in module or "core.events" in module for module in modules)
+    of_wire = any(".schemas.wire" in module for module in modules)
     for node in ast.walk(tree):
         match node:
             case ast.Name(id=name) | ast.Attribute(attr=name) | ast.ClassDef(name=name):
@@ -41,25 +41,18 @@ def named(tree: ast.AST) -> Iterator[str]:
                 yield f"{name}()"
 
 
-def touched(root: Path, classes: Set[str], functions: Set[str]) -> list[str]:
-    paths = sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.py"))
+def touched(words: Set[str]) -> list[str]:
+    paths = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
     trees = ((path, ast.parse(path.read_text("utf-8"))) for path in paths)
-    words = classes | {f"{name}()" for name in functions}
-    return [str(path.relative_to(root)) for path, tree in trees if words & set(named(tree))]
+    return [str(path.relative_to(ROOT)) for path, tree in trees if words & set(named(tree))]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("ops", nargs="*", default=OPS)
-    parser.add_argument("--root", type=Path, default=Path(__file__).parents[1])
-    parser.add_argument("--words", nargs="+", help="these classes instead")
-    parser.add_argument("--functions", nargs="*", default=(), help="these functions instead")
-    args = parser.parse_args()
-    wanted = [(classes_of(op), {op}) for op in args.ops]
-    if args.words:
-        wanted = [(set(args.words), set(args.functions))]
-    for classes, functions in wanted:
-        files = touched(args.root, classes, functions)
+    for op in parser.parse_args().ops:
+        classes = classes_of(op)
+        files = touched(classes | {f"{op}()"})
         print(f"{len(files):3} (target {TARGET})  {', '.join(sorted(classes))}")
         print("".join(f"      {name}\n" for name in files), end="")
 
