@@ -24,8 +24,8 @@ WORKERS ?= 3
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core test-gpu nightly mutation lint format chaos sim \
-	bench bench-switch schemas docs clean
+.PHONY: help setup setup-core demo test test-core test-gpu nightly mutation measure lint format \
+	chaos sim bench bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -55,6 +55,10 @@ nightly: setup ## random histories of the engine: HISTORIES=100000 MACHINE=lease
 
 mutation: setup ## small changes in arbiter/core that no core test notices: SAMPLE=300 SEED=n
 	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
+
+measure: setup ## how long the path of a request is, and what one more request touches
+	$(TOOL) tests/measure_path.py
+	$(TOOL) tests/measure_request.py
 
 lint: setup ## style, types and import layers
 	$(BIN)/ruff check .

@@ -41,8 +41,8 @@ class Display:
         print(printable(text), flush=True)
 
     def event(self, event: JsonMap, at_s: float) -> None:
-        """A history event of the arbiter, `at_s` seconds after the start."""
-        if event["kind"] not in QUIET_KINDS:
+        """A history event of the arbiter, `at_s` seconds after the start; none from before it."""
+        if at_s >= 0.0 and event["kind"] not in QUIET_KINDS:
             self.say(f"{at_s:6.1f} s  {describe(event)}")
 
     def robot(self, line: str, at_s: float) -> None:
