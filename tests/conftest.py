@@ -26,6 +26,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [f"{_ROOT}/src", str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
+# Several workers keep the cores busy: threads of a library would only wait for each other. OpenMP
+# reads it when it is first used.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 # MuJoCo reads it when it is first imported, by whichever test of this process that is.
 os.environ.setdefault("MUJOCO_GL", "egl")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

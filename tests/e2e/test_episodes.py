@@ -117,10 +117,9 @@ class Programs:
                 "--device", f"fake:{self.arbiter.gpu_folder}",
                 "--footprint", f"{size},{size},{CONTEXT_BYTES}", *flags,
             ]  # fmt: skip
-            environ = self.arbiter.environ | {"OMP_NUM_THREADS": "1"}
             with (self.runtime / "programs.log").open("ab") as log:
                 self.running[name] = start(
-                    "episode", arguments, environ, log.fileno(), log.fileno()
+                    "episode", arguments, self.arbiter.environ, log.fileno(), log.fileno()
                 )
 
     def runs(self, name: str) -> bool:
@@ -129,7 +128,7 @@ class Programs:
     def start(self, name: str, *words: str, **environ: str) -> None:
         if self.runs(name):
             return
-        environ = self.arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ
+        environ = self.arbiter.environ | environ
         with (self.runtime / "programs.log").open("ab") as log:
             self.running[name] = start(
                 f"vram-{name}", words, environ, log.fileno(), log.fileno(), cwd=ROOT

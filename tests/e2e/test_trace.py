@@ -72,7 +72,7 @@ class Programs:
 
     def __init__(self, arbiter: ArbiterProcess, environ: dict[str, str]) -> None:
         self.log = arbiter.runtime / "programs.log"
-        self._environ = arbiter.environ | {"OMP_NUM_THREADS": "1"} | environ
+        self._environ = arbiter.environ | environ
         self._running: list[Forked] = []
 
     def start(self, program: str, *argv: str) -> None:

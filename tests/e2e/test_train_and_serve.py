@@ -63,7 +63,6 @@ def test_a_recorded_session_is_trained_on_served_and_benchmarked(
     Path("act-grab/rskill.yaml").write_text(manifest)
     environ = arbiter_daemon.environ | {
         "VRAM_FAKE_GPU": str(arbiter_daemon.gpu_folder),
-        "OMP_NUM_THREADS": "1",
         "HF_HUB_OFFLINE": "1",
         "HF_HOME": str(tmp_path / "hub"),
     }

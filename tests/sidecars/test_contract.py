@@ -113,9 +113,10 @@ class Host:
             "--configs", str(self.configs), "--footprint", "1GB,1GB,100MB",
             "--device", f"fake:{self.arbiter.gpu_folder}", "--min-residency-s", "0", "--nice", "0",
         ]  # fmt: skip
-        environ = {**self.arbiter.environ, "OMP_NUM_THREADS": "1"}
         with (self.arbiter.runtime / f"{self.kind.name}.log").open("ab") as log:
-            self.process = start("vram-sidecar", arguments, environ, log.fileno(), log.fileno())
+            self.process = start(
+                "vram-sidecar", arguments, self.arbiter.environ, log.fileno(), log.fileno()
+            )
 
     def close(self) -> None:
         for client in (self.client, self.operator, self.other):

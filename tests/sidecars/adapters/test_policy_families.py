@@ -75,13 +75,8 @@ def manifest_of(name: str, dtype: str | None = None, **fields: Any) -> RSkillMan
 
 @pytest.fixture(scope="module", autouse=True)
 def small_networks() -> Iterator[None]:
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     with policies.small_networks():
         yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
