@@ -94,26 +94,19 @@ def load_reward(weights: Weights, device: str) -> Any:
 OTHERS: dict[str, Callable[[Path], None]] = {
     "owlv2": tiny_vision.save_owlv2,
     "grounding_dino": tiny_vision.save_grounding_dino,
-    "vqbet": policies.save_vqbet,
-    "smolvla": policies.save_smolvla,
     "compact_act": shipped_copy("so101-grab"),
     "compact_progress": shipped_copy("so101-progress"),
-    "shipped detector": shipped_copy("so101-detector"),
     "shipped vlm": shipped_copy("so101-scene-vlm"),
 }
 MODELS: dict[str, tuple[Callable[[Weights, str], Any],
 str]] = {  # how it is loaded, and a part that it does not work without
     "act": (load_policy, "model.action_head"),
-    "vqbet": (load_policy, "vqbet.action_head"),
-    "smolvla": (load_policy, "model.action_out_proj"),
     "compact_act": (load_policy, "act."),
     "compact_progress": (load_reward, "judge"),
     "owlvit": (load_detector, "box_head"),
     "owlv2": (load_detector, "class_head"),
     "grounding_dino": (load_detector, "bbox_embed"),
-    "qwen": (load_vlm, "lm_head"),
     "qwen nf4": (load_vlm_nf4, "mlp.down_proj"),
-    "shipped detector": (load_detector, "box_head"),
     "shipped vlm": (load_vlm, "layers.0"),
 }  # fmt: skip
 
