@@ -63,6 +63,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, object]]:
     )
 
 
+@pytest.mark.nightly
 def test_every_row_has_the_documented_fields(rows: list[dict[str, object]]) -> None:
     assert len({row["name"] for row in rows}) == len(rows) > 8
     for row in rows:
@@ -71,6 +72,7 @@ def test_every_row_has_the_documented_fields(rows: list[dict[str, object]]) -> N
         assert (row["ok"] is None) == (row["target"] is None)
 
 
+@pytest.mark.nightly
 def test_a_row_says_a_time_or_a_value_or_why_not(rows: list[dict[str, object]]) -> None:
     for row in rows:
         time, value = row["p50_us"], row["value"]
@@ -79,6 +81,7 @@ def test_a_row_says_a_time_or_a_value_or_why_not(rows: list[dict[str, object]]) 
             assert 0 < time <= row["p99_us"]
 
 
+@pytest.mark.nightly
 def test_a_comparison_names_its_floor(rows: list[dict[str, object]]) -> None:
     grant = next(row for row in rows if str(row["name"]).startswith("grant: acquire"))
     assert grant["against"] == "F"

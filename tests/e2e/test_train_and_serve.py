@@ -18,7 +18,9 @@ from tests.support.prepared import Forked, run, start, warm
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(600)]
+pytestmark = [
+    pytest.mark.heavy, pytest.mark.e2e, pytest.mark.nightly, pytest.mark.timeout(600),
+]  # fmt: skip
 
 PAGE = ROOT / "docs/how-to/train-a-policy.md"
 SCENE = """cameras:
