@@ -126,20 +126,19 @@ class RerunStream:
             except (FrameStale, ModelError) as error:
                 self.event(f"camera {camera}: {error.message}", "WARN")
 
-    def world(self, world: WorldState, *, pictures: bool) -> None:
+    def world(self, world: WorldState) -> None:
         """Show a state of the world."""
         joints = world.joint_state
         self.numbers("state", dict(zip(joints.name, joints.position, strict=True)))
         if world.base_pose is not None:
             self.numbers("base", dict(zip("xyz", world.base_pose.xyz, strict=True)))
-        if pictures:
-            self.frames(world.image_frames or {})
+        self.frames(world.image_frames or {})
 
-    def tick(self, tick: GoalTick, *, pictures: bool) -> None:
+    def tick(self, tick: GoalTick) -> None:
         """Show a tick of a goal: what was seen, what the motors were told, what was withheld."""
         result = tick.result
         self.at(tick.world.stamp_ns / 1e9, result.tick_idx)
-        self.world(tick.world, pictures=pictures)
+        self.world(tick.world)
         self.numbers("action", tick.targets)
         if tick.base_velocity is not None:
             self.numbers(
