@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.protocols import RobotDescription, SafetyGate, Stepped
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.limits import Kinematics, Limits
@@ -26,7 +27,6 @@ from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import (
     Action,
     JointState,
-    Pose,
     SensorFrame,
     WorldState,
 )
@@ -106,7 +106,6 @@ class ArmEnvironment:
 
     def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
         positions, velocities = self.arm.joint_state(), self.arm.joint_velocity()
-        x, y, yaw = self.arm.base_pose()
         return WorldState(
             stamp_ns=stamp_ns,
             joint_state=JointState(
@@ -115,11 +114,7 @@ class ArmEnvironment:
                 velocity=tuple(velocities[name] for name in positions),
                 stamp_ns=stamp_ns,
             ),
-            base_pose=Pose(
-                xyz=(x, y, 0.0),
-                quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
-                frame_id="map",
-            ),
+            base_pose=planar_pose(*self.arm.base_pose(), "map"),
             image_frames=dict(frames) if frames is not None else None,
         )
 

@@ -14,8 +14,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vram_arbiter.runner.planar import yaw_of
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig, wrap_angle
 from vram_arbiter.runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.motion import JointRamp, is_at, joint_positions
@@ -61,9 +62,7 @@ class Orientation(_Part):
 
     @property
     def yaw_rad(self) -> float:
-        return math.atan2(
-            2 * (self.w * self.z + self.x * self.y), self.w**2 + self.x**2 - self.y**2 - self.z**2
-        )
+        return yaw_of((self.x, self.y, self.z, self.w))
 
 
 class PoseHeader(BaseModel):
@@ -107,8 +106,7 @@ def base_pose(world: WorldState) -> Pose2D:
     if world.base_pose is None or "base_pose" in world.stale:
         raise ModelError("the base's pose is not known", hint="nothing drives without odometry")
     x, y, _ = world.base_pose.xyz
-    qx, qy, qz, qw = world.base_pose.quat_xyzw
-    return Pose2D(x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
+    return Pose2D(x, y, yaw_of(world.base_pose.quat_xyzw))
 
 
 def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose2D:
@@ -161,7 +159,7 @@ class Navigate(SkillBase):
             self._controller = PlanarController(goal, self._config, control_dt_s=self._period_s)
             self._start_m = max(self._controller.distance_m(here), 1e-3)
         gap_m = self._controller.distance_m(here)
-        turn_rad = abs(_wrap(self._controller.goal.yaw_rad - here.yaw_rad))
+        turn_rad = abs(wrap_angle(self._controller.goal.yaw_rad - here.yaw_rad))
         self.fraction = min(max(1.0 - gap_m / self._start_m, 0.0), 0.99)
         if self._controller.reached(here) or self._settling:
             self._settling += 1
@@ -220,7 +218,3 @@ class Navigate(SkillBase):
                 f"the base stays {gap_m:.3f} m and {turn_rad:.3f} rad from its goal",
                 hint="the goal lies on or behind the table",
             )
-
-
-def _wrap(angle_rad: float) -> float:
-    return math.atan2(math.sin(angle_rad), math.cos(angle_rad))

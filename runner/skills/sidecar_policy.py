@@ -16,8 +16,10 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncForeignUse
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import (
     Act,
@@ -31,7 +33,7 @@ from vram_arbiter.runner.sensors.pictures import as_rgb
 from vram_arbiter.runner.skills.actions import Stepper, Twist
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played, Row
-from vram_arbiter.runner.skills.model_phase import PHASE_S, Explainer, model_phase
+from vram_arbiter.runner.skills.model_phase import PHASE_S, model_phase
 from vram_arbiter.runner.skills.motion import JointRamp, is_at, joint_positions
 from vram_arbiter.runner.skills.wiring import View, Wiring
 from vram_arbiter.schemas.control import ControlMode
@@ -91,20 +93,6 @@ _AGAIN = (
 )
 
 
-class Use(Protocol):
-    """A busy interval on the sidecar's lease (`clients.lease.ForeignUse`)."""
-
-    lost: VramError | None
-
-    async def end(self) -> None: ...
-
-
-class Arbiter(Explainer, Protocol):
-    """What is needed of `clients.client.AsyncClient`."""
-
-    async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use: ...
-
-
 class SidecarPolicy(SkillBase):
     """`arbiter` None: the sidecar loads at once.
 
@@ -125,7 +113,7 @@ class SidecarPolicy(SkillBase):
         manifest: RSkillManifest,
         wiring: Wiring,
         client: PolicyClient,
-        arbiter: Arbiter | None,
+        arbiter: AsyncClient | None,
         *,
         period_s: float,
         wait_s: float = 0.0,
@@ -156,7 +144,7 @@ class SidecarPolicy(SkillBase):
         self._latency_steps = latency_steps
         self._steps = wiring.rollout.rollout_steps or max(1, round(wiring.rollout_s / period_s))
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._use: Use | None = None
+        self._use: AsyncForeignUse | None = None
         self._token: tuple[int, ...] | None = None
         self._loaded = False
         self._task = ""

@@ -197,7 +197,7 @@ class Halted(SystemClock):
 def run_of(clock: SystemClock, pipeline: str) -> _Run:
     """A pipeline whose thread is the test."""
     params = GStreamerParams(pipeline=pipeline)
-    return _Run(load(), build(params, probe_platform().platform), params, "wrist", clock)
+    return _Run(load(), build(params, probe_platform()), params, "wrist", clock)
 
 
 def test_a_thread_that_is_stopped_makes_no_picture_younger() -> None:
