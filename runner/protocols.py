@@ -8,6 +8,7 @@ skill states.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -336,9 +337,7 @@ class Picture(Protocol):
 class Work(Protocol):
     """Takes callables for the control thread, from any thread."""
 
-    def post(
-        self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]
-    ) -> None: ...
+    def post[T](self, work: Callable[[], T]) -> Future[T]: ...
 
     def close(self) -> None: ...
 
