@@ -439,10 +439,7 @@ def test_it_lives_with_opencv_and_torch(order: str) -> None:
     fresh(order.format(TAKE_ONE, TAKE_ONE))
 
 
-@pytest.mark.parametrize(
-    "before", ["import zmq, msgpack, yaml", "import zmq, numpy", "import zmq, cv2, numpy"]
-)
-def test_what_throws_in_cpp_lives_on_after_it(before: str) -> None:
+def test_what_throws_in_cpp_lives_on_after_it() -> None:
     """Regression: with GStreamer's libunwind in the process, the next C++ exception (matplotlib
     throws and catches one as it is imported) ended it with a segmentation fault.
     """
@@ -451,7 +448,7 @@ def test_what_throws_in_cpp_lives_on_after_it(before: str) -> None:
         "import matplotlib; matplotlib.use('Agg'); import matplotlib.pyplot as p; "
         "p.figure().savefig('/dev/null', format='png')"
     )
-    fresh(f"{before}\n{TAKE_ONE}\n{draws}")
+    fresh(f"import zmq, numpy\n{TAKE_ONE}\n{draws}")
 
 
 def test_importing_it_loads_no_gstreamer() -> None:
