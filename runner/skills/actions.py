@@ -18,9 +18,9 @@ from vram_arbiter.runner.skills.motion import bounded
 from vram_arbiter.runner.skills.rotations import axis_angle, matrix_of, turn
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.manifest.vocabulary import Rotation
+from vram_arbiter.schemas.world import Twist
 
 Row = tuple[float, ...]
-Twist = tuple[float, float, float, float, float, float]
 Kind = Literal[
     "joint_position",
     "joint_delta",

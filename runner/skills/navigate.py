@@ -19,9 +19,8 @@ from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig, wrap_angle
 from vram_arbiter.runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
 from vram_arbiter.runner.skills.base import SkillBase
-from vram_arbiter.runner.skills.motion import JointRamp, is_at, joint_positions
+from vram_arbiter.runner.skills.motion import JointRamp, action_of, is_at, joint_positions
 from vram_arbiter.runner.skills.ros_goals import parse_goal
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import Action, Finite, WorldState
@@ -174,21 +173,11 @@ class Navigate(SkillBase):
             return Hold("standing still")
         self._watch(gap_m, turn_rad)
         vx, vy, wz = self._controller.command(here)
-        return Act(
-            Action(
-                control_mode=ControlMode.BODY_TWIST,
-                body_twist=((vx, vy, 0.0, 0.0, 0.0, wz),),
-                stamp_ns=world.stamp_ns,
-            )
-        )
+        return Act(action_of({}, world.stamp_ns, (vx, vy, 0.0, 0.0, 0.0, wz)))
 
     def _fold_arm(self, world: WorldState) -> Action | None:
         """Return the next step towards the folded pose, or None once the arm is there."""
-        rest = {
-            name: value
-            for name, value in zip(ARM_JOINTS, REST_POSE, strict=True)
-            if name in FOLDED_JOINTS
-        }
+        rest = dict(zip(FOLDED_JOINTS, REST_POSE, strict=False))
         measured = joint_positions(world, FOLDED_JOINTS)
         if self._fold is None:
             if is_at(measured, rest):
@@ -198,13 +187,7 @@ class Navigate(SkillBase):
         if self._fold.done(measured):
             self._folded = True
             return None
-        target = self._fold.next_target()
-        return Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(tuple(target.values()),),
-            joint_names=tuple(target),
-            stamp_ns=world.stamp_ns,
-        )
+        return action_of(self._fold.next_target(), world.stamp_ns)
 
     def _watch(self, gap_m: float, turn_rad: float) -> None:
         best_m, best_rad = self._best

@@ -30,13 +30,12 @@ from vram_arbiter.runner.protocols import (
     StepOutcome,
 )
 from vram_arbiter.runner.sensors.pictures import as_rgb
-from vram_arbiter.runner.skills.actions import Stepper, Twist
+from vram_arbiter.runner.skills.actions import Stepper
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played, Row
 from vram_arbiter.runner.skills.model_phase import PHASE_S, model_phase
-from vram_arbiter.runner.skills.motion import JointRamp, is_at, joint_positions
+from vram_arbiter.runner.skills.motion import JointRamp, action_of, is_at, joint_positions
 from vram_arbiter.runner.skills.wiring import View, Wiring
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
@@ -59,7 +58,7 @@ from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.sidecar import LoadResult, RealTimeChunking
-from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
+from vram_arbiter.schemas.world import SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -326,7 +325,7 @@ class SidecarPolicy(SkillBase):
         measured = joint_positions(world, self._read)
         if not self._running:
             if not self._at_start(measured):
-                return Act(_joint_action(self._target, None, world))
+                return Act(action_of(self._target, world.stamp_ns))
             self._running = True
             return Hold("at the start pose")
         if player.played >= self._steps or self._stands_still(player):
@@ -369,7 +368,7 @@ class SidecarPolicy(SkillBase):
         else:
             self._recent.append(tuple(targets.values()))
         return Act(
-            _joint_action(targets, step.twist, world),
+            action_of(targets, world.stamp_ns, step.twist),
             chunk_index=played.chunk,
             chunk=self._chunk_start(played),
             problem=step.problem,
@@ -481,22 +480,6 @@ def _count(begun: JsonMap, name: str) -> int | None:
     """Return what a sidecar says of an episode; None: a server of the field, which does not."""
     found = begun.get(name)
     return found if isinstance(found, int) and found > 0 else None
-
-
-def _joint_action(targets: Mapping[str, float], twist: Twist | None, world: WorldState) -> Action:
-    """Return an action of joint targets (rad), with a base's velocity, or of that alone."""
-    driving = None if twist is None else (twist,)
-    if not targets and driving is not None:
-        return Action(
-            control_mode=ControlMode.BODY_TWIST, body_twist=driving, stamp_ns=world.stamp_ns
-        )
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION,
-        joint_targets=(tuple(targets.values()),),
-        joint_names=tuple(targets),
-        body_twist=driving,
-        stamp_ns=world.stamp_ns,
-    )
 
 
 def _picture(frame: SensorFrame, view: View | None) -> Any:
