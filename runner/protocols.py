@@ -8,9 +8,10 @@ skill states.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, NoReturn, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from vram_arbiter.schemas.errors import EstopRequested, TransientError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -18,7 +19,6 @@ from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.world import (
     Action,
     CameraModel,
-    JointState,
     RunResult,
     SensorFrame,
     TickResult,
@@ -316,32 +316,6 @@ class RobotDescription:
         return tuple(joint.name for joint in self.joints)
 
 
-class Hal(Protocol):
-    """Hardware of one robot, or its twin. All calls on the control thread; joint units are rad.
-
-    `send_action` takes one-step actions that have passed the safety gate: joint positions, a body
-    twist for a robot with a base, or both. `estop`
-    stops the motors as fast as the hardware can, latches, and always raises
-    `schemas.errors.EstopRequested`; from then on `send_action` raises it too.
-    """
-
-    description: RobotDescription
-
-    def connect(self) -> None: ...
-
-    def disconnect(self) -> None: ...
-
-    def read_state(self) -> JointState: ...
-
-    def send_action(self, action: Action) -> None: ...
-
-    def sent(self) -> Mapping[str, float]:
-        """Return the last target (rad) that the motors really got, by joint; empty at first."""
-        ...
-
-    def estop(self, reason: str) -> NoReturn: ...
-
-
 class Picture(Protocol):
     """One picture of a camera; its colors may be decoded only when they are read."""
 
@@ -363,9 +337,7 @@ class Picture(Protocol):
 class Work(Protocol):
     """Takes callables for the control thread, from any thread."""
 
-    def post(
-        self, work: Callable[[], Any], deliver: Callable[[Any, BaseException | None], None]
-    ) -> None: ...
+    def post[T](self, work: Callable[[], T]) -> Future[T]: ...
 
     def close(self) -> None: ...
 

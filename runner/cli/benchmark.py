@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.benchmark_report import MAX_STEPS, REPORT, table, write_report
 from vram_arbiter.runner.cli.common import (
     add_skill_flags,
@@ -43,9 +44,7 @@ if TYPE_CHECKING:
 SO101 = "so101"
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner benchmark`."""
     bench = commands.add_parser(
         "benchmark", help="measure success rates of skills and policies, with videos"

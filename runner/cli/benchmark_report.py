@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonMap
 
 if TYPE_CHECKING:
-    from vram_arbiter.runner.sim.benchmark import Cell, CellSummary
+    from vram_arbiter.runner.sim.benchmark import Cell
 
 REPORT = "benchmark.json"
 MAX_STEPS = 600  # of an episode, 20 s, where --max-steps does not say
@@ -47,7 +48,7 @@ def write_report(args: argparse.Namespace, cells: Sequence[Cell], *, complete: b
         raise ConfigError(f"{target} cannot be written: {error}") from error
 
 
-def table(rows: Sequence[CellSummary]) -> str:
+def table(rows: Sequence[JsonMap]) -> str:
     """Format the cells as a table."""
     lines = [COLUMNS, *(_row(row) for row in rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
@@ -57,7 +58,7 @@ def table(rows: Sequence[CellSummary]) -> str:
     )
 
 
-def _row(row: CellSummary) -> tuple[str, ...]:
+def _row(row: JsonMap) -> tuple[str, ...]:
     interval = row["interval_95"]
     rate = row["success_rate"]
     task = f" ({row['task']})" if row["task"] else ""

@@ -15,8 +15,10 @@ import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.common import (
     add_serving_flags,
     announce,
@@ -57,7 +59,6 @@ from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic
-from vram_arbiter.runner.skills.sidecar_policy import Arbiter
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,
@@ -77,9 +78,7 @@ SERVES = True
 OWN_GOAL = "task"  # goal id of the file's own task
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner deploy`."""
     deploy = commands.add_parser("deploy", help="run the robot of a deployment file")
     deploy.add_argument(
@@ -201,7 +200,7 @@ class Deploy:
 
     # -- steps
     def _offered(
-        self, parts: Parts, manifests: list[RSkillManifest], arbiter: Arbiter | None
+        self, parts: Parts, manifests: list[RSkillManifest], arbiter: AsyncClient | None
     ) -> Catalogue:
         check_sidecars(sidecars_given(self._args.sidecar), manifests)
         makers = self._make_makers(parts, arbiter)
@@ -232,7 +231,7 @@ class Deploy:
         sidecars += [watch.line for watch in self._watches]
         return [*sidecars, ("goals", f"served on {self._endpoint}"), ("arbiter", arbiter)]
 
-    def _identity(self, parts: Parts, arbiter: Arbiter | None) -> GoalData:
+    def _identity(self, parts: Parts, arbiter: AsyncClient | None) -> GoalData:
         return {
             "robot": self._file.robot.robot_id,
             "simulated": parts.hal.description.simulated,

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE, Catalogue, Maker
-from vram_arbiter.runner.protocols import Hal, SensorReader
+from vram_arbiter.runner.protocols import SensorReader
 from vram_arbiter.runner.recording.columns import whole_rate
 from vram_arbiter.runner.recording.commit import check_folder
+from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.body import body_of
 from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.runner.safety.gate import RobotGate
@@ -80,7 +81,7 @@ class Parts:
     `safety`.
     """
 
-    hal: Hal
+    hal: HalBase
     readers: tuple[SensorReader, ...]
     gate: RobotGate
     lerobot_units: LerobotUnits | None = None  # None: lerobot does not know such a robot

@@ -7,21 +7,14 @@ import asyncio
 import contextlib
 from collections import Counter
 from pathlib import Path
-from typing import Protocol
 
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.display.display import Display
 from vram_arbiter.runner.protocols import InferenceRunner
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.wire.replies import StatusReply
 
 LEASES_PERIOD_S = 1.0
-
-
-class Leases(Protocol):
-    """What is needed of `clients.client.AsyncClient`."""
-
-    async def status(self) -> StatusReply: ...
 
 
 def add_display_flag(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +39,7 @@ def display_runner(
     args: argparse.Namespace,
     runner: InferenceRunner,
     name: str,
-    arbiter: Leases | None,
+    arbiter: AsyncClient | None,
     stack: contextlib.AsyncExitStack,
 ) -> None:
     """Show the runner until the stack is left, beside its recorder."""
@@ -62,7 +55,7 @@ def display_runner(
         stack.callback(polling.cancel)
 
 
-async def _show_leases(arbiter: Leases, display: Display) -> None:
+async def _show_leases(arbiter: AsyncClient, display: Display) -> None:
     while True:
         with contextlib.suppress(VramError):  # a daemon that restarts is asked again
             charged: Counter[str] = Counter()

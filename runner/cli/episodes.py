@@ -6,14 +6,13 @@ import argparse
 import asyncio
 from pathlib import Path
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.recording import commit
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner episodes`."""
     episodes = commands.add_parser(
         "episodes", help="list recorded episodes and the operator's marks"

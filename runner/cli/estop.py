@@ -11,6 +11,7 @@ import asyncio
 import os
 
 from vram_arbiter.clients.estop import ANSWER_S, stop
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.schemas.errors import ConfigError, RunnerUnreachable, UntrustedServer
 from vram_arbiter.schemas.estop import path_of
 from vram_arbiter.schemas.runtime import terminal
@@ -18,9 +19,7 @@ from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, program_endpo
 from vram_arbiter.schemas.runtime.printable import printable
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner estop`."""
     estop = commands.add_parser(
         "estop", help="stop a robot's motors; its runner refuses goals until it is started again"

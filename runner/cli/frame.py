@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note
 from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.schemas.errors import ConfigError
@@ -14,9 +15,7 @@ from vram_arbiter.schemas.errors import ConfigError
 ENCODINGS: dict[str, Literal["jpeg", "png"]] = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner frame`."""
     frame = commands.add_parser(
         "frame", help="save the newest picture of a running runner's camera"

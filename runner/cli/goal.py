@@ -9,6 +9,7 @@ import signal
 from collections.abc import AsyncIterator
 from typing import TYPE_CHECKING
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note, show_json
 from vram_arbiter.runner.cli.numbers import positive, positive_int
 from vram_arbiter.schemas.plain import JsonMap
@@ -17,9 +18,7 @@ if TYPE_CHECKING:
     from vram_arbiter.schemas.goals import FeedbackPush
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner goal`."""
     goal = commands.add_parser(
         "goal", help="send a goal to a running runner and wait for its result"

@@ -41,7 +41,7 @@ async def evaluate(args: argparse.Namespace) -> int:
     wanted = [_policy(manifests.get(name), name, args) for name in dict.fromkeys(args.skill)]
     leases = [[] if args.no_arbiter else lease_of(manifest, args) for manifest in wanted]
     check_output("--out", args.out / REPORT)
-    paths = [await asyncio.to_thread(_checkpoint, manifest) for manifest in wanted]
+    paths = [await asyncio.to_thread(checkpoint_of, manifest) for manifest in wanted]
     stopping = asyncio.Event()
     install_signals(stopping)
     cells: list[Cell] = []
@@ -88,7 +88,7 @@ def _policy(manifest: RSkillManifest | None, name: str, args: argparse.Namespace
     return manifest
 
 
-def _checkpoint(manifest: RSkillManifest) -> str:
+def checkpoint_of(manifest: RSkillManifest) -> str:
     """Return the folder of the checkpoint, or its hub id where no revision is pinned. Blocks.
 
     lerobot-eval reads configuration and processors of the newest revision, whatever is pinned: a

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, show
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner mark`."""
     mark = commands.add_parser(
         "mark", help="mark the recorded episode of the running goal, or of the last one"

@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.numbers import not_negative_int
 from vram_arbiter.runner.recording.reader import Recorded, read_frame
 from vram_arbiter.schemas.errors import ConfigError
@@ -19,9 +20,7 @@ TRACE_URL_VARIABLE = "VRAM_TRACE_URL"
 TRACE_FIELDS = ("{trace_id}", "{span_id}")
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner replay`."""
     replay = commands.add_parser("replay", help="show a recorded frame, its tick and its trace")
     replay.add_argument("--dataset", type=Path, required=True, help="folder of the recording")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, show
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner reset`."""
     reset = commands.add_parser("reset", help="restart the scene of a running simulator")
     reset.add_argument("--seed", type=int, help="seed of another scene; default: the current one")

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import importlib.util
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note
 from vram_arbiter.runner.cli.common import install_signals
 from vram_arbiter.runner.ros2.goal_action import INTERFACE, NAME, RunnerGoals
@@ -15,9 +16,7 @@ from vram_arbiter.schemas.errors import ConfigError, InternalError
 SERVES = True
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner ros2`."""
     ros2 = commands.add_parser(
         "ros2",

@@ -13,6 +13,7 @@ import os
 from pathlib import Path
 
 from vram_arbiter.clients.output_paths import check_output
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.common import (
     AS_FAST_AS_POSSIBLE_HZ,
     add_serving_flags,
@@ -46,9 +47,7 @@ log = logging.getLogger("runner")
 SERVES = True
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner sim`."""
     sim = commands.add_parser("sim", help="simulate the SO-101 on a mobile base")
     sim.add_argument("--scene", type=Path, help="scene file; without it the built-in table")

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, show, show_json
 
 
-def add_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
+def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner state`."""
     state = commands.add_parser("state", help="show what a running runner sees and does")
     state.add_argument("--json", action="store_true", help="all of it, for programs")

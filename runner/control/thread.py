@@ -11,6 +11,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
 from vram_arbiter.runner.protocols import Goal, GoalData, InferenceRunner, SkillEnded
@@ -31,17 +32,15 @@ class ControlThread:
         self.runner = runner
         self._max_ticks = max_ticks
         self._thread = threading.Thread(target=self._main, name="control", daemon=True)
-        self._loop: asyncio.AbstractEventLoop
-        self._ready: asyncio.Future[None]
+        self._ready: Future[None] = _promised()
+        self._ended: Future[RunResult] = _promised()
         self.ended: asyncio.Future[RunResult]
 
     async def __aenter__(self) -> ControlThread:
-        self._loop = asyncio.get_running_loop()
-        self._ready = self._loop.create_future()
-        self.ended = self._loop.create_future()
+        self.ended = asyncio.wrap_future(self._ended)
         self._thread.start()
         try:
-            await self._ready
+            await asyncio.wrap_future(self._ready)
         except BaseException:
             self.runner.request_stop()
             await asyncio.wait([self.ended])
@@ -62,11 +61,10 @@ class ControlThread:
         except BaseException as error:  # noqa: BLE001 — delivered to the awaiter of the start
             self.runner.mailbox.close()
             self._deactivate()
-            self._settle(self._ready, None, error)
-            self._settle(self.ended, None, InternalError("the control loop never started"))
+            self._ready.set_exception(error)
+            self._ended.set_exception(InternalError("the control loop never started"))
             return
-        self._settle(self._ready, None, None)
-        result: RunResult | None = None
+        self._ready.set_result(None)
         failure: BaseException | None = None
         try:
             result = self.runner.run(self._max_ticks)
@@ -77,7 +75,10 @@ class ControlThread:
             failure = error
         self.runner.mailbox.close()
         stuck = self._deactivate()
-        self._settle(self.ended, result, failure or stuck)
+        if (failure := failure or stuck) is not None:
+            self._ended.set_exception(failure)
+        else:
+            self._ended.set_result(result)
 
     def _deactivate(self) -> BaseException | None:
         """Deactivate the runner. Returns the error, if any, for the awaiter of the end."""
@@ -88,30 +89,12 @@ class ControlThread:
             return error
         return None
 
-    def _settle(
-        self, future: asyncio.Future[Any], result: Any, error: BaseException | None
-    ) -> None:
-        def settle() -> None:
-            if future.done():
-                return
-            if error is None:
-                future.set_result(result)
-            else:
-                future.set_exception(error)
-
-        try:
-            self._loop.call_soon_threadsafe(settle)
-        except RuntimeError:
-            log.debug("the event loop closed before the control thread did")
-
     async def call[T](self, work: Callable[[], T]) -> T:
         """Run `work` on the control thread between two ticks.
 
         Raises what it raises, InternalError when the thread has ended.
         """
-        future: asyncio.Future[T] = self._loop.create_future()
-        self.runner.mailbox.post(work, lambda result, error: self._settle(future, result, error))
-        return await future
+        return await asyncio.wrap_future(self.runner.mailbox.post(work))
 
     async def run_skill(
         self,
@@ -126,13 +109,10 @@ class ControlThread:
         runner's progress is that of the goal before. `taken_back` gets the counts of a canceled
         goal.
         """
-        ended: asyncio.Future[SkillEnded] = self._loop.create_future()
+        end: Future[SkillEnded] = _promised()
+        ended = asyncio.wrap_future(end)
         try:
-            await self.call(
-                lambda: self.runner.begin_skill(
-                    skill, goal, lambda end: self._settle(ended, end, None)
-                )
-            )
+            await self.call(lambda: self.runner.begin_skill(skill, goal, end.set_result))
             on_begun()
             futures: list[asyncio.Future[Any]] = [ended, self.ended]
             await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
@@ -144,9 +124,16 @@ class ControlThread:
         finally:
             if (
                 not ended.done()
-            ):  # canceled, deadline, or the loop died: the mailbox keeps the order
+            ):  # canceled, deadline, a loop that died: the mailbox keeps the order
                 ended.cancel()
                 try:
                     taken_back(await self.call(self.runner.end_skill))
                 except VramError:
                     log.debug("the control thread ended before the skill did")
+
+
+def _promised() -> Future[Any]:
+    """Return a future that the control thread resolves, whether its awaiter was canceled or not."""
+    future: Future[Any] = Future()
+    future.set_running_or_notify_cancel()
+    return future

@@ -12,9 +12,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import replace
 
+from vram_arbiter.runner.display.stream import RerunStream
 from vram_arbiter.runner.protocols import Goal, GoalData, GoalTick, SkillEnded
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.world import WorldState
@@ -27,53 +27,19 @@ IDLE_S = 0.2  # between goals the state is shown so often
 CLOSE_S = 60.0  # importing it may take half of that on a busy machine
 
 
-class Stream(Protocol):
-    """What is needed of `display.stream.RerunStream`."""
-
-    def at(self, time_s: float, tick: int | None = None) -> None: ...
-
-    def world(self, world: WorldState, *, pictures: bool) -> None: ...
-
-    def tick(self, tick: GoalTick, *, pictures: bool) -> None: ...
-
-    def event(self, text: str, level: str = "INFO") -> None: ...
-
-    def goal(self, text: str) -> None: ...
-
-    def leases(self, charged: Mapping[str, float]) -> None: ...
-
-    def close(self) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
-class _Shown:
-    tick: GoalTick
-    pictures: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Ended:
-    goal: Goal
-    ended: SkillEnded | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Leases:
-    charged: Mapping[str, float]
-    stamp_s: float
-
-
 class Display:
     """Implements `runner.protocols.TickSink`. `latest` is read between goals, on its thread.
 
     `make` makes the stream on that thread: a viewer takes seconds to start.
     """
 
-    def __init__(self, make: Callable[[], Stream], latest: Callable[[], WorldState | None]) -> None:
+    def __init__(
+        self, make: Callable[[], RerunStream], latest: Callable[[], WorldState | None]
+    ) -> None:
         self._make = make
         self._latest = latest
         self._changed = threading.Condition()
-        self._queue: deque[_Shown | _Ended | _Leases] = deque()
+        self._queue: deque[Callable[[RerunStream], None]] = deque()
         self._closing = False
         self._broken = False
         self._goal_id = ""
@@ -108,17 +74,15 @@ class Display:
             if len(self._queue) >= QUEUE_TICKS:
                 self.dropped_ticks += 1
                 return
-            pictures = len(self._queue) < PICTURES_UNTIL
-            if not pictures:
+            if len(self._queue) >= PICTURES_UNTIL:
                 self.dropped_pictures += 1
-                bare = tick.world.model_copy(update={"image_frames": None})
-                tick = replace(tick, world=bare)
-            self._queue.append(_Shown(tick, pictures))
+                tick = replace(tick, world=tick.world.model_copy(update={"image_frames": None}))
+            self._queue.append(lambda stream: self._show_tick(stream, tick))
             self._changed.notify()
 
     def goal_ended(self, goal: Goal, ended: SkillEnded | None) -> None:
         """See `runner.protocols.TickSink`."""
-        self._put(_Ended(goal, ended))
+        self._put(lambda stream: self._show_end(stream, goal, ended))
 
     def facts(self) -> GoalData:
         """Return an empty map: a view adds nothing to the result."""
@@ -127,9 +91,10 @@ class Display:
     # -- any thread
     def leases(self, charged: Mapping[str, float]) -> None:
         """Show the bytes that leases are charged now, by holder."""
-        self._put(_Leases(dict(charged), time.monotonic()))
+        now_s = time.monotonic()
+        self._put(lambda stream: self._show_leases(stream, dict(charged), now_s))
 
-    def _put(self, item: _Ended | _Leases) -> None:
+    def _put(self, item: Callable[[RerunStream], None]) -> None:
         with self._changed:
             if not self._closing and not self._broken and len(self._queue) < 2 * QUEUE_TICKS:
                 self._queue.append(item)
@@ -140,8 +105,8 @@ class Display:
         try:
             stream = self._make()
             try:
-                while (item := self._next()) is not False:
-                    self._show(stream, item)
+                while (show := self._next()) is not None:
+                    show(stream)
             finally:
                 stream.close()
         except VramError as error:
@@ -156,41 +121,44 @@ class Display:
             self._broken = True
             self._queue.clear()
 
-    def _next(self) -> _Shown | _Ended | _Leases | bool | None:
-        """Return the next item; None when there was none for a while, False at the end."""
+    def _next(self) -> Callable[[RerunStream], None] | None:
+        """Return what is shown next: the idle state when there was nothing for a while; None at the
+        end.
+        """
         with self._changed:
             self._changed.wait_for(lambda: bool(self._queue) or self._closing, IDLE_S)
             if self._queue:
                 return self._queue.popleft()
-            return False if self._closing else None
+            return None if self._closing else self._show_idle
 
-    def _show(self, stream: Stream, item: _Shown | _Ended | _Leases | bool | None) -> None:
-        match item:
-            case _Shown(tick=tick, pictures=pictures):
-                goal = tick.goal
-                stream.tick(tick, pictures=pictures)
-                if goal.goal_id != self._goal_id:
-                    self._goal_id = goal.goal_id
-                    stream.goal(f"{goal.rskill_id}: {goal.prompt}\n\n{goal.goal_id}")
-                    stream.event(f"goal {goal.goal_id}: {goal.rskill_id} {goal.prompt}".rstrip())
-            case _Ended(goal=goal, ended=ended):
-                self._goal_id = ""
-                error = ended.error if ended is not None else None
-                said = "taken back" if ended is None else str(error or "succeeded")
-                stream.goal(f"idle, after {goal.rskill_id}: {said}")
-                stream.event(f"goal {goal.goal_id}: {said}", "INFO" if error is None else "ERROR")
-            case _Leases(charged=charged, stamp_s=stamp_s):
-                stream.at(stamp_s)
-                gone = dict.fromkeys(self._charged.keys() - charged.keys(), 0.0)
-                for name in charged.keys() - self._charged.keys():
-                    stream.event(f"lease {name}: granted")
-                for name in gone:
-                    stream.event(f"lease {name}: ended")
-                self._charged = charged
-                stream.leases({**charged, **gone})
-            case _:
-                world = self._latest()
-                if world is not None and world.stamp_ns > self._idle_stamp:
-                    self._idle_stamp = world.stamp_ns
-                    stream.at(world.stamp_ns / 1e9)
-                    stream.world(world, pictures=True)
+    def _show_tick(self, stream: RerunStream, tick: GoalTick) -> None:
+        goal = tick.goal
+        stream.tick(tick)
+        if goal.goal_id != self._goal_id:
+            self._goal_id = goal.goal_id
+            stream.goal(f"{goal.rskill_id}: {goal.prompt}\n\n{goal.goal_id}")
+            stream.event(f"goal {goal.goal_id}: {goal.rskill_id} {goal.prompt}".rstrip())
+
+    def _show_end(self, stream: RerunStream, goal: Goal, ended: SkillEnded | None) -> None:
+        self._goal_id = ""
+        error = ended.error if ended is not None else None
+        said = "taken back" if ended is None else str(error or "succeeded")
+        stream.goal(f"idle, after {goal.rskill_id}: {said}")
+        stream.event(f"goal {goal.goal_id}: {said}", "INFO" if error is None else "ERROR")
+
+    def _show_leases(self, stream: RerunStream, charged: Mapping[str, float], at_s: float) -> None:
+        stream.at(at_s)
+        gone = dict.fromkeys(self._charged.keys() - charged.keys(), 0.0)
+        for name in charged.keys() - self._charged.keys():
+            stream.event(f"lease {name}: granted")
+        for name in gone:
+            stream.event(f"lease {name}: ended")
+        self._charged = charged
+        stream.leases({**charged, **gone})
+
+    def _show_idle(self, stream: RerunStream) -> None:
+        world = self._latest()
+        if world is not None and world.stamp_ns > self._idle_stamp:
+            self._idle_stamp = world.stamp_ns
+            stream.at(world.stamp_ns / 1e9)
+            stream.world(world)

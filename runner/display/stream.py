@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
 
 from vram_arbiter.runner.protocols import GoalTick
-from vram_arbiter.runner.sensors.pictures import COLOURS, as_rgb
+from vram_arbiter.runner.sensors.pictures import COLOURS, as_rgb, encode
 from vram_arbiter.schemas.errors import ConfigError, FrameStale, ModelError
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame, WorldState
 
 APPLICATION = "vram-runner"
 RERUN = "rerun"
-JPEG_QUALITY = 85
 GIB = 1 << 30
 SPAWN_S = 30.0  # a viewer opens its window and its port
 ANSWER_S = 5.0
@@ -100,46 +98,34 @@ class RerunStream:
         """Show what the robot is doing, in place of what it did before."""
         self._stream.log("goal", self._rerun.TextDocument(text))
 
-    def picture(self, camera: str, rgb: Any) -> None:
-        """Show a picture: uint8, height × width × 3."""
-        import cv2
-
-        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        if done:
-            self._encoded(camera, bytes(data))
-
-    def _encoded(self, camera: str, jpeg: bytes) -> None:
-        image = self._rerun.EncodedImage(contents=jpeg, media_type="image/jpeg")
-        self._stream.log(f"camera/{camera}", image)
-
     def frames(self, frames: Mapping[str, SensorFrame]) -> None:
         """Show the cameras' pictures; those without colors are left out."""
         for camera, frame in frames.items():
             if frame.data is None or frame.encoding not in COLOURS:
                 continue
-            if frame.encoding is FrameEncoding.JPEG:
-                self._encoded(camera, frame.data)
-                continue
+            jpeg = frame.data
             try:
-                self.picture(camera, as_rgb(frame))
+                if frame.encoding is not FrameEncoding.JPEG:
+                    jpeg = encode(as_rgb(frame), "jpeg")
             except (FrameStale, ModelError) as error:
                 self.event(f"camera {camera}: {error.message}", "WARN")
+                continue
+            image = self._rerun.EncodedImage(contents=jpeg, media_type="image/jpeg")
+            self._stream.log(f"camera/{camera}", image)
 
-    def world(self, world: WorldState, *, pictures: bool) -> None:
+    def world(self, world: WorldState) -> None:
         """Show a state of the world."""
         joints = world.joint_state
         self.numbers("state", dict(zip(joints.name, joints.position, strict=True)))
         if world.base_pose is not None:
             self.numbers("base", dict(zip("xyz", world.base_pose.xyz, strict=True)))
-        if pictures:
-            self.frames(world.image_frames or {})
+        self.frames(world.image_frames or {})
 
-    def tick(self, tick: GoalTick, *, pictures: bool) -> None:
+    def tick(self, tick: GoalTick) -> None:
         """Show a tick of a goal: what was seen, what the motors were told, what was withheld."""
         result = tick.result
         self.at(tick.world.stamp_ns / 1e9, result.tick_idx)
-        self.world(tick.world, pictures=pictures)
+        self.world(tick.world)
         self.numbers("action", tick.targets)
         if tick.base_velocity is not None:
             self.numbers(

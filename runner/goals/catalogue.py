@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from vram_arbiter.runner.protocols import Skill, SkillKey
+from vram_arbiter.runner.skills.ros_standins import StandIns
 from vram_arbiter.schemas.body import Body
 from vram_arbiter.schemas.errors import ManifestInvalid, UnknownSkill
 from vram_arbiter.schemas.manifest import Kind, ManifestError, RSkillManifest, load_manifest
@@ -37,15 +37,6 @@ START_S = 90.0
 FILE_NAME = "rskill.yaml"
 
 Maker = Callable[[RSkillManifest], Skill]
-
-
-@runtime_checkable
-class Selective(Protocol):
-    """A maker that cannot make every skill of its kind."""
-
-    def refuses(self, manifest: RSkillManifest) -> str:
-        """Return why it cannot make this skill; empty: it can."""
-        ...
 
 
 def read_manifests(paths: Iterable[Path]) -> list[RSkillManifest]:
@@ -104,7 +95,7 @@ class Catalogue:
         if self._body is not None and (why := self._body.misfit(manifest)):
             return why
         maker = self._makers.get(manifest.kind)
-        return maker.refuses(manifest) if isinstance(maker, Selective) else ""
+        return maker.refuses(manifest) if isinstance(maker, StandIns) else ""
 
     def find(
         self, rskill_id: str, revision: str = ""

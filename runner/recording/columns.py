@@ -7,11 +7,11 @@ not import lerobot, and numpy only in the writer's process.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypedDict
 
+from vram_arbiter.runner.planar import yaw_of
 from vram_arbiter.runner.protocols import GoalTick
 from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.runner.sensors.pictures import COLOURS, as_rgb
@@ -177,9 +177,7 @@ def _colours(frames: Mapping[str, SensorFrame], camera: str) -> SensorFrame:
 
 def _plane(pose: Pose) -> dict[str, float]:
     """x, y (m) and yaw (rad) of the base on its plane."""
-    qx, qy, qz, qw = pose.quat_xyzw
-    yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
-    return {"x_m": pose.xyz[0], "y_m": pose.xyz[1], "yaw_rad": yaw}
+    return {"x_m": pose.xyz[0], "y_m": pose.xyz[1], "yaw_rad": yaw_of(pose.quat_xyzw)}
 
 
 # -- as lerobot takes them

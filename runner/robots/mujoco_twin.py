@@ -10,11 +10,11 @@ command that is not repeated stands for `DRIVE_S`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from vram_arbiter.runner.control.clock import Clock, SystemClock
+from vram_arbiter.runner.planar import drive
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.sim.scene import load_mujoco
@@ -112,10 +112,11 @@ class MujocoTwin(HalBase):
             return
         driven = 0
         if any(self._velocity):
+            base = [self._u[name] for name in self._base]
             until_s = max(0.0, (self._drive_until_ns - self._at_ns) / 1e9)
             driven = min(steps, int(until_s / step_s))
             for _ in range(driven):
-                self._move_base(step_s)
+                drive(self._data.ctrl, base, self._velocity, step_s)
                 self._mujoco.mj_step(self._model, self._data)
         if steps > driven:
             self._mujoco.mj_step(self._model, self._data, nstep=steps - driven)
@@ -125,15 +126,6 @@ class MujocoTwin(HalBase):
             raise RobotFault(
                 "the twin's physics came apart", hint="start it again; this is a defect of ours"
             )
-
-    def _move_base(self, step_s: float) -> None:
-        """Move the targets of the base's actuators by one time step of its velocity."""
-        x, y, turn = (self._u[name] for name in self._base)
-        ctrl, (vx, vy, wz) = self._data.ctrl, self._velocity
-        yaw = float(ctrl[turn])
-        ctrl[x] += step_s * (vx * math.cos(yaw) - vy * math.sin(yaw))
-        ctrl[y] += step_s * (vx * math.sin(yaw) + vy * math.cos(yaw))
-        ctrl[turn] += step_s * wz
 
     def _diverged(self) -> tuple[int, ...]:
         kind = self._mujoco.mjtWarning

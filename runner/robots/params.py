@@ -18,6 +18,7 @@ from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.yamltext import Mistake, config_error
 
+SOURCE = "deployment"  # of mistakes, until the deployment file gives them its name and lines
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -120,12 +121,12 @@ class LerobotParams(ModelParams):
     estop: Estop = "hold"
 
 
-def wrong(source: str, path: Path, problem: str) -> ConfigError:
+def wrong(path: Path, problem: str) -> ConfigError:
     """Return one mistake below `hal`."""
-    return config_error(source, [Mistake(0, dotted(("hal", *path)), problem)])
+    return config_error(SOURCE, [Mistake(0, dotted(("hal", *path)), problem)])
 
 
-def read_params[T: Params](kind: type[T], config: HalConfig, source: str) -> T:
+def read_params[T: Params](kind: type[T], config: HalConfig) -> T:
     """Return `hal.params`. Raises ConfigError with every mistake."""
     try:
         return kind.model_validate(config.params)
@@ -134,10 +135,10 @@ def read_params[T: Params](kind: type[T], config: HalConfig, source: str) -> T:
             Mistake(0, f"hal.params.{found.field}", found.message)
             for found in problems_of(error, kind, config.params)
         ]
-        raise config_error(source, problems) from error
+        raise config_error(SOURCE, problems) from error
 
 
-def check_joints(given: JsonMap, names: tuple[str, ...], path: Path, source: str) -> None:
+def check_joints(given: JsonMap, names: tuple[str, ...], path: Path) -> None:
     """Raise ConfigError for each key of `given`, at `path`, that is no joint."""
     problems = [
         Mistake(
@@ -147,4 +148,4 @@ def check_joints(given: JsonMap, names: tuple[str, ...], path: Path, source: str
         if name not in names
     ]
     if problems:
-        raise config_error(source, problems)
+        raise config_error(SOURCE, problems)

@@ -7,7 +7,7 @@ servos are Feetech STS3215.
 from __future__ import annotations
 
 from vram_arbiter.runner.protocols import EndEffector, Joint, MobileBase, RobotDescription
-from vram_arbiter.runner.robots.units import JointScale, JointUnit, LerobotUnits
+from vram_arbiter.runner.robots.units import JointUnit, LerobotUnits, scale_of_unit
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
 
 NAME = "so101"
@@ -48,5 +48,5 @@ def lerobot_units_of(description: RobotDescription) -> LerobotUnits | None:
     if description.joint_names != ARM_JOINTS:
         return None
     units = dict.fromkeys(ARM_JOINTS, JointUnit.DEG) | {GRIPPER: JointUnit.PERCENT}
-    scales = {name: JointScale(units[name], *RANGES_RAD[name]) for name in ARM_JOINTS}
+    scales = {name: scale_of_unit(units[name], *RANGES_RAD[name]) for name in ARM_JOINTS}
     return LerobotUnits("so_follower", scales)

@@ -18,44 +18,36 @@ class JointUnit(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class JointScale:
-    """Conversion of one joint's numbers to and from rad.
+class Scale:
+    """Linear map: `number * scale + offset` is the joint's own (rad, or m of a linear one)."""
+
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def joint(self, number: float) -> float:
+        """Return the joint's own value. Not clipped: a joint beyond its range is told as such."""
+        return number * self.scale + self.offset
+
+    def of(self, joint_value: float) -> float:
+        """Return the number for a joint's own value."""
+        return (joint_value - self.offset) / self.scale
+
+
+def scale_of_unit(
+    unit: JointUnit, lower_rad: float, upper_rad: float, sign: int = 1, offset_rad: float = 0.0
+) -> Scale:
+    """Return the map of a unit over a joint's range.
 
     `sign` -1 reverses the direction; `offset_rad` is added to angles (never to percentages).
     """
-
-    unit: JointUnit
-    lower_rad: float
-    upper_rad: float
-    sign: int = 1
-    offset_rad: float = 0.0
-
-    def to_rad(self, value: float) -> float:
-        """Convert to rad. Not clipped: a joint beyond its range is reported as such."""
-        match self.unit:
-            case JointUnit.DEG:
-                return self.sign * math.radians(value) + self.offset_rad
-            case JointUnit.RAD:
-                return self.sign * value + self.offset_rad
-            case JointUnit.PERCENT:
-                share = value / 100.0
-            case JointUnit.SIGNED_PERCENT:
-                share = (value + 100.0) / 200.0
-        return self.lower_rad + (share if self.sign > 0 else 1.0 - share) * (
-            self.upper_rad - self.lower_rad
-        )
-
-    def from_rad(self, angle_rad: float) -> float:
-        """Return the number to send for a target in rad."""
-        match self.unit:
-            case JointUnit.DEG:
-                return math.degrees((angle_rad - self.offset_rad) * self.sign)
-            case JointUnit.RAD:
-                return (angle_rad - self.offset_rad) * self.sign
-            case _:
-                share = (angle_rad - self.lower_rad) / (self.upper_rad - self.lower_rad)
-                share = share if self.sign > 0 else 1.0 - share
-                return 100.0 * share if self.unit is JointUnit.PERCENT else 200.0 * share - 100.0
+    if unit is JointUnit.DEG:
+        return Scale(sign * math.pi / 180.0, offset_rad)
+    if unit is JointUnit.RAD:
+        return Scale(sign, offset_rad)
+    begin, end = (lower_rad, upper_rad) if sign > 0 else (upper_rad, lower_rad)
+    if unit is JointUnit.PERCENT:
+        return Scale((end - begin) / 100.0, begin)
+    return Scale((end - begin) / 200.0, (begin + end) / 2.0)
 
 
 POSITION = ".pos"  # lerobot's features of joint positions: `elbow_flex.pos`
@@ -66,10 +58,8 @@ class LerobotUnits:
     """How lerobot records a robot: the type's name in its datasets, and the unit of each joint."""
 
     robot_type: str
-    scales: Mapping[str, JointScale]
+    scales: Mapping[str, Scale]
 
     def named(self, angles_rad: Mapping[str, float]) -> dict[str, float]:
         """Return joint angles by lerobot's names, in its units."""
-        return {
-            name + POSITION: self.scales[name].from_rad(angle) for name, angle in angles_rad.items()
-        }
+        return {name + POSITION: self.scales[name].of(angle) for name, angle in angles_rad.items()}

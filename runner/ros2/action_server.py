@@ -10,7 +10,7 @@ import asyncio
 import logging
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, Protocol, Self
 
@@ -79,7 +79,7 @@ class _Goal:
     execution: Execution
     result: asyncio.Future[JsonObject]
     status: Status = Status.EXECUTING
-    ended: bool = field(default=False)
+    ended: bool = False
 
     def info(self) -> JsonObject:
         return {"goal_id": _uuid(self.goal_id), "stamp": _stamp(self.accepted_s)}

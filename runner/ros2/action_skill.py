@@ -16,6 +16,7 @@ from typing import Final
 
 from vram_arbiter.runner.protocols import Done, Goal, Hold, StepOutcome
 from vram_arbiter.runner.ros2.action_client import ActionClient
+from vram_arbiter.runner.ros2.action_server import Status
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.ros_goals import merge
 from vram_arbiter.runner.skills.ros_standins import interface_of
@@ -36,7 +37,6 @@ log = logging.getLogger(__name__)
 
 SERVER_S: Final = 10.0  # for a server to be found, and to accept or reject
 CANCEL_S: Final = 2.0
-SUCCEEDED, CANCELED, ABORTED = 4, 5, 6  # of action_msgs/GoalStatus
 
 
 class RosAction(SkillBase):
@@ -95,12 +95,12 @@ class RosAction(SkillBase):
             )
             return
         status, told = result.result()["status"], result.result()["result"]
-        if status == SUCCEEDED:
+        if status == Status.SUCCEEDED:
             self._ended = Done({"result": told})
             return
         why = next((text for text in told.values() if isinstance(text, str) and text), "")
         problem = f"the server of {self._name} ended the goal with status {status}"
-        kind = Cancelled if status == CANCELED else ModelError
+        kind = Cancelled if status == Status.CANCELED else ModelError
         code = told.get("error_code")
         self._ended = kind(f"{problem}, error code {code}" + (f": {why}" if why else ""))
 

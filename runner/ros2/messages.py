@@ -14,117 +14,82 @@ from typing import Any, Final
 
 from vram_arbiter.runner.sensors.ros2_dds import parse, topic_type, written
 
-type Fields = tuple[tuple[str, str], ...]
+type Fields = tuple[tuple[str, str, float], ...]
+"""Name, type and default number of each."""
 
-_XYZ: Final[Fields] = (("x", "float64"), ("y", "float64"), ("z", "float64"))
-_TOLERANCE: Final[Fields] = (
-    ("position", "float64"),
-    ("velocity", "float64"),
-    ("acceleration", "float64"),
-)
-_CALL: Final[Fields] = (("guid", "uint64"), ("seq", "int64"))
-"""What rmw_cyclonedds writes before each request and reply: the client, and its number."""
-
-MESSAGES: Final[Mapping[str, Fields]] = {
-    "builtin_interfaces/Time": (("sec", "int32"), ("nanosec", "uint32")),
-    "builtin_interfaces/Duration": (("sec", "int32"), ("nanosec", "uint32")),
-    "std_msgs/Header": (("stamp", "builtin_interfaces/Time"), ("frame_id", "string")),
-    "unique_identifier_msgs/UUID": (("uuid", "uint8[16]"),),
-    "geometry_msgs/Point": _XYZ,
-    "geometry_msgs/Vector3": _XYZ,
-    "geometry_msgs/Quaternion": (*_XYZ, ("w", "float64=1")),
-    "geometry_msgs/Pose": (
-        ("position", "geometry_msgs/Point"),
-        ("orientation", "geometry_msgs/Quaternion"),
-    ),
-    "geometry_msgs/PoseStamped": (("header", "std_msgs/Header"), ("pose", "geometry_msgs/Pose")),
+MESSAGES: Final[Mapping[str, str]] = {
+    "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec, uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
+    "unique_identifier_msgs/UUID": "uint8[16] uuid",
+    "geometry_msgs/Point": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Vector3": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w 1",
+    "geometry_msgs/Pose": "geometry_msgs/Point position, geometry_msgs/Quaternion orientation",
+    "geometry_msgs/PoseStamped": "std_msgs/Header header, geometry_msgs/Pose pose",
     "geometry_msgs/Transform": (
-        ("translation", "geometry_msgs/Vector3"),
-        ("rotation", "geometry_msgs/Quaternion"),
+        "geometry_msgs/Vector3 translation, geometry_msgs/Quaternion rotation"
     ),
-    "geometry_msgs/Twist": (
-        ("linear", "geometry_msgs/Vector3"),
-        ("angular", "geometry_msgs/Vector3"),
-    ),
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear, geometry_msgs/Vector3 angular",
     "trajectory_msgs/JointTrajectoryPoint": (
-        ("positions", "float64[]"),
-        ("velocities", "float64[]"),
-        ("accelerations", "float64[]"),
-        ("effort", "float64[]"),
-        ("time_from_start", "builtin_interfaces/Duration"),
+        "float64[] positions, float64[] velocities, float64[] accelerations, float64[] effort, "
+        "builtin_interfaces/Duration time_from_start"
     ),
     "trajectory_msgs/JointTrajectory": (
-        ("header", "std_msgs/Header"),
-        ("joint_names", "string[]"),
-        ("points", "trajectory_msgs/JointTrajectoryPoint[]"),
+        "std_msgs/Header header, string[] joint_names, "
+        "trajectory_msgs/JointTrajectoryPoint[] points"
     ),
     "trajectory_msgs/MultiDOFJointTrajectoryPoint": (
-        ("transforms", "geometry_msgs/Transform[]"),
-        ("velocities", "geometry_msgs/Twist[]"),
-        ("accelerations", "geometry_msgs/Twist[]"),
-        ("time_from_start", "builtin_interfaces/Duration"),
+        "geometry_msgs/Transform[] transforms, geometry_msgs/Twist[] velocities, "
+        "geometry_msgs/Twist[] accelerations, builtin_interfaces/Duration time_from_start"
     ),
     "trajectory_msgs/MultiDOFJointTrajectory": (
-        ("header", "std_msgs/Header"),
-        ("joint_names", "string[]"),
-        ("points", "trajectory_msgs/MultiDOFJointTrajectoryPoint[]"),
+        "std_msgs/Header header, string[] joint_names, "
+        "trajectory_msgs/MultiDOFJointTrajectoryPoint[] points"
     ),
-    "control_msgs/JointTolerance": (("name", "string"), *_TOLERANCE),
+    "control_msgs/JointTolerance": (
+        "string name, float64 position, float64 velocity, float64 acceleration"
+    ),
     "control_msgs/JointComponentTolerance": (
-        ("joint_name", "string"),
-        ("component", "uint16"),
-        *_TOLERANCE,
+        "string joint_name, uint16 component, float64 position, float64 velocity, "
+        "float64 acceleration"
     ),
     "control_msgs/FollowJointTrajectory_Goal": (
-        ("trajectory", "trajectory_msgs/JointTrajectory"),
-        ("multi_dof_trajectory", "trajectory_msgs/MultiDOFJointTrajectory"),
-        ("path_tolerance", "control_msgs/JointTolerance[]"),
-        ("component_path_tolerance", "control_msgs/JointComponentTolerance[]"),
-        ("goal_tolerance", "control_msgs/JointTolerance[]"),
-        ("component_goal_tolerance", "control_msgs/JointComponentTolerance[]"),
-        ("goal_time_tolerance", "builtin_interfaces/Duration"),
+        "trajectory_msgs/JointTrajectory trajectory, "
+        "trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory, "
+        "control_msgs/JointTolerance[] path_tolerance, "
+        "control_msgs/JointComponentTolerance[] component_path_tolerance, "
+        "control_msgs/JointTolerance[] goal_tolerance, "
+        "control_msgs/JointComponentTolerance[] component_goal_tolerance, "
+        "builtin_interfaces/Duration goal_time_tolerance"
     ),
-    "control_msgs/FollowJointTrajectory_Result": (
-        ("error_code", "int32"),
-        ("error_string", "string"),
-    ),
-    "nav2_msgs/NavigateToPose_Goal": (
-        ("pose", "geometry_msgs/PoseStamped"),
-        ("behavior_tree", "string"),
-    ),
-    "nav2_msgs/NavigateToPose_Result": (("error_code", "uint16"), ("error_msg", "string")),
+    "control_msgs/FollowJointTrajectory_Result": "int32 error_code, string error_string",
+    "nav2_msgs/NavigateToPose_Goal": "geometry_msgs/PoseStamped pose, string behavior_tree",
+    "nav2_msgs/NavigateToPose_Result": "uint16 error_code, string error_msg",
     "openral_msgs/ExecuteRskill_Goal": (
-        ("rskill_id", "string"),
-        ("revision", "string"),
-        ("prompt", "string"),
-        ("prompt_metadata_json", "string"),
-        ("goal_params_json", "string"),
-        ("deadline_s", "float64"),
+        "string rskill_id, string revision, string prompt, string prompt_metadata_json, "
+        "string goal_params_json, float64 deadline_s"
     ),
-    "openral_msgs/ExecuteRskill_Result": (
-        ("success", "bool"),
-        ("failure_reason", "string"),
-        ("trace_id", "string"),
-    ),
+    "openral_msgs/ExecuteRskill_Result": "bool success, string failure_reason, string trace_id",
     "openral_msgs/ExecuteRskill_Feedback": (
-        ("progress", "float32"),
-        ("state", "string"),
-        ("chunk_index", "uint32"),
-        ("chunks_total", "uint32"),
+        "float32 progress, string state, uint32 chunk_index, uint32 chunks_total"
     ),
-    "action_msgs/GoalInfo": (
-        ("goal_id", "unique_identifier_msgs/UUID"),
-        ("stamp", "builtin_interfaces/Time"),
-    ),
-    "action_msgs/GoalStatus": (("goal_info", "action_msgs/GoalInfo"), ("status", "int8")),
-    "action_msgs/GoalStatusArray": (("status_list", "action_msgs/GoalStatus[]"),),
-    "action_msgs/CancelGoal_Request": (*_CALL, ("goal_info", "action_msgs/GoalInfo")),
-    "action_msgs/CancelGoal_Response": (
-        *_CALL,
-        ("return_code", "int8"),
-        ("goals_canceling", "action_msgs/GoalInfo[]"),
-    ),
+    "action_msgs/GoalInfo": "unique_identifier_msgs/UUID goal_id, builtin_interfaces/Time stamp",
+    "action_msgs/GoalStatus": "action_msgs/GoalInfo goal_info, int8 status",
+    "action_msgs/GoalStatusArray": "action_msgs/GoalStatus[] status_list",
+    "action_msgs/CancelGoal_Request": "action_msgs/GoalInfo goal_info",
+    "action_msgs/CancelGoal_Response": "int8 return_code, action_msgs/GoalInfo[] goals_canceling",
 }
+"""The fields of each message, as ROS writes them: type, name, and a default."""
+_OF_ACTIONS: Final[Mapping[str, str]] = {
+    "SendGoal_Request": "unique_identifier_msgs/UUID goal_id, ACTION_Goal goal",
+    "SendGoal_Response": "bool accepted, builtin_interfaces/Time stamp",
+    "FeedbackMessage": "unique_identifier_msgs/UUID goal_id, ACTION_Feedback feedback",
+    "GetResult_Request": "unique_identifier_msgs/UUID goal_id",
+    "GetResult_Response": "int8 status, ACTION_Result result",
+}
+_CALL: Final = "uint64 guid, int64 seq"
+"""What rmw_cyclonedds writes before each request and reply: the client, and its number."""
 _NUMBERS: Final[Mapping[str, str]] = {
     "bool": "?", "int8": "b", "uint8": "B", "uint16": "H", "int32": "i", "uint32": "I",
     "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
@@ -136,22 +101,17 @@ ITEMS_MAX: Final = 100_000  # of one sequence
 def fields_of(kind: str) -> Fields:
     """Return the fields of a message, or of a service or topic that an action consists of."""
     if kind in MESSAGES:
-        return MESSAGES[kind]
-    package, _, name = kind.partition("/")
-    action, _, part = name.partition("_")
-    action = f"{package}/{action}"
-    goal_id = ("goal_id", "unique_identifier_msgs/UUID")
-    return {
-        "SendGoal_Request": (*_CALL, goal_id, ("goal", f"{action}_Goal")),
-        "SendGoal_Response": (
-            *_CALL,
-            ("accepted", "bool"),
-            ("stamp", "builtin_interfaces/Time"),
-        ),
-        "FeedbackMessage": (goal_id, ("feedback", f"{action}_Feedback")),
-        "GetResult_Request": (*_CALL, goal_id),
-        "GetResult_Response": (*_CALL, ("status", "int8"), ("result", f"{action}_Result")),
-    }[part]
+        text = MESSAGES[kind]
+    else:
+        package, _, name = kind.partition("/")
+        action, _, part = name.partition("_")
+        text = _OF_ACTIONS[part].replace("ACTION", f"{package}/{action}")
+    if kind.endswith(("_Request", "_Response")):
+        text = f"{_CALL}, {text}"
+    words = [field.split() for field in text.split(", ")]
+    return tuple(
+        (name, base, float(default[0]) if default else 0.0) for base, name, *default in words
+    )
 
 
 # -- CDR, by Cyclone
@@ -165,16 +125,15 @@ def read(kind: str, cdr: bytes) -> dict[str, Any]:
     return dataclasses.asdict(parse(_struct(kind), cdr))
 
 
-def _split(kind: str) -> tuple[str, int | None, float]:
-    """Return the type of an entry, its count (None: one, 0: any number), and its default."""
-    kind, _, default = kind.partition("=")
+def _split(kind: str) -> tuple[str, int | None]:
+    """Return the type of an entry, and its count (None: one, 0: any number)."""
     base, bracket, count = kind.rstrip("]").partition("[")
-    return base, (int(count or 0) if bracket else None), float(default or 0)
+    return base, (int(count or 0) if bracket else None)
 
 
-def _made(kind: str, value: Any, at: str) -> Any:
+def _made(kind: str, value: Any, at: str, default: float = 0.0) -> Any:
     """Return Cyclone's value of an entry. `at` names it in errors."""
-    base, count, default = _split(kind)
+    base, count = _split(kind)
     if count is not None:
         items = [] if value is None else value
         if not isinstance(items, Sequence) or isinstance(items, str) or len(items) > ITEMS_MAX:
@@ -194,12 +153,11 @@ def _made(kind: str, value: Any, at: str) -> Any:
     if not isinstance(given, Mapping):
         raise ValueError(f"{at or base}: expected a map, got {type(value).__name__}")
     fields = fields_of(base)
-    if unknown := sorted(set(given) - {name for name, _ in fields}):
+    if unknown := sorted(set(given) - {name for name, _, _ in fields}):
         raise ValueError(f"{at or base}: unknown field {unknown[0]}")
     below = f"{at}." if at else ""
-    return _struct(base)(
-        **{name: _made(entry, given.get(name), below + name) for name, entry in fields}
-    )
+    made = {name: _made(of, given.get(name), below + name, one) for name, of, one in fields}
+    return _struct(base)(**made)
 
 
 def _number(code: str, value: Any, at: str) -> float | bool:
@@ -231,14 +189,14 @@ def _struct(kind: str) -> Any:
     from cyclonedds.idl import make_idl_struct, types
 
     def of(entry: str) -> Any:
-        base, count, _ = _split(entry)
+        base, count = _split(entry)
         plain = {"string": str, "bool": bool}.get(base)
         one = plain or (getattr(types, base) if base in _NUMBERS else _struct(base))
         if count is None:
             return one
         return types.array[one, count] if count else types.sequence[one]
 
-    members = {name: of(entry) for name, entry in fields_of(kind)}
+    members = {name: of(entry) for name, entry, _ in fields_of(kind)}
     return make_idl_struct(kind.partition("/")[2] + "_", dds_name(kind), members)
 
 

@@ -18,9 +18,10 @@ import socket
 import stat
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Self
 
 from vram_arbiter.runner.control.realtime import hasten
@@ -53,14 +54,6 @@ class _Connection:
     obey_by_s: float | None = None  # set once it has asked
 
 
-@dataclass(slots=True)
-class _Inbox:
-    """What other threads tell the server's thread."""
-
-    obeyed: deque[tuple[EstopRequested | None, BaseException | None]] = field(default_factory=deque)
-    stopping: bool = False
-
-
 class EstopServer:
     """`with EstopServer(endpoint, robot): ...` serves `path_of(endpoint)`; the caller
     holds the goal endpoint's lock.
@@ -91,12 +84,12 @@ class EstopServer:
         self._obey_s = obey_s
         self._silent_s = silent_s
         self._realtime = realtime
-        self._inbox = _Inbox()
+        self._stopping = False
         self._connections: dict[int, _Connection] = {}  # by descriptor, oldest first
         self._wake = -1
         self._waking = threading.Lock()
         self._told = False  # `on_stop` was called
-        self._obeying = False  # `obey_estop` is posted and has not run
+        self._obeying: Future[EstopRequested | None] | None = None  # until its outcome is told
         self._spare: int | None = (
             None  # a descriptor for the time when the process has used all others
         )
@@ -115,7 +108,7 @@ class EstopServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._inbox.stopping = True
+        self._stopping = True
         self._wake_up()
         self._thread.join()
         with contextlib.suppress(OSError):
@@ -181,7 +174,7 @@ class EstopServer:
         if self._realtime:
             hasten(realtime=True)
         check_s = time.monotonic() + CHECK_S
-        while not self._inbox.stopping:
+        while not self._stopping:
             try:
                 self._round(check_s)
                 if time.monotonic() >= check_s:
@@ -206,8 +199,9 @@ class EstopServer:
                 os.eventfd_read(self._wake)
             elif (connection := self._connections.get(key.fd)) is not None:
                 self._read(connection)
-        while self._inbox.obeyed:
-            self._tell_outcome(*self._inbox.obeyed.popleft())
+        if self._obeying is not None and self._obeying.done():
+            obeyed, self._obeying = self._obeying, None
+            self._tell_outcome(obeyed)
         now_s = time.monotonic()
         for connection in list(self._connections.values()):
             if connection.obey_by_s is None and now_s >= connection.since_s + self._silent_s:
@@ -318,29 +312,22 @@ class EstopServer:
             else reason
         )
         self._reply(connection, Answer.LATCHED if first else Answer.ALREADY, in_force)
-        if not self._obeying:
-            self._obeying = True
+        if self._obeying is None:
             try:
-                self._robot.mailbox.post(self._robot.obey_estop, self._deliver)
+                self._obeying = self._robot.mailbox.post(self._robot.obey_estop)
             except InternalError as error:
-                self._deliver(None, error)
+                self._obeying = Future()
+                self._obeying.set_exception(error)
+            self._obeying.add_done_callback(lambda _: self._wake_up())  # on the control thread
         if not self._told:
             self._told = True
             self._on_stop(reason, connection.pid, connection.uid)
 
-    def _deliver(self, error: EstopRequested | None, failure: BaseException | None) -> None:
-        """Control thread."""
-        self._inbox.obeyed.append((error, failure))
-        self._wake_up()
-
-    def _tell_outcome(self, error: EstopRequested | None, failure: BaseException | None) -> None:
-        self._obeying = False
-        if failure is not None:
-            answer, text = (
-                Answer.HUNG,
-                f"the control loop did not obey the emergency stop: {failure}",
-            )
-        elif error is not None and not error.details.get("told", True):
+    def _tell_outcome(self, obeyed: Future[EstopRequested | None]) -> None:
+        if (failure := obeyed.exception()) is not None:
+            answer = Answer.HUNG
+            text = f"the control loop did not obey the emergency stop: {failure}"
+        elif (error := obeyed.result()) is not None and not error.details.get("told", True):
             answer, text = Answer.NOT_TOLD, error.message
         else:
             answer, text = Answer.OBEYED, error.message if error is not None else ""

@@ -11,11 +11,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Protocol
 
 from pydantic import ValidationError
 
-from vram_arbiter.clients.sidecar.perception import Detection
+from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.protocols import Picture
 from vram_arbiter.runner.sensors.detections import DetectionSlot
@@ -30,7 +29,6 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.sidecar import LoadResult, PingResult
 from vram_arbiter.schemas.world import DetectedObject
 
 log = logging.getLogger(__name__)
@@ -38,25 +36,6 @@ log = logging.getLogger(__name__)
 LOAD_WAIT_S = 30.0  # for the lease, before the detector asks again
 LOOK_S = 30.0  # a detector that takes longer for one picture hangs
 SEPARATOR = "</c>"  # of several queries, as the field writes them
-
-
-class Detector(Protocol):
-    """What is needed of `clients.sidecar.perception.DetectorClient`."""
-
-    async def ping(self) -> PingResult: ...
-
-    async def load(self, timeout_s: float | None = None) -> LoadResult: ...
-
-    async def detect(
-        self,
-        image_png: bytes,
-        query: str,
-        *,
-        score_threshold: float | None = None,
-        token: tuple[int, ...] | None = None,
-        timeout_s: float | None = None,
-        fresh_s: float | None = None,
-    ) -> list[Detection]: ...
 
 
 class ContinuousDetector:
@@ -70,7 +49,7 @@ class ContinuousDetector:
         self,
         config: DetectorConfig,
         labels: tuple[str, ...],
-        client: Detector,
+        client: DetectorClient,
         picture: Callable[[str, float], Picture],
         slot: DetectionSlot,
         clock: Clock,

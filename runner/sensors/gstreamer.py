@@ -118,7 +118,7 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
         libraries = load()
     except ConfigError as error:
         raise refuse_field(config, "backend", f"{error.message}; {error.hint}") from error
-    text = build(params, probe_platform().platform)
+    text = build(params, probe_platform())
     try:
         _parse(
             libraries, text

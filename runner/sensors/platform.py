@@ -7,14 +7,12 @@ element.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 TEGRA_RELEASE = "etc/nv_tegra_release"
 # NUL-separated texts, such as nvidia,p3737-0000 and nvidia,tegra234
 BOARD = "proc/device-tree/compatible"
-DRIVER = "proc/driver/nvidia/version"
 GPU_NODES = "dev/nvidia[0-9]*"
 
 
@@ -29,38 +27,21 @@ class Platform(StrEnum):
     """No NVIDIA device that this process can reach: software decoders."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlatformReport:
-    """The platform and the evidence for it, for people."""
-
-    platform: Platform
-    evidence: str
-
-
-def probe_platform(root: Path = Path("/")) -> PlatformReport:
+def probe_platform(root: Path = Path("/")) -> Platform:
     """Probe the machine whose file system begins at `root`.
 
-    Tegra comes first: new Jetsons have a PC's device files as well.
+    Tegra comes first: new Jetsons have a PC's device files as well. A driver without a GPU that
+    this process can reach is none.
     """
-    if (root / TEGRA_RELEASE).exists():
-        return PlatformReport(Platform.TEGRA, f"/{TEGRA_RELEASE} exists")
-    if board := next(
-        (text for text in _texts(root / BOARD) if text.startswith("nvidia,tegra")), None
+    if (root / TEGRA_RELEASE).exists() or any(
+        text.startswith(b"nvidia,tegra") for text in _texts(root / BOARD)
     ):
-        return PlatformReport(Platform.TEGRA, f"the board is {board}")
-    nodes = sorted(path.name for path in root.glob(GPU_NODES))
-    if nodes:
-        return PlatformReport(Platform.NVIDIA_DESKTOP, f"/dev/{nodes[0]} exists")
-    if (root / DRIVER).exists():
-        return PlatformReport(
-            Platform.CPU_ONLY, "the NVIDIA driver is loaded, but no GPU is visible to this process"
-        )
-    return PlatformReport(Platform.CPU_ONLY, "no NVIDIA device")
+        return Platform.TEGRA
+    return Platform.NVIDIA_DESKTOP if any(root.glob(GPU_NODES)) else Platform.CPU_ONLY
 
 
-def _texts(path: Path) -> tuple[str, ...]:
+def _texts(path: Path) -> list[bytes]:
     try:
-        raw = path.read_bytes()
+        return path.read_bytes().split(b"\0")
     except OSError:
-        return ()
-    return tuple(part.decode("ascii", "replace") for part in raw.split(b"\0") if part)
+        return []

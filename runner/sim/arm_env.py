@@ -14,19 +14,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.protocols import RobotDescription, SafetyGate, Stepped
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.limits import Kinematics, Limits
 from vram_arbiter.runner.sim.config import CONTROL_HZ
 from vram_arbiter.runner.sim.env import SimEnv
-from vram_arbiter.runner.skills.motion import bounded
+from vram_arbiter.runner.skills.motion import action_of, bounded
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import EnvironmentFailed, InternalError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import (
     Action,
     JointState,
-    Pose,
     SensorFrame,
     WorldState,
 )
@@ -106,7 +106,6 @@ class ArmEnvironment:
 
     def observe(self, stamp_ns: int, frames: Mapping[str, SensorFrame] | None) -> WorldState:
         positions, velocities = self.arm.joint_state(), self.arm.joint_velocity()
-        x, y, yaw = self.arm.base_pose()
         return WorldState(
             stamp_ns=stamp_ns,
             joint_state=JointState(
@@ -115,11 +114,7 @@ class ArmEnvironment:
                 velocity=tuple(velocities[name] for name in positions),
                 stamp_ns=stamp_ns,
             ),
-            base_pose=Pose(
-                xyz=(x, y, 0.0),
-                quat_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
-                frame_id="map",
-            ),
+            base_pose=planar_pose(*self.arm.base_pose(), "map"),
             image_frames=dict(frames) if frames is not None else None,
         )
 
@@ -163,17 +158,16 @@ class ArmEnvironment:
             raise ModelError(f"expected a row of joint targets, got {raw!r}: {error}") from error
         if not row or len(row) != len(names) or not all(map(math.isfinite, row)):
             raise ModelError(f"an action is {len(names)} finite joint targets in rad, not {row}")
-        return _joint_action(names, row)
+        return action_of(dict(zip(names, row, strict=True)), 0)
 
     def sample(self) -> Action:
         """Return random targets near the last ones, within one step of the gate."""
-        row = []
+        targets = {}
         for name, (low, high) in self._limits.items():
             reach = REACH_SHARE * self._gate.limits.speeds_rad_s[name] / CONTROL_HZ
-            row.append(
-                min(max(self._targets[name] + self._random.uniform(-reach, reach), low), high)
-            )
-        return _joint_action(tuple(self._limits), row)
+            there = self._targets[name] + self._random.uniform(-reach, reach)
+            targets[name] = min(max(there, low), high)
+        return action_of(targets, 0)
 
     def sent(self) -> Mapping[str, float]:
         """Return the targets that the servos really got."""
@@ -189,12 +183,6 @@ class ArmEnvironment:
             bounded(self._targets[name], target, REACH_SHARE * most[name] / CONTROL_HZ)
             for name, target in zip(self._limits, row, strict=True)
         ]
-
-
-def _joint_action(names: tuple[str, ...], row: Sequence[float]) -> Action:
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION, joint_targets=(tuple(row),), joint_names=names
-    )
 
 
 def _commands(

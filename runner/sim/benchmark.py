@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import re
 import time
 from collections.abc import Callable, Iterable
@@ -17,19 +16,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final, TypedDict
+from typing import Any, Final
 
 from vram_arbiter.runner.protocols import Goal, GoalParams, Skill, SkillEnded
 from vram_arbiter.runner.sim.config import CONTROL_HZ
 from vram_arbiter.runner.sim.robot import VIDEO_EVERY, SimRunner
 from vram_arbiter.runner.sim.video import VideoRecorder
 from vram_arbiter.schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 log = logging.getLogger(__name__)
 
-Z_95: Final = 1.959964  # the normal distribution's 97.5 % point
 ERRORS_IN_A_ROW_MAX: Final = 3  # a missing sidecar will not be there for the next seed either
 
 Told = tuple[str, GoalParams]
@@ -43,12 +42,10 @@ def wilson(successes: int, of: int) -> tuple[float, float] | None:
     """
     if of == 0:
         return None
-    share, square = successes / of, Z_95**2
-    middle = share + square / (2 * of)
-    half = Z_95 * math.sqrt(share * (1 - share) / of + square / (4 * of * of))
-    return max(0.0, (middle - half) / (1 + square / of)), min(
-        1.0, (middle + half) / (1 + square / of)
-    )
+    from scipy.stats import binomtest
+
+    interval = binomtest(successes, of).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,25 +68,6 @@ class SeedOutcome:
     trace_id: str | None = None  # of its span; None without telemetry
 
 
-class CellSummary(TypedDict):
-    """Sums of a cell in the report."""
-
-    world: str
-    contestant: str
-    revision: str
-    task: str | None
-    complete: bool
-    why: str
-    played: int
-    judged: int
-    successes: int
-    errors: int
-    success_rate: float | None
-    interval_95: tuple[float, float] | None
-    mean_steps: float | None
-    mean_standing_steps: float | None
-
-
 @dataclass(slots=True)
 class Cell:
     """All episodes of one contestant in one world. `complete` False: stopped, or abandoned
@@ -104,7 +82,7 @@ class Cell:
     complete: bool = False
     why: str = ""
 
-    def summary(self) -> CellSummary:
+    def summary(self) -> JsonObject:
         """Sums, as they go into the report."""
         ran = [played for played in self.episodes if played.success is not None]
         stepped = [played for played in ran if played.steps]  # lerobot-eval does not tell them

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from vram_arbiter.runner.planar import drive
 from vram_arbiter.runner.sim.config import (
     ARM_JOINTS,
     BASE_JOINTS,
@@ -127,14 +128,11 @@ class SimEnv:
         """
         mujoco = load_mujoco()
 
-        for q, u, value in zip(self._base_q, self._base_u, base_pose, strict=True):
-            self._data.qpos[q] = value
-            self._data.ctrl[u] = value
+        data = self._data
+        data.qpos[self._base_q] = data.ctrl[self._base_u] = base_pose
         if arm is not None:
-            for q, v, u, value in zip(self._arm_q, self._arm_v, self._arm_u, arm, strict=True):
-                self._data.qpos[q] = value
-                self._data.qvel[v] = 0.0
-                self._data.ctrl[u] = value
+            data.qpos[self._arm_q] = data.ctrl[self._arm_u] = arm
+            data.qvel[self._arm_v] = 0.0
         mujoco.mj_forward(self._model, self._data)
 
     def close(self) -> None:
@@ -168,36 +166,21 @@ class SimEnv:
         """
         mujoco = load_mujoco()
 
+        twist = [0.0, 0.0, 0.0]
+        if base_velocity is not None:
+            twist = _finite(base_velocity, 3, "a base velocity (vx, vy, wz)")
+        if isinstance(arm_target, Mapping):
+            arm_target = [arm_target[name] for name in ARM_JOINTS]
         if arm_target is not None:
-            values = (
-                [float(arm_target[n]) for n in ARM_JOINTS]
-                if isinstance(arm_target, Mapping)
-                else [float(v) for v in arm_target]
-            )
-            if len(values) != len(ARM_JOINTS) or not all(map(math.isfinite, values)):
-                raise ValueError(
-                    f"an arm target is {len(ARM_JOINTS)} finite joint angles in rad, not {values}"
-                )
-        twist = [float(v) for v in base_velocity] if base_velocity is not None else [0.0, 0.0, 0.0]
-        if len(twist) != 3 or not all(map(math.isfinite, twist)):
-            raise ValueError(f"a base velocity is three finite numbers (vx, vy, wz), not {twist}")
-        if arm_target is not None:
-            for u, value, (low, high) in zip(self._arm_u, values, self._arm_range, strict=True):
-                self._data.ctrl[u] = min(max(value, low), high)
+            values = _finite(arm_target, len(ARM_JOINTS), "an arm target in rad")
+            self._data.ctrl[self._arm_u] = values
+            self._data.ctrl[self._arm_u] = self._data.ctrl[self._arm_u].clip(*self._arm_range.T)
         speed = math.hypot(twist[0], twist[1])
         shrink = min(1.0, MAX_BASE_SPEED_M_S / speed) if speed > 0 else 1.0
         turn = min(max(twist[2], -MAX_BASE_TURN_RAD_S), MAX_BASE_TURN_RAD_S)
-        ux, uy, uyaw = self._base_u
-        dt = self.config.timestep_s
+        velocity = (shrink * twist[0], shrink * twist[1], turn)
         for _ in range(self._substeps):
-            yaw = float(self._data.ctrl[uyaw])
-            self._data.ctrl[ux] += (
-                dt * shrink * (twist[0] * math.cos(yaw) - twist[1] * math.sin(yaw))
-            )
-            self._data.ctrl[uy] += (
-                dt * shrink * (twist[0] * math.sin(yaw) + twist[1] * math.cos(yaw))
-            )
-            self._data.ctrl[uyaw] += dt * turn
+            drive(self._data.ctrl, self._base_u, velocity, self.config.timestep_s)
             mujoco.mj_step(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
         self.steps += 1
@@ -222,15 +205,15 @@ class SimEnv:
 
     def joint_state(self) -> dict[str, float]:
         """Measured arm joint angles in rad, by name, in the order of `ARM_JOINTS`."""
-        return {n: float(self._data.qpos[q]) for n, q in zip(ARM_JOINTS, self._arm_q, strict=True)}
+        return dict(zip(ARM_JOINTS, self._data.qpos[self._arm_q].tolist(), strict=True))
 
     def joint_velocity(self) -> dict[str, float]:
         """Measured arm joint velocities in rad/s, by name."""
-        return {n: float(self._data.qvel[v]) for n, v in zip(ARM_JOINTS, self._arm_v, strict=True)}
+        return dict(zip(ARM_JOINTS, self._data.qvel[self._arm_v].tolist(), strict=True))
 
     def base_pose(self) -> tuple[float, float, float]:
         """Odometry: x, y (m) and yaw (rad) of the base in the map frame."""
-        x, y, yaw = (float(self._data.qpos[q]) for q in self._base_q)
+        x, y, yaw = self._data.qpos[self._base_q].tolist()
         return x, y, wrap_angle(yaw)
 
     def gripper_position(self) -> tuple[float, float, float]:
@@ -340,3 +323,10 @@ class SimEnv:
     def _to_base(self, point: Any) -> tuple[float, float, float]:
         local = self._base_rotation().T @ (point - self._data.xpos[self._base_body])
         return float(local[0]), float(local[1]), float(local[2])
+
+
+def _finite(values: Sequence[float], count: int, what: str) -> list[float]:
+    numbers = [float(value) for value in values]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{what} is {count} finite numbers, not {numbers}")
+    return numbers

@@ -9,14 +9,15 @@ policies, skills or the arbiter.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import math
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.runner.sim.config import COLOURS, SceneConfig
 from vram_arbiter.runner.sim.layout import Layout
-from vram_arbiter.schemas.plain import JsonObject
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.sim.config import CameraSpec, ObjectSpec
@@ -29,9 +30,10 @@ GRASP_POINT = (0.0135, 0.0, -0.0955)
 FIXED_FINGER_GEOM = "fixed_finger"
 MOVING_FINGER_GEOM = "moving_finger"
 
-_SHELL = (0.86, 0.87, 0.90, 1.0)
-_MOTOR = (0.13, 0.13, 0.15, 1.0)
-_FINGER = (0.35, 0.36, 0.40, 1.0)
+_SHELL = (0.86, 0.87, 0.90)
+_MOTOR = (0.13, 0.13, 0.15)
+_FINGER = (0.35, 0.36, 0.40)
+_CORNERS = tuple(itertools.product((-1, 1), (-1, 1)))
 _PAD_QUAT = (0.68849, -0.68849, 0.1612, -0.1612)  # of the wheel's own moving jaw pad
 # bit 1: the world, table and objects; bit 2: the arm and the base, which never collide with each
 # other
@@ -78,9 +80,7 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
-    framebuffer = getattr(
-        spec.visual, "global"
-    )  # `global` is a keyword: attribute access by name only
+    framebuffer = getattr(spec.visual, "global")  # a keyword of Python
     framebuffer.offwidth = max(c.width_px for c in config.cameras.values())
     framebuffer.offheight = max(c.height_px for c in config.cameras.values())
     spec.visual.quality.shadowsize = 1024
@@ -94,7 +94,7 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     mount = base.add_frame(pos=list(config.mount_in_base_m))
     spec.attach(arm, frame=mount, prefix=ARM_PREFIX)
     for item in layout.objects:
-        _add_object(spec, item, config, mujoco)
+        _add_object(spec, item, config)
     parents = {
         "world": spec.worldbody,
         "base": base,
@@ -105,185 +105,115 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     return spec.compile()
 
 
+def _geom(body: Any, kind: str, rgb: Sequence[float], bits: Mapping[str, int], **more: Any) -> None:
+    """Add a geom without a mass of its own; its body, or nothing, states one."""
+    shape = getattr(load_mujoco().mjtGeom, f"mjGEOM_{kind}")
+    body.add_geom(type=shape, rgba=[*rgb, 1], **{"mass": 0, **bits, **more})
+
+
 def _add_world(spec: Any, layout: Layout, config: SceneConfig, mujoco: Any) -> None:
-    world = spec.worldbody
-    box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
+    world, look = spec.worldbody, layout.look
     world.add_light(
-        pos=[*layout.look.light_xy, 2.4],
-        dir=[0.35 - 0.5 * layout.look.light_xy[0], -0.5 * layout.look.light_xy[1], -2.0],
+        pos=[*look.light_xy, 2.4],
+        dir=[0.35 - 0.5 * look.light_xy[0], -0.5 * look.light_xy[1], -2.0],
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[layout.look.diffuse] * 3,
+        diffuse=[look.diffuse] * 3,
         specular=[0.1] * 3,
         ambient=[0.0] * 3,
         castshadow=True,
     )
-    world.add_geom(
-        name="floor",
-        type=plane,
-        size=[4, 4, 0.1],
-        rgba=[*layout.look.floor_rgb, 1],
-        contype=1,
-        conaffinity=1,
-    )
+    floor = {"contype": 1, "conaffinity": 1}
+    _geom(world, "PLANE", look.floor_rgb, floor, name="floor", size=[4, 4, 0.1])
     half = [config.table_depth_m / 2, config.table_width_m / 2, 0.012]
     centre = config.table_edge_x_m + half[0]
-    world.add_geom(
-        name="table",
-        type=box,
-        size=half,
-        pos=[centre, 0, config.table_top_z_m - half[2]],
-        rgba=[*layout.look.table_rgb, 1],
-        friction=[0.8, 0.005, 0.0005],
-        **_WORLD_BITS,
-    )
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            leg_z = (config.table_top_z_m - 2 * half[2]) / 2
-            world.add_geom(
-                type=box,
-                size=[0.015, 0.015, leg_z],
-                pos=[centre + sx * (half[0] - 0.03), sy * (half[1] - 0.03), leg_z],
-                rgba=[0.25, 0.25, 0.27, 1],
-                **_SEEN_ONLY,
-            )
+    at = [centre, 0, config.table_top_z_m - half[2]]
+    felt = {"friction": [0.8, 0.005, 0.0005]}
+    _geom(world, "BOX", look.table_rgb, _WORLD_BITS, name="table", size=half, pos=at, **felt)
+    leg_z = (config.table_top_z_m - 2 * half[2]) / 2
+    for sx, sy in _CORNERS:
+        at = [centre + sx * (half[0] - 0.03), sy * (half[1] - 0.03), leg_z]
+        _geom(world, "BOX", (0.25, 0.25, 0.27), _SEEN_ONLY, size=[0.015, 0.015, leg_z], pos=at)
 
 
 def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
     """Add the planar base: two slides and a hinge with stiff, critically damped actuators."""
-    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     base = spec.worldbody.add_body(name="base_link", pos=[0, 0, 0], gravcomp=1.0)
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    for name, kind, axis in (
-        ("base_x", slide, [1, 0, 0]),
-        ("base_y", slide, [0, 1, 0]),
-        ("base_yaw", hinge, [0, 0, 1]),
+    for name, kind, axis, gain in (
+        ("base_x", slide, [1, 0, 0], 9000.0),
+        ("base_y", slide, [0, 1, 0], 9000.0),
+        ("base_yaw", hinge, [0, 0, 1], 400.0),
     ):
         base.add_joint(name=name, type=kind, axis=axis)
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=gain, kv=gain / 10)
+        actuator.ctrllimited = False
     base.mass, base.inertia, base.ipos = 20.0, [0.5, 0.5, 0.5], [0.0, 0.0, 0.1]
     base.explicitinertial = True
     half_x, half_y = config.base_half_size_m
     top = config.mount_in_base_m[2]
-    offset = (
-        config.mount_in_base_m[0] + 0.05 - half_x
-    )  # the front face is 5 cm before the arm's axis
-    base.add_geom(
-        name="base_body",
-        type=box,
-        size=[half_x, half_y, (top - 0.05) / 2],
-        pos=[offset, 0, 0.05 + (top - 0.05) / 2],
-        rgba=[0.20, 0.23, 0.28, 1],
-        mass=0,
-        **_ROBOT_BITS,
-    )
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            base.add_geom(
-                type=cylinder,
-                size=[0.045, 0.018, 0],
-                pos=[offset + sx * (half_x - 0.05), sy * (half_y - 0.02), 0.045],
-                quat=[math.sqrt(0.5), math.sqrt(0.5), 0, 0],
-                rgba=[0.08, 0.08, 0.08, 1],
-                mass=0,
-                **_SEEN_ONLY,
-            )
+    offset = config.mount_in_base_m[0] + 0.05 - half_x  # its front is 5 cm before the arm's axis
+    half_z = (top - 0.05) / 2
+    where = {"size": [half_x, half_y, half_z], "pos": [offset, 0, 0.05 + half_z]}
+    _geom(base, "BOX", (0.20, 0.23, 0.28), _ROBOT_BITS, name="base_body", **where)
+    lying = [math.sqrt(0.5), math.sqrt(0.5), 0, 0]
+    for sx, sy in _CORNERS:
+        at = [offset + sx * (half_x - 0.05), sy * (half_y - 0.02), 0.045]
+        wheel = {"size": [0.045, 0.018, 0], "pos": at, "quat": lying}
+        _geom(base, "CYLINDER", (0.08, 0.08, 0.08), _SEEN_ONLY, **wheel)
     eye = config.cameras["front"].pos_m
-    base.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=[0.010, 0, 0],
-        fromto=[eye[0] - 0.03, eye[1], top, eye[0] - 0.03, eye[1], eye[2]],
-        rgba=[0.3, 0.3, 0.33, 1],
-        mass=0,
-        **_SEEN_ONLY,
-    )
-    for name, gain, damping in (
-        ("base_x", 9000.0, 900.0),
-        ("base_y", 9000.0, 900.0),
-        ("base_yaw", 400.0, 40.0),
-    ):
-        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=gain, kv=damping)
-        actuator.ctrllimited = False
+    mast = [eye[0] - 0.03, eye[1], top, eye[0] - 0.03, eye[1], eye[2]]
+    _geom(base, "CAPSULE", (0.3, 0.3, 0.33), _SEEN_ONLY, size=[0.010, 0, 0], fromto=mast)
     return base
 
 
 def arm_spec(mujoco: Any) -> Any:
     """Add the wheel's arm without its meshes, as primitives; fingers are boxes that grasp well."""
     arm = mujoco.MjSpec.from_file(str(arm_mjcf_path()))
-    for geom in list(arm.geoms):
-        arm.delete(geom)
-    for mesh in list(arm.meshes):
-        arm.delete(mesh)
-    for material in list(arm.materials):
-        arm.delete(material)
+    for item in (*arm.geoms, *arm.meshes, *arm.materials):
+        arm.delete(item)
     for body in arm.bodies:
         body.gravcomp = 1.0  # the servos hold the arm's own weight; what is grasped still pulls
-    box, capsule = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
 
     def dress(
-        body: str, kind: Any, rgba: tuple[float, ...], solid: bool = False, **where: Any
+        body: str, kind: str, rgb: Sequence[float], solid: bool = False, **where: Any
     ) -> None:
-        bits = _ROBOT_BITS if solid else _SEEN_ONLY
-        arm.body(body).add_geom(type=kind, rgba=list(rgba), mass=0, group=1, **bits, **where)
+        _geom(arm.body(body), kind, rgb, _ROBOT_BITS if solid else _SEEN_ONLY, group=1, **where)
 
-    dress("base", box, _SHELL, pos=[-0.005, 0, 0.025], size=[0.045, 0.035, 0.025])
-    dress("base", box, _MOTOR, pos=[0.0263, 0, 0.0437], size=[0.022, 0.012, 0.018])
-    dress("shoulder", box, _MOTOR, pos=[-0.0304, 0.0, -0.035], size=[0.020, 0.014, 0.024])
-    dress("shoulder", box, _SHELL, pos=[-0.012, 0.0, -0.012], size=[0.030, 0.022, 0.012])
+    dress("base", "BOX", _SHELL, pos=[-0.005, 0, 0.025], size=[0.045, 0.035, 0.025])
+    dress("base", "BOX", _MOTOR, pos=[0.0263, 0, 0.0437], size=[0.022, 0.012, 0.018])
+    dress("shoulder", "BOX", _MOTOR, pos=[-0.0304, 0.0, -0.035], size=[0.020, 0.014, 0.024])
+    dress("shoulder", "BOX", _SHELL, pos=[-0.012, 0.0, -0.012], size=[0.030, 0.022, 0.012])
     upper = [-0.11257, -0.028, 0.0182]
-    dress("upper_arm", capsule, _SHELL, fromto=[0, 0, 0.0182, *upper], size=[0.016, 0, 0])
-    dress("upper_arm", box, _MOTOR, pos=upper, size=[0.020, 0.014, 0.017])
+    dress("upper_arm", "CAPSULE", _SHELL, fromto=[0, 0, 0.0182, *upper], size=[0.016, 0, 0])
+    dress("upper_arm", "BOX", _MOTOR, pos=upper, size=[0.020, 0.014, 0.017])
     lower = [-0.1349, 0.0052, 0.0182]
-    dress("lower_arm", capsule, _SHELL, fromto=[0, 0, 0.0182, *lower], size=[0.014, 0, 0])
-    dress("lower_arm", box, _MOTOR, solid=True, pos=lower, size=[0.018, 0.014, 0.016])
-    dress("wrist", box, _SHELL, solid=True, pos=[0, -0.036, 0.0181], size=[0.018, 0.024, 0.018])
-    dress("gripper", box, _MOTOR, solid=True, pos=[0.004, 0.0, -0.020], size=[0.016, 0.018, 0.018])
+    dress("lower_arm", "CAPSULE", _SHELL, fromto=[0, 0, 0.0182, *lower], size=[0.014, 0, 0])
+    dress("lower_arm", "BOX", _MOTOR, solid=True, pos=lower, size=[0.018, 0.014, 0.016])
+    dress("wrist", "BOX", _SHELL, solid=True, pos=[0, -0.036, 0.0181], size=[0.018, 0.024, 0.018])
+    hand = {"pos": [0.004, 0.0, -0.020], "size": [0.016, 0.018, 0.018]}
+    dress("gripper", "BOX", _MOTOR, solid=True, **hand)
     # fixed finger: inner face at x = -0.0015 as on the wheel's own pad
-    dress("gripper", box, _SHELL, pos=[-0.010, 0, -0.060], size=[0.006, 0.011, 0.030])
-    grip: JsonObject = {
-        "condim": 6,
-        "friction": [1.6, 0.02, 0.002],
-        "priority": 1,
-        "solref": [0.006, 1.0],
-    }
-    gripper = arm.body("gripper")
-    gripper.add_geom(
-        name=FIXED_FINGER_GEOM,
-        type=box,
-        pos=[-0.0060, 0, -0.0925],
-        size=[0.0045, 0.0095, 0.0125],
-        rgba=list(_FINGER),
-        mass=0,
-        group=1,
-        **_ROBOT_BITS,
-        **grip,
+    dress("gripper", "BOX", _SHELL, pos=[-0.010, 0, -0.060], size=[0.006, 0.011, 0.030])
+    pad: dict[str, Any] = {"size": [0.0045, 0.0095, 0.0125], "condim": 6, "priority": 1}
+    pad |= {"friction": [1.6, 0.02, 0.002], "solref": [0.006, 1.0], "solid": True}
+    dress("gripper", "BOX", _FINGER, name=FIXED_FINGER_GEOM, pos=[-0.0060, 0, -0.0925], **pad)
+    arm.body("gripper").add_site(
+        name=GRASP_SITE, pos=list(GRASP_POINT), size=[0.003, 0, 0], group=4
     )
-    gripper.add_site(name=GRASP_SITE, pos=list(GRASP_POINT), size=[0.003, 0, 0], group=4)
-    jaw = arm.body("moving_jaw_so101_v1")
-    jaw.add_geom(
-        type=capsule, fromto=[0, 0, 0.0189, -0.0140, -0.060, 0.0189],
-        size=[0.0075, 0, 0], rgba=list(_SHELL),
-        mass=0, group=1, **_SEEN_ONLY,
-    )  # fmt: skip
-    jaw.add_geom(
-        name=MOVING_FINGER_GEOM,
-        type=box,
-        pos=[-0.01233 + 0.444 * -0.0047, -0.07625 + 0.896 * 0.0047, 0.0189],
-        quat=list(_PAD_QUAT),
-        size=[0.0045, 0.0095, 0.0125],
-        rgba=list(_FINGER),
-        mass=0,
-        group=1,
-        **_ROBOT_BITS,
-        **grip,
-    )
+    jaw = "moving_jaw_so101_v1"
+    finger = [0, 0, 0.0189, -0.0140, -0.060, 0.0189]
+    dress(jaw, "CAPSULE", _SHELL, fromto=finger, size=[0.0075, 0, 0])
+    at = [-0.01233 + 0.444 * -0.0047, -0.07625 + 0.896 * 0.0047, 0.0189]
+    dress(jaw, "BOX", _FINGER, name=MOVING_FINGER_GEOM, pos=at, quat=list(_PAD_QUAT), **pad)
     return arm
 
 
-def _add_object(spec: Any, item: ObjectSpec, config: SceneConfig, mujoco: Any) -> None:
+def _add_object(spec: Any, item: ObjectSpec, config: SceneConfig) -> None:
     kinds = {
-        "cube": (mujoco.mjtGeom.mjGEOM_BOX, [item.size_m / 2] * 3),
-        "ball": (mujoco.mjtGeom.mjGEOM_SPHERE, [item.size_m / 2, 0, 0]),
-        "cylinder": (mujoco.mjtGeom.mjGEOM_CYLINDER, [item.size_m / 2, item.height_m / 2, 0]),
+        "cube": ("BOX", [item.size_m / 2] * 3),
+        "ball": ("SPHERE", [item.size_m / 2, 0, 0]),
+        "cylinder": ("CYLINDER", [item.size_m / 2, item.height_m / 2, 0]),
     }
     kind, size = kinds[item.shape]
     body = spec.worldbody.add_body(
@@ -292,17 +222,9 @@ def _add_object(spec: Any, item: ObjectSpec, config: SceneConfig, mujoco: Any) -
         quat=[math.cos(item.yaw_rad / 2), 0, 0, math.sin(item.yaw_rad / 2)],
     )
     body.add_freejoint(name=item.name)
-    body.add_geom(
-        name=item.name,
-        type=kind,
-        size=size,
-        mass=0.03,
-        rgba=[*COLOURS[item.colour], 1],
-        condim=6,
-        # the rolling friction keeps a ball where it was put, as felt on a table would
-        friction=[0.8, 0.01, 0.004],
-        **_WORLD_BITS,
-    )
+    # the rolling friction keeps a ball where it was put, as felt on a table would
+    grip = {"mass": 0.03, "condim": 6, "friction": [0.8, 0.01, 0.004]}
+    _geom(body, kind, COLOURS[item.colour], _WORLD_BITS, name=item.name, size=size, **grip)
 
 
 def _add_camera(parent: Any, name: str, camera: CameraSpec) -> None:
@@ -314,17 +236,7 @@ def _add_camera(parent: Any, name: str, camera: CameraSpec) -> None:
     back /= np.linalg.norm(back)
     right = np.cross(np.asarray(camera.up, dtype=float), back)
     right /= np.linalg.norm(right)
-    up = np.cross(back, right)
-    parent.add_camera(
-        name=name, pos=eye.tolist(), fovy=camera.fovy_deg, quat=_quat(right, up, back)
-    )
-
-
-def _quat(right: Any, up: Any, back: Any) -> list[float]:
-    """Quaternion (w, x, y, z) of the rotation whose columns are the three axes."""
-    import numpy as np
-
-    mujoco = load_mujoco()
     quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.stack([right, up, back], axis=1).flatten())
-    return [float(v) for v in quat]
+    axes = np.stack([right, np.cross(back, right), back], axis=1)
+    load_mujoco().mju_mat2Quat(quat, axes.flatten())
+    parent.add_camera(name=name, pos=eye.tolist(), fovy=camera.fovy_deg, quat=quat.tolist())

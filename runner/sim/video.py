@@ -18,6 +18,7 @@ QUEUE_MAX = 30  # pictures; two to three seconds of video
 WAIT_S = 1.0  # between two looks whether the encoder is still there
 LINE_PX = 22
 FONT_SCALE = 0.5
+ENCODING = ("-preset", "veryfast", "-crf", "26", "-threads", "1", "-movflags", "+faststart")
 
 
 class VideoRecorder:
@@ -70,19 +71,14 @@ class VideoRecorder:
                 try:
                     if writer is None:
                         writer, size = self._open(rgb.shape[1], rgb.shape[0]), rgb.shape
-                    if (
-                        rgb.shape != size
-                    ):  # ffmpeg counts bytes: every later picture would be garbled
+                    if rgb.shape != size:  # ffmpeg counts bytes: all later ones would be garbled
                         raise RuntimeError(
                             f"the pictures were {size[1]} × {size[0]},"
                             f" now one is {rgb.shape[1]} × {rgb.shape[0]}"
                         )
                     writer.send(_caption(rgb, lines))
                     self.written += 1
-                except (
-                    OSError,
-                    RuntimeError,
-                ) as error:  # ffmpeg missing, disk full: the robot goes on
+                except (OSError, RuntimeError) as error:  # no ffmpeg, disk full: the robot goes on
                     self.error = str(error)
                     log.error("no video: %s", error)
         finally:
@@ -101,16 +97,7 @@ class VideoRecorder:
             fps=self.fps,
             codec="libx264",
             macro_block_size=2,
-            output_params=[
-                "-preset",
-                "veryfast",
-                "-crf",
-                "26",
-                "-threads",
-                "1",
-                "-movflags",
-                "+faststart",
-            ],
+            output_params=list(ENCODING),
         )
         writer.send(None)
         return writer

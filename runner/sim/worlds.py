@@ -5,21 +5,20 @@ Nothing is simulated here: the control thread does that.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from vram_arbiter.runner.goals.catalogue import Maker, sidecar_endpoint
-from vram_arbiter.runner.protocols import MobileBase, Skill
+from vram_arbiter.runner.goals.catalogue import Maker
+from vram_arbiter.runner.protocols import MobileBase
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.config import SceneConfig
 from vram_arbiter.runner.sim.env import MAX_BASE_SPEED_M_S, MAX_BASE_TURN_RAD_S, SimEnv
-from vram_arbiter.runner.skills.ros_standins import NAVIGATE, TRAJECTORY, StandIn, StandIns
+from vram_arbiter.runner.skills.ros_standins import NAVIGATE, StandIn
 from vram_arbiter.schemas.control import ControlMode
-from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.manifest import Kind
 
 ROBOT: Final = "so101-mobile"
 OBSERVATION_CAMERAS: Final = ("front", "wrist")  # the first is the default one
@@ -48,36 +47,21 @@ def makers_of(
     latency_steps: int | None = None,
 ) -> dict[Kind, Maker]:
     """Return the makers of the skills that can act in this world; as `SidecarPolicy`."""
-    from vram_arbiter.clients.sidecar.policy import PolicyClient
+    from vram_arbiter.runner.skills import makers
     from vram_arbiter.runner.skills.navigate import Navigate
-    from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
-    from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
-    from vram_arbiter.runner.skills.wiring import wire_up
 
-    def make_policy(manifest: RSkillManifest) -> Skill:
-        return SidecarPolicy(
-            manifest,
-            wire_up(manifest, world.robot, world.robot.rest_pose_rad),
-            PolicyClient(sidecar_endpoint(manifest.name, given, os.environ)),
-            arbiter,
-            period_s=period_s,
-            wait_s=wait_s,
-            latency_steps=latency_steps,
-            speeds_rad_s=world.limits_for(manifest).speeds_rad_s,
-            sent=world.sent,
-        )
-
-    joint, twist = ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST
-    known = {
-        NAVIGATE: StandIn(
-            lambda manifest: Navigate(manifest, world.arm.config, period_s=period_s),
-            frozenset({twist, joint}),
-        ),
-        TRAJECTORY: StandIn(
-            lambda manifest: FollowJointTrajectory(
-                manifest, world.limits_for(manifest), period_s=period_s, sent=world.sent
-            ),
-            frozenset({joint}),
-        ),
-    }
-    return {Kind.VLA: make_policy, Kind.ROS_ACTION: StandIns(known, world.robot.joint_names)}
+    navigate = StandIn(
+        lambda manifest: Navigate(manifest, world.arm.config, period_s=period_s),
+        frozenset({ControlMode.BODY_TWIST, ControlMode.JOINT_POSITION}),
+    )
+    return makers.makers_of(
+        world.robot,
+        world.limits_for,
+        world.sent,
+        given,
+        arbiter,
+        period_s=period_s,
+        wait_s=wait_s,
+        latency_steps=latency_steps,
+        others={NAVIGATE: navigate},
+    )

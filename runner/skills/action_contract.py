@@ -7,25 +7,23 @@ cannot do. Pure but for the model's frames.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from vram_arbiter.runner.protocols import EndEffector, Joint, RobotDescription
+from vram_arbiter.runner.robots.units import Scale
 from vram_arbiter.runner.skills.actions import TWIST, ActionPlan, Command, Kind
 from vram_arbiter.runner.skills.kinematics import ArmModel
-from vram_arbiter.runner.skills.units import SAME, Scale, of_joint, opening
+from vram_arbiter.runner.skills.units import SAME, of_joint, opening
 from vram_arbiter.schemas.control import CARTESIAN_MODES, GRIPPER_MODES, JOINT_MODES, ControlMode
 from vram_arbiter.schemas.findings import Path, Problem
 from vram_arbiter.schemas.manifest import RSkillManifest
-from vram_arbiter.schemas.manifest.contracts import ActuatorRequirement, ControlModeSemantics
+from vram_arbiter.schemas.manifest.contracts import ActuatorRequirement
 from vram_arbiter.schemas.manifest.io_contracts import ActionContract, ActionSlot
-from vram_arbiter.schemas.manifest.vocabulary import (
-    ActionRepresentation,
-    GripperConvention,
-    Rotation,
-)
+from vram_arbiter.schemas.manifest.vocabulary import ActionRepresentation, GripperConvention
 
 _PATH = ("action_contract",)
-_SLOTS = ("action_contract", "slots")
 
 _IN_WORDS = {
     ActionRepresentation.DELTA_EE_6D: (6, False),
@@ -34,11 +32,20 @@ _IN_WORDS = {
 }
 _ALL = (-math.inf, math.inf)
 _PLANAR = ("base_x", "base_y", "base_yaw")
+_TWISTS = {2: (0, 5), 3: (0, 1, 5), 6: (0, 1, 2, 3, 4, 5)}
+
+
+class _Misfit(Exception):
+    """The one thing that keeps a part of the contract from this robot, and its field."""
+
+    def __init__(self, path: Path, message: str) -> None:
+        super().__init__(message)
+        self.problem = Problem(path, message)
 
 
 @dataclass(slots=True)
 class _Resolver:
-    """One contract against one robot; `findings` collects what does not fit."""
+    """One contract against one robot, slot by slot; `findings` collects what does not fit."""
 
     manifest: RSkillManifest
     robot: RobotDescription
@@ -47,209 +54,158 @@ class _Resolver:
     commands: list[Command] = field(default_factory=list)
     scales: list[Scale] = field(default_factory=list)
     bounds: dict[int, tuple[float, float]] = field(default_factory=dict)
-    commanded: dict[str, Path] = field(default_factory=dict)
+    commanded: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
 
-    def wrong(self, path: Path, message: str) -> None:
-        self.findings.append(Problem(path, message))
+    def attempt(self, step: Callable[..., None], *given: Any) -> None:
+        """Resolve a part of the contract; a finding if it does not fit."""
+        try:
+            step(*given)
+        except _Misfit as misfit:
+            self.findings.append(misfit.problem)
 
-    # -- what the manifest says elsewhere
     def actuator(self, modes: frozenset[ControlMode]) -> ActuatorRequirement | None:
         """Return the manifest's actuator of these modes, if it has one."""
         return next((a for a in self.manifest.actuators_required if a.kind in modes), None)
 
-    def semantics(self, modes: frozenset[ControlMode]) -> ControlModeSemantics | None:
-        """Return how the actuator of these modes is meant, if the manifest has one."""
+    def is_delta(self, modes: frozenset[ControlMode]) -> bool:
+        """Return whether the actuator of these modes is told steps."""
         found = self.actuator(modes)
-        return found.control_mode_semantics if found is not None else None
-
-    def gripper_convention(self, slot: ActionSlot | None) -> GripperConvention | None:
-        if slot is not None and slot.gripper_convention is not None:
-            return slot.gripper_convention
-        return stated_convention(self.manifest) or self.robot.units.gripper_convention
+        return found is not None and found.control_mode_semantics.mode == "delta"
 
     # -- the vector
     def resolve(self, joints: tuple[str, ...]) -> None:
         contract = self.manifest.action_contract
-        slots = contract.slots if contract is not None else None
-        representation = contract.representation if contract is not None else None
-        if contract is not None and slots is not None:
-            self.scales = [SAME] * contract.dim
-            for index, slot in enumerate(slots):
-                self.slot((*_SLOTS, index), slot, contract)
-        elif contract is not None and representation in _IN_WORDS:
-            self.tool_vector(contract, representation)
-        elif representation is ActionRepresentation.CARTESIAN_POSE:
-            self.wrong(
+        if contract is None:
+            contract = ActionContract.model_construct(dim=len(joints))
+        self.scales = [SAME] * contract.dim
+        if contract.slots is not None:
+            for index, slot in enumerate(contract.slots):
+                self.attempt(self.slot, (*_PATH, "slots", index), slot)
+        elif contract.representation in _IN_WORDS:
+            self.attempt(self.tool_vector, contract, contract.representation)
+        else:
+            self.attempt(self.joint_vector, contract, joints)
+
+    def joint_vector(self, contract: ActionContract, joints: tuple[str, ...]) -> None:
+        if contract.representation is ActionRepresentation.CARTESIAN_POSE:
+            raise _Misfit(
                 (*_PATH, "representation"),
                 "cartesian_pose does not say how it writes the orientation: give slots with"
                 " rotation",
             )
-        else:
-            self.joint_vector(contract, joints)
-
-    def joint_vector(self, contract: ActionContract | None, joints: tuple[str, ...]) -> None:
-        dim = contract.dim if contract is not None else len(joints)
-        if dim != len(joints):
-            self.wrong((*_PATH, "dim"), f"commands {dim} joints, the robot has {len(joints)}")
-            return
-        velocity = (
-            contract is not None
-            and contract.representation is ActionRepresentation.JOINT_VELOCITIES
-        )
-        self.scales = [SAME] * dim
-        self.joint_command(
-            _PATH,
-            tuple(range(dim)),
-            joints,
-            ControlMode.JOINT_VELOCITY if velocity else ControlMode.JOINT_POSITION,
-        )
+        if contract.dim != len(joints):
+            said = f"commands {contract.dim} joints, the robot has {len(joints)}"
+            raise _Misfit((*_PATH, "dim"), said)
+        velocity = contract.representation is ActionRepresentation.JOINT_VELOCITIES
+        mode = ControlMode.JOINT_VELOCITY if velocity else ControlMode.JOINT_POSITION
+        self.joint_command(_PATH, tuple(range(contract.dim)), joints, mode)
 
     def tool_vector(self, contract: ActionContract, representation: ActionRepresentation) -> None:
+        """Resolve a vector that is described by a word, as the slots that it stands for."""
         width, with_gripper = _IN_WORDS[representation]
+        path = (*_PATH, "representation")
         if contract.dim != width + with_gripper:
-            self.wrong(
-                (*_PATH, "dim"),
-                f"is {contract.dim}; {representation} has {width + with_gripper} values",
-            )
-            return
+            said = f"is {contract.dim}; {representation} has {width + with_gripper} values"
+            raise _Misfit((*_PATH, "dim"), said)
         if len({end.frame for end in self.robot.ends}) != 1:
-            self.wrong(
-                (*_PATH, "representation"),
+            raise _Misfit(
+                path,
                 f"{representation} moves the one end effector of a robot; {self.robot.name} has"
                 f" {len(self.robot.ends) or 'none'}: give slots with ee and frame",
             )
-            return
-        semantics = self.semantics(CARTESIAN_MODES)
-        frame = semantics.reference_frame if semantics is not None else None
+        arm = self.actuator(CARTESIAN_MODES)
+        frame = None if arm is None else arm.control_mode_semantics.reference_frame
         if frame is None:
-            self.wrong(
-                (*_PATH, "representation"),
+            raise _Misfit(
+                path,
                 f"the frame of {representation} is not stated: give an actuator of kind"
                 " cartesian_delta its reference_frame, or slots",
             )
-            return
-        self.scales = [SAME] * contract.dim
-        end = self.robot.ends[0]
-        self.tool_command(
-            _PATH, tuple(range(width)), ControlMode.CARTESIAN_DELTA, end.name, frame, None, contract
-        )
+        end, mode = self.robot.ends[0].name, ControlMode.CARTESIAN_DELTA
+        arm_slot = ActionSlot(range=(0, width - 1), control_mode=mode, ee=end, frame=frame)
+        self.tool_slot(_PATH, arm_slot, mode)
         if with_gripper:
-            self.gripper_command(
-                _PATH, width, ControlMode.GRIPPER_POSITION, end.name, self.gripper_convention(None)
-            )
+            mode = ControlMode.GRIPPER_POSITION
+            gripper = ActionSlot(range=(width, width), control_mode=mode, ee=end)
+            self.gripper_slot(_PATH, gripper, mode)
 
-    def slot(self, path: Path, slot: ActionSlot, contract: ActionContract) -> None:
-        at = tuple(range(slot.range[0], slot.range[1] + 1))
-        mode = slot.control_mode
+    def slot(self, path: Path, slot: ActionSlot) -> None:
+        at, mode = _places(slot), slot.control_mode
         if slot.terminate:
             self.commands.append(Command("terminate", at))
             return
         if mode is None:  # discarded
             return
         if slot.input_bounds is not None:
-            for index in at:
-                self.bounds[index] = slot.input_bounds
+            self.bounds |= dict.fromkeys(at, slot.input_bounds)
         if mode in JOINT_MODES:
-            self.joint_slot(path, at, slot.joint_names, mode)
+            self.joint_slot(path, slot, mode)
         elif mode in CARTESIAN_MODES:
-            self.tool_command(
-                path, at, mode, slot.ee or "", slot.frame or "", slot.rotation, contract
-            )
+            self.tool_slot(path, slot, mode)
         elif mode in GRIPPER_MODES:
-            if len(at) != 1:
-                self.wrong((*path, "range"), f"covers {len(at)} values; a gripper takes one")
-                return
-            self.gripper_command(path, at[0], mode, slot.ee or "", self.gripper_convention(slot))
+            self.gripper_slot(path, slot, mode)
         elif mode is ControlMode.BODY_TWIST:
-            self.twist_slot(path, at, slot.frame or "")
+            self.twist_slot(path, slot)
         elif mode is ControlMode.COMPOSITE_MODE:
             self.notes.append(
                 f"{Problem(path, '').field}: composite_mode changes nothing: arm and base are"
                 " driven at once, and the arm's frames move with the base"
             )
         else:
-            self.wrong(
-                (*path, "control_mode"),
-                f"{mode} cannot be sent: {self.robot.name} is driven by joint positions",
-            )
+            self.cannot_send(path, mode)
+
+    def cannot_send(self, path: Path, mode: ControlMode) -> None:
+        said = f"{mode} cannot be sent: {self.robot.name} is driven by joint positions"
+        raise _Misfit((*path, "control_mode"), said)
 
     # -- joints
-    def joint_slot(
-        self,
-        path: Path,
-        at: tuple[int, ...],
-        names: tuple[str, ...],
-        mode: ControlMode,
-    ) -> None:
-        base = self.robot.base
-        if names and set(names) & set(base.joints if base is not None else _PLANAR):
-            self.base_joints(path, at, names, mode)
+    def joint_slot(self, path: Path, slot: ActionSlot, mode: ControlMode) -> None:
+        at, names, base = _places(slot), slot.joint_names, self.robot.base
+        if set(names) & set(base.joints if base is not None else _PLANAR):
+            self.base_joints(path, slot, mode)
             return
-        semantics = self.semantics(JOINT_MODES)
-        order = names or (semantics.joint_order if semantics is not None else None)
+        arm = self.actuator(JOINT_MODES)
+        order = names or (arm.control_mode_semantics.joint_order if arm is not None else None)
         wanted = tuple(order or self.robot.joint_names)
         if len(wanted) != len(at):
-            self.wrong(
-                (*path, "range"),
-                f"covers {len(at)} values for {len(wanted)} joints: give joint_names",
-            )
-            return
+            said = f"covers {len(at)} values for {len(wanted)} joints: give joint_names"
+            raise _Misfit((*path, "range"), said)
         self.joint_command(path, at, wanted, mode)
 
-    def base_joints(
-        self,
-        path: Path,
-        at: tuple[int, ...],
-        names: tuple[str, ...],
-        mode: ControlMode,
-    ) -> None:
-        base = self.robot.base
+    def base_joints(self, path: Path, slot: ActionSlot, mode: ControlMode) -> None:
+        base, names = self.robot.base, slot.joint_names
         if base is None:
-            self.wrong(
-                (*path, "joint_names"),
-                f"drives a base ({', '.join(names)}); {self.robot.name} has none",
-            )
-        elif mode is not ControlMode.JOINT_VELOCITY:
-            self.wrong((*path, "control_mode"), f"a base is driven by velocities, not by {mode}")
-        elif unknown := [name for name in names if name not in base.joints]:
-            self.wrong(
+            said = f"drives a base ({', '.join(names)}); {self.robot.name} has none"
+            raise _Misfit((*path, "joint_names"), said)
+        if mode is not ControlMode.JOINT_VELOCITY:
+            said = f"a base is driven by velocities, not by {mode}"
+            raise _Misfit((*path, "control_mode"), said)
+        if unknown := [name for name in names if name not in base.joints]:
+            raise _Misfit(
                 (*path, "joint_names"),
                 f"mixes the base's joints with {', '.join(unknown)}; the base has"
                 f" {', '.join(base.joints)}",
             )
-        else:
-            places = [(0, 1, 5)[base.joints.index(name)] for name in names]
-            self.drive(path, at, places)
+        places = tuple((0, 1, 5)[base.joints.index(name)] for name in names)
+        self.drive(path, _places(slot), places)
 
     def joint_command(
-        self,
-        path: Path,
-        at: tuple[int, ...],
-        names: tuple[str, ...],
-        mode: ControlMode,
+        self, path: Path, at: tuple[int, ...], names: tuple[str, ...], mode: ControlMode
     ) -> None:
         known = {joint.name: joint for joint in self.robot.joints}
         if unknown := [name for name in names if name not in known]:
-            self.wrong(
-                path,
-                f"moves {', '.join(unknown)}; the robot has {', '.join(known) or 'no joints'}",
-            )
-            return
+            said = f"moves {', '.join(unknown)}; the robot has {', '.join(known) or 'no joints'}"
+            raise _Misfit(path, said)
         if mode is ControlMode.JOINT_TORQUE:
-            self.wrong(
-                (*path, "control_mode"),
-                f"joint_torque cannot be sent: {self.robot.name} is driven by joint positions",
-            )
-            return
-        semantics = self.semantics(frozenset({ControlMode.JOINT_POSITION}))
-        delta = semantics is not None and semantics.mode == "delta"
+            self.cannot_send(path, mode)
+        delta = self.is_delta(frozenset({ControlMode.JOINT_POSITION}))
         kind: Kind = "joint_delta" if delta else "joint_position"
         if mode is ControlMode.JOINT_VELOCITY:
             kind = "joint_velocity"
-        for index, name in enumerate(names):
+        for index, name in zip(at, names, strict=True):
             scale = self.joint_scale(path, known[name])
-            self.scales[at[index]] = scale if kind == "joint_position" else Scale(scale.scale)
+            self.scales[index] = scale if kind == "joint_position" else Scale(scale.scale)
         gripper = self.actuator(GRIPPER_MODES)
         apart: tuple[int, ...] = ()  # grippers that do not go as the other joints do
         if gripper is not None and not (
@@ -267,112 +223,83 @@ class _Resolver:
             self.commands.append(Command(kind, tuple(at[i] for i in rest), moved))
 
     def joint_scale(self, path: Path, joint: Joint) -> Scale:
-        contract = self.manifest.action_contract
-        units = contract.joint_units if contract is not None else None
-        scale = of_joint(joint, units, stated_convention(self.manifest))
-        if isinstance(scale, str):
-            self.wrong(path, scale)
-            return SAME
-        return scale
+        try:
+            return scale_of(joint, self.manifest)
+        except ValueError as error:
+            raise _Misfit(path, str(error)) from error
 
     def claim(self, path: Path, names: tuple[str, ...]) -> None:
-        for name in names:
-            if name in self.commanded:
-                self.wrong(path, f"commands {name} a second time")
-            self.commanded[name] = path
+        if again := [name for name in names if name in self.commanded]:
+            raise _Misfit(path, f"commands {', '.join(again)} a second time")
+        self.commanded.update(names)
 
     # -- tools and grippers
-    def end(self, path: Path, name: str) -> EndEffector | None:
+    def end(self, path: Path, name: str) -> EndEffector:
         """Return the end effector of that name, or a frame of the model as one."""
         found = next((end for end in self.robot.ends if end.name == name), None)
         if found is None and self.model is not None and self.model.has(name):
             return EndEffector(name, name)
         if found is None:
             known = ", ".join(end.name for end in self.robot.ends) or "none"
-            self.wrong((*path, "ee"), f"no end effector {name!r}; the robot has {known}")
+            raise _Misfit((*path, "ee"), f"no end effector {name!r}; the robot has {known}")
         return found
 
-    def frame(self, path: Path, name: str) -> bool:
-        if self.model is not None and not self.model.has(name):
-            self.wrong((*path, "frame"), no_frame(name, self.model))
-            return False
-        return self.model is not None
-
-    def tool_command(
-        self,
-        path: Path,
-        at: tuple[int, ...],
-        mode: ControlMode,
-        ee: str,
-        frame: str,
-        rotation: Rotation | None,
-        contract: ActionContract,
-    ) -> None:
-        if self.model is None:
-            self.wrong(
-                (*path, "control_mode") if path != _PATH else (*_PATH, "representation"),
+    def tool_slot(self, path: Path, slot: ActionSlot, mode: ControlMode) -> None:
+        at, frame, rotation, model = _places(slot), slot.frame or "", slot.rotation, self.model
+        if model is None:
+            raise _Misfit(
+                (*path, "control_mode" if path != _PATH else "representation"),
                 f"{mode} needs a model of {self.robot.name} for its kinematics; there is none",
             )
-            return
-        end = self.end(path, ee)
-        if not self.frame(path, frame) or end is None:
-            return
-        if not self.model.has(end.frame):
-            self.wrong((*path, "ee"), no_frame(end.frame, self.model))
-            return
-        turning = len(at) > 3
+        end = self.end(path, slot.ee or "")
+        for part, name in (("frame", frame), ("ee", end.frame)):
+            if not model.has(name):
+                raise _Misfit((*path, part), no_frame(name, model))
         widths: tuple[int, ...] = (3, 6)
         if mode is ControlMode.CARTESIAN_POSE:
             widths = (3,) if rotation is None else (3 + rotation.width,)
         if len(at) not in widths:
-            self.wrong(
+            raise _Misfit(
                 (*path, "range"),
                 f"covers {len(at)} values; {mode} has {' or '.join(map(str, widths))}"
                 + (" (a pose with an orientation needs rotation)" if widths == (3,) else ""),
             )
-            return
-        movers = self.model.movers(end.frame)
-        if len(movers) < (6 if turning else 3):
-            self.wrong(
+        movers, freedom = model.movers(end.frame), 6 if len(at) > 3 else 3
+        if len(movers) < freedom:
+            raise _Misfit(
                 path,
-                f"{mode} of {6 if turning else 3} degrees of freedom; the {len(movers)} joints"
+                f"{mode} of {freedom} degrees of freedom; the {len(movers)} joints"
                 f" that move {end.frame} cannot follow it",
             )
-            return
         if mode is ControlMode.CARTESIAN_DELTA:
-            self.delta_scale(path, at, contract)
+            self.delta_scale(at)
         self.claim(path, movers)
         kind: Kind = mode.value  # type: ignore[assignment]
         self.commands.append(Command(kind, at, movers, end.frame, frame, rotation))
 
-    def delta_scale(self, path: Path, at: tuple[int, ...], contract: ActionContract) -> None:
-        scale = contract.cartesian_delta_scale or self.robot.units.cartesian_delta_scale
+    def delta_scale(self, at: tuple[int, ...]) -> None:
+        contract = self.manifest.action_contract
+        stated = contract.cartesian_delta_scale if contract is not None else None
+        scale = stated or self.robot.units.cartesian_delta_scale
         if scale is None or len(scale) < len(at):
-            self.wrong(
+            raise _Misfit(
                 (*_PATH, "cartesian_delta_scale"),
                 "is not stated, and a unit of the delta may be anything: give m and rad per unit"
                 " (1 where the policy answers in m and rad) here or in hal.params.units",
             )
-            return
         for index, factor in zip(at, scale, strict=False):
             self.scales[index] = Scale(factor)
 
-    def gripper_command(
-        self,
-        path: Path,
-        at: int,
-        mode: ControlMode,
-        ee: str,
-        convention: GripperConvention | None,
-    ) -> None:
-        end = self.end(path, ee)
-        if end is None:
-            return
+    def gripper_slot(self, path: Path, slot: ActionSlot, mode: ControlMode) -> None:
+        if slot.width != 1:
+            raise _Misfit((*path, "range"), f"covers {slot.width} values; a gripper takes one")
+        end = self.end(path, slot.ee or "")
         joint = next((j for j in self.robot.joints if j.name == end.gripper), None)
         if joint is None:
-            self.wrong((*path, "ee"), f"{ee} has no gripper that this robot moves")
-            return
-        self.gripper_value(path, at, joint, mode, convention)
+            raise _Misfit((*path, "ee"), f"{slot.ee} has no gripper that this robot moves")
+        stated = slot.gripper_convention or stated_convention(self.manifest)
+        convention = stated or self.robot.units.gripper_convention
+        self.gripper_value(path, slot.range[0], joint, mode, convention)
 
     def gripper_value(
         self,
@@ -384,56 +311,46 @@ class _Resolver:
     ) -> None:
         """Command one gripper by one value."""
         if convention is None:
-            self.wrong(
+            raise _Misfit(
                 path,
                 f"{mode} does not say which number is open: give gripper_convention here or in"
                 " actuators_required, or in hal.params.units",
             )
-            return
         self.claim(path, (joint.name,))
-        if mode is ControlMode.GRIPPER_BINARY:
-            scale = opening(convention)
-            if scale is None:
-                self.wrong(path, f"{convention} is no convention of a gripper that is on or off")
-                return
-            self.scales[at] = scale
-            self.commands.append(Command("gripper_switch", (at,), (joint.name,)))
-            return
-        found = of_joint(joint, None, convention)
-        if isinstance(found, str):
-            self.wrong(path, found)
-            return
-        semantics = self.semantics(GRIPPER_MODES)
-        delta = semantics is not None and semantics.mode == "delta"
-        self.scales[at] = Scale(found.scale) if delta else found
-        self.commands.append(
-            Command("joint_delta" if delta else "joint_position", (at,), (joint.name,))
-        )
+        kind: Kind = "joint_delta" if self.is_delta(GRIPPER_MODES) else "joint_position"
+        try:
+            if mode is ControlMode.GRIPPER_BINARY:
+                kind, scale = "gripper_switch", opening(convention)
+            else:
+                scale = of_joint(joint, None, convention)
+        except ValueError as error:
+            raise _Misfit(path, str(error)) from error
+        self.scales[at] = Scale(scale.scale) if kind == "joint_delta" else scale
+        self.commands.append(Command(kind, (at,), (joint.name,)))
 
     # -- the base
-    def twist_slot(self, path: Path, at: tuple[int, ...], frame: str) -> None:
-        places = {2: (0, 5), 3: (0, 1, 5), 6: (0, 1, 2, 3, 4, 5)}.get(len(at))
-        if self.robot.base is None:
-            self.wrong((*path, "control_mode"), f"{self.robot.name} has no base to drive")
-        elif frame != self.robot.base.frame:
-            self.wrong(
-                (*path, "frame"),
-                f"{frame!r}: the base is driven in its own frame, {self.robot.base.frame!r}",
-            )
-        elif places is None:
-            self.wrong(
-                (*path, "range"),
-                f"covers {len(at)} values; a twist has 2 (vx, wz), 3 (vx, vy, wz) or 6",
-            )
-        else:
-            self.drive(path, at, list(places))
+    def twist_slot(self, path: Path, slot: ActionSlot) -> None:
+        base = self.robot.base
+        if base is None:
+            raise _Misfit((*path, "control_mode"), f"{self.robot.name} has no base to drive")
+        if slot.frame != base.frame:
+            said = f"{slot.frame!r}: the base is driven in its own frame, {base.frame!r}"
+            raise _Misfit((*path, "frame"), said)
+        if slot.width not in _TWISTS:
+            said = f"covers {slot.width} values; a twist has 2 (vx, wz), 3 (vx, vy, wz) or 6"
+            raise _Misfit((*path, "range"), said)
+        self.drive(path, _places(slot), _TWISTS[slot.width])
 
-    def drive(self, path: Path, at: tuple[int, ...], places: list[int]) -> None:
+    def drive(self, path: Path, at: tuple[int, ...], places: tuple[int, ...]) -> None:
         """Command the base: value `at[i]` is entry `places[i]` of the twist."""
         self.claim(path, ("the base",))
         order = sorted(range(len(at)), key=lambda i: places[i])
         names = tuple(TWIST[places[i]] for i in order)
         self.commands.append(Command("base_velocity", tuple(at[i] for i in order), names))
+
+
+def _places(slot: ActionSlot) -> tuple[int, ...]:
+    return tuple(range(slot.range[0], slot.range[1] + 1))
 
 
 def stated_convention(manifest: RSkillManifest) -> GripperConvention | None:
@@ -442,6 +359,13 @@ def stated_convention(manifest: RSkillManifest) -> GripperConvention | None:
         if actuator.kind in GRIPPER_MODES:
             return actuator.control_mode_semantics.gripper_convention
     return None
+
+
+def scale_of(joint: Joint, manifest: RSkillManifest) -> Scale:
+    """Return the map of a joint's numbers in the manifest's vectors. Raises ValueError."""
+    contract = manifest.action_contract
+    units = contract.joint_units if contract is not None else None
+    return of_joint(joint, units, stated_convention(manifest))
 
 
 def no_frame(name: str, model: ArmModel) -> str:
@@ -473,7 +397,7 @@ def plan_actions(
     resolver = _Resolver(manifest, robot, model)
     resolver.resolve(joints)
     if not resolver.commands and not resolver.findings:
-        resolver.wrong((*_PATH, "slots"), "command nothing")
+        resolver.findings.append(Problem((*_PATH, "slots"), "command nothing"))
     commanded = dict.fromkeys(
         name
         for command in resolver.commands

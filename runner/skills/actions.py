@@ -1,8 +1,7 @@
 """A policy's action vector as commands of this robot.
 
 `ActionPlan.rows` turns a chunk into rows in m and rad, `numbers` turns them back; `Stepper.step`
-turns one row into joint targets and a body twist. Rows of absolute joint targets need no step.
-Nothing here is a limit: every command passes the safety gate. `action_contract` makes the plans.
+turns one row into joint targets and a body twist. Nothing here is a limit: every command passes the safety gate. `action_contract` makes the plans.
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.runner.robots.units import Scale
 from vram_arbiter.runner.skills.kinematics import REACHED_M, REACHED_RAD, ArmModel, Pose3
 from vram_arbiter.runner.skills.motion import bounded
 from vram_arbiter.runner.skills.rotations import axis_angle, matrix_of, turn
-from vram_arbiter.runner.skills.units import Scale
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.manifest.vocabulary import Rotation
+from vram_arbiter.schemas.world import Twist
 
 Row = tuple[float, ...]
-Twist = tuple[float, float, float, float, float, float]
 Kind = Literal[
     "joint_position",
     "joint_delta",
@@ -70,14 +69,6 @@ class ActionPlan:
     joints: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...] | None = None
     notes: tuple[str, ...] = ()
-
-    @property
-    def direct(self) -> bool:
-        """Return whether the whole vector is absolute joint targets, in the order of `joints`."""
-        return len(self.commands) == 1 and (
-            self.commands[0].kind == "joint_position"
-            and self.commands[0].at == tuple(range(self.dim))
-        )
 
     def rows(self, actions: Any) -> list[Row]:
         """Return the rows of a chunk in m and rad.

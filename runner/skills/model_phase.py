@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Final, Protocol
+from typing import Final
 
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.schemas.sizes import format_bytes
-from vram_arbiter.schemas.wire.explained import Explanation, WhyReply
+from vram_arbiter.schemas.wire.explained import Explanation
 
 PHASE_S: Final = 1.0  # between two looks
 
 
-class Explainer(Protocol):
-    """What is needed of `clients.client.AsyncClient`."""
-
-    async def why(self, consumer: str) -> WhyReply: ...
-
-
-async def model_phase(client: SidecarClient, arbiter: Explainer | None) -> str:
+async def model_phase(client: SidecarClient, arbiter: AsyncClient | None) -> str:
     """Return the phase in words: starting, waiting for the GPU (for what), loading (how far).
 
     Raises what the sidecar and the arbiter raise.

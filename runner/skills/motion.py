@@ -1,4 +1,5 @@
-"""Bounded joint motion to a known pose: the arm folds before it drives or before a policy begins.
+"""Joint targets as actions, and bounded motion to a known pose: the arm folds before it drives or
+before a policy begins.
 
 Pure: joint names and radians in, targets out, one per control step.
 """
@@ -7,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ModelError
-from vram_arbiter.schemas.world import WorldState
+from vram_arbiter.schemas.world import Action, Twist, WorldState
 
 SPEED_RAD_S = 1.6
 REACHED_RAD = 0.06  # servos under load stop a little short
@@ -26,6 +28,20 @@ def joint_positions(world: WorldState, names: tuple[str, ...]) -> dict[str, floa
     if missing:
         raise ModelError(f"the joint state lacks {', '.join(missing)}")
     return {name: known[name] for name in names}
+
+
+def action_of(targets: Mapping[str, float], stamp_ns: int, twist: Twist | None = None) -> Action:
+    """Return an action of joint targets (rad), with a base's velocity, or of that alone."""
+    driving = None if twist is None else (twist,)
+    if not targets and driving is not None:
+        return Action(control_mode=ControlMode.BODY_TWIST, body_twist=driving, stamp_ns=stamp_ns)
+    return Action(
+        control_mode=ControlMode.JOINT_POSITION,
+        joint_targets=(tuple(targets.values()),),
+        joint_names=tuple(targets),
+        body_twist=driving,
+        stamp_ns=stamp_ns,
+    )
 
 
 def bounded(here: float, there: float, reach: float) -> float:

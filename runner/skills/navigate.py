@@ -14,13 +14,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vram_arbiter.runner.planar import yaw_of
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig, wrap_angle
 from vram_arbiter.runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
 from vram_arbiter.runner.skills.base import SkillBase
-from vram_arbiter.runner.skills.motion import JointRamp, is_at, joint_positions
+from vram_arbiter.runner.skills.motion import JointRamp, action_of, is_at, joint_positions
 from vram_arbiter.runner.skills.ros_goals import parse_goal
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import Action, Finite, WorldState
@@ -61,9 +61,7 @@ class Orientation(_Part):
 
     @property
     def yaw_rad(self) -> float:
-        return math.atan2(
-            2 * (self.w * self.z + self.x * self.y), self.w**2 + self.x**2 - self.y**2 - self.z**2
-        )
+        return yaw_of((self.x, self.y, self.z, self.w))
 
 
 class PoseHeader(BaseModel):
@@ -107,8 +105,7 @@ def base_pose(world: WorldState) -> Pose2D:
     if world.base_pose is None or "base_pose" in world.stale:
         raise ModelError("the base's pose is not known", hint="nothing drives without odometry")
     x, y, _ = world.base_pose.xyz
-    qx, qy, qz, qw = world.base_pose.quat_xyzw
-    return Pose2D(x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
+    return Pose2D(x, y, yaw_of(world.base_pose.quat_xyzw))
 
 
 def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose2D:
@@ -161,7 +158,7 @@ class Navigate(SkillBase):
             self._controller = PlanarController(goal, self._config, control_dt_s=self._period_s)
             self._start_m = max(self._controller.distance_m(here), 1e-3)
         gap_m = self._controller.distance_m(here)
-        turn_rad = abs(_wrap(self._controller.goal.yaw_rad - here.yaw_rad))
+        turn_rad = abs(wrap_angle(self._controller.goal.yaw_rad - here.yaw_rad))
         self.fraction = min(max(1.0 - gap_m / self._start_m, 0.0), 0.99)
         if self._controller.reached(here) or self._settling:
             self._settling += 1
@@ -176,21 +173,11 @@ class Navigate(SkillBase):
             return Hold("standing still")
         self._watch(gap_m, turn_rad)
         vx, vy, wz = self._controller.command(here)
-        return Act(
-            Action(
-                control_mode=ControlMode.BODY_TWIST,
-                body_twist=((vx, vy, 0.0, 0.0, 0.0, wz),),
-                stamp_ns=world.stamp_ns,
-            )
-        )
+        return Act(action_of({}, world.stamp_ns, (vx, vy, 0.0, 0.0, 0.0, wz)))
 
     def _fold_arm(self, world: WorldState) -> Action | None:
         """Return the next step towards the folded pose, or None once the arm is there."""
-        rest = {
-            name: value
-            for name, value in zip(ARM_JOINTS, REST_POSE, strict=True)
-            if name in FOLDED_JOINTS
-        }
+        rest = dict(zip(FOLDED_JOINTS, REST_POSE, strict=False))
         measured = joint_positions(world, FOLDED_JOINTS)
         if self._fold is None:
             if is_at(measured, rest):
@@ -200,13 +187,7 @@ class Navigate(SkillBase):
         if self._fold.done(measured):
             self._folded = True
             return None
-        target = self._fold.next_target()
-        return Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(tuple(target.values()),),
-            joint_names=tuple(target),
-            stamp_ns=world.stamp_ns,
-        )
+        return action_of(self._fold.next_target(), world.stamp_ns)
 
     def _watch(self, gap_m: float, turn_rad: float) -> None:
         best_m, best_rad = self._best
@@ -220,7 +201,3 @@ class Navigate(SkillBase):
                 f"the base stays {gap_m:.3f} m and {turn_rad:.3f} rad from its goal",
                 hint="the goal lies on or behind the table",
             )
-
-
-def _wrap(angle_rad: float) -> float:
-    return math.atan2(math.sin(angle_rad), math.cos(angle_rad))

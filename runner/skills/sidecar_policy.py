@@ -16,8 +16,10 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncForeignUse
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import (
     Act,
@@ -28,13 +30,12 @@ from vram_arbiter.runner.protocols import (
     StepOutcome,
 )
 from vram_arbiter.runner.sensors.pictures import as_rgb
-from vram_arbiter.runner.skills.actions import Stepper, Twist
+from vram_arbiter.runner.skills.actions import Stepper
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played, Row
-from vram_arbiter.runner.skills.model_phase import PHASE_S, Explainer, model_phase
-from vram_arbiter.runner.skills.motion import JointRamp, bounded, is_at, joint_positions
+from vram_arbiter.runner.skills.model_phase import PHASE_S, model_phase
+from vram_arbiter.runner.skills.motion import JointRamp, action_of, is_at, joint_positions
 from vram_arbiter.runner.skills.wiring import View, Wiring
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
@@ -57,7 +58,7 @@ from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.sidecar import LoadResult, RealTimeChunking
-from vram_arbiter.schemas.world import Action, SensorFrame, WorldState
+from vram_arbiter.schemas.world import SensorFrame, WorldState
 
 log = logging.getLogger(__name__)
 
@@ -91,20 +92,6 @@ _AGAIN = (
 )
 
 
-class Use(Protocol):
-    """A busy interval on the sidecar's lease (`clients.lease.ForeignUse`)."""
-
-    lost: VramError | None
-
-    async def end(self) -> None: ...
-
-
-class Arbiter(Explainer, Protocol):
-    """What is needed of `clients.client.AsyncClient`."""
-
-    async def begin_use(self, lease_id: str, token: Sequence[int], label: str = "") -> Use: ...
-
-
 class SidecarPolicy(SkillBase):
     """`arbiter` None: the sidecar loads at once.
 
@@ -112,11 +99,10 @@ class SidecarPolicy(SkillBase):
     steps a chunk takes there (`chunks.ChunkPlayer`).
 
     `speeds_rad_s`, by joint, limits the way to the start pose and a policy's steps to what one
-    period allows. The safety gate would rightly withhold larger leaps; absolute targets are
-    approached only where the manifest says that they lead (`targets_lead`), and else sent as they
-    are. Steps begin at the motors' last
-    targets (`sent`, rad by joint): a command may be dropped for being late, or shortened by the
-    gate.
+    period allows. The safety gate would rightly withhold larger leaps; absolute targets of arm
+    joints are approached only where the manifest says that they lead (`targets_lead`), and else
+    sent as they are. Steps begin at the motors' last targets (`sent`, rad by joint): a command may
+    be dropped for being late, or shortened by the gate.
     """
 
     holds_gpu = True
@@ -126,7 +112,7 @@ class SidecarPolicy(SkillBase):
         manifest: RSkillManifest,
         wiring: Wiring,
         client: PolicyClient,
-        arbiter: Arbiter | None,
+        arbiter: AsyncClient | None,
         *,
         period_s: float,
         wait_s: float = 0.0,
@@ -137,24 +123,17 @@ class SidecarPolicy(SkillBase):
         super().__init__(manifest)
         longest = {name: STEP_SHARE * v * period_s for name, v in (speeds_rad_s or {}).items()}
         self._longest_steps = longest
-        leads = bool(longest) and wiring.actions.direct and wiring.rollout.targets_lead
-        self._longest = tuple(longest[name] for name in wiring.joints) if leads else None
         self._read = wiring.robot.joint_names
-        self._stepper = (
-            None
-            if wiring.actions.direct
-            else Stepper(
-                wiring.actions,
-                wiring.robot,
-                wiring.model,
-                period_s=period_s,
-                longest=longest,
-                leading=wiring.rollout.targets_lead,
-            )
+        self._stepper = Stepper(
+            wiring.actions,
+            wiring.robot,
+            wiring.model,
+            period_s=period_s,
+            longest=longest,
+            leading=wiring.rollout.targets_lead,
         )
         self._sent = sent
-        self._commanded: Row | None = None
-        self._last: Mapping[str, float] = {}  # what was commanded last, by joint
+        self._commanded: Mapping[str, float] = {}  # by joint; empty: nothing yet
         self.cameras = tuple(wiring.cameras)
         self._wiring = wiring
         self._client = client
@@ -164,7 +143,7 @@ class SidecarPolicy(SkillBase):
         self._latency_steps = latency_steps
         self._steps = wiring.rollout.rollout_steps or max(1, round(wiring.rollout_s / period_s))
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._use: Use | None = None
+        self._use: AsyncForeignUse | None = None
         self._token: tuple[int, ...] | None = None
         self._loaded = False
         self._task = ""
@@ -189,7 +168,7 @@ class SidecarPolicy(SkillBase):
         await self._occupy(goal)
         begun = await self._client.reset({TASK_KEY: self._task}, token=self._token)
         rollout = self._wiring.rollout
-        self._ramp, self._running, self._commanded = None, False, None
+        self._ramp, self._running, self._commanded = None, False, {}
         self._recent.clear()
         self._seen = deque(maxlen=_count(begun, "n_obs_steps") or rollout.n_obs_steps or 1)
         # of this goal: a late request without a token would load the model anew
@@ -346,7 +325,7 @@ class SidecarPolicy(SkillBase):
         measured = joint_positions(world, self._read)
         if not self._running:
             if not self._at_start(measured):
-                return Act(_joint_action(self._target, None, world))
+                return Act(action_of(self._target, world.stamp_ns))
             self._running = True
             return Hold("at the start pose")
         if player.played >= self._steps or self._stands_still(player):
@@ -357,17 +336,7 @@ class SidecarPolicy(SkillBase):
         if played is None:
             return Hold("the policy thinks", standing=player.played > 0)
         self.fraction = player.played / self._steps
-        if self._stepper is not None:
-            return self._stepped(self._stepper, played, measured, world)
-        self._recent.append(played.row)
-        row = self._step_towards(played.row, measured)
-        action = Action(
-            control_mode=ControlMode.JOINT_POSITION,
-            joint_targets=(row,),
-            joint_names=self._wiring.joints,
-            stamp_ns=world.stamp_ns,
-        )
-        return Act(action, chunk_index=played.chunk, chunk=self._chunk_start(played))
+        return self._stepped(player, played, measured, world)
 
     def _chunk_start(self, played: Played) -> ChunkStart | None:
         if not played.first:
@@ -376,29 +345,30 @@ class SidecarPolicy(SkillBase):
         return ChunkStart(self._latency_s, played.prefetched, self._latency_s > budget_s)
 
     def _stepped(
-        self, stepper: Stepper, played: Played, measured: Mapping[str, float], world: WorldState
+        self,
+        player: ChunkPlayer,
+        played: Played,
+        measured: Mapping[str, float],
+        world: WorldState,
     ) -> StepOutcome:
-        """Return what a row that is not just joint targets comes to from here."""
-        player = self._player
+        """Return what a row comes to from here."""
         start = dict(measured)
-        if self._commanded is not None:
-            start.update(self._sent() if self._sent is not None else self._last)
-        step = stepper.step(played.row, start)
+        if self._commanded:
+            start.update(self._sent() if self._sent is not None else self._commanded)
+        step = self._stepper.step(played.row, start)
         if step.terminated:
-            played_so_far = {"steps": player.played, "chunks": player.chunks} if player else {}
-            return Done({**played_so_far, "terminated": True})
+            return Done({"steps": player.played, "chunks": player.chunks, "terminated": True})
         if step.withheld:
             return Hold(step.problem, withheld=True)
         targets = {name: step.targets.get(name, start[name]) for name in self._wiring.joints}
-        self._commanded = tuple(targets.values())
-        self._last = targets
+        self._commanded = targets
         driving = step.twist is not None and any(abs(v) > STILL_RAD for v in step.twist)
         if driving:
             self._recent.clear()
         else:
-            self._recent.append(self._commanded)
+            self._recent.append(tuple(targets.values()))
         return Act(
-            _joint_action(targets, step.twist, world),
+            action_of(targets, world.stamp_ns, step.twist),
             chunk_index=played.chunk,
             chunk=self._chunk_start(played),
             problem=step.problem,
@@ -420,20 +390,6 @@ class SidecarPolicy(SkillBase):
             return True
         self._target = self._ramp.next_target()
         return False
-
-    def _step_towards(self, row: Row, measured: Mapping[str, float]) -> Row:
-        """Return the policy's targets, or as much of the way there as one period allows."""
-        if self._longest is None:
-            return row
-        start = self._commanded or tuple(measured[name] for name in self._wiring.joints)
-        if self._commanded is not None and self._sent is not None:
-            sent = self._sent()
-            start = tuple(sent.get(name, measured[name]) for name in self._wiring.joints)
-        self._commanded = tuple(
-            bounded(here, target, longest)
-            for here, target, longest in zip(start, row, self._longest, strict=True)
-        )
-        return self._commanded
 
     def _stands_still(self, player: ChunkPlayer) -> bool:
         if not self._wiring.rollout.stop_when_still or player.played < STILL_FROM * self._steps:
@@ -524,22 +480,6 @@ def _count(begun: JsonMap, name: str) -> int | None:
     """Return what a sidecar says of an episode; None: a server of the field, which does not."""
     found = begun.get(name)
     return found if isinstance(found, int) and found > 0 else None
-
-
-def _joint_action(targets: Mapping[str, float], twist: Twist | None, world: WorldState) -> Action:
-    """Return an action of joint targets (rad), with a base's velocity, or of that alone."""
-    driving = None if twist is None else (twist,)
-    if not targets and driving is not None:
-        return Action(
-            control_mode=ControlMode.BODY_TWIST, body_twist=driving, stamp_ns=world.stamp_ns
-        )
-    return Action(
-        control_mode=ControlMode.JOINT_POSITION,
-        joint_targets=(tuple(targets.values()),),
-        joint_names=tuple(targets),
-        body_twist=driving,
-        stamp_ns=world.stamp_ns,
-    )
 
 
 def _picture(frame: SensorFrame, view: View | None) -> Any:

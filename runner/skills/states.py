@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from vram_arbiter.runner.protocols import RobotDescription
-from vram_arbiter.runner.skills.action_contract import no_frame, stated_convention
+from vram_arbiter.runner.robots.units import Scale
+from vram_arbiter.runner.skills.action_contract import no_frame, scale_of
 from vram_arbiter.runner.skills.kinematics import ArmModel, Pose3
 from vram_arbiter.runner.skills.rotations import matrix_of, numbers
-from vram_arbiter.runner.skills.units import SAME, Scale, of_joint
+from vram_arbiter.runner.skills.units import SAME
 from vram_arbiter.schemas.errors import StateStale
 from vram_arbiter.schemas.findings import Path, Problem
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -271,15 +272,12 @@ def _resolve(
     base = robot.base
     match part.kind:
         case "joint_positions" | "joint_velocities":
-            units = manifest.action_contract.joint_units if manifest.action_contract else None
-            found = []
-            for name in part.joints:
-                scale = of_joint(known[name], units, stated_convention(manifest))
-                if isinstance(scale, str):
-                    wrong(scale)
-                    scale = SAME
-                found.append(scale)
-            return replace(part, scales=tuple(found))
+            try:
+                scales = tuple(scale_of(known[name], manifest) for name in part.joints)
+            except ValueError as error:
+                wrong(str(error))
+                scales = (SAME,) * len(part.joints)
+            return replace(part, scales=scales)
         case "fingers":
             if len(part.joints) not in (1, 2):
                 wrong(f"names {len(part.joints)} joints; a gripper has 1, or 2 fingers")

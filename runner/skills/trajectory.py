@@ -17,12 +17,11 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field
 from vram_arbiter.runner.protocols import Act, Done, Goal, StepOutcome
 from vram_arbiter.runner.safety.limits import Limits
 from vram_arbiter.runner.skills.base import SkillBase
-from vram_arbiter.runner.skills.motion import REACHED_RAD, joint_positions
+from vram_arbiter.runner.skills.motion import REACHED_RAD, action_of, joint_positions
 from vram_arbiter.runner.skills.ros_goals import parse_goal
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import BadRequest, GoalRejected
 from vram_arbiter.schemas.manifest import RSkillManifest
-from vram_arbiter.schemas.world import Action, WorldState
+from vram_arbiter.schemas.world import WorldState
 
 POINTS_MAX = 2000
 JOINTS_MAX = 64
@@ -221,14 +220,8 @@ class FollowJointTrajectory(SkillBase):
                     f"{worst} is {errors[worst]:.3f} rad from the last point",
                     hint="something is in the way, or the trajectory is too fast for the arm",
                 )
-        return Act(
-            Action(
-                control_mode=ControlMode.JOINT_POSITION,
-                joint_targets=(self._target(elapsed_s),),
-                joint_names=names,
-                stamp_ns=world.stamp_ns,
-            )
-        )
+        targets = dict(zip(names, self._target(elapsed_s), strict=True))
+        return Act(action_of(targets, world.stamp_ns))
 
     def withheld(self) -> None:
         """Let the clock stand: a target that moved on while the arm stood would be too fast."""

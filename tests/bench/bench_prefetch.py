@@ -23,7 +23,7 @@ import yaml
 
 from tests.bench.grabs import MANIFEST, benchmark_arguments, grab_sidecar
 from vram_arbiter.runner.cli.benchmark import benchmark_of, entries_of
-from vram_arbiter.runner.sim.benchmark import CellSummary
+from vram_arbiter.schemas.plain import JsonObject
 
 HEAD = (
     "| latency | prefetch_at | n_action_steps | steps | of them standing | success |\n"
@@ -39,7 +39,7 @@ class Cell:
     prefetch_at: int
     keep: int
 
-    def played(self, endpoint: str, seeds: range) -> CellSummary:
+    def played(self, endpoint: str, seeds: range) -> JsonObject:
         """Return the summary of the benchmark. Raises RuntimeError without a verdict."""
         raw = yaml.safe_load(MANIFEST.read_text(encoding="utf-8"))
         raw["policy_extras"]["prefetch_at"] = self.prefetch_at
@@ -56,7 +56,7 @@ class Cell:
             raise RuntimeError(f"{self}: {cell.why or cell.episodes[-1].message}")
         return summary
 
-    def row(self, summary: CellSummary) -> str:
+    def row(self, summary: JsonObject) -> str:
         """Return the line of the table."""
         latency = "real time" if self.latency is None else self.latency
         return (

@@ -4,13 +4,14 @@ physics.
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.runner.manual_clock import ManualClock
+from tests.support.prepared import warm
 from vram_arbiter.runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.robot import SimRunner, sim_runner
@@ -159,6 +160,18 @@ def navigate_manifest() -> Path:
 @pytest.fixture
 def endpoint(tmp_path: Path) -> str:
     return f"ipc://{tmp_path}/runner.sock"
+
+
+@pytest.fixture(scope="module")
+def forked_writers() -> Iterator[None]:
+    """Let recorders of this process, and of runners that it forks, fork their writers."""
+    from tests.support.dataset_writer import FORKING
+    from vram_arbiter.runner.recording import recorder
+
+    warm("dataset-writer")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorder, "subprocess", FORKING)
+        yield
 
 
 @pytest.fixture

@@ -32,6 +32,7 @@ from vram_arbiter.runner.skills.base import SkillState
 from vram_arbiter.schemas.config.robot import DetectorConfig
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import process
 from vram_arbiter.schemas.world import Action, JointState, WorldState
 
@@ -109,7 +110,40 @@ def main() -> None:
     fall_behind(clock)
     look_in_vain(clock)
     said["pages"].append(generate_latest(registry).decode())
+    exporter.clear()
+    said["some"] = some_ticks(clock, exporter)
     print(json.dumps(said))
+
+
+def some_ticks(clock: ManualClock, exporter: InMemorySpanExporter) -> dict[str, Any]:
+    """What a robot's ticks record when one in four is to be traced."""
+    twin, camera = Twin(clock), FedCamera("front", clock)
+    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
+    runner = hardware_runner(
+        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
+    )
+    runner.spans.share = 0.25
+    runner.activate()
+    skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
+    skill.state = SkillState.ACTIVE
+    ticks = [runner.tick(), runner.tick()]  # nobody has the arm
+    idle_spans = len(exporter.get_finished_spans())
+    goal = Goal("g", "a/nod", traceparent=sys.argv[2])
+    runner.mailbox.post(lambda: runner.begin_skill(skill, goal, lambda ended: None))
+    ticks += [runner.tick() for _ in range(9)]
+    runner.mailbox.post(runner.end_skill)
+    ticks.append(runner.tick())
+    runner.deactivate()
+    spans = exporter.get_finished_spans()
+    return {
+        "idle_spans": idle_spans,
+        "tick_spans": [f"{s.context.span_id:016x}" for s in spans if s.name == telemetry.SPAN_TICK],
+        "send_parents": [
+            f"{s.parent.span_id:016x}" for s in spans if s.name == telemetry.SPAN_SEND and s.parent
+        ],
+        "traces": sorted({f"{span.context.trace_id:032x}" for span in spans}),
+        "ticks": [tick.trace_context and tick.trace_context["traceparent"] for tick in ticks],
+    }
 
 
 class Slow(Nod):

@@ -149,36 +149,27 @@ async def test_a_signal_cancels_the_goal_and_ends_in_order(
     assert result["metadata"]["robot"] == "bench"
 
 
-def test_the_files_own_task_ends_the_program(start: Start) -> None:
-    process = start(more=TASK, steps="20")
+@pytest.mark.parametrize(
+    ("more", "steps", "code", "success", "said"),
+    [
+        (TASK, "20", 0, True, "task done"),
+        (TASK.replace("400", "10"), "", 1, False, "not done within 10 ticks"),
+        (TASK + "max_ticks: 30\n", "", 1, False, ""),
+        ("max_ticks: 30\n", "", 0, None, ""),
+    ],
+    ids=["done", "limited task", "limited run with a task", "limited run"],
+)
+def test_the_end_of_a_files_task_or_ticks_ends_the_program(
+    start: Start, more: str, steps: str, code: int, success: bool | None, said: str
+) -> None:
+    process = start(more=more, steps=steps)
     out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    assert process.returncode == code, err
     result = json.loads(out)
-    assert result["success"] is True
-    assert result["n_ticks"] > 20
+    assert result["success"] is success
+    assert result["n_ticks"] == 30 or "max_ticks" not in more
     assert result["p99_tick_ms"] > 0
-
-
-def test_a_task_that_is_not_done_in_its_ticks_has_failed(start: Start) -> None:
-    process = start(more=TASK.replace("400", "10"))
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 1, err
-    assert json.loads(out)["success"] is False
-    assert "not done within 10 ticks" in err
-
-
-def test_the_end_of_a_run_that_is_limited_in_ticks_leaves_its_task_undone(start: Start) -> None:
-    process = start(more=TASK + "max_ticks: 30\n")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 1, err
-    assert json.loads(out)["n_ticks"] == 30
-
-
-def test_a_run_without_a_task_ends_after_its_ticks(start: Start) -> None:
-    process = start(more="max_ticks: 30\n")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert json.loads(out)["n_ticks"] == 30
+    assert said in err
 
 
 async def test_a_camera_file_that_ends_withholds_and_fails_the_goal(

@@ -361,16 +361,6 @@ def test_a_stop_that_the_robot_latched_by_itself_is_the_runners_too(
     assert runner.estop is ended[0].error
 
 
-def test_a_late_action_is_withheld_under_drop(
-    started: MakeRunner, twin: Twin, nod: Any, clock: Any
-) -> None:
-    runner = started(deadline_policy=DeadlinePolicy.DROP)
-    begin(runner, nod(on_step=lambda world: clock.advance(2 * PERIOD_S)))
-    result = tick(runner, clock)
-    assert (result.action_applied, result.deadline_missed) == (False, True)
-    assert not twin.sent
-
-
 def test_a_goal_whose_actions_all_come_too_late_fails(
     started: MakeRunner, twin: Twin, nod: Any, clock: Any
 ) -> None:

@@ -27,7 +27,7 @@ from vram_arbiter.runner.protocols import (
 )
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.control import ControlMode
-from vram_arbiter.schemas.world import Action, JointState, TickResult, WorldState
+from vram_arbiter.schemas.world import Action, JointState, WorldState
 
 ACTION = Action(
     control_mode=ControlMode.JOINT_POSITION, joint_targets=((0.0,),), joint_names=("a",)
@@ -66,15 +66,8 @@ class Desk:
         self.clock.advance(self.apply_s)
         return Applied(action_applied=action is not None)
 
-    def ticked(self, result: TickResult) -> None: ...
-
     def targets(self) -> dict[str, float]:
         return {}
-
-    def transition(self) -> None: ...
-
-    def success(self) -> bool | None:
-        return None
 
     def facts(self) -> dict[str, Any]:
         return {}

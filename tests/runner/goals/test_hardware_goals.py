@@ -205,17 +205,6 @@ async def test_what_was_fresh_is_stale_while_the_loop_hangs(
 
 
 @pytest.mark.usefixtures("patient")
-async def test_the_command_line_stops_the_robot(
-    made: Bench, endpoint: str, capfd: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["estop", "--reason", "smoke", "--endpoint", endpoint]
-    assert await asyncio.to_thread(main, argv) == 0
-    assert made.runner.estop is not None
-    assert made.twin.story == ["connect", "halt"]
-    assert "bench: emergency stop: smoke; all joints stand still" in capfd.readouterr().out
-
-
-@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize(
     "cause", [RobotFault("motor 2 does not answer"), TypeError("a driver's defect")]
 )
@@ -352,16 +341,6 @@ async def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(
         pass
     assert len(made.twin.sent) == sent
     assert (await client.state())["estop"] is None
-
-
-async def test_a_goal_is_limited_in_ticks(made: Bench, client: RunnerClient) -> None:
-    goal = await client.send_goal(RSKILL, prompt="nod", max_ticks=4)
-    result = await goal.result(60)
-    assert (result["status"], result["code"]) == ("failed", "limit_exceeded")
-    assert (
-        result["data"]["ticks"] >= 4
-    )  # more where the machine stood still, and the skill was not asked
-    assert made.skill.taken <= 4
 
 
 @pytest.mark.heavy

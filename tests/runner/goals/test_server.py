@@ -414,7 +414,7 @@ async def test_a_goal_runs_when_it_has_the_arm_and_not_before(
         busy.set()
         go_on.wait(60)
 
-    b.runner.mailbox.post(hold_up, lambda *_: None)
+    b.runner.mailbox.post(hold_up)
     await asyncio.to_thread(busy.wait, 60)
     second = await client.send_goal(RSKILL, prompt="wait")
     feedback = aiter(second.feedback())

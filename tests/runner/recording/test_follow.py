@@ -121,7 +121,7 @@ def test_a_goal_that_is_taken_back_ends_before_the_next_one_begins(
         runner.end_skill()
         runner.begin_skill(Scripted(Hold("c")), NEXT, lambda _: None)
 
-    runner.mailbox.post(swap, lambda *_: None)
+    runner.mailbox.post(swap)
     runner.tick()
     runner.deactivate()
     assert follower.order == [("tick", "g"), ("end", "g"), ("tick", "h"), ("end", "h")]

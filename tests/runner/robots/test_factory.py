@@ -8,7 +8,7 @@ import pytest
 
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
-from vram_arbiter.runner.robots.units import JointScale, JointUnit
+from vram_arbiter.runner.robots.units import JointUnit, Scale, scale_of_unit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 
@@ -17,8 +17,8 @@ PANDA_JOINT = {"panda_joint1": {"max_speed_rad_s": 2.0}}
 
 def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
     with pytest.raises(ConfigError) as caught:
-        make_hal(HalConfig(adapter=adapter, **sections), source="robot.yaml")
-    assert str(caught.value).startswith("robot.yaml: hal.")
+        make_hal(HalConfig(adapter=adapter, **sections))
+    assert str(caught.value).startswith("deployment: hal.")
     return [(field["field"], field["problem"]) for field in caught.value.details["fields"]]
 
 
@@ -148,27 +148,27 @@ def test_the_kinematic_twin_is_made_without_moving() -> None:
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("angle_rad", [-1.0, -0.2, 0.0, 0.7, 2.0])
 def test_units_come_back_as_they_went(unit: JointUnit, sign: int, angle_rad: float) -> None:
-    scale = JointScale(unit, -1.0, 2.0, sign, 0.25)
-    assert scale.to_rad(scale.from_rad(angle_rad)) == pytest.approx(angle_rad)
+    scale = scale_of_unit(unit, -1.0, 2.0, sign, 0.25)
+    assert scale.joint(scale.of(angle_rad)) == pytest.approx(angle_rad)
 
 
 @pytest.mark.parametrize(
     ("scale", "value", "angle_rad"),
     [
-        (JointScale(JointUnit.DEG, -2, 2), 90.0, 1.5707963),
-        (JointScale(JointUnit.DEG, -2, 2, -1, 0.5), 90.0, -1.0707963),
-        (JointScale(JointUnit.RAD, -2, 2, -1), 0.5, -0.5),
-        (JointScale(JointUnit.PERCENT, -0.5, 1.5), 0.0, -0.5),
-        (JointScale(JointUnit.PERCENT, -0.5, 1.5), 75.0, 1.0),
-        (JointScale(JointUnit.PERCENT, -0.5, 1.5, -1), 100.0, -0.5),
-        (JointScale(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 0.0, 1.0),
-        (JointScale(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 100.0, 3.0),
+        (scale_of_unit(JointUnit.DEG, -2, 2), 90.0, 1.5707963),
+        (scale_of_unit(JointUnit.DEG, -2, 2, -1, 0.5), 90.0, -1.0707963),
+        (scale_of_unit(JointUnit.RAD, -2, 2, -1), 0.5, -0.5),
+        (scale_of_unit(JointUnit.PERCENT, -0.5, 1.5), 0.0, -0.5),
+        (scale_of_unit(JointUnit.PERCENT, -0.5, 1.5), 75.0, 1.0),
+        (scale_of_unit(JointUnit.PERCENT, -0.5, 1.5, -1), 100.0, -0.5),
+        (scale_of_unit(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 0.0, 1.0),
+        (scale_of_unit(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 100.0, 3.0),
         (
-            JointScale(JointUnit.PERCENT, 0.0, 1.0),
+            scale_of_unit(JointUnit.PERCENT, 0.0, 1.0),
             110.0,
             1.1,
         ),  # beyond its range is told, not hidden
     ],
 )
-def test_units_mean_what_they_say(scale: JointScale, value: float, angle_rad: float) -> None:
-    assert scale.to_rad(value) == pytest.approx(angle_rad)
+def test_units_mean_what_they_say(scale: Scale, value: float, angle_rad: float) -> None:
+    assert scale.joint(value) == pytest.approx(angle_rad)

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from tests.runner.small_robots import moving
-from vram_arbiter.runner.protocols import Hal, RobotDescription
+from vram_arbiter.runner.protocols import RobotDescription
+from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.so101_kinematics import So101Kinematics, kinematics_for
 from vram_arbiter.runner.safety.gate import RobotGate
@@ -20,13 +21,13 @@ pytestmark = pytest.mark.heavy
 
 
 @pytest.fixture
-def hal(clock: Any) -> Hal:
+def hal(clock: Any) -> HalBase:
     made = make_hal(HalConfig(adapter="so101_mujoco"), clock=clock)
     made.connect()
     return made
 
 
-def gate_of(hal: Hal, **envelope: Any) -> RobotGate:
+def gate_of(hal: HalBase, **envelope: Any) -> RobotGate:
     safety = SafetyEnvelope(**envelope)
     kinematics = kinematics_for(hal.description)
     return RobotGate(
@@ -35,7 +36,7 @@ def gate_of(hal: Hal, **envelope: Any) -> RobotGate:
 
 
 def drive(
-    hal: Hal, gate: RobotGate, clock: Any, ticks: int, wanted: dict[str, float]
+    hal: HalBase, gate: RobotGate, clock: Any, ticks: int, wanted: dict[str, float]
 ) -> tuple[list[tuple[str, ...]], list[dict[str, float]]]:
     """A policy that always wants the same pose, a little nearer each tick, as a chunk of steps
     would have it.
@@ -78,14 +79,14 @@ def test_only_robots_that_are_known_have_kinematics() -> None:
     assert kinematics_for(RobotDescription("lerobot:hope_jr", (), {})) is None
 
 
-def test_an_allowed_motion_is_followed(hal: Hal, clock: Any) -> None:
+def test_an_allowed_motion_is_followed(hal: HalBase, clock: Any) -> None:
     said, states = drive(hal, gate_of(hal), clock, 60, {"shoulder_pan": 0.6, "gripper": 1.0})
     assert states[-1]["shoulder_pan"] == pytest.approx(0.6, abs=0.03)
     assert states[-1]["gripper"] == pytest.approx(1.0, abs=0.03)
     assert not any("stale" in line for problems in said for line in problems)
 
 
-def test_the_tool_never_leaves_the_workspace(hal: Hal, clock: Any) -> None:
+def test_the_tool_never_leaves_the_workspace(hal: HalBase, clock: Any) -> None:
     arm = So101Kinematics()
     start = arm.points(dict(zip(*(hal.read_state().name, hal.read_state().position), strict=True)))[
         "tool"
@@ -101,7 +102,7 @@ def test_the_tool_never_leaves_the_workspace(hal: Hal, clock: Any) -> None:
     assert start[1] + 0.04 < reached < wall_y + 0.015  # the servo's overshoot
 
 
-def test_the_tool_keeps_its_speed(hal: Hal, clock: Any) -> None:
+def test_the_tool_keeps_its_speed(hal: HalBase, clock: Any) -> None:
     arm = So101Kinematics()
     _, states = drive(hal, gate_of(hal, max_ee_speed_m_s=0.2), clock, 60, {"shoulder_pan": 1.0})
     tools = [arm.points(state)["tool"] for state in states]
@@ -109,7 +110,7 @@ def test_the_tool_keeps_its_speed(hal: Hal, clock: Any) -> None:
     assert max(speeds) / 3 < 0.25  # over three ticks: what a servo's ringing leaves of 0.2 m/s
 
 
-def test_a_table_is_not_pressed_into(hal: Hal, clock: Any) -> None:
+def test_a_table_is_not_pressed_into(hal: HalBase, clock: Any) -> None:
     """The arm goes down onto the table: without kinematics of the table, the torque tells."""
     gate = gate_of(hal, max_torque_nm=1.0)
     efforts = []

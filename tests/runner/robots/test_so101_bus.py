@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.runner.small_robots import moving
-from vram_arbiter.runner.protocols import Hal
+from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.so101 import RANGES_RAD
 from vram_arbiter.schemas.config.robot import HalConfig
@@ -46,7 +46,7 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServoBus]:
 
 
 @pytest.fixture
-def hal(bus: ServoBus, calibrated: Path, clock: Any) -> Iterator[Hal]:
+def hal(bus: ServoBus, calibrated: Path, clock: Any) -> Iterator[HalBase]:
     made = make_hal(config(bus, calibrated), clock=clock)
     made.connect()
     yield made
@@ -73,13 +73,13 @@ def config(bus: ServoBus, folder: Path, **params: Any) -> HalConfig:
     return HalConfig(adapter="lerobot:so101_follower", transport=transport, params=params)
 
 
-def test_the_description_is_the_arms(hal: Hal) -> None:
+def test_the_description_is_the_arms(hal: HalBase) -> None:
     assert hal.description.name == "so101"
     assert not hal.description.simulated
     assert hal.description.joint_names == NAMES
 
 
-def test_angles_are_read_from_the_servos_counts(hal: Hal, bus: ServoBus) -> None:
+def test_angles_are_read_from_the_servos_counts(hal: HalBase, bus: ServoBus) -> None:
     bus.put(1, PRESENT, 2047 + 652)  # a turn has 4096 counts
     bus.put(6, PRESENT, 4095)  # open
     state = hal.read_state()
@@ -89,7 +89,7 @@ def test_angles_are_read_from_the_servos_counts(hal: Hal, bus: ServoBus) -> None
     assert state.position[5] == pytest.approx(RANGES_RAD["gripper"][1])
 
 
-def test_targets_reach_the_servos(hal: Hal, bus: ServoBus) -> None:
+def test_targets_reach_the_servos(hal: HalBase, bus: ServoBus) -> None:
     hal.send_action(moving(elbow_flex=-0.5, gripper=RANGES_RAD["gripper"][0]))
     assert hal.read_state().position[2] == pytest.approx(
         -0.5, abs=0.002
@@ -115,7 +115,7 @@ def test_a_range_that_the_file_narrows_limits_a_joint_and_does_not_stretch_it(
     hal.disconnect()
 
 
-def test_the_stop_holds_and_the_end_lets_go(hal: Hal, bus: ServoBus) -> None:
+def test_the_stop_holds_and_the_end_lets_go(hal: HalBase, bus: ServoBus) -> None:
     hal.send_action(moving(shoulder_pan=0.3))
     with pytest.raises(EstopRequested, match="hold the present pose"):
         hal.estop("test")
@@ -128,7 +128,7 @@ def test_the_stop_holds_and_the_end_lets_go(hal: Hal, bus: ServoBus) -> None:
     assert not any(bus.torque(servo) for servo in range(1, 7))
 
 
-def test_a_cable_that_is_out_is_a_fault(hal: Hal, bus: ServoBus) -> None:
+def test_a_cable_that_is_out_is_a_fault(hal: HalBase, bus: ServoBus) -> None:
     bus.cut()
     with pytest.raises(RobotFault, match="so101 does not answer"):
         hal.read_state()

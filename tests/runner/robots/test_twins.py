@@ -165,11 +165,6 @@ def test_what_no_gate_lets_through_is_not_sent(
     assert positions(hal) == pytest.approx(dict(hal.description.rest_pose_rad), abs=0.02)
 
 
-def test_the_description_needs_no_simulator() -> None:
-    hal = make_hal(HalConfig(adapter="so101_kinematic"))
-    assert hal.description.joint_names[0] == "shoulder_pan"
-
-
 @HEAVY
 def test_the_description_is_that_of_the_published_model() -> None:
     from vram_arbiter.runner.sim.scene import arm_mjcf_path, load_mujoco

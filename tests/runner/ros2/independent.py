@@ -1,17 +1,16 @@
 """An independent participant's side of a ROS 2 action: types and codec of Cyclone DDS alone."""
 
-from dataclasses import dataclass
 from typing import Any
 
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import array, int8, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.idl.types import array, int8, int64, sequence, uint8, uint64
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
+
+from tests.runner.sensors.ros2_node import Time_, struct
 
 QUALITY = Qos(
     Policy.Reliability.Reliable(duration(seconds=10)),
@@ -21,41 +20,29 @@ QUALITY = Qos(
 """ROS 2's of services."""
 
 
-@dataclass
-@final
-class Time_(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
-    sec: int32
-    nanosec: uint32
+UUID_ = struct("unique_identifier_msgs.msg.dds_.UUID_", uuid=array[uint8, 16])
+GoalInfo_ = struct("action_msgs.msg.dds_.GoalInfo_", goal_id=UUID_, stamp=Time_)
+CancelRequest_ = struct(
+    "action_msgs.srv.dds_.CancelGoal_Request_", guid=uint64, seq=int64, goal_info=GoalInfo_
+)
+CancelResponse_ = struct(
+    "action_msgs.srv.dds_.CancelGoal_Response_",
+    guid=uint64,
+    seq=int64,
+    return_code=int8,
+    goals_canceling=sequence[GoalInfo_],
+)
 
 
-@dataclass
-@final
-class UUID_(IdlStruct, typename="unique_identifier_msgs.msg.dds_.UUID_"):
-    uuid: array[uint8, 16]
-
-
-@dataclass
-@final
-class GoalInfo_(IdlStruct, typename="action_msgs.msg.dds_.GoalInfo_"):
-    goal_id: UUID_
-    stamp: Time_
-
-
-@dataclass
-@final
-class CancelRequest_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Request_"):
-    guid: uint64
-    seq: int64
-    goal_info: GoalInfo_
-
-
-@dataclass
-@final
-class CancelResponse_(IdlStruct, typename="action_msgs.srv.dds_.CancelGoal_Response_"):
-    guid: uint64
-    seq: int64
-    return_code: int8
-    goals_canceling: sequence[GoalInfo_]
+def action_of(prefix: str, goal: Any, result: Any) -> tuple[Any, ...]:
+    """Return request and reply of an action's services `send_goal` and `get_result`."""
+    call = {"guid": uint64, "seq": int64}
+    return (
+        struct(prefix + "SendGoal_Request_", **call, goal_id=UUID_, goal=goal),
+        struct(prefix + "SendGoal_Response_", **call, accepted=bool, stamp=Time_),
+        struct(prefix + "GetResult_Request_", **call, goal_id=UUID_),
+        struct(prefix + "GetResult_Response_", **call, status=int8, result=result),
+    )
 
 
 def topics(participant: DomainParticipant, path: str, request: type, response: type) -> list[Topic]:

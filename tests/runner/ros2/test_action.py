@@ -23,111 +23,34 @@ pytestmark = [pytest.mark.heavy, pytest.mark.anyio]
 pytest.importorskip("cyclonedds")
 
 from cyclonedds.domain import DomainParticipant  # noqa: E402
-from cyclonedds.idl import IdlStruct  # noqa: E402
-from cyclonedds.idl.annotations import final  # noqa: E402
-from cyclonedds.idl.types import float64, int8, int64, uint16, uint64  # noqa: E402
+from cyclonedds.idl.types import float64, uint16  # noqa: E402
 
 from tests.runner.ros2.independent import (  # noqa: E402
-    UUID_,
     CancelRequest_,
     CancelResponse_,
     Time_,
+    action_of,
     server_of,
+    struct,
     valid,
 )
 
 DOMAIN = 80
+PREFIX = "nav2_msgs.action.dds_.NavigateToPose_"
 WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
 PATIENCE_S = 60.0
 
 
-@dataclass
-@final
-class Header_(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    stamp: Time_
-    frame_id: str
-
-
-@dataclass
-@final
-class Point_(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-@final
-class Quaternion_(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-
-@dataclass
-@final
-class Pose_(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
-    position: Point_
-    orientation: Quaternion_
-
-
-@dataclass
-@final
-class PoseStamped_(IdlStruct, typename="geometry_msgs.msg.dds_.PoseStamped_"):
-    header: Header_
-    pose: Pose_
-
-
-@dataclass
-@final
-class Goal_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_Goal_"):
-    pose: PoseStamped_
-    behavior_tree: str
-
-
-@dataclass
-@final
-class Result_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_Result_"):
-    error_code: uint16
-    error_msg: str
-
-
-@dataclass
-@final
-class SendRequest_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_SendGoal_Request_"):
-    guid: uint64
-    seq: int64
-    goal_id: UUID_
-    goal: Goal_
-
-
-@dataclass
-@final
-class SendResponse_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_SendGoal_Response_"):
-    guid: uint64
-    seq: int64
-    accepted: bool
-    stamp: Time_
-
-
-@dataclass
-@final
-class ResultRequest_(IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_GetResult_Request_"):
-    guid: uint64
-    seq: int64
-    goal_id: UUID_
-
-
-@dataclass
-@final
-class ResultResponse_(
-    IdlStruct, typename="nav2_msgs.action.dds_.NavigateToPose_GetResult_Response_"
-):
-    guid: uint64
-    seq: int64
-    status: int8
-    result: Result_
+Header_ = struct("std_msgs.msg.dds_.Header_", stamp=Time_, frame_id=str)
+Point_ = struct("geometry_msgs.msg.dds_.Point_", x=float64, y=float64, z=float64)
+Quaternion_ = struct(
+    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
+)
+Pose_ = struct("geometry_msgs.msg.dds_.Pose_", position=Point_, orientation=Quaternion_)
+PoseStamped_ = struct("geometry_msgs.msg.dds_.PoseStamped_", header=Header_, pose=Pose_)
+Goal_ = struct("nav2_msgs.action.dds_.NavigateToPose_Goal_", pose=PoseStamped_, behavior_tree=str)
+Result_ = struct("nav2_msgs.action.dds_.NavigateToPose_Result_", error_code=uint16, error_msg=str)
+SendRequest_, SendResponse_, ResultRequest_, ResultResponse_ = action_of(PREFIX, Goal_, Result_)
 
 
 @dataclass

@@ -6,7 +6,6 @@ import asyncio
 import uuid
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +23,12 @@ pytest.importorskip("cyclonedds")
 
 from cyclonedds.core import Policy, Qos  # noqa: E402
 from cyclonedds.domain import DomainParticipant  # noqa: E402
-from cyclonedds.idl import IdlStruct  # noqa: E402
-from cyclonedds.idl.annotations import final  # noqa: E402
 from cyclonedds.idl.types import (  # noqa: E402
     float32,
     float64,
     int8,
-    int64,
     sequence,
     uint32,
-    uint64,
 )
 from cyclonedds.sub import DataReader  # noqa: E402
 from cyclonedds.topic import Topic  # noqa: E402
@@ -46,7 +41,9 @@ from tests.runner.ros2.independent import (  # noqa: E402
     CancelResponse_,
     GoalInfo_,
     Time_,
+    action_of,
     client_of,
+    struct,
     valid,
 )
 
@@ -61,87 +58,25 @@ LATCHED = Qos(
 PREFIX = "openral_msgs.action.dds_.ExecuteRskill_"
 
 
-@dataclass
-@final
-class Goal_(IdlStruct, typename=PREFIX + "Goal_"):
-    rskill_id: str
-    revision: str
-    prompt: str
-    prompt_metadata_json: str
-    goal_params_json: str
-    deadline_s: float64
-
-
-@dataclass
-@final
-class Result_(IdlStruct, typename=PREFIX + "Result_"):
-    success: bool
-    failure_reason: str
-    trace_id: str
-
-
-@dataclass
-@final
-class Feedback_(IdlStruct, typename=PREFIX + "Feedback_"):
-    progress: float32
-    state: str
-    chunk_index: uint32
-    chunks_total: uint32
-
-
-@dataclass
-@final
-class FeedbackMessage_(IdlStruct, typename=PREFIX + "FeedbackMessage_"):
-    goal_id: UUID_
-    feedback: Feedback_
-
-
-@dataclass
-@final
-class SendRequest_(IdlStruct, typename=PREFIX + "SendGoal_Request_"):
-    guid: uint64
-    seq: int64
-    goal_id: UUID_
-    goal: Goal_
-
-
-@dataclass
-@final
-class SendResponse_(IdlStruct, typename=PREFIX + "SendGoal_Response_"):
-    guid: uint64
-    seq: int64
-    accepted: bool
-    stamp: Time_
-
-
-@dataclass
-@final
-class ResultRequest_(IdlStruct, typename=PREFIX + "GetResult_Request_"):
-    guid: uint64
-    seq: int64
-    goal_id: UUID_
-
-
-@dataclass
-@final
-class ResultResponse_(IdlStruct, typename=PREFIX + "GetResult_Response_"):
-    guid: uint64
-    seq: int64
-    status: int8
-    result: Result_
-
-
-@dataclass
-@final
-class GoalStatus_(IdlStruct, typename="action_msgs.msg.dds_.GoalStatus_"):
-    goal_info: GoalInfo_
-    status: int8
-
-
-@dataclass
-@final
-class GoalStatusArray_(IdlStruct, typename="action_msgs.msg.dds_.GoalStatusArray_"):
-    status_list: sequence[GoalStatus_]
+Goal_ = struct(
+    PREFIX + "Goal_",
+    rskill_id=str,
+    revision=str,
+    prompt=str,
+    prompt_metadata_json=str,
+    goal_params_json=str,
+    deadline_s=float64,
+)
+Result_ = struct(PREFIX + "Result_", success=bool, failure_reason=str, trace_id=str)
+Feedback_ = struct(
+    PREFIX + "Feedback_", progress=float32, state=str, chunk_index=uint32, chunks_total=uint32
+)
+FeedbackMessage_ = struct(PREFIX + "FeedbackMessage_", goal_id=UUID_, feedback=Feedback_)
+SendRequest_, SendResponse_, ResultRequest_, ResultResponse_ = action_of(PREFIX, Goal_, Result_)
+GoalStatus_ = struct("action_msgs.msg.dds_.GoalStatus_", goal_info=GoalInfo_, status=int8)
+GoalStatusArray_ = struct(
+    "action_msgs.msg.dds_.GoalStatusArray_", status_list=sequence[GoalStatus_]
+)
 
 
 class Commander:

@@ -2,110 +2,76 @@
 codec of Cyclone DDS alone, fields of control_msgs as of ROS 2 Jazzy.
 """
 
-from dataclasses import dataclass
-
 import pytest
 
 pytestmark = pytest.mark.heavy
 pytest.importorskip("cyclonedds")
 
-from cyclonedds.idl import IdlStruct  # noqa: E402
-from cyclonedds.idl.annotations import final  # noqa: E402
 from cyclonedds.idl.types import float64, int32, sequence, uint16, uint32  # noqa: E402
 
-from tests.runner.ros2.independent import Time_  # noqa: E402
+from tests.runner.ros2.independent import Time_, struct  # noqa: E402
 from vram_arbiter.runner.ros2.messages import read, write  # noqa: E402
 
 KIND = "control_msgs/FollowJointTrajectory_"
 
 
-@dataclass
-@final
-class Duration_(IdlStruct, typename="builtin_interfaces.msg.dds_.Duration_"):
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-@final
-class Stamped_(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    stamp: Time_
-    frame_id: str
-
-
-@dataclass
-@final
-class Point_(IdlStruct, typename="trajectory_msgs.msg.dds_.JointTrajectoryPoint_"):
-    positions: sequence[float64]
-    velocities: sequence[float64]
-    accelerations: sequence[float64]
-    effort: sequence[float64]
-    time_from_start: Duration_
-
-
-@dataclass
-@final
-class Trajectory_(IdlStruct, typename="trajectory_msgs.msg.dds_.JointTrajectory_"):
-    header: Stamped_
-    joint_names: sequence[str]
-    points: sequence[Point_]
-
-
-@dataclass
-@final
-class MultiPoint_(IdlStruct, typename="trajectory_msgs.msg.dds_.MultiDOFJointTrajectoryPoint_"):
-    """Only ever empty here; its transforms and twists are told as numbers."""
-
-    transforms: sequence[float64]
-    velocities: sequence[float64]
-    accelerations: sequence[float64]
-    time_from_start: Duration_
-
-
-@dataclass
-@final
-class MultiTrajectory_(IdlStruct, typename="trajectory_msgs.msg.dds_.MultiDOFJointTrajectory_"):
-    header: Stamped_
-    joint_names: sequence[str]
-    points: sequence[MultiPoint_]
-
-
-@dataclass
-@final
-class Tolerance_(IdlStruct, typename="control_msgs.msg.dds_.JointTolerance_"):
-    name: str
-    position: float64
-    velocity: float64
-    acceleration: float64
-
-
-@dataclass
-@final
-class Component_(IdlStruct, typename="control_msgs.msg.dds_.JointComponentTolerance_"):
-    joint_name: str
-    component: uint16
-    position: float64
-    velocity: float64
-    acceleration: float64
-
-
-@dataclass
-@final
-class Goal_(IdlStruct, typename="control_msgs.action.dds_.FollowJointTrajectory_Goal_"):
-    trajectory: Trajectory_
-    multi_dof_trajectory: MultiTrajectory_
-    path_tolerance: sequence[Tolerance_]
-    component_path_tolerance: sequence[Component_]
-    goal_tolerance: sequence[Tolerance_]
-    component_goal_tolerance: sequence[Component_]
-    goal_time_tolerance: Duration_
-
-
-@dataclass
-@final
-class Result_(IdlStruct, typename="control_msgs.action.dds_.FollowJointTrajectory_Result_"):
-    error_code: int32
-    error_string: str
+Duration_ = struct("builtin_interfaces.msg.dds_.Duration_", sec=int32, nanosec=uint32)
+Stamped_ = struct("std_msgs.msg.dds_.Header_", stamp=Time_, frame_id=str)
+Point_ = struct(
+    "trajectory_msgs.msg.dds_.JointTrajectoryPoint_",
+    positions=sequence[float64],
+    velocities=sequence[float64],
+    accelerations=sequence[float64],
+    effort=sequence[float64],
+    time_from_start=Duration_,
+)
+Trajectory_ = struct(
+    "trajectory_msgs.msg.dds_.JointTrajectory_",
+    header=Stamped_,
+    joint_names=sequence[str],
+    points=sequence[Point_],
+)
+MultiPoint_ = struct(
+    "trajectory_msgs.msg.dds_.MultiDOFJointTrajectoryPoint_",
+    transforms=sequence[float64],
+    velocities=sequence[float64],
+    accelerations=sequence[float64],
+    time_from_start=Duration_,
+)
+MultiTrajectory_ = struct(
+    "trajectory_msgs.msg.dds_.MultiDOFJointTrajectory_",
+    header=Stamped_,
+    joint_names=sequence[str],
+    points=sequence[MultiPoint_],
+)
+Tolerance_ = struct(
+    "control_msgs.msg.dds_.JointTolerance_",
+    name=str,
+    position=float64,
+    velocity=float64,
+    acceleration=float64,
+)
+Component_ = struct(
+    "control_msgs.msg.dds_.JointComponentTolerance_",
+    joint_name=str,
+    component=uint16,
+    position=float64,
+    velocity=float64,
+    acceleration=float64,
+)
+Goal_ = struct(
+    "control_msgs.action.dds_.FollowJointTrajectory_Goal_",
+    trajectory=Trajectory_,
+    multi_dof_trajectory=MultiTrajectory_,
+    path_tolerance=sequence[Tolerance_],
+    component_path_tolerance=sequence[Component_],
+    goal_tolerance=sequence[Tolerance_],
+    component_goal_tolerance=sequence[Component_],
+    goal_time_tolerance=Duration_,
+)
+Result_ = struct(
+    "control_msgs.action.dds_.FollowJointTrajectory_Result_", error_code=int32, error_string=str
+)
 
 
 def test_another_codec_reads_a_goal_and_writes_one_that_is_read() -> None:

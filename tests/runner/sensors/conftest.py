@@ -1,12 +1,12 @@
 """Real sources of pictures for the readers: video files, and a server of RTSP on loopback."""
 
+import contextlib
 import socket
 import struct
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -38,66 +38,82 @@ def make_video(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-class Server(ABC):
-    """Accepts connections one after another on loopback and gives each to `serve`, until it is
-    closed.
+class RtspServer(ABC):
+    """A small RTSP server on loopback: one client after another, packets inside the connection (what
+    a firewall-friendly camera does). `media` are the SDP's lines of its stream, the port is 0. With
+    a password every client is refused.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, media: str, password: str = "") -> None:
+        self.media, self.password = media, password
+        self.closing = False
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._socket.getsockname()[1]
-        self.connections: list[socket.socket] = []
-        self.requests: list[str] = []
-        self._closing = False
+        self._connection: socket.socket | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def _run(self) -> None:
-        while True:
-            try:
-                connection = self._socket.accept()[0]
-            except OSError:
-                return
-            if self._closing:
-                connection.close()
-                return
-            self.connections.append(connection)
-            with connection:
-                try:
-                    self.serve(connection)
-                except OSError:
-                    pass  # the reader went away, or the test cut the line
-
     @abstractmethod
-    def serve(self, connection: socket.socket) -> None:
-        """Talk to one client; returning ends its connection."""
+    def play(self, connection: socket.socket) -> None:
+        """Send the stream; returning ends the connection."""
 
-    def request(self, stream: Any) -> str:
-        """The head of the next request."""
-        head = ""
-        while (line := stream.readline().decode()) not in ("\r\n", ""):
-            head += line
-        self.requests.append(head)
-        return head
+    def cut(self) -> None:
+        """Pull the plug of the client that looks."""
+        if self._connection is not None:
+            with contextlib.suppress(OSError):
+                self._connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        self._closing = True
-        for connection in self.connections:
-            try:
-                connection.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass
-        try:
+        self.closing = True
+        self.cut()
+        with contextlib.suppress(OSError):
             socket.create_connection(("127.0.0.1", self.port), 5).close()  # wakes `accept`
-        except OSError:
-            pass
         self._socket.close()
         self._thread.join(30)
 
+    def _run(self) -> None:
+        while not self.closing:
+            try:
+                self._connection = self._socket.accept()[0]
+            except OSError:
+                return
+            with self._connection, contextlib.suppress(OSError):  # a client that goes away
+                self._serve(self._connection)
 
-class RtspServer(Server):
-    """A small RTSP server: one transport stream, in RTP packets inside the RTSP connection (what a
-    firewall-friendly camera does).
+    def _serve(self, connection: socket.socket) -> None:
+        with connection.makefile("rb") as stream:
+            while not self.closing:
+                head = ""
+                while (line := stream.readline().decode()) not in ("\r\n", ""):
+                    head += line
+                if not head:
+                    return
+                method = head.split(" ", 1)[0]
+                number = next(line for line in head.splitlines() if line.lower().startswith("cseq"))
+                connection.sendall(self._answer(method, number, "Authorization:" in head).encode())
+                if method == "PLAY" and not self.password:
+                    self.play(connection)
+                    return
+
+    def _answer(self, method: str, number: str, authorized: bool) -> str:
+        if self.password:
+            asked = 'WWW-Authenticate: Basic realm="camera"\r\n'
+            status, more = ("403 Forbidden", "") if authorized else ("401 Unauthorized", asked)
+            return f"RTSP/1.0 {status}\r\n{number}\r\n{more}\r\n"
+        body = ""
+        if method == "DESCRIBE":
+            body = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=test\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\n"
+            body += f"m=video 0 RTP/AVP {self.media}\r\na=control:track0\r\n"
+        more = {
+            "OPTIONS": "Public: OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN\r\n",
+            "DESCRIBE": f"Content-Type: application/sdp\r\nContent-Length: {len(body)}\r\n",
+            "SETUP": "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n",
+        }.get(method, "Session: 1\r\n")
+        return f"RTSP/1.0 200 OK\r\n{number}\r\n{more}\r\n{body}"
+
+
+class FilmServer(RtspServer):
+    """Sends one MPEG transport stream.
 
     Each play sends the whole stream again, at once, then waits until it is cut or the client
     leaves. With `hold`, it keeps back the second half until that is set: a network that stands
@@ -107,34 +123,9 @@ class RtspServer(Server):
     def __init__(self, stream: bytes) -> None:
         self.stream = stream
         self.played = 0
-        self.cut = threading.Event()
+        self.over = threading.Event()
         self.hold: threading.Event | None = None
-        super().__init__()
-
-    def serve(self, connection: socket.socket) -> None:
-        with connection.makefile("rb") as stream:
-            while head := self.request(stream):
-                method = head.split(" ", 1)[0]
-                number = next(line for line in head.splitlines() if line.lower().startswith("cseq"))
-                more, body = "", ""
-                if method == "OPTIONS":
-                    more = "Public: OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN\r\n"
-                elif method == "DESCRIBE":
-                    body = (
-                        "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=test\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\n"
-                        "m=video 0 RTP/AVP 33\r\na=control:track0\r\n"
-                    )
-                    more = f"Content-Type: application/sdp\r\nContent-Length: {len(body)}\r\n"
-                elif method == "SETUP":
-                    more = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n"
-                elif method in ("PLAY", "TEARDOWN"):
-                    more = "Session: 1\r\n"
-                connection.sendall(f"RTSP/1.0 200 OK\r\n{number}\r\n{more}\r\n{body}".encode())
-                if method == "PLAY":
-                    self.play(connection)
-                    return
-                if method == "TEARDOWN":
-                    return
+        super().__init__("33")
 
     def play(self, connection: socket.socket) -> None:
         self.played += 1
@@ -144,24 +135,24 @@ class RtspServer(Server):
             payload = self.stream[at : at + 7 * PACKET]
             packet = struct.pack(">BBHII", 0x80, 33, sequence & 0xFFFF, sequence * 900, 1) + payload
             connection.sendall(struct.pack(">BBH", 0x24, 0, len(packet)) + packet)
-        self.cut.wait(60)
-        if not self._closing:
-            self.cut.clear()
+        self.over.wait(60)
+        if not self.closing:
+            self.over.clear()
 
     def close(self) -> None:
-        self._closing = True
-        self.cut.set()
+        self.closing = True
+        self.over.set()
         if self.hold is not None:
             self.hold.set()
         super().close()
 
 
 @pytest.fixture
-def make_rtsp() -> Iterator[Callable[[bytes], RtspServer]]:
-    made: list[RtspServer] = []
+def make_rtsp() -> Iterator[Callable[[bytes], FilmServer]]:
+    made: list[FilmServer] = []
 
-    def make(stream: bytes) -> RtspServer:
-        made.append(RtspServer(stream))
+    def make(stream: bytes) -> FilmServer:
+        made.append(FilmServer(stream))
         return made[-1]
 
     yield make

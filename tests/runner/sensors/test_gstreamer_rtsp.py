@@ -2,14 +2,13 @@
 RTP packets.
 """
 
-import contextlib
 import socket
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.runner.sensors.conftest import RtspServer
 from tests.runner.sensors.reading import CLOCK, end_of, frame_of
 from vram_arbiter.runner.sensors.factory import make_reader
 from vram_arbiter.runner.sensors.slot import SlotReader
@@ -26,78 +25,15 @@ SIZE = (96, 64)
 FORMATS = {"h264": "96 H264/90000", "mjpeg": "26 JPEG/90000"}
 
 
-class NetworkCamera:
-    """A small RTSP server on loopback: one client after another, RTP inside the connection, an
-    unending stream by `source`.
-    """
+class NetworkCamera(RtspServer):
+    """An unending stream of RTP packets by the GStreamer elements `source`."""
 
     def __init__(self, codec: str, source: str, password: str = "") -> None:
-        self.codec, self.source, self.password = codec, source, password
-        self._socket = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._socket.getsockname()[1]
-        self._connection: socket.socket | None = None
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+        self.source = source
+        number = FORMATS[codec].split(" ")[0]
+        super().__init__(f"{number}\r\na=rtpmap:{FORMATS[codec]}", password)
 
-    def cut(self) -> None:
-        """Pull the plug of whoever looks."""
-        if self._connection is not None:
-            with contextlib.suppress(OSError):
-                self._connection.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        self._closing.set()
-        self.cut()
-        with contextlib.suppress(OSError):
-            socket.create_connection(("127.0.0.1", self.port), 5).close()  # wakes `accept`
-        self._thread.join(30)
-        self._socket.close()
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            self._connection = self._socket.accept()[0]
-            with self._connection, contextlib.suppress(OSError):  # a client that goes away
-                self._serve(self._connection)
-
-    def _serve(self, connection: socket.socket) -> None:
-        with connection.makefile("rb") as stream:
-            while not self._closing.is_set():
-                head = b""
-                while (line := stream.readline()) not in (b"\r\n", b""):
-                    head += line
-                if not head:
-                    return
-                lines = head.decode().splitlines()
-                method = lines[0].split(" ", 1)[0]
-                sequence = next(line for line in lines if line.lower().startswith("cseq"))
-                if self.password and "Authorization:" not in head.decode():
-                    answer = (
-                        f"RTSP/1.0 401 Unauthorized\r\n{sequence}\r\nWWW-Authenticate: Basic "
-                        'realm="camera"\r\n\r\n'
-                    )
-                elif self.password:
-                    answer = f"RTSP/1.0 403 Forbidden\r\n{sequence}\r\n\r\n"
-                else:
-                    answer = f"RTSP/1.0 200 OK\r\n{sequence}\r\n{self._answer(method)}"
-                connection.sendall(answer.encode())
-                if method == "PLAY":
-                    self._play(connection)
-
-    def _answer(self, method: str) -> str:
-        number = FORMATS[self.codec].split(" ")[0]
-        body = (
-            "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=test\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\n"
-            f"m=video 0 RTP/AVP {number}\r\na=rtpmap:{FORMATS[self.codec]}\r\na=control:track0\r\n"
-        )
-        return {
-            "OPTIONS": "Public: OPTIONS, DESCRIBE, SETUP, PLAY, TEARDOWN\r\n\r\n",
-            "DESCRIBE": "Content-Type: application/sdp\r\nContent-Length: "
-            f"{len(body)}\r\n\r\n{body}",
-            "SETUP": "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n\r\n",
-        }.get(method, "Session: 1\r\n\r\n")
-
-    def _play(self, connection: socket.socket) -> None:
+    def play(self, connection: socket.socket) -> None:
         from vram_arbiter.runner.sensors.gstreamer import load
 
         gst = load().gst
@@ -105,7 +41,7 @@ class NetworkCamera:
         sink = pipeline.get_by_name("out")
         pipeline.set_state(gst.State.PLAYING)
         try:
-            while not self._closing.is_set():
+            while not self.closing:
                 sample = sink.try_pull_sample(50_000_000)
                 if sample is None:
                     if sink.is_eos():

@@ -171,7 +171,7 @@ def test_a_stream_that_breaks_off_is_opened_again_and_given_up_in_the_end(
     deadline_ns = SystemClock().now_ns() + 60 * 10**9
     assert grey(reader.read_synced(deadline_ns)) == pytest.approx(96, abs=8)
     before = len(shelf.frames)
-    server.cut.set()
+    server.over.set()
     while server.played < 2 or len(shelf.frames) <= before:
         reader.read_synced(deadline_ns)  # waits through the interruption
     server.close()
@@ -208,7 +208,7 @@ def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
     begun_ns = clock.now_ns()
     clock.shift_ns = 100 * 10**9  # the network stands still for a hundred seconds
     server.hold.set()
-    server.cut.set()
+    server.over.set()
     wait_for_end(reader)
     late = shelf.frames[-1]
     age_s = (clock.now_ns() - late.stamp_monotonic_ns) / 1e9

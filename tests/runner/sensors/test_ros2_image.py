@@ -1,12 +1,9 @@
-"""ROS 2 pictures over DDS on loopback: a publisher and a subscriber in processes of their own,
-which know nothing of the product.
+"""ROS 2 pictures over DDS on loopback: a publisher and a subscriber that know nothing of the
+product.
 """
 
-import base64
-import json
 import logging
 import os
-import signal
 import subprocess
 import sys
 import uuid
@@ -34,49 +31,13 @@ from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError, FrameStale
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
-pytestmark = pytest.mark.heavy  # Cyclone DDS
+pytestmark = pytest.mark.heavy
+pytest.importorskip("cyclonedds")
+
+from tests.runner.sensors.ros2_node import Node  # noqa: E402
 
 DOMAIN = "77"
 Reading = Callable[[SlotReader], SlotReader]
-
-
-class Node:
-    """The other process. `tell` sends it a line, `told` waits for one of its."""
-
-    def __init__(
-        self, what: str, topic: str, message: str, reliability: str, network: str = NETWORK
-    ) -> None:
-        script = Path(__file__).with_name("ros2_node.py")
-        self.process = subprocess.Popen(
-            [sys.executable, str(script), what, topic, message, reliability],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, "CYCLONEDDS_URI": network},
-            text=True,
-        )
-        assert self.told() == {"ready": True}
-
-    def tell(self, **line: Any) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(line) + "\n")
-        self.process.stdin.flush()
-
-    def told(self) -> Any:
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, f"the node ended with {self.process.wait(30)}"
-        return json.loads(line)
-
-    def publish(self, data: bytes, stamp_ns: int | None = None, **fields: Any) -> None:
-        stamp_ns = SystemClock().wall_ns() if stamp_ns is None else stamp_ns
-        self.tell(stamp=divmod(stamp_ns, 10**9), data=base64.b64encode(data).decode(), **fields)
-        assert self.told() == {"sent": True}
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            assert self.process.stdin is not None
-            self.process.stdin.close()
-            self.process.wait(30)
 
 
 @pytest.fixture(autouse=True)
@@ -94,14 +55,8 @@ def topic() -> str:
 def node() -> Iterator[Callable[..., Node]]:
     made: list[Node] = []
 
-    def make(
-        what: str,
-        topic: str,
-        message: str = "image",
-        reliability: str = "best_effort",
-        network: str = NETWORK,
-    ) -> Node:
-        made.append(Node(what, topic, message, reliability, network))
+    def make(topic: str, message: str = "image", reliability: str = "best_effort") -> Node:
+        made.append(Node(int(DOMAIN), topic, message, reliability).offer())
         return made[-1]
 
     yield make
@@ -136,7 +91,7 @@ def picture_now(reader: SlotReader, publisher: Node, data: bytes, **fields: Any)
     """Publish until this picture is the newest: best effort repeats nothing. At most a minute."""
     slot = reader.slot
     for _ in range(300):
-        publisher.publish(data, **fields)
+        publisher.publish(data, **{"stamp_ns": SystemClock().wall_ns(), **fields})
         with slot._changed:
             if slot._changed.wait_for(
                 lambda: slot._frame is not None and slot._frame.data == data, 0.2
@@ -156,11 +111,11 @@ def why_stale(reader: SlotReader, word: str) -> str:
 
 
 @pytest.mark.parametrize("reliability", ["best_effort", "reliable"])
-def test_pictures_of_another_process_arrive(
+def test_pictures_of_another_node_arrive(
     topic: str, node: Callable[..., Node], reading: Reading, reliability: str
 ) -> None:
     reader = reading(reader_of(topic, reliability=reliability))
-    publisher = node("publish", topic, "image", "reliable")
+    publisher = node(topic, "image", "reliable")
     data = os.urandom(64 * 48 * 3)
     before_ns = SystemClock().wall_ns()
     frame = picture_now(reader, publisher, data, **image(64, 48))
@@ -182,7 +137,7 @@ def test_a_reader_waits_for_its_publisher_and_says_so(
         reader.read_latest()
     assert stale.value.details["absent"]
     until(lambda: f"camera front reads {topic}" in caplog.text)
-    publisher = node("publish", topic)
+    publisher = node(topic)
     assert picture_now(reader, publisher, bytes(12), **image(2, 2)).height == 2
     assert f"camera front has a publisher on {topic}" in caplog.text
     assert caplog.text.count("has a publisher") == 1
@@ -192,7 +147,7 @@ def test_a_picture_larger_than_a_datagram_arrives_whole(
     topic: str, node: Callable[..., Node], reading: Reading
 ) -> None:
     reader = reading(reader_of(topic, reliability="reliable"))
-    publisher = node("publish", topic, "image", "reliable")
+    publisher = node(topic, "image", "reliable")
     data = os.urandom(640 * 480 * 3)
     assert picture_now(reader, publisher, data, **image(640, 480, "bgr8")).data == data
 
@@ -203,7 +158,7 @@ def test_jpeg_pictures(topic: str, node: Callable[..., Node], reading: Reading) 
 
     data = bytes(cv2.imencode(".jpg", np.full((48, 64, 3), 90, dtype=np.uint8))[1])
     reader = reading(reader_of(topic + "/compressed", message="compressed"))
-    publisher = node("publish", topic + "/compressed", "compressed")
+    publisher = node(topic + "/compressed", "compressed")
     frame = picture_now(reader, publisher, data, format="jpeg")
     assert (frame.encoding, frame.width, frame.height, frame.channels) == ("jpeg", 64, 48, 3)
     assert frame.data == data
@@ -213,7 +168,7 @@ def test_age_counts_from_the_header(
     topic: str, node: Callable[..., Node], reading: Reading
 ) -> None:
     reader = reading(reader_of(topic, max_age_ms=1_000.0, reliability="reliable"))
-    publisher = node("publish", topic, "image", "reliable")
+    publisher = node(topic, "image", "reliable")
     old_ns = (
         SystemClock().wall_ns() - 30 * 10**9
     )  # a machine that has just been started has no longer past
@@ -234,7 +189,7 @@ def test_age_can_count_from_the_arrival(
     topic: str, node: Callable[..., Node], reading: Reading
 ) -> None:
     reader = reading(reader_of(topic, stamp="arrival"))
-    publisher = node("publish", topic)
+    publisher = node(topic)
     frame = picture_now(
         reader, publisher, bytes(12), stamp_ns=1, **image(2, 2)
     )  # a clock that begins with the machine
@@ -245,12 +200,12 @@ def test_a_picture_that_cannot_be_used_is_not_shown(
     topic: str, node: Callable[..., Node], reading: Reading
 ) -> None:
     reader = reading(reader_of(topic, reliability="reliable"))
-    publisher = node("publish", topic, "image", "reliable")
+    publisher = node(topic, "image", "reliable")
     picture_now(reader, publisher, bytes(12), **image(2, 2))
-    publisher.publish(bytes(4), **image(2, 2, "bayer_rggb8", 1))
+    publisher.publish(bytes(4), SystemClock().wall_ns(), **image(2, 2, "bayer_rggb8", 1))
     assert "'bayer_rggb8' is not supported" in why_stale(reader, "bayer")
     picture_now(reader, publisher, bytes(12), **image(2, 2))
-    publisher.publish(bytes(11), **image(2, 2))
+    publisher.publish(bytes(11), SystemClock().wall_ns(), **image(2, 2))
     assert "in 11 bytes" in why_stale(reader, "11 bytes")
     assert picture_now(reader, publisher, bytes(12), **image(2, 2)).width == 2
 
@@ -259,11 +214,11 @@ def test_a_publisher_that_leaves_takes_its_picture_with_it(
     topic: str, node: Callable[..., Node], reading: Reading
 ) -> None:
     reader = reading(reader_of(topic))
-    publisher = node("publish", topic)
+    publisher = node(topic)
     picture_now(reader, publisher, bytes(12), **image(2, 2))
     publisher.close()
     assert f"{topic} has no publisher any more" in why_stale(reader, "no publisher")
-    other = node("publish", topic)
+    other = node(topic)
     assert picture_now(reader, other, bytes(12), **image(2, 2)).height == 2
 
 
@@ -312,23 +267,11 @@ def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: 
     assert slot._frame is None
 
 
-def test_a_killed_publisher_is_noticed_too(
-    topic: str, node: Callable[..., Node], reading: Reading
-) -> None:
-    reader = reading(reader_of(topic))
-    brief = NETWORK.replace("<Discovery>", "<Discovery><LeaseDuration>1s</LeaseDuration>")
-    publisher = node("publish", topic, network=brief)
-    picture_now(reader, publisher, bytes(12), **image(2, 2))
-    publisher.process.send_signal(signal.SIGKILL)
-    publisher.process.wait(30)
-    assert "has no publisher" in why_stale(reader, "no publisher")  # when its lease in DDS is over
-
-
 def test_a_publisher_with_another_quality_of_service_is_named(
     topic: str, node: Callable[..., Node], reading: Reading
 ) -> None:
     reader = reading(reader_of(topic, reliability="reliable"))
-    node("publish", topic, "image", "best_effort")
+    node(topic, "image", "best_effort")
     assert "set reliability: best_effort" in why_stale(reader, "best_effort")
 
 
@@ -336,7 +279,7 @@ def test_stopping_ends_the_thread_and_starting_begins_anew(
     topic: str, node: Callable[..., Node]
 ) -> None:
     reader = reader_of(topic)
-    publisher = node("publish", topic)
+    publisher = node(topic)
     for _ in range(2):
         reader.start()
         assert isinstance(reader, RosImageReader)
@@ -349,9 +292,9 @@ def test_stopping_ends_the_thread_and_starting_begins_anew(
 
 
 def test_the_frames_of_any_reader_can_be_published(
-    topic: str, node: Callable[..., Node], make_video: Callable[..., Path], reading: Reading
+    topic: str, make_video: Callable[..., Path], reading: Reading
 ) -> None:
-    subscriber = node("subscribe", topic, "image", "reliable")
+    subscriber = Node(int(DOMAIN), topic, "image", "reliable")
     camera = SensorReaderConfig(
         sensor_id="file",
         backend_params={"path": str(make_video([200], fps=20.0)), "loop": True},
@@ -359,13 +302,11 @@ def test_the_frames_of_any_reader_can_be_published(
         publish_topic=topic,
     )
     reading(make_reader(camera, SystemClock()))
-    got = subscriber.told()
-    assert (got["width"], got["height"], got["encoding"], got["step"], got["frame_id"]) == (
-        64, 48, "bgr8", 64 * 3, "file",
-    )  # fmt: skip
-    data = base64.b64decode(got["data"])
-    assert len(data) == 64 * 48 * 3
-    assert sum(data) / len(data) == pytest.approx(200, abs=3)
+    got = subscriber.take()
+    assert (got.width, got.height, got.encoding, got.step) == (64, 48, "bgr8", 64 * 3)
+    assert got.header.frame_id == "file"
+    assert len(got.data) == 64 * 48 * 3
+    assert sum(got.data) / len(got.data) == pytest.approx(200, abs=3)
 
 
 def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: str) -> None:

@@ -23,7 +23,7 @@ from tests.runner.manual_clock import ManualClock
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.cli import lerobot_eval
 from vram_arbiter.runner.cli.benchmark import add_parser, entries_of
-from vram_arbiter.runner.cli.lerobot_eval import cells_of, flags_of, lease_of
+from vram_arbiter.runner.cli.lerobot_eval import cells_of, checkpoint_of, flags_of, lease_of
 from vram_arbiter.runner.protocols import ChunkStart, Hold
 from vram_arbiter.runner.recording.reader import read_frame
 from vram_arbiter.runner.sim.benchmark import Benchmark, Cell, file_name, wilson
@@ -249,6 +249,7 @@ def test_contestants_and_seeds_make_a_report_a_table_and_videos(
 
 @pytest.mark.heavy
 @pytest.mark.timeout(600)
+@pytest.mark.usefixtures("forked_writers")
 def test_the_expert_in_our_own_scene_is_recorded(tmp_path: Path) -> None:
     common = ["benchmark", "--no-arbiter", "--no-videos", "--out", str(tmp_path)]
     grabs = ["--policy", "expert", "--episodes", "1", "--max-steps", "150"]
@@ -264,6 +265,7 @@ def test_the_expert_in_our_own_scene_is_recorded(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.timeout(600)
+@pytest.mark.usefixtures("forked_writers")
 def test_a_benchmark_ends_with_the_first_episode_that_is_not_recorded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -406,27 +408,45 @@ def grab_of(folder: Path, weights: str) -> Path:
     return manifest
 
 
-@pytest.mark.heavy
-@pytest.mark.timeout(600)
-def test_lerobot_eval_plays_a_pinned_checkpoint_in_an_environment_of_lerobot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """lerobot's own program, with an environment and a small policy that it knows by a plugin.
-
-    Regression: lerobot-eval was given the revision as a flag, and read configuration and processors
-    of the newest one.
-    """
-    pytest.importorskip("lerobot.policies", reason="needs the sidecars extra")
-    from huggingface_hub import constants
-
+@pytest.fixture
+def pinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of `hf://lab/point@v1` in an offline cache of the hub, still empty."""
+    constants = pytest.importorskip("huggingface_hub.constants")
     cached, commit = tmp_path / "hub/models--lab--point", "0123456789" * 4
-    make_point_policy(cached / "snapshots" / commit)
+    folder = cached / "snapshots" / commit
+    folder.mkdir(parents=True)
     (cached / "refs").mkdir()
     (cached / "refs/v1").write_text(commit, encoding="utf-8")
-    manifest = grab_of(tmp_path, "hf://lab/point@v1")
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    return folder
+
+
+def test_a_pinned_checkpoint_is_played_from_its_own_folder(tmp_path: Path, pinned: Path) -> None:
+    """Regression: lerobot-eval was given the revision as a flag, and read configuration and
+    processors of the newest one.
+    """
+    (pinned / "config.json").write_text("{}", encoding="utf-8")
+    played = load_manifest(grab_of(tmp_path, "hf://lab/point@v1"))
+    assert Path(checkpoint_of(played)) == pinned
+    newest = load_manifest(grab_of(tmp_path, "hf://lab/point"))
+    assert checkpoint_of(newest) == "lab/point"
+
+
+@pytest.mark.heavy
+@pytest.mark.nightly  # its program imports torch and lerobot once more
+@pytest.mark.timeout(600)
+def test_lerobot_eval_plays_a_checkpoint_in_an_environment_of_lerobot(
+    tmp_path: Path,
+    pinned: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """lerobot's own program, with an environment and a small policy that it knows by a plugin."""
+    pytest.importorskip("lerobot.policies", reason="needs the sidecars extra")
+    make_point_policy(pinned)
+    manifest = grab_of(tmp_path, "hf://lab/point@v1")
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}/src:{ROOT}")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # lerobot leaves a file there

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.runner.conftest import KinematicEnv, world_of
-from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import (
     Act,
     ChunkStart,
@@ -351,28 +350,6 @@ def test_speeds_are_judged_by_simulated_time(make_runner: Make, env: Any, clock:
     ticks = [runner.tick() for _ in range(3)]
     assert [tick.action_applied for tick in ticks] == [True, True, True]
     assert env.joints["shoulder_pan"] == -0.4
-
-
-def test_a_policy_that_is_lost_fails_its_goal(make_runner: Make) -> None:
-    _, ended = play_script(make_runner(rate_hz=0), [Act(joints(9.0))] * 40, 30)
-    assert isinstance(ended[0].error, ModelError)
-    assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
-
-
-def test_a_late_action_is_dropped_on_the_way_to_the_simulator(
-    make_runner: Make, env: Any, clock: Any
-) -> None:
-    class Slow(Scripted):
-        def step(self, world: WorldState) -> StepOutcome:
-            clock.advance(0.2)
-            return super().step(world)
-
-    runner = make_runner(rate_hz=10, clock=clock, deadline_policy=DeadlinePolicy.DROP)
-    runner.activate()
-    runner.run(max_ticks=1)
-    runner.begin_skill(Slow(Act(joints(0.1))), GOAL, lambda _: None)
-    assert not runner.tick().action_applied
-    assert env.steps == [(None, None)]
 
 
 def test_a_stop_that_comes_while_the_skill_decides_acts_in_this_tick(

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played
-from vram_arbiter.schemas.errors import Evicted, ModelError
+from vram_arbiter.schemas.errors import ModelError
 
 Row = tuple[float, ...]
 
@@ -158,22 +158,6 @@ def test_what_the_chunks_say_about_the_steps_to_come() -> None:
     assert player.left_over(3) == [(0, 1), (0, 2), (0, 3)]
 
 
-@pytest.mark.parametrize("keep", [None, 1, 3])
-@pytest.mark.parametrize("size", [1, 2, 5, 16])
-@pytest.mark.parametrize("prefetch_at", [0, 1, 5, 20])
-@pytest.mark.parametrize("delay", [0, 4])
-def test_any_size_and_any_prefetch_play_on(
-    size: int, prefetch_at: int, delay: int, keep: int | None
-) -> None:
-    policy = Policy(size)
-    player = ChunkPlayer(policy.fetch, prefetch_at=prefetch_at, keep=keep)
-    played = play(player, policy, 50, delay)
-    assert player.played == len(played)
-    if prefetch_at == 0:
-        rows = size if keep is None else min(size, keep)
-        assert played == [(float(i // rows), float(i % rows)) for i in range(50)]
-
-
 def test_without_prefetch_the_observation_is_taken_after_the_last_row() -> None:
     policy = Policy(3)
     player = ChunkPlayer(policy.fetch)
@@ -192,25 +176,6 @@ def test_without_prefetch_the_observation_is_taken_after_the_last_row() -> None:
 def test_waiting_for_a_chunk_is_bounded() -> None:
     player = ChunkPlayer(Policy(3).fetch, wait_s=0.01)
     assert player.next_row("o") is None
-
-
-def test_a_chunk_that_is_there_is_played_at_once_when_waiting_is_allowed() -> None:
-    def fetch(_: Any) -> Any:
-        future: concurrent.futures.Future[list[Row]] = concurrent.futures.Future()
-        future.set_result([(1.0,)])
-        return future
-
-    assert ChunkPlayer(fetch, wait_s=1.0).next_row("o") == Played(0, (1.0,), first=True)
-
-
-@pytest.mark.parametrize("error", [Evicted("gone"), ModelError("no")])
-def test_what_the_fetch_raises_reaches_the_skill(error: Exception) -> None:
-    policy = Policy(1)
-    player = ChunkPlayer(policy.fetch)
-    player.next_row("o")
-    policy.futures[-1].set_exception(error)
-    with pytest.raises(type(error)):
-        player.next_row(None)
 
 
 def test_an_empty_chunk_and_a_missing_observation_are_refused() -> None:
@@ -232,39 +197,6 @@ def test_closing_forgets_what_is_under_way() -> None:
     player.next_row(None)
     player.close()
     assert player.wants_observation()
-
-
-def test_a_chunk_that_is_there_when_it_is_due_is_a_hit_and_a_late_one_a_miss() -> None:
-    policy = Policy(3)
-    player = ChunkPlayer(policy.fetch, prefetch_at=1, keep=2)
-    told: list[bool | None] = []
-
-    def two_rows() -> None:
-        for _ in range(2):
-            row = player.next_row("o")
-            assert row is not None
-            told.append(row.prefetched)
-
-    assert player.next_row("o") is None
-    policy.answer()
-    two_rows()  # the second row asks for the next chunk
-    policy.answer()
-    two_rows()
-    assert player.next_row("o") is None
-    policy.answer()
-    two_rows()
-    assert told == [None, None, True, None, False, None]
-
-
-def test_an_answer_that_comes_while_it_is_waited_for_is_played_at_once() -> None:
-    with concurrent.futures.ThreadPoolExecutor(1) as pool:
-
-        def fetch(observation: Any) -> Any:
-            return pool.submit(lambda: [(float(observation),)])
-
-        player = ChunkPlayer(fetch, wait_s=60.0)
-        rows = [player.next_row(n) for n in range(20)]
-    assert [row.row for row in rows if row is not None] == [(float(n),) for n in range(20)]
 
 
 def test_a_request_that_was_cancelled_or_timed_out_is_a_typed_error() -> None:

@@ -68,16 +68,21 @@ class Answers:
     prefetch_at=st.integers(0, 30),
     delays=st.lists(st.one_of(st.none(), st.integers(0, 12)), min_size=1, max_size=6),
     failing=st.sets(st.integers(0, 5), max_size=2),
+    keep=st.one_of(st.none(), st.integers(1, 8)),
 )
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_any_sizes_any_prefetch_any_lateness(
-    sizes: list[int], prefetch_at: int, delays: list[int | None], failing: set[int]
+    sizes: list[int],
+    prefetch_at: int,
+    delays: list[int | None],
+    failing: set[int],
+    keep: int | None,
 ) -> None:
     failed: list[int | None] = [-1 if n in failing else delay for n, delay in enumerate(delays)]
     if all(delay == -1 for delay in failed):
         failed.append(0)
     answers = Answers(sizes, failed)
-    player = ChunkPlayer(answers.fetch, prefetch_at=prefetch_at)
+    player = ChunkPlayer(answers.fetch, prefetch_at=prefetch_at, keep=keep)
     played: list[Played] = []
     stood_still, failures = False, 0
     # each row costs at most one request, each request at most 13 steps and one failure before it

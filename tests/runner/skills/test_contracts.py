@@ -227,7 +227,6 @@ def test_joints_in_the_policys_order_in_degrees_with_a_gripper_in_percent() -> N
         "state_contract: {dim: 6}\n"
     )
     wiring = wire_up(manifest, robot, None)
-    assert wiring.actions.direct
     told = [25.0, -90.0, 45.0, 30.0, -60.0, 10.0]
     (row,) = wiring.actions.rows(np.array([told]))
     targets = dict(zip(wiring.joints, row, strict=True))
