@@ -2,7 +2,6 @@
 drift from the models."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -24,15 +23,9 @@ def write_changed(folder: Path, kind: str, old: str, new: str, more: str = "") -
     return folder / "rskill.yaml"
 
 
-def test_check_says_ok_for_good_files() -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.schemas", "check", *map(str, SAMPLES)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert result.stdout.splitlines() == [f"{path}: ok" for path in SAMPLES]
+def test_check_says_ok_for_good_files(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", *map(str, SAMPLES)]) == 0
+    assert capsys.readouterr().out.splitlines() == [f"{path}: ok" for path in SAMPLES]
 
 
 def test_check_names_every_wrong_field_and_goes_on(

@@ -16,7 +16,6 @@ from vram_arbiter.schemas.tools import (
     TOOLS,
     ExecuteRskill,
     function_schema,
-    function_schemas,
     parse_skill_call,
     parse_tool_call,
     skill_function,
@@ -115,13 +114,6 @@ def test_function_schema_offers_what_the_class_accepts(name: str) -> None:
     assert set(function["parameters"]["properties"]) == set(TOOLS[name].model_fields) - {"tool"}
     assert set(function["parameters"].get("required", [])) <= set(CALLS[name])
     assert function["parameters"]["additionalProperties"] is False
-
-
-def test_function_schemas_of_some_or_all() -> None:
-    assert [schema["function"]["name"] for schema in function_schemas(["query_scene"])] == [
-        "query_scene"
-    ]
-    assert len(function_schemas()) == len(TOOLS)
 
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,40}/[A-Za-z0-9._-]{1,60}", fullmatch=True)

@@ -8,7 +8,6 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from tests.support.paths import ROOT
-from vram_arbiter.schemas import defaults
 from vram_arbiter.schemas.config.arbiter import LIVE_KEYS, ArbiterConfig, load_config
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.yamltext import parse_yaml
@@ -69,16 +68,6 @@ def test_every_key_of_the_model_has_a_description() -> None:
         section = type(getattr(ArbiterConfig(), name))
         for key, field in section.model_fields.items():
             assert field.description, f"{name}.{key} says nothing about itself"
-
-
-def test_the_defaults_are_the_products_constants() -> None:
-    config = ArbiterConfig()
-    assert config.gpu.reserve_bytes == defaults.RESERVE_BYTES
-    assert config.revoke.deadline_s == defaults.REVOKE_DEADLINE_S
-    assert config.verify.poll_s == defaults.VERIFY_POLL_S
-    assert config.verify.tolerance_bytes == defaults.VERIFY_TOLERANCE_BYTES
-    assert config.limits.rate_per_client_per_s == defaults.RATE_PER_CLIENT_PER_S
-    assert config.history.max_events == defaults.HISTORY_MAX_EVENTS
 
 
 def test_an_empty_file_is_the_default() -> None:
