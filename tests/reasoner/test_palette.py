@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vram_arbiter.reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, skills_of
@@ -297,10 +297,11 @@ JSON = st.recursive(
     lambda inner: (
         st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
     ),
-    max_leaves=12,
+    max_leaves=6,
 )
 
 
+@settings(max_examples=60)
 @given(
     schema=st.dictionaries(
         st.sampled_from(["type", "enum", "required", "properties", "items", "minimum", "minItems"]),

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vram_arbiter.schemas.errors import BadRequest, UnknownOp
@@ -119,6 +119,7 @@ def test_function_schema_offers_what_the_class_accepts(name: str) -> None:
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,40}/[A-Za-z0-9._-]{1,60}", fullmatch=True)
 
 
+@settings(max_examples=40)
 @given(st.lists(NAMES, min_size=2, max_size=6, unique=True))
 def test_each_skill_has_a_function_name_of_its_own(names: list[str]) -> None:
     made = [skill_tool_name(name) for name in names]
