@@ -100,15 +100,6 @@ def test_a_mistyped_section_is_named() -> None:
     )
 
 
-def test_sections_that_moved_are_named_with_their_lines() -> None:
-    """Regression: only the first was named, and without its line."""
-    lines = problem("gpu:\n  pids: own\ntelemetry: {}\nhttp:\n  listen: 9870\n").splitlines()
-    assert [line.partition(" any more")[0] for line in lines] == [
-        "arbiter.yaml:3: telemetry: is not a section",
-        "arbiter.yaml:4: http: is not a section",
-    ]
-
-
 def test_a_key_that_resembles_nothing_lists_the_known_ones() -> None:
     assert "known here: days, max_events" in problem("history:\n  zzz: 1\n")
 
