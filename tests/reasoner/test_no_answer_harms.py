@@ -203,11 +203,9 @@ ANSWERS = st.builds(Answer, TEXT, st.lists(calls(), min_size=0, max_size=2).map(
 GOOD = st.builds(lambda call: Answer("", (call,)), calls())
 
 
-@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(
-    st.lists(
-        st.tuples(st.one_of(GOOD, GOOD, GOOD, ANSWERS), st.booleans()), min_size=1, max_size=10
-    )
+    st.lists(st.tuples(st.one_of(GOOD, GOOD, GOOD, ANSWERS), st.booleans()), min_size=1, max_size=8)
 )
 def test_no_answer_moves_what_it_may_not(answers: list[tuple[Answer, bool]]) -> None:
     world, results = _play(list(answers))
