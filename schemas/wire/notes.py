@@ -1,14 +1,14 @@
 """Notes: what happened, as history, subscribers, telemetry, the log and replays learn it.
 
-One class for each kind, with typed fields and no words; `AnyNote` lists them all. A note about a
-lease goes with `About`. `arbiter.rpc.words` makes the event of both: `{"kind", "lease_id"?,
-"consumer"?, "gpu"?, "traceparent"?, …, "reason"?}`. A field that has its default is left out.
+One class for each kind, with typed fields and no words. A note about a lease goes with `About`.
+`arbiter.rpc.words` makes the event of both: `{"kind", "lease_id"?, "consumer"?, "gpu"?,
+"traceparent"?, …, "reason"?}`. A field that has its default is left out.
 Standard library only.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 from vram_arbiter.schemas.ids import GpuId, LeaseId, UseId
 from vram_arbiter.schemas.wire.codes import Cause, Order, Wait, Why
@@ -30,8 +30,12 @@ class About:
     traceparent: str | None = None
 
 
+class AnyNote(Tagged):
+    """Base of all notes."""
+
+
 # -- waiting and granting
-class QueuedNote(Tagged, kind="queued"):
+class QueuedNote(AnyNote, kind="queued"):
     """A request waits."""
 
     position: int | None
@@ -40,14 +44,14 @@ class QueuedNote(Tagged, kind="queued"):
     block: BlockView | None = None  # why nothing is granted on its GPU
 
 
-class GrantedNote(Tagged, kind="granted"):
+class GrantedNote(AnyNote, kind="granted"):
     charge_bytes: int
     waited_ms: float
     evicted: tuple[str, ...]  # consumers
     by_itself: bool = False  # back from standby, without an acquire
 
 
-class ReadyNote(Tagged, kind="ready"):
+class ReadyNote(AnyNote, kind="ready"):
     """The holder has loaded."""
 
     charge_bytes: int
@@ -66,7 +70,7 @@ class EvictedLease:
     charge_bytes: int
 
 
-class SwitchNote(Tagged, kind="switch"):
+class SwitchNote(AnyNote, kind="switch"):
     """Time of a grant from the acquire to `ready`, by phase; it comes with each `ready`. Of several
     victims the slowest counts. `switched`: a lease was evicted for it."""
 
@@ -81,13 +85,13 @@ class SwitchNote(Tagged, kind="switch"):
     total_ms: float
 
 
-class DeniedNote(Tagged, kind="denied"):
+class DeniedNote(AnyNote, kind="denied"):
     """A request that waited, or a grant that could not be recorded, is over."""
 
     refusal: Refusal = field(metadata=_CODE)
 
 
-class RefusedNote(Tagged, kind="refused"):
+class RefusedNote(AnyNote, kind="refused"):
     """A request for bytes was refused at once. `left_out`: refusals of the same process that were
     not noted."""
 
@@ -97,20 +101,20 @@ class RefusedNote(Tagged, kind="refused"):
     left_out: int = 0
 
 
-class CancelledNote(Tagged, kind="cancelled"):
+class CancelledNote(AnyNote, kind="cancelled"):
     why: Why
     by: str = ""
 
 
 # -- uses
-class UseBeganNote(Tagged, kind="use_began"):
+class UseBeganNote(AnyNote, kind="use_began"):
     use_id: UseId
     label: str
     uses: int
     resumed: bool
 
 
-class UseEndedNote(Tagged, kind="use_ended"):
+class UseEndedNote(AnyNote, kind="use_ended"):
     use_id: UseId
     label: str
     ms: float
@@ -119,7 +123,7 @@ class UseEndedNote(Tagged, kind="use_ended"):
 
 
 # -- leaving
-class RevokeAskedNote(Tagged, kind="revoke_asked"):
+class RevokeAskedNote(AnyNote, kind="revoke_asked"):
     """A holder is revoked for the first time."""
 
     wanted_by: str  # consumer of the waiter
@@ -129,7 +133,7 @@ class RevokeAskedNote(Tagged, kind="revoke_asked"):
     order: Order | None = None
 
 
-class RevokeWithdrawnNote(Tagged, kind="revoke_withdrawn"):
+class RevokeWithdrawnNote(AnyNote, kind="revoke_withdrawn"):
     """A revoke ends without an eviction: nothing wants the bytes any more."""
 
     wanted_by: str  # consumer of the waiter that is gone
@@ -138,22 +142,22 @@ class RevokeWithdrawnNote(Tagged, kind="revoke_withdrawn"):
     ms: float  # since the revoke
 
 
-class RevokeAckedNote(Tagged, kind="revoke_acked"):
+class RevokeAckedNote(AnyNote, kind="revoke_acked"):
     safe_point_eta_s: float | None
     uses: int
 
 
-class RemindedNote(Tagged, kind="reminded"):
+class RemindedNote(AnyNote, kind="reminded"):
     uses: int
     acked: bool
 
 
-class DeadlinePassedNote(Tagged, kind="deadline_passed"):
+class DeadlinePassedNote(AnyNote, kind="deadline_passed"):
     uses: int
     wanted_by: str
 
 
-class SignalledNote(Tagged, kind="signalled"):
+class SignalledNote(AnyNote, kind="signalled"):
     """An operator ended the process of a holder."""
 
     signal: Literal["term", "kill"]
@@ -162,22 +166,22 @@ class SignalledNote(Tagged, kind="signalled"):
     reason: str
 
 
-class UnloadingNote(Tagged, kind="unloading"):
+class UnloadingNote(AnyNote, kind="unloading"):
     asked: bool
 
 
-class ReleasedNote(Tagged, kind="released"):
+class ReleasedNote(AnyNote, kind="released"):
     exiting: bool
     was: str  # its state before
     why: Why
 
 
-class ExpiredNote(Tagged, kind="expired"):
+class ExpiredNote(AnyNote, kind="expired"):
     why: Why
     ttl_s: float
 
 
-class LostNote(Tagged, kind="lost"):
+class LostNote(AnyNote, kind="lost"):
     why: Why
     pid: int | None = None
 
@@ -191,7 +195,7 @@ class Culprit:
     bytes: int
 
 
-class VerifiedNote(Tagged, kind="verified"):
+class VerifiedNote(AnyNote, kind="verified"):
     """A verdict. `resolved` False: the verification goes on."""
 
     verdict: str
@@ -204,7 +208,7 @@ class VerifiedNote(Tagged, kind="verified"):
 
 
 # -- standby
-class StandbyNote(Tagged, kind="standby"):
+class StandbyNote(AnyNote, kind="standby"):
     """A lease is away. `comes_back`: by itself."""
 
     left_for: str
@@ -212,7 +216,7 @@ class StandbyNote(Tagged, kind="standby"):
     comes_back: bool
 
 
-class ParkedNote(Tagged, kind="parked"):
+class ParkedNote(AnyNote, kind="parked"):
     """A lease is away, its weights are in host RAM. `comes_back`: by itself."""
 
     left_for: str
@@ -221,14 +225,14 @@ class ParkedNote(Tagged, kind="parked"):
 
 
 # -- measurements
-class OomNote(Tagged, kind="oom"):
+class OomNote(AnyNote, kind="oom"):
     requested_bytes: int
     allocated_bytes: int | None
     charge_bytes: int
     learnt_load_peak_bytes: int | None
 
 
-class DriftNote(Tagged, kind="drift"):
+class DriftNote(AnyNote, kind="drift"):
     """A footprint is not what was declared. Said once for a lease and part."""
 
     part: str
@@ -245,7 +249,7 @@ class OverHolder:
     over_bytes: int
 
 
-class PressureNote(Tagged, kind="pressure"):
+class PressureNote(AnyNote, kind="pressure"):
     """A GPU holds more than its budget, or (0 bytes) no longer does."""
 
     gpu: GpuId
@@ -254,29 +258,29 @@ class PressureNote(Tagged, kind="pressure"):
     holders: tuple[OverHolder, ...]
 
 
-class StowawayNote(Tagged, kind="stowaway"):
+class StowawayNote(AnyNote, kind="stowaway"):
     gpu: GpuId
     pid: int
     name: str
     used_bytes: int
 
 
-class ProbeFailedNote(Tagged, kind="probe_failed"):
+class ProbeFailedNote(AnyNote, kind="probe_failed"):
     gpu: GpuId
     reason: str
 
 
-class ProbeOkNote(Tagged, kind="probe_ok"):
+class ProbeOkNote(AnyNote, kind="probe_ok"):
     gpu: GpuId
 
 
 # -- the daemon
-class JournalFailedNote(Tagged, kind="journal_failed"):
+class JournalFailedNote(AnyNote, kind="journal_failed"):
     key: str
     reason: str
 
 
-class RecoveredNote(Tagged, kind="recovered"):
+class RecoveredNote(AnyNote, kind="recovered"):
     """What the journal told at the start. `leases`: what must be accounted for."""
 
     leases: tuple[str, ...]
@@ -284,24 +288,24 @@ class RecoveredNote(Tagged, kind="recovered"):
     doubt: str = ""
 
 
-class ReattachedNote(Tagged, kind="reattached"):
+class ReattachedNote(AnyNote, kind="reattached"):
     uses: int
     state: str
 
 
-class ServingNote(Tagged, kind="serving"):
+class ServingNote(AnyNote, kind="serving"):
     """Grants begin, so long after the start."""
 
     seconds: float
 
 
-class ResumedNote(Tagged, kind="resumed"):
+class ResumedNote(AnyNote, kind="resumed"):
     """The machine was suspended, or the daemon stopped."""
 
     slept_s: float
 
 
-class OperatorNote(Tagged, kind="operator"):
+class OperatorNote(AnyNote, kind="operator"):
     """An operator's order was followed."""
 
     action: str
@@ -312,44 +316,7 @@ class OperatorNote(Tagged, kind="operator"):
     silent_s: float | None = None
 
 
-type AnyNote = (
-    QueuedNote
-    | GrantedNote
-    | ReadyNote
-    | SwitchNote
-    | DeniedNote
-    | RefusedNote
-    | CancelledNote
-    | UseBeganNote
-    | UseEndedNote
-    | RevokeAskedNote
-    | RevokeWithdrawnNote
-    | RevokeAckedNote
-    | RemindedNote
-    | DeadlinePassedNote
-    | SignalledNote
-    | UnloadingNote
-    | ReleasedNote
-    | ExpiredNote
-    | LostNote
-    | VerifiedNote
-    | StandbyNote
-    | ParkedNote
-    | OomNote
-    | DriftNote
-    | PressureNote
-    | StowawayNote
-    | ProbeFailedNote
-    | ProbeOkNote
-    | JournalFailedNote
-    | RecoveredNote
-    | ReattachedNote
-    | ServingNote
-    | ResumedNote
-    | OperatorNote
-)
-
-NOTES: Final[Mapping[str, type]] = {cls.TAG[1]: cls for cls in get_args(AnyNote.__value__)}
+NOTES: Final[Mapping[str, type]] = {cls.TAG[1]: cls for cls in AnyNote.__subclasses__()}
 """Every note of the engine by its kind."""
 
 WARNING_KINDS: Final = frozenset(
