@@ -13,7 +13,7 @@ from tests.support.llm_apis import OpenAi
 
 type Decide = Callable[[dict[str, Any]], tuple[str, dict[str, Any]]]
 """Name and arguments of the call that answers a request."""
-type Answer = Callable[[BaseHTTPRequestHandler], None]
+type Answer = Callable[[BaseHTTPRequestHandler], object]
 
 
 class StandIn:
@@ -82,7 +82,7 @@ class StandIn:
 
     def hangs(self) -> None:
         """Takes the request and says nothing while the test lasts."""
-        self.answers.append(lambda handler: self.over.wait(30) and None)
+        self.answers.append(lambda handler: self.over.wait(30))
 
     def drips(self) -> None:
         """A space every 20 ms, for ever: each read succeeds, the answer never ends."""
