@@ -53,30 +53,26 @@ LOOK = LocateInView(query="red cube")
 ASK = QueryScene(question="what is held?")
 
 
-async def test_a_goals_end_becomes_an_outcome(a_runner: Any) -> None:
-    found = []
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        for status, code in (
-            ("succeeded", ""),
-            ("failed", "oom"),
-            ("canceled", ""),
-            ("deadline", ""),
-        ):
-            runner.accepted.clear()
-            doing = asyncio.create_task(Tools(client, None, None)(GRAB))
-            await runner.accepted.wait()
-            await runner.end(status, code=code)
-            outcome = await doing
-            found.append((outcome.status, outcome.code))
-    assert found == [
-        ("succeeded", ""),
-        ("failed", "oom"),
-        ("canceled", ""),
-        ("failed", "deadline"),
-    ]
+@pytest.mark.parametrize(
+    ("ended", "code", "told"),
+    [
+        ("succeeded", "", ("succeeded", "")),
+        ("failed", "oom", ("failed", "oom")),
+        ("canceled", "", ("canceled", "")),
+        ("deadline", "", ("failed", "deadline")),
+    ],
+)
+async def test_a_goals_end_becomes_an_outcome(
+    runner: Any, client: RunnerClient, ended: str, code: str, told: tuple[str, str]
+) -> None:
+    doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+    await runner.accepted.wait()
+    await runner.end(ended, code=code)
+    outcome = await doing
+    assert (outcome.status, outcome.code) == told
 
 
-async def test_what_follows_a_goal_is_said_while_it_runs(a_runner: Any) -> None:
+async def test_what_follows_a_goal_is_said_while_it_runs(runner: Any, client: RunnerClient) -> None:
     class Said(Hints):
         def __init__(self) -> None:
             self.follow = asyncio.Queue[str]()
@@ -84,33 +80,29 @@ async def test_what_follows_a_goal_is_said_while_it_runs(a_runner: Any) -> None:
         async def follows(self, rskill_id: str) -> None:
             await self.follow.put(rskill_id)
 
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        said = Said()
-        drive = GRAB.model_copy(update={"next_rskill_id": "test/next"})
-        doing = asyncio.create_task(Tools(client, None, None, hints=said)(drive))
-        await runner.accepted.wait()
-        follows = await said.follow.get()
-        await runner.end("succeeded")
-        found = follows, (await doing).status
-    assert found == ("test/next", "succeeded")
+    said = Said()
+    drive = GRAB.model_copy(update={"next_rskill_id": "test/next"})
+    doing = asyncio.create_task(Tools(client, None, None, hints=said)(drive))
+    await runner.accepted.wait()
+    follows = await said.follow.get()
+    await runner.end("succeeded")
+    assert (follows, (await doing).status) == ("test/next", "succeeded")
 
 
 @pytest.mark.parametrize("heard", [True, False])
 async def test_a_goal_nobody_waits_for_any_more_is_cancelled_and_its_end_is_heard(
-    a_runner: Any, heard: bool
+    runner: Any, client: RunnerClient, heard: bool
 ) -> None:
     """Regression: a goal went on moving the arm after the reasoner that had sent it was told to
     end, or where its acceptance was not received."""
 
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        runner.deaf |= set() if heard else {"goal"}
-        doing = asyncio.create_task(Tools(client, None, None)(GRAB))
-        await (runner.accepted if heard else runner.heard).wait()
-        doing.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await doing
-        found = len(runner.cancelled), runner.goal
-    assert found == (1, None)
+    runner.deaf |= set() if heard else {"goal"}
+    doing = asyncio.create_task(Tools(client, None, None)(GRAB))
+    await (runner.accepted if heard else runner.heard).wait()
+    doing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await doing
+    assert (len(runner.cancelled), runner.goal) == (1, None)
 
 
 def test_patience_counts_motion_and_not_the_wait_for_the_gpu(a_runner: Any) -> None:
@@ -324,7 +316,7 @@ async def test_a_place_of_long_ago_is_none(
     assert outcome.status == status
 
 
-@pytest.mark.parametrize("call", [LOOK, ASK])
+@pytest.mark.parametrize("call", [LOOK, ASK])  # a reward model is asked by the same function
 @pytest.mark.parametrize("late", [0, LOOKS_MAX - 1, LOOKS_MAX])
 async def test_a_picture_that_waited_for_the_gpu_is_not_looked_at_and_a_new_one_is(
     a_runner: Any, a_sidecar: Any, call: Any, late: int
@@ -396,16 +388,15 @@ async def test_nothing_is_loaded_or_unloaded_beside_a_goal(a_runner: Any, a_side
     assert asked == ["load", "unload", "unload"]
 
 
-async def test_an_unknown_component_and_a_prompt(a_runner: Any) -> None:
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        tools = Tools(client, None, None)
-        calls = [
-            LifecycleTransition(node="kernel", transition="deactivate"),
-            EmitPrompt(target_topic="/operator", text="help"),
-            LOOK,
-            ASK,
-        ]
-        found = [(await tools(call)).status for call in calls]
+async def test_an_unknown_component_and_a_prompt(runner: Any, client: RunnerClient) -> None:
+    tools = Tools(client, None, None)
+    calls = [
+        LifecycleTransition(node="kernel", transition="deactivate"),
+        EmitPrompt(target_topic="/operator", text="help"),
+        LOOK,
+        ASK,
+    ]
+    found = [(await tools(call)).status for call in calls]
     assert found == ["refused", "done", "refused", "refused"]
 
 
@@ -490,12 +481,11 @@ async def test_a_runner_that_was_started_again_ends_the_episode_and_gets_no_goal
     assert (danger, more, code) == ("the runner was started again", [], "goal_rejected")
 
 
-async def test_a_goal_without_an_end_is_given_up(a_runner: Any) -> None:
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        outcome = await Tools(client, None, None, goal_grace_s=0.0)(
-            ExecuteRskill(rskill_id="lab/grab", deadline_s=0.2)
-        )
-        cancelled = runner.cancelled
+async def test_a_goal_without_an_end_is_given_up(runner: Any, client: RunnerClient) -> None:
+    outcome = await Tools(client, None, None, goal_grace_s=0.0)(
+        ExecuteRskill(rskill_id="lab/grab", deadline_s=0.2)
+    )
+    cancelled = runner.cancelled
     assert (outcome.status, outcome.code) == ("failed", "wait_timeout")
     assert len(cancelled) == 1
 
@@ -527,47 +517,45 @@ class Stopper:
         return GRAB if episode.running is None else StopGoal()
 
 
-async def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(a_runner: Any) -> None:
+async def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(
+    runner: Any, client: RunnerClient
+) -> None:
     """Regression: the second cancel (a person's, behind the planner's) ended the wait for its
     end.
     """
 
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        runner.ends_on_cancel, runner.result_error = False, BadState("it is still running")
-        inbox = Inbox()
-        palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
-        episode = asyncio.create_task(
-            run_episode("x", Stopper(), palette, Tools(client, None, None), inbox=inbox)
-        )
-        await runner.accepted.wait()
-        inbox.put(Said("stop it"))
-        while not runner.cancelled:
-            await asyncio.sleep(0.01)
-        inbox.put(Cancel("at once"))
-        await asyncio.wait(
-            {episode}, timeout=0.3
-        )  # what is tested is that time passes without an end
-        waits = not episode.done()
-        runner.result_error = None
-        await runner.end("canceled")
-        result = await episode
-        found = (
-            ("waited" if waits else "left it running"),
-            [step["status"] for step in result["steps"]],
-        )
+    runner.ends_on_cancel, runner.result_error = False, BadState("it is still running")
+    inbox = Inbox()
+    palette = Palette((Skill("lab/grab", "vla", "", ("grasp",)),))
+    episode = asyncio.create_task(
+        run_episode("x", Stopper(), palette, Tools(client, None, None), inbox=inbox)
+    )
+    await runner.accepted.wait()
+    inbox.put(Said("stop it"))
+    while not runner.cancelled:
+        await asyncio.sleep(0.01)
+    inbox.put(Cancel("at once"))
+    await asyncio.wait({episode}, timeout=0.3)  # what is tested is that time passes without an end
+    waits = not episode.done()
+    runner.result_error = None
+    await runner.end("canceled")
+    result = await episode
+    found = (
+        ("waited" if waits else "left it running"),
+        [step["status"] for step in result["steps"]],
+    )
     assert found == ("waited", ["canceled"])
 
 
 @pytest.mark.parametrize("ended", [InternalError("a defect"), LimitExceeded("too many")])
 async def test_a_goal_whose_result_cannot_be_asked_for_is_called_off(
-    a_runner: Any, ended: VramError
+    runner: Any, client: RunnerClient, ended: VramError
 ) -> None:
     """Regression: the goal went on without anybody who waited for it."""
 
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        runner.result_error = ended
-        outcome = await Tools(client, None, None)(GRAB)
-        found = outcome.status, outcome.code, len(runner.cancelled)
+    runner.result_error = ended
+    outcome = await Tools(client, None, None)(GRAB)
+    found = outcome.status, outcome.code, len(runner.cancelled)
     assert found == ("failed", ended.code, 1)
 
 
