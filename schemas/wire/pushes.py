@@ -3,7 +3,7 @@ library only."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.plain import JsonMap
@@ -13,7 +13,11 @@ from vram_arbiter.schemas.wire.tagged import Tagged
 from vram_arbiter.schemas.wire.views import LeaseView
 
 
-class RevokePush(Tagged, push="revoke"):
+class AnyPush(Tagged):
+    """Base of all pushes."""
+
+
+class RevokePush(AnyPush, push="revoke"):
     """The arbiter asks the holder to leave. Repeated every `REVOKE_RESEND_S` until acknowledged;
     idempotent."""
 
@@ -30,27 +34,27 @@ class RevokePush(Tagged, push="revoke"):
     traceparent: str = ""  # of the eviction, or of the waiter: the unloading belongs to that trace
 
 
-class RevokeWithdrawnPush(Tagged, push="revoke_withdrawn"):
+class RevokeWithdrawnPush(AnyPush, push="revoke_withdrawn"):
     """The holder may stay: nothing wants its bytes any more. One that unloads already goes on."""
 
     lease_id: str
     token: Token
 
 
-class GrantedPush(Tagged, push="granted"):
+class GrantedPush(AnyPush, push="granted"):
     """A request that waited is granted."""
 
     lease: LeaseView
 
 
-class DeniedPush(Tagged, push="denied"):
+class DeniedPush(AnyPush, push="denied"):
     """A request that waited ends without a grant."""
 
     lease_id: str
     error: ErrorView
 
 
-class LostPush(Tagged, push="lost"):
+class LostPush(AnyPush, push="lost"):
     """The lease is over and its holder did not end it (expired, fenced): unload and
     acquire again."""
 
@@ -59,23 +63,19 @@ class LostPush(Tagged, push="lost"):
     error: ErrorView
 
 
-class EventPush(Tagged, push="event"):
+class EventPush(AnyPush, push="event"):
     """One history event, for subscribers: `{"seq", "at_wall_s", "kind", "lease_id"?, …}`."""
 
     event: JsonMap
 
 
-class PreparePush(Tagged, push="prepare"):
+class PreparePush(AnyPush, push="prepare"):
     """The consumer's model is wanted soon. `by`: the client that said so."""
 
     by: str
 
 
-type AnyPush = (
-    RevokePush | RevokeWithdrawnPush | GrantedPush | DeniedPush | LostPush | EventPush | PreparePush
-)
-
 PUSHES: Final[Mapping[str, type[Any]]] = MappingProxyType(
-    {cls.TAG[1]: cls for cls in get_args(AnyPush.__value__)}
+    {cls.TAG[1]: cls for cls in AnyPush.__subclasses__()}
 )
 """Kind → type of the push."""
