@@ -1,5 +1,5 @@
-"""A local server of a language model: scripted answers, or a call of a tool decided by each request,
-and the misbehavior of real ones: silence, drips, floods, hang-ups.
+"""A local server of a language model: scripted answers, or a call of a tool that each request
+decides, and the misbehavior of real ones: silence, drips, floods, hang-ups.
 """
 
 import contextlib

@@ -52,7 +52,7 @@ def flags(*argv: str) -> Any:
     return parser("").parse_args(["--detector", "none", "--scene-vlm", "none", *argv])
 
 
-async def said(*argv: str) -> None:
+async def speaks(*argv: str) -> None:
     """Speak to the running reasoner, as the command line does."""
     await speak(flags(*argv), argv[0].removeprefix("--"))
 
@@ -91,10 +91,10 @@ async def test_tasks_in_sequence(
         await told({"op": "submit", "text": "drive away"})
         await state_of(2, "running")
         for text in ("left", "right"):
-            await said("--submit", text)
+            await speaks("--submit", text)
         assert capsys.readouterr().out == "task 3, 1 before it\ntask 4, 2 before it\n"
-        await said("--cancel", "not that way", "--number", "3")
-        await said("--tasks")
+        await speaks("--cancel", "not that way", "--number", "3")
+        await speaks("--tasks")
         listed = [json.loads(line)["state"] for line in capsys.readouterr().out.splitlines()]
         assert listed == ["success", "running", "canceled", "queued"]
         assert (await told({"op": "state"}))["queued"] == 1
@@ -133,11 +133,11 @@ async def test_a_goal_ends_with_its_episode_whatever_the_model_does(
             _one_task(flags("--task", "drive home", "--planner", "anthropic"))
         )
         await runner.accepted.wait()
-        await said("--say", "slowly")
+        await speaks("--say", "slowly")
         await comes_true(lambda: len(stand_in.asked) == 2)
         match ended_by:
             case "person":
-                await said("--cancel", "lunch")
+                await speaks("--cancel", "lunch")
             case "signal":
                 signal.raise_signal(signal.SIGTERM)
             case "stop":

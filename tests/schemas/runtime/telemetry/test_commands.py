@@ -70,7 +70,7 @@ def program(lines: str, **environ: str) -> "subprocess.Popen[str]":
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def exported_spans(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Exporter of the spans of this process, as if the environment asked for them."""
     from opentelemetry.sdk.trace import TracerProvider
     from opentelemetry.sdk.trace.export import SimpleSpanProcessor
@@ -104,7 +104,7 @@ def raising(error: BaseException) -> Callable[[Command], None]:
     ],
 )
 def test_the_end_of_a_command_is_recorded(
-    recorded: Any, ends: Callable[[Command], None], code: int
+    exported_spans: Any, ends: Callable[[Command], None], code: int
 ) -> None:
     try:
         with command("tool", "do") as running:
@@ -113,7 +113,7 @@ def test_the_end_of_a_command_is_recorded(
         failed = isinstance(error, RuntimeError)
     else:
         failed = False
-    (span,) = recorded.get_finished_spans()
+    (span,) = exported_spans.get_finished_spans()
     assert span.attributes == {telemetry.ATTR_COMMAND: "do", telemetry.ATTR_EXIT_CODE: code}
     assert [event.name for event in span.events] == ["exception"] * failed
 
